@@ -99,6 +99,7 @@ def require_versions(app: str, told: dict[str, Any]) -> None:
     assert told["ray"] == (None if app == "apart" else ray.__version__)
     assert Path(told["prefix"]).name == ("virtualenv" if app == "installed" else app)
     assert told["variable"] == (None if app == "old" else "set")
+    assert told["gpus"] == ""  # which no replica asked for
 
 
 @pytest.mark.parametrize("app", ["old", "new", "apart", "installed"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from contextlib import nullcontext
 from types import SimpleNamespace
 from typing import Any
@@ -14,6 +15,7 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.ray_tools.private import gpus_here
 from vlagents_ray.serve.launch import readiness, server
 from vlagents_ray.serve.launch.deployment_file import deployment, with_replicas_on
+from vlagents_ray.serve.replica import engine_replica
 
 
 def args(gpus: float, **said: Any) -> dict[str, Any]:
@@ -112,3 +114,14 @@ def test_what_a_cluster_is_missing_is_repeated_until_it_is_there(
     monkeypatch.setattr(readiness, "_http_reason", lambda _: None)
     readiness.wait_until_ready(serve, {"a": "url"}, ["a"], float("inf"), lambda: next(missing))
     assert [record.getMessage() for record in caplog.records] == ["waiting: a GPU"] * 2
+
+
+@pytest.mark.parametrize(("given", "visible"), [([], ""), (["2"], "2")])
+def test_gpus_are_hidden_from_a_replica_to_which_ray_gave_none(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch, given: list[str], visible: str
+) -> None:
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "2")
+    monkeypatch.setattr(engine_replica, "gpus_here", lambda: 4.0)
+    engine_replica.hide_gpus(given)
+    assert os.environ["CUDA_VISIBLE_DEVICES"] == visible
+    assert ("resources: {num_gpus: 1}" in caplog.text) == (not given)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray import Act, ActionSpec, Agent, Contract, Obs
-from vlagents_ray.policies.loading import report_progress, report_uncompiled
+from vlagents_ray.policies.loading import report_device, report_progress, report_uncompiled
 
 ALIVE: weakref.WeakSet[Telling] = weakref.WeakSet()  # sessions that this process holds
 
@@ -53,6 +53,8 @@ class Telling(Agent):
     def act(self, obs: Obs) -> Act:
         if obs.info.get("exit"):
             os._exit(7)
+        if obs.info.get("broken"):
+            raise RuntimeError("CUDA error: device-side assert triggered")
         self.acts += 1
         self.observe(Obs(info={"value": obs.info.get("value", 0)}))
         position = obs.state["position"][:1] if obs.state else np.zeros(1)
@@ -88,6 +90,7 @@ class Compiling(Telling):
         report_progress("compiling 1 rows (1 of 2)")
         report_progress("compiling 2 rows (2 of 2)")
         report_uncompiled("2 rows")
+        report_device({"kind": "cuda", "name": "a GPU"})
 
 
 class Unpicklable(Telling):

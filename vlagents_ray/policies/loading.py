@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
+from typing import Any
 
 logger = logging.getLogger(__name__)
 
@@ -23,6 +24,9 @@ class LoadingReport:
     on_progress: Callable[[str], None]  # called with each step, on the thread that loads
     batch_sizes: Sequence[int]  # the server's, ascending
     uncompiled: list[str] = field(default_factory=list)  # what runs without compilation, although `compile` is set
+    devices: list[dict[str, Any]] = field(default_factory=list)  # on which models are, see `accelerator.described`
+    most_rows: int | None = None  # of a forward pass, if memory was found to hold no more
+    on_out_of_memory: Callable[[], None] = lambda: None  # called each time that a forward pass does not fit, also later
 
 
 _report: ContextVar[LoadingReport | None] = ContextVar("_report", default=None)
@@ -30,15 +34,18 @@ _report: ContextVar[LoadingReport | None] = ContextVar("_report", default=None)
 
 @contextmanager
 def loading_report(
-    on_progress: Callable[[str], None], batch_sizes: Sequence[int] = COMPILED_SIZES
+    on_progress: Callable[[str], None],
+    batch_sizes: Sequence[int] = COMPILED_SIZES,
+    on_out_of_memory: Callable[[], None] = lambda: None,
 ) -> Iterator[LoadingReport]:
     """Yield the report of the policy that is loaded in this context.
 
     Args:
         on_progress: Called with each step of a long load, on the thread that loads.
         batch_sizes: For which a policy is compiled whose settings name none, ascending.
+        on_out_of_memory: Called each time that a forward pass of the policy does not fit into memory.
     """
-    report = LoadingReport(on_progress, batch_sizes)
+    report = LoadingReport(on_progress, batch_sizes, on_out_of_memory=on_out_of_memory)
     token = _report.set(report)
     try:
         yield report
@@ -46,10 +53,14 @@ def loading_report(
         _report.reset(token)
 
 
-def served_batch_sizes() -> list[int]:
-    """Return the batch sizes of the server that loads the policy, ascending, for a policy that must fix some."""
-    report = _report.get()
-    return list(COMPILED_SIZES if report is None else report.batch_sizes)
+@contextmanager
+def current_report() -> Iterator[LoadingReport]:
+    """Yield the report of this context, or a new one if no server has opened any."""
+    if (report := _report.get()) is not None:
+        yield report
+        return
+    with loading_report(lambda _: None) as report:
+        yield report
 
 
 def report_progress(step: str) -> None:
@@ -57,6 +68,13 @@ def report_progress(step: str) -> None:
     logger.info("%s", step)
     if (report := _report.get()) is not None:
         report.on_progress(step)
+
+
+def report_device(device: dict[str, Any]) -> None:
+    """Log and report a device on which a policy computes."""
+    logger.info("device: %s", device)
+    if (report := _report.get()) is not None and device not in report.devices:
+        report.devices.append(device)
 
 
 def report_uncompiled(what: str) -> None:

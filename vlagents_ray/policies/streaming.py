@@ -53,8 +53,8 @@ class StreamingPolicy(ModelPolicy):
         if any(one is not None for one in found):
             yield found
         places = list(rows)
-        for start in range(0, len(places), self.config.rows):
-            some = places[start : start + self.config.rows]
+        for start in range(0, len(places), self.most_rows):
+            some = places[start : start + self.most_rows]
             for actions, more in self._parts([rows[i] for i in some]):
                 parts: list[Act | Exception | None] = [None] * len(obs)
                 for i, action in zip(some, actions, strict=True):

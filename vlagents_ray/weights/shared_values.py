@@ -125,8 +125,11 @@ class _GpuMemory:
         return self._uuid(value.device) if on_gpu else ""
 
     def finish(self, device: Any) -> None:
-        """Wait until what was begun on a GPU is done, for which another process does not wait."""
-        sys.modules["torch"].cuda.synchronize(device)
+        """Wait until what this thread began on a GPU is done, for which another process does not wait.
+
+        It waits for the current stream, not for the device, which would end the captures of other threads.
+        """
+        sys.modules["torch"].cuda.current_stream(device).synchronize()
 
     @contextmanager
     def handed_over(self, storage: Any) -> Iterator[StorageHandle]:

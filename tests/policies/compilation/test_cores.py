@@ -226,6 +226,56 @@ def test_a_program_with_other_results_is_not_used(
         np.testing.assert_allclose(one, other, atol=1e-6)
 
 
+@pytest.mark.parametrize("kept", [(0,), (1,), (0, 1)])
+def test_a_program_that_keeps_an_input_of_its_first_call_is_not_used(
+    monkeypatch: pytest.MonkeyPatch, kept: tuple[int, ...]
+) -> None:
+    """As a CUDA graph does that missed a part: the values which that part had in the capture stay."""
+
+    def stale(graph: Any, examples: Sequence[Any]) -> Callable[..., Any]:
+        first: list[Any] = []
+
+        def program(*inputs: Any) -> Any:
+            # The model's weights are inputs, too; those of the core have as many rows as the batch.
+            first.extend([] if first else [one.clone() for one in inputs])
+            own = [i for i, one in enumerate(inputs) if not isinstance(one, torch.nn.Parameter)]
+            for i in (own[place] for place in kept):
+                inputs = (*inputs[:i], first[i], *inputs[i + 1 :])
+            return graph(*inputs)
+
+        return program
+
+    monkeypatch.setattr(Compilation, "backend", staticmethod(stale))
+    with pytest.raises(ConfigError, match="compile: require: 'linear': its results are off by"):
+        made(compile="require", batch_sizes=[2])
+    torch._dynamo.reset()
+
+
+def test_a_program_is_not_made_with_the_inputs_with_which_it_is_compared(monkeypatch: pytest.MonkeyPatch) -> None:
+    kept: list[Any] = []
+
+    def stale(graph: Any, examples: Sequence[Any]) -> Callable[..., Any]:
+        def program(*inputs: Any) -> Any:
+            kept.extend([] if kept else [graph(*inputs)])
+            return kept[0]
+
+        return program
+
+    monkeypatch.setattr(Compilation, "backend", staticmethod(stale))
+    compilation, always = Compilation("require"), torch.ones(2, 3)
+    core = compilation.core("sum", lambda numbers: numbers.sum(-1))
+    with pytest.raises(ConfigError, match="'sum': its results are off by"):
+        compilation.add_size(2, lambda: core(always))
+    torch._dynamo.reset()
+
+
+def test_each_comparison_has_inputs_of_its_own(compiler: CountingCompiler) -> None:
+    """A program that is right once, for the inputs after which it was made, is not used."""
+    right = iter([True, True])  # the first call, and the first comparison
+    compiler.change[2] = lambda out: out if next(right, False) else out + 1
+    assert loaded(compile=True, batch_sizes=[2])[0].compilation.sizes == []
+
+
 def test_the_rounding_of_a_program_is_accepted(compiler: CountingCompiler) -> None:
     compiler.change[1] = lambda out: out * 1.0001
     assert loaded(compile="require", batch_sizes=[1])[0].compilation.sizes == [1]

@@ -115,6 +115,7 @@ def test_the_steps_of_a_long_start_there_are_reported_here() -> None:
         one.close()
     assert steps == ["compiling 1 rows (1 of 2)", "compiling 2 rows (2 of 2)"]
     assert report.uncompiled == ["2 rows"]
+    assert report.devices == [{"kind": "cuda", "name": "a GPU"}]
 
 
 def test_the_policy_runs_in_another_process_with_its_variables_and_this_ones_devices(
@@ -248,6 +249,18 @@ def test_a_policy_that_exits_in_an_act_loses_the_connection() -> None:
     [reply] = ask_all(one, [("a", Request("act", observation(exit=True)))])
     assert isinstance(reply.error, ConnectionLost)
     assert "exit status 7" in str(reply.error)
+    one.close()
+
+
+def test_a_child_whose_accelerator_failed_ends_so_that_the_replica_is_replaced() -> None:
+    one = Engine(agent())
+    one.start()
+    ask(one, "a", "reset", instruction="a task")
+    [reply] = ask_all(one, [("a", Request("act", observation(broken=True)))])
+    assert isinstance(reply.error, PolicyFailed)
+    wait_for(lambda: not one.ready)
+    with pytest.raises(PolicyUnavailable, match="exit status 1"):
+        one.check_health()
     one.close()
 
 

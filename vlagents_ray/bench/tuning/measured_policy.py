@@ -19,7 +19,6 @@ from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.messages import RankName, Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.models.agent_copies import AgentCopies
-from vlagents_ray.serve.models.loaded_model import synchronise
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -173,7 +172,6 @@ class MeasuredPolicy:
             if isinstance(act, Exception):
                 raise act
             acts.append(act)
-        synchronise()
         return acts
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, Field, field_validator, model_validator
@@ -113,9 +114,9 @@ class ModelConfig(BaseModel, extra="forbid"):
             raise ValueError(f"got {sizes}, want ascending positive numbers, such as [1, 2, 4, 8, 16]")
         return sizes
 
-    def with_sizes(self, sizes: list[int]) -> Self:
+    def with_sizes(self, sizes: Sequence[int]) -> Self:
         """Return the settings with these `batch_sizes`, unless they name others."""
-        return self if self.batch_sizes is not None else self.model_copy(update={"batch_sizes": sizes})
+        return self if self.batch_sizes is not None else self.model_copy(update={"batch_sizes": list(sizes)})
 
     @property
     def rows(self) -> int:

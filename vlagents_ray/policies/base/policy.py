@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import abc
 import copy
+import itertools
+import logging
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from operator import attrgetter
@@ -19,6 +21,7 @@ from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, InvalidAction, InvalidObservation, NotReset, PolicyFailed
 from vlagents_ray.interface import BEHAVIOUR, DELAY, DISTRIBUTION, EXECUTED, LEFTOVER, Act, Agent, Obs
 from vlagents_ray.policies.adapters import ADAPTER, Adapters, require_base_alone
+from vlagents_ray.policies.base.accelerator import free_memory, is_out_of_memory
 from vlagents_ray.policies.base.checkpoint import find_adapter, used_checkpoints
 from vlagents_ray.policies.base.checkpoint_files import weights_of
 from vlagents_ray.policies.base.config import ModelConfig
@@ -32,8 +35,10 @@ from vlagents_ray.policies.base.model_inputs import (
 )
 from vlagents_ray.policies.compilation import Compilation, quantize, require_whole
 from vlagents_ray.policies.determinism import require_deterministic
-from vlagents_ray.policies.loading import report_progress, served_batch_sizes
+from vlagents_ray.policies.loading import COMPILED_SIZES, LoadingReport, current_report, report_progress
 from vlagents_ray.validation import check_action
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +73,7 @@ class ModelPolicy(Agent, abc.ABC):
     `config.rows` rows. A session's noise comes from its own generator, seeded by the config's seed and the episode's.
     """
 
-    shared: ClassVar[tuple[str, ...]] = ("config", "model", "compilation", "adapters")
+    shared: ClassVar[tuple[str, ...]] = ("config", "model", "compilation", "adapters", "report")
     network: ClassVar[str | None] = None  # the attribute whose linear layers `quantization` may keep in 8 bits
     adaptable: ClassVar[bool] = False  # whether `predict` runs `network` within `self.adapters.rows`
 
@@ -77,6 +82,7 @@ class ModelPolicy(Agent, abc.ABC):
         self.model: Any = None
         self.compilation = Compilation(self.config.compile)  # `load` marks the model's cores with it
         self.adapters = Adapters()
+        self.report = LoadingReport(lambda _: None, COMPILED_SIZES)  # the server's, once loaded
         self.episode: PolicyEpisode | None = None
         if self.config.adapters and not self.adaptable:
             raise ConfigError(f"adapters: {type(self).__name__} does not offer them; merge each into its base")
@@ -85,6 +91,11 @@ class ModelPolicy(Agent, abc.ABC):
     def history(self) -> int:
         """The largest number of observations of each session that `predict` uses."""
         return 1
+
+    @property
+    def most_rows(self) -> int:
+        """The largest number of rows of one forward pass: the config's, or fewer if more did not fit into memory."""
+        return min(self.config.rows, self.report.most_rows or self.config.rows)
 
     @property
     def state_dim(self) -> int | None:
@@ -118,20 +129,30 @@ class ModelPolicy(Agent, abc.ABC):
         """Compute one chunk for each row, all in one forward pass. A row's result must not depend on the others."""
 
     def initialize(self) -> None:
-        """Load the checkpoint; with `batch_sizes`, run each of them once, or compile the model's cores for it."""
-        if self.config.compile:
-            self.config = self.config.with_sizes(served_batch_sizes())
-        self.model = self._load_with_adapters() if self.config.adapters else self.load()
+        """Load the checkpoint; with `batch_sizes`, run each of them once, or compile the model's cores for it.
+
+        Without, one row and a full batch run on an accelerator, so that a missing kernel, or too little memory, is not
+        first found by a robot.
+        """
+        with current_report() as self.report:
+            if self.config.compile:
+                self.config = self.config.with_sizes(self.report.batch_sizes)
+            self.model = self._load_with_adapters() if self.config.adapters else self.load()
         if self.config.quantization:
             quantize(self, self.config.quantization)
-        sizes = self.config.batch_sizes or ()
+        sizes = self.config.batch_sizes or []
+        if not sizes and any(device["kind"] != "cpu" for device in self.report.devices):
+            sizes = sorted({1, self.config.rows})
+        seeds = itertools.count()
         for number, size in enumerate(sizes, 1):
             report_progress(
                 f"{'compiling' if self.config.compile else 'running'} {size} rows ({number} of {len(sizes)})"
             )
             if self.compilation.cores:
-                self.compilation.add_size(size, partial(self._run_examples, size))
-            self._run_examples(size)
+                self.compilation.add_size(size, partial(self._run_examples, size, seeds))
+            self._run_examples(size, seeds)
+        if sizes:
+            free_memory()  # which a full batch took, and usual ones do not need
         if self.config.deterministic:
             require_deterministic(self._chunks, self._example, self.config.rows)
 
@@ -292,12 +313,45 @@ class ModelPolicy(Agent, abc.ABC):
         return {"mean": mean, "std": std, "samples": drawn, **_stacked([sample.behaviour for sample in samples])}
 
     def _forward(self, rows: list[Row]) -> list[Prediction | Exception]:
+        """Compute all rows; if the memory of an accelerator is exhausted, in smaller forward passes from then on."""
+        while True:
+            before = [row.rng.bit_generator.state for row in rows]
+            try:
+                return self._passes(rows)
+            except Exception as error:
+                if not is_out_of_memory(error) or not self._lower_rows(len(rows), error):
+                    raise
+            free_memory()  # after the handler, whose traceback refers to the tensors of the pass
+            for row, state in zip(rows, before, strict=True):  # the same noise again
+                row.rng.bit_generator.state = state
+
+    def _lower_rows(self, rows: int, error: Exception) -> bool:
+        """Halve the largest forward pass after one of up to `rows` rows did not fit; return whether it was over 1."""
+        self.report.on_out_of_memory()
+        tried = min(self.most_rows, self._size(rows))
+        fits = [size for size in self.config.batch_sizes or (tried // 2,) if 0 < size <= tried // 2]
+        said = f"of at most {fits[-1]} rows from now on" if fits else "no smaller one is possible"
+        logger.error(
+            "out of memory in a forward pass of %d rows: %s. Lower batch.max_size, max_rows or batch_sizes, or free "
+            "memory of the device (%s)",
+            tried,
+            said,
+            error,
+        )
+        self.report.most_rows = fits[-1] if fits else self.report.most_rows
+        return bool(fits)
+
+    def _size(self, rows: int) -> int:
+        """Return the number of rows to which a pass of so many is padded."""
+        return next((size for size in self.config.batch_sizes or () if size >= rows), rows)
+
+    def _passes(self, rows: list[Row]) -> list[Prediction | Exception]:
         """Compute all rows, in forward passes of the sizes that the config allows."""
         found: list[Prediction | Exception] = []
-        most = self.config.rows
+        most = self.most_rows
         for start in range(0, len(rows), most):
             part = rows[start : start + most]
-            size = next((s for s in self.config.batch_sizes or () if s >= len(part)), len(part))
+            size = self._size(len(part))
             last = part[-1]  # whose copies see what it sees
             filled = [*part, *(copy.deepcopy(last, {id(last.frames): last.frames}) for _ in range(size - len(part)))]
             if self.config.deterministic:  # each row has frames of its own, so that as many are encoded in every batch
@@ -308,9 +362,9 @@ class ModelPolicy(Agent, abc.ABC):
             found += results[: len(part)]
         return found
 
-    def _run_examples(self, size: int) -> None:
-        """Run a forward pass of that many rows; raises the first error of a row."""
-        self._chunks([self._example(seed) for seed in range(size)])
+    def _run_examples(self, size: int, seeds: Iterator[int]) -> None:
+        """Run a forward pass of that many rows with the next seeds; raises the first error of a row."""
+        self._chunks([self._example(next(seeds)) for _ in range(size)])
 
     def _chunks(self, rows: Sequence[Row]) -> list[np.ndarray]:
         """Return the chunks of rows; raises the first error of a row."""
@@ -322,7 +376,7 @@ class ModelPolicy(Agent, abc.ABC):
         return chunks
 
     def _example(self, seed: int, instruction: str = "warm up") -> Row:
-        """Return a row for the warm-up: random images, and zeros for a state, that fit the contract."""
+        """Return a row for the warm-up: random images, and a random state near zero, that fit the contract."""
         rng, contract = np.random.default_rng(seed), self.contract or Contract()
         lengths = {name: part.dim or 1 for name, part in (contract.state or {}).items()}
         unstated = [name for name, part in (contract.state or {}).items() if part.dim is None]
@@ -333,8 +387,8 @@ class ModelPolicy(Agent, abc.ABC):
                 name: rng.integers(0, 256, (one.height or 224, one.width or 224, 3), np.uint8)
                 for name, one in (contract.cameras or {}).items()
             },
-            gripper=1.0,
-            state={name: np.zeros(length, np.float32) for name, length in lengths.items()},
+            gripper=float(rng.random()),
+            state={name: rng.uniform(-0.1, 0.1, length).astype(np.float32) for name, length in lengths.items()},
         )
         session = copy.copy(self)
         session._begin(instruction, seed, self.adapters.example(seed))

@@ -68,20 +68,21 @@ class Compilation:
         return self.cores[-1]
 
     def add_size(self, size: int, forward: Callable[[], object]) -> None:
-        """Compile all cores for a batch size, larger than those before, and compare them with the eager pass.
+        """Compile all cores for a batch size, larger than those before, and compare them twice with the eager pass.
 
         If that fails, batches of this size use the programs of the next larger size, or run eagerly.
 
         Args:
             size: The number of rows.
-            forward: Runs a forward pass of that many rows.
+            forward: Runs a forward pass of that many rows, of other values each time.
 
         Raises:
             ConfigError: A core failed, and the mode is "require".
         """
         began, self.building = time.monotonic(), size
         try:
-            forward()
+            forward()  # makes the programs
+            forward()  # compares them after all of them were made
         except CompilationFailed as failure:
             for core in self.cores:
                 core.drop(size)
@@ -139,16 +140,20 @@ class Core:
         return wanted
 
     def _compiled(self, tensors: Sequence[Any]) -> Callable[..., Any]:
-        function = self._function
+        """Return the program for tensors of these shapes.
+
+        It is made with other values than those of a comparison: a CUDA graph that missed a part of the core returns the
+        results of the values with which it was captured.
+        """
+        function, torch = self._function, require("torch")
+        tensors = [torch.zeros_like(tensor) for tensor in tensors]
 
         def core(*tensors: Any) -> Any:
             return function(*tensors)
 
         # torch counts the programs of each code object, and gives up after eight of them
         core.__code__ = core.__code__.replace(co_name=f"{self._name}_{len(tensors[0])}")
-        program: Callable[..., Any] = require("torch").compile(
-            core, fullgraph=True, dynamic=False, backend=self._owner.backend
-        )
+        program: Callable[..., Any] = torch.compile(core, fullgraph=True, dynamic=False, backend=self._owner.backend)
         program(*tensors)
         return CudaGraph(program, tensors) if tensors[0].device.type == "cuda" else program
 

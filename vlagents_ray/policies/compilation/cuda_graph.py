@@ -2,12 +2,67 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import threading
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 from vlagents_ray.registry import require
 
 _WARM_UP = 3  # calls before the capture, in which libraries allocate their own memory
+_EMPTY = "CUDA Graph is empty"  # in torch's warning
+
+
+class CaptureLock:
+    """Keeps acts and pushes of weights out of the captures of this process.
+
+    A call that waits for a whole device ends any capture on it, with an error on both threads, whatever the mode of the
+    capture. A waiting capture goes before the next act, but waits for a push without delaying acts.
+    """
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._acting: set[int] = set()  # threads
+        self._capturing = False  # or about to
+        self.pushes = threading.RLock()  # the context of a push, within which its thread may also act
+
+    @contextmanager
+    def act(self) -> Iterator[None]:
+        """Wait for the end of a capture; none begins within this context, which a thread does not enter twice."""
+        thread = threading.get_ident()
+        with self._changed:
+            self._changed.wait_for(lambda: not self._capturing)
+            self._acting.add(thread)
+        try:
+            yield
+        finally:
+            with self._changed:
+                self._acting.discard(thread)
+                self._changed.notify_all()
+
+    @contextmanager
+    def capture(self) -> Iterator[None]:
+        """Wait for running acts and pushes; none begins within this context.
+
+        Raises:
+            RuntimeError: This thread acts itself.
+        """
+        if threading.get_ident() in self._acting:
+            raise RuntimeError("a CUDA graph cannot be captured within an act; capture it in Agent.initialize")
+        with self.pushes:
+            try:
+                with self._changed:
+                    self._capturing = True
+                    self._changed.wait_for(lambda: not self._acting)
+                yield
+            finally:
+                with self._changed:
+                    self._capturing = False
+                    self._changed.notify_all()
+
+
+CAPTURES = CaptureLock()
 
 
 class CudaGraph:
@@ -23,20 +78,29 @@ class CudaGraph:
         Args:
             function: The function.
             tensors: Its arguments, on one GPU, whose values do not matter.
+
+        Raises:
+            RuntimeError: The function cannot be captured, or none of its work was.
         """
         torch = require("torch")
-        self._inputs = [tensor.clone() for tensor in tensors]
-        with torch.cuda.device(self._inputs[0].device):
-            stream = torch.cuda.Stream()
-            stream.wait_stream(torch.cuda.current_stream())
-            with torch.cuda.stream(stream):
+        self._inputs, device = [tensor.clone() for tensor in tensors], tensors[0].device
+        # The stream is named, since torch's own one is on the device of the first capture of the process. The current
+        # one is entered again, since `torch.cuda.graph` leaves its own if the capture fails.
+        own, current = torch.cuda.Stream(device), torch.cuda.current_stream(device)
+        with torch.cuda.device(device), torch.cuda.stream(current):
+            own.wait_stream(current)
+            with torch.cuda.stream(own):
                 for _ in range(_WARM_UP):
                     function(*self._inputs)
-            torch.cuda.current_stream().wait_stream(stream)
+            current.wait_stream(own)
             self._graph = torch.cuda.CUDAGraph()
-            # Other checkpoints act meanwhile, on other threads, whose calls must not end the capture.
-            with torch.cuda.graph(self._graph, capture_error_mode="thread_local"):
-                self._result = function(*self._inputs)
+            with CAPTURES.capture(), warnings.catch_warnings(record=True) as said:
+                warnings.simplefilter("always")
+                # Preparations of acts go on meanwhile, on other threads, whose calls must not end the capture.
+                with torch.cuda.graph(self._graph, stream=own, capture_error_mode="thread_local"):
+                    self._result = function(*self._inputs)
+        if any(_EMPTY in str(warning.message) for warning in said):
+            raise RuntimeError("the CUDA graph is empty: all work ran on another stream, or on another device")
 
     def __call__(self, *tensors: Any) -> Any:
         """Return the function's result for tensors of the captured shapes, in memory of its own."""

@@ -23,7 +23,6 @@ from vlagents_ray.policies.base.model_inputs import (
 )
 from vlagents_ray.policies.base.realtime import Guide
 from vlagents_ray.policies.flow import OFFERED
-from vlagents_ray.policies.loading import served_batch_sizes
 from vlagents_ray.policies.openpi.config import OpenPiConfig
 from vlagents_ray.policies.openpi.models import OpenPiModel, load_jax, load_torch
 from vlagents_ray.policies.openpi.robots import RobotConvention, choose_robot
@@ -104,7 +103,7 @@ class OpenPi(ModelPolicy):
         elif (folder / "params").is_dir():
             if self.config.compile:
                 raise ConfigError("compile: openpi's JAX models always are; leave it out")
-            self.config = self.config.with_sizes(served_batch_sizes())
+            self.config = self.config.with_sizes(self.report.batch_sizes)
             model = load_jax(config, folder, self.config)
         else:
             raise ConfigError(

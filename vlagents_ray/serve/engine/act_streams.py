@@ -65,8 +65,7 @@ class ActStreams:
                 ticket.answer(reply)
 
         try:
-            with model.busy, call:
-                model.require_open()
+            with model.running(call):
                 model.parameters.use(weights)
                 stream = model.agent.act_batch_stream(observations, agents)  # type: ignore[arg-type]
                 del observations  # they may lie in memory that their sender needs back
@@ -86,6 +85,7 @@ class ActStreams:
             failure, padded = error, [error] * padding
         for i, (ticket, _) in list(waiting.items()):
             send(i, failure or self._unfinished(ticket))
+        model.calls.record_batch([failure] if failure else [None])
         model.padding.check_results(padded)
         self._stats.batch(len(acting), rows)
 

@@ -29,7 +29,7 @@ from vlagents_ray.serve.engine.resets import Resets
 from vlagents_ray.serve.engine.responses import Watchers, build_reply, public_error, timing
 from vlagents_ray.serve.engine.session_transfer import DrainList, SessionTransfer
 from vlagents_ray.serve.models.checkpoints import Checkpoints
-from vlagents_ray.serve.models.loaded_model import LoadedModel, Loader, synchronise
+from vlagents_ray.serve.models.loaded_model import LoadedModel, Loader
 from vlagents_ray.serve.models.model_manager import ModelManager
 from vlagents_ray.serve.queue.batch_queue import BatchQueue, PendingRequest, Rank
 from vlagents_ray.serve.queue.call_limits import CallLimits, PolicyCall, PolicyCalls
@@ -81,6 +81,7 @@ class Engine:
         loader = Loader(self._source, version, batch_sizes, max_batch_size, check, self.calls)
         self.models = ModelManager(self._source, loader, self.sessions)
         self.stats, self.admission = MetricsBuffer(), Admission(in_flight_bytes)
+        loader.on_out_of_memory = self.stats.out_of_memory
         self._batch_sizes, self._reply_bytes = batch_sizes, reply_bytes
         self._preparations: Preparations | None = None  # None if the engine has no threads
         self._loading = self.models.loading()
@@ -138,6 +139,7 @@ class Engine:
             raise self.models.loading() if self._unready is self._loading else self._unready
         if not self.queue.alive():
             raise PolicyFailed("the policy's thread has ended")
+        self.calls.require_device()
 
     def check_health(self) -> None:
         """Raise the full reason why the policy cannot act, including errors of the agents' own health checks.
@@ -149,6 +151,7 @@ class Engine:
         if (call := self.calls.overdue()) is not None:
             raise PolicyUnavailable(call.describe())
         self.require_ready()
+        self.calls.check_health()
         self.models.check_health()
 
     def notice_hung(self) -> None:
@@ -302,8 +305,7 @@ class Engine:
     def _observe(self, ticket: PendingRequest) -> None:
         session, model, weights = self._ready(ticket)
         if session.agent is not None and ticket.request.obs is not None:  # `_ready` and the decoder ensure both
-            with model.busy, model.call("observe"):
-                model.require_open()
+            with model.running(model.call("observe")):
                 model.parameters.use(weights)
                 session.agent.observe(ticket.request.obs)
         ticket.request.obs = None
@@ -334,15 +336,14 @@ class Engine:
         rows = len(observations)
         call = model.call("act", rows if self._batch_sizes else None)
         try:
-            with model.busy, call:
-                model.require_open()
+            with model.running(call):
                 model.parameters.use(weights)
                 results: Sequence[Act | Exception] = model.agent.act_batch(observations, agents)  # type: ignore[arg-type]
-                synchronise()
             if len(results) != rows:
                 raise PolicyFailed(f"act_batch: got {rows} observations, returned {len(results)} actions")
         except Exception as error:  # noqa: BLE001 - becomes the replies
             results = [error] * rows
+        model.calls.record_batch(results[: len(acting)])
         del observations  # they may lie in memory that their sender needs back
         for ticket, _ in acting:
             ticket.request.obs = None

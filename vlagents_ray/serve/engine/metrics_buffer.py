@@ -59,6 +59,7 @@ class Collected:
     requests: dict[Kind, Sample[Times]] = field(default_factory=dict)
     batches: Sample[int] = field(default_factory=Sample)  # observations per forward pass
     padding: int = 0  # number of padding rows in all batches
+    out_of_memory: int = 0  # forward passes that did not fit into memory
     hung: Counter[str] = field(default_factory=Counter)  # calls of the policy that exceeded their limit, by op
 
 
@@ -96,6 +97,11 @@ class MetricsBuffer:
         """Record a call of the policy that has exceeded its limit."""
         with self._lock:
             self._collected.hung[op] += 1
+
+    def out_of_memory(self) -> None:
+        """Record a forward pass that did not fit into the accelerator's memory."""
+        with self._lock:
+            self._collected.out_of_memory += 1
 
     def collect(self) -> Collected:
         """Return the metrics recorded since the last call."""

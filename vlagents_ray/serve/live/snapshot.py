@@ -149,6 +149,7 @@ class ReplicaView:
                 "checkpoint": metadata["checkpoint"],
                 "digest": (metadata["weights"] or {}).get("digest"),
                 "weights": metadata["policy_version"],
+                "devices": engine.models.devices,
                 "ready": engine.ready,
                 "step": engine.models.step,
                 "session_limit": engine.sessions.limit,

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import gc
 import json
 import logging
-import sys
 import threading
 import time
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,7 +16,8 @@ from vlagents_ray.errors import UnknownSession
 from vlagents_ray.interface import Agent, Obs
 from vlagents_ray.policies.base.checkpoint import used_checkpoints
 from vlagents_ray.policies.base.checkpoint_files import weights_of
-from vlagents_ray.policies.loading import loading_report
+from vlagents_ray.policies.compilation.cuda_graph import CAPTURES
+from vlagents_ray.policies.loading import LoadingReport, loading_report
 from vlagents_ray.protocol.messages import Request
 from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.serve.models.checkpoints import Checkpoints, resolved
@@ -46,7 +46,7 @@ class LoadedModel:
     calls: PolicyCalls  # running calls of the replica, including those of this agent
     parameters: ModelWeights  # versions of the weights
     busy: threading.Lock  # lock held while its agent runs, or is being closed
-    uncompiled: Sequence[str]  # what runs without compilation, although its settings ask for it
+    report: LoadingReport  # what it reported while it loaded
     since: float = field(default_factory=time.monotonic)  # time at which it was loaded, s
     sessions: int = 0  # number of sessions that hold it
     closed: bool = False
@@ -72,11 +72,6 @@ class LoadedModel:
             if obs is not None:
                 check_observation(obs, self.contract)
 
-    def require_open(self) -> None:
-        """Raise `UnknownSession` if the model and its sessions were closed while the caller waited for `busy`."""
-        if self.closed:
-            raise UnknownSession(f"{self.choice} has just been unloaded for another; reset the session")
-
     def call(self, op: str, kind: Hashable = None) -> PolicyCall:
         """Return a context for calls of the agent, which detects one that does not return.
 
@@ -86,6 +81,18 @@ class LoadedModel:
         if call is None:
             call = self._calls_by_kind[op, kind] = PolicyCall(self.calls, op)
         return call
+
+    @contextmanager
+    def running(self, call: PolicyCall) -> Iterator[PolicyCall]:
+        """Hold the agent for a call: no other thread runs it, and no other model is captured as a CUDA graph.
+
+        Raises:
+            UnknownSession: The model and its sessions were closed meanwhile.
+        """
+        with self.busy, CAPTURES.act(), call:
+            if self.closed:
+                raise UnknownSession(f"{self.choice} has just been unloaded for another; reset the session")
+            yield call
 
     def pad(self, observations: list[Obs | None], agents: list[Agent | None]) -> int:
         """Append rows that fill a batch up to the next size; return their number. On the policy's thread alone."""
@@ -131,6 +138,7 @@ class Loader:
         self._check = check
         self._calls = calls
         self.on_progress: Callable[[str], None] = lambda _: None  # called with each step of a long load
+        self.on_out_of_memory: Callable[[], None] = lambda: None  # called each time that a model finds none left
 
     def load(self, choice: CheckpointChoice, settings: dict[str, Any], agent: Agent | None = None) -> LoadedModel:
         """Load a model into `agent`, by default a new one; the agent is closed if it cannot be served.
@@ -149,7 +157,10 @@ class Loader:
     def _load(self, choice: CheckpointChoice, settings: dict[str, Any], agent: Agent | None) -> LoadedModel:
         agent = agent or self._source.make(settings)
         try:
-            with used_checkpoints() as found, loading_report(self.on_progress, self._compiled_sizes) as report:
+            with (
+                used_checkpoints() as found,
+                loading_report(self.on_progress, self._compiled_sizes, self.on_out_of_memory) as report,
+            ):
                 agent.initialize()
             weights = agent.weights_id or weights_of(found)
             contract = agent.contract
@@ -180,7 +191,7 @@ class Loader:
             calls,
             parameters,
             busy,
-            report.uncompiled,
+            report,
         )
 
     def version(self, settings: Mapping[str, Any]) -> str:
@@ -193,23 +204,8 @@ def key_of(settings: Mapping[str, Any]) -> str:
     return json.dumps(settings, sort_keys=True)
 
 
-def free_memory() -> None:
-    """Free memory at once: agents often contain reference cycles, and torch caches the GPU memory that it allocated."""
-    gc.collect()
-    torch = sys.modules.get("torch")
-    if torch is not None and torch.cuda.is_initialized():
-        torch.cuda.empty_cache()
-
-
 def _close_agent(agent: Agent) -> None:
     try:
         agent.close()
     except Exception:
         logger.exception("%s: could not be closed", type(agent).__name__)
-
-
-def synchronise() -> None:
-    """Wait for the GPU to finish, so that `inference_ms` includes its work."""
-    torch = sys.modules.get("torch")
-    if torch is not None and torch.cuda.is_initialized():
-        torch.cuda.synchronize()

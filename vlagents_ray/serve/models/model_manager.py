@@ -18,11 +18,11 @@ from typing import Any
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import PolicyUnavailable, UnknownSession, VLAgentsError
 from vlagents_ray.interface import Agent, Parts
+from vlagents_ray.policies.base.accelerator import free_memory
 from vlagents_ray.serve.models.checkpoints import Checkpoints
 from vlagents_ray.serve.models.loaded_model import (
     LoadedModel,
     Loader,
-    free_memory,
     key_of,
 )
 from vlagents_ray.serve.models.model_cache import (
@@ -52,6 +52,7 @@ class ModelManager:
         self.continues_plans = False  # whether that model's chunks go on from the plan that is executed
         self.contract: Contract | None = None  # contract of the deployment's own model that was loaded last
         self.weights: dict[str, Any] | None = None  # weights of the deployment's own model that was loaded last
+        self.devices: list[dict[str, Any]] = []  # on which that model computes
         self.step = ""  # the step of a long first load, such as "compiling 4 rows (3 of 5)"
         self.on_step: Callable[[str], None] = lambda _: None  # called with it, on the thread that loads
         self._source = source
@@ -132,7 +133,7 @@ class ModelManager:
     def uncompiled(self) -> list[str]:
         """What of the loaded models runs without compilation, although their settings ask for it."""
         with self._changed:
-            return [what for model in self._cache.loaded.values() for what in model.uncompiled]
+            return [what for model in self._cache.loaded.values() for what in model.report.uncompiled]
 
     def loading(self) -> PolicyUnavailable:
         """Return the error for clients while the first checkpoint is loaded, which names the step."""
@@ -240,7 +241,7 @@ class ModelManager:
     def _set_own_model(self, model: LoadedModel) -> None:
         self.contract, self._fingerprint = model.contract, model.version[1]
         self.act_parts, self.continues_plans = model.agent.act_parts, model.agent.continues_plans
-        self.weights = model.weights
+        self.weights, self.devices = model.weights, model.report.devices
 
     def _loop(self) -> None:
         while (task := self._next_task()) is not None:

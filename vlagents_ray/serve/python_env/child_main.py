@@ -22,7 +22,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 from vlagents_ray.contract import Contract
-from vlagents_ray.errors import ConfigError, PolicyFailed, VLAgentsError
+from vlagents_ray.errors import ConfigError, PolicyFailed, PolicyUnavailable, VLAgentsError
 from vlagents_ray.interface import Agent
 from vlagents_ray.policies.wrapper import build_agent
 from vlagents_ray.protocol.messages import INNER_OPS, Limits
@@ -35,6 +35,7 @@ _PR_SET_PDEATHSIG = 1
 # The replica checks requests, removes idle sessions and detects calls that take too long, so the child does not.
 _NO_LIMITS = Limits(**dict.fromkeys([limit.name for limit in fields(Limits)], 2**40))
 _NEVER_S = 1e6
+_CHECK_S = 1.0  # interval of the checks whether the accelerator still computes
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,9 +118,15 @@ def run() -> None:
             "act_parts": models.act_parts,
             "continues_plans": models.continues_plans,
             "uncompiled": models.uncompiled,
+            "devices": models.devices,
         }
     )
-    over.wait()
+    while not over.wait(_CHECK_S):
+        try:
+            engine.calls.require_device()
+        except PolicyUnavailable:
+            logging.getLogger(__name__).exception("the process ends, so that the replica is replaced")
+            os._exit(1)
     engine.close()
     server.close()
 

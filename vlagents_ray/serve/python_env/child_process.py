@@ -23,7 +23,7 @@ from vlagents_ray.client.transports.local.shm import ShmTransport
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, ConnectionLost, PolicyFailed, PolicyUnavailable, VLAgentsError
 from vlagents_ray.interface import Parts
-from vlagents_ray.policies.loading import report_progress, report_uncompiled
+from vlagents_ray.policies.loading import report_device, report_progress, report_uncompiled
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.python_env import child_main
 from vlagents_ray.serve.python_env.child_main import Settings
@@ -175,6 +175,8 @@ class Child:
             raise PolicyFailed(f"in {self._python}: {said['error']}")
         for what in said["uncompiled"]:
             report_uncompiled(what)
+        for device in said["devices"]:
+            report_device(device)
         return said
 
     def _keep(self) -> None:

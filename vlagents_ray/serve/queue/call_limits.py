@@ -11,12 +11,16 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+
+from vlagents_ray.errors import PolicyFailed, PolicyUnavailable, VLAgentsError
+from vlagents_ray.policies.base.accelerator import is_device_failure
 
 _WARM_UP_CALLS = 2  # per kind of call: the first one compiles, and the second one compiles for dynamic sizes
 _MULTIPLE = 10  # limit of a call, as a multiple of the longest call of its kind so far
 LOAD = "load"
+FAILED_BATCHES = 20  # in a row, without any action, after which a replica is replaced
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +51,9 @@ class PolicyCall:
         self._calls.under_way.add(self)
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        if error is not None:
+            self._calls.record_error(error)
         self._calls.under_way.discard(self)
         self.ended = self._calls.clock()
         took_s = self.ended - self.began
@@ -91,7 +97,42 @@ class PolicyCalls:
         self.limits = limits or CallLimits()
         self.clock = clock
         self.under_way: set[PolicyCall] = set()
+        self.failed_batches = 0  # in a row
+        self.broken: BaseException | None = None  # error of an accelerator, after which no call succeeds
+
+    def record_error(self, error: BaseException) -> None:
+        """Note an error of the policy, if it says that its accelerator failed."""
+        if self.broken is None and is_device_failure(error):
+            self.broken = error
+
+    def record_batch(self, results: Sequence[object]) -> None:
+        """Count the batches in a row that gave errors of the policy alone; errors of requests do not count."""
+        errors = [one for one in results if isinstance(one, Exception)]
+        for error in errors:
+            self.record_error(error)
+        if len(errors) < len(results):
+            self.failed_batches = 0
+        elif all(isinstance(error, PolicyFailed) or not isinstance(error, VLAgentsError) for error in errors):
+            self.failed_batches += 1
+
+    def require_device(self) -> None:
+        """Raise `PolicyUnavailable` if the accelerator failed, so that clients begin again at another replica."""
+        if self.broken is not None:
+            raise PolicyUnavailable(
+                f"the policy's accelerator failed ({_line(self.broken)}); this replica is replaced, and the session "
+                f"begins again at another one"
+            ) from self.broken
+
+    def check_health(self) -> None:
+        """Raise if the accelerator failed, or the last batches all did."""
+        self.require_device()
+        if self.failed_batches >= FAILED_BATCHES:
+            raise PolicyFailed(f"the last {self.failed_batches} batches failed as a whole; the server's log says why")
 
     def overdue(self) -> PolicyCall | None:
         """Return a running call that has exceeded its limit, or None."""
         return next((call for call in tuple(self.under_way) if call.lasted_s > call.limit_s), None)
+
+
+def _line(error: BaseException) -> str:
+    return f"{type(error).__name__}: {str(error).partition(chr(10))[0]}"

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
+import ray
+
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import PolicyFailed, VLAgentsError
+from vlagents_ray.policies.base.accelerator import VISIBLE
 from vlagents_ray.protocol.frames import decode_requests
 from vlagents_ray.protocol.messages import Reply, Request
+from vlagents_ray.ray_tools.private import gpus_here
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.engine.dispatch import Dispatcher
@@ -34,6 +39,8 @@ class EngineReplica:
     ) -> None:
         """Make the engine, without loading the policy; see `Engine` for the last two arguments."""
         self._args = args
+        if VISIBLE not in args.environment.env_vars:
+            hide_gpus(ray.get_runtime_context().get_accelerator_ids().get("GPU", []))
         self._limits = args.limits.limits()
         self._engine = Engine(
             args.checkpoints.of(partial(make_agent, args), args.config),
@@ -92,3 +99,20 @@ class EngineReplica:
     async def check_health(self) -> None:
         """Raise if the policy died or hangs; Serve calls this once the policy has loaded, and replaces the replica."""
         await asyncio.to_thread(self._engine.check_health)  # includes the policy's own check
+
+
+def hide_gpus(given: Sequence[str]) -> None:
+    """Hide the node's GPUs from this process and its children, unless Ray has given it some.
+
+    Ray itself does not hide them from a replica with `num_gpus: 0`, which would take memory of the first one,
+    unreserved. It must be called before anything uses CUDA.
+    """
+    if given:
+        return
+    if found := gpus_here():
+        logger.warning(
+            "this node has %g GPUs, which are hidden from the policy, as its resources say num_gpus: 0; with "
+            "resources: {num_gpus: 1} it gets one",
+            found,
+        )
+    os.environ[VISIBLE] = ""

@@ -13,6 +13,7 @@
 | `vlagents_policy_version` | gauge | newest version of the weights; 0 is the checkpoint that was loaded |
 | `vlagents_weight_push_ms` | histogram | from new weights at the replica that received them until all act with them |
 | `vlagents_uncompiled` | gauge | batch sizes that run without compilation, although the policy's `compile` is set |
+| `vlagents_out_of_memory` | counter | forward passes that did not fit into memory; not those in a child process |
 | `vlagents_hung_calls` | counter | op; calls of the policy that took longer than `limits` allow |
 | `vlagents_shadow_dropped` | counter | observations that the candidate of a shadow did not get |
 | `vlagents_shadow_observations` | counter | outcome ("compared", "failed"); observations that the candidate got |
@@ -96,6 +97,7 @@ class Exporter:
         self._version = make(Gauge, "policy_version", "Newest version of the weights.")
         self._pushes = make(Histogram, "weight_push_ms", "Time until all replicas act with weights.", boundaries=_MS)
         self._hung = make(Counter, "hung_calls", "Calls of the policy over their time limit.", "op")
+        self._out_of_memory = make(Counter, "out_of_memory", "Forward passes that did not fit into memory.")
         self._uncompiled = make(Gauge, "uncompiled", "Batch sizes that run without the compilation that is set.")
         self._unreadable = make(Gauge, "keys_unreadable_s", "Time in which the key file could not be read.")
         self._dropped = make(Counter, "shadow_dropped", "Observations that the candidate did not get.")
@@ -171,6 +173,8 @@ class Exporter:
             self._batch.observe(observations)
         for op, calls in collected.hung.items():
             self._hung.inc(calls, {"op": op})
+        if collected.out_of_memory:
+            self._out_of_memory.inc(collected.out_of_memory)
         if collected.padding:
             self._padding.inc(collected.padding)
 

@@ -142,6 +142,7 @@ class PolicyReplica(EngineReplica, ReplicaWeights, ReplicaLive, ReplicaShadow, C
             "policy": self._args.policy,
             "checkpoint": resolved(models.config),
             "weights": models.weights,
+            "devices": models.devices,
             "policy_version": self._engine.weights.describe(),
             "checkpoints": models.describe(),
             "config": models.config,

@@ -17,6 +17,7 @@ from weakref import WeakValueDictionary
 
 from vlagents_ray.errors import MessageTooLarge, NotTrainable, Overloaded, UnknownSession, WeightsNotStaged
 from vlagents_ray.interface import POLICY, Agent
+from vlagents_ray.policies.compilation.cuda_graph import CAPTURES
 from vlagents_ray.weights.check import fingerprint, fitted, require_fit
 from vlagents_ray.weights.safetensors import ValueSpec, read_header
 from vlagents_ray.weights.shared_values import gpu_of
@@ -184,8 +185,9 @@ class ModelWeights:
                 )
             self._staged = placeholder
         try:
-            values = fitted(self._values(newest), pushed, partial=partial, allow_same=allow_same)
-            staged = WeightsVersion(number, fingerprint(values), values)
+            with CAPTURES.pushes:
+                values = fitted(self._values(newest), pushed, partial=partial, allow_same=allow_same)
+                staged = WeightsVersion(number, fingerprint(values), values)
         except BaseException:
             self.drop(number)
             raise
@@ -266,7 +268,8 @@ class ModelWeights:
 
     def portable_values(self, version: WeightsVersion) -> dict[str, Any]:
         """Return the values of a version as numpy arrays, for another process."""
-        return {name: portable(value) for name, value in self._values(version).items()}
+        with CAPTURES.pushes:
+            return {name: portable(value) for name, value in self._values(version).items()}
 
     def _forget_staged(self) -> None:
         self._staged = self._waiting = None

@@ -1,0 +1,231 @@
+"""Devices that are missing, exhausted or broken."""
+
+from __future__ import annotations
+
+import copy
+import re
+import sys
+from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from vlagents_ray import Obs
+from vlagents_ray.contract import ActionSpec, Contract, StateSpec
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.interface import DISTRIBUTION, SAMPLES, Act
+from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row
+from vlagents_ray.policies.base.accelerator import is_device_failure, is_out_of_memory, jax_device, torch_device
+from vlagents_ray.policies.base.model_inputs import state_vector
+from vlagents_ray.policies.loading import loading_report, report_device
+from vlagents_ray.serve.engine.engine import Engine
+
+pytestmark = pytest.mark.torch
+
+DIM, HORIZON = 2, 3
+OLD = "The NVIDIA driver on your system is too old (found version 12040)"
+
+
+def without_cuda(patch: pytest.MonkeyPatch) -> None:
+    """Let torch be one whose CUDA the driver does not support."""
+
+    def empty(*_: Any, device: Any) -> None:
+        if device.type == "cuda":
+            raise RuntimeError(f"{OLD}. Please update it.\nmore")
+
+    patch.setattr(torch.cuda, "is_available", lambda: False)
+    patch.setattr(torch, "empty", empty)
+
+
+@pytest.mark.parametrize("given", ["0", "3,4", "GPU-8f2c", "MIG-1"])
+def test_a_gpu_that_torch_cannot_use_is_an_error_with_torchs_reason(monkeypatch: Any, given: str) -> None:
+    without_cuda(monkeypatch)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", given)
+    torchs = re.escape(f"torch {torch.__version__} cannot use: {OLD}")
+    with pytest.raises(ConfigError, match=rf"given GPU {given} .*{torchs}.*or set device: cpu"):
+        torch_device("auto")
+    assert torch_device("cpu").type == "cpu"
+
+
+@pytest.mark.parametrize("given", [None, "", "-1", "NoDevFiles"])
+def test_without_a_gpu_auto_is_the_cpu(monkeypatch: Any, given: str | None) -> None:
+    without_cuda(monkeypatch)
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    if given is not None:
+        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", given)
+    with loading_report(lambda _: None) as report:
+        assert torch_device("auto").type == "cpu"
+    assert report.devices == [{"kind": "cpu", "device": "cpu", "torch": torch.__version__}]
+
+
+def test_what_a_gpu_is_is_reported(monkeypatch: Any) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch, "empty", lambda *_, **__: None)
+    h100 = SimpleNamespace(name="NVIDIA H100", total_memory=80 * 2**30)
+    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda _: h100)
+    monkeypatch.setattr(torch.version, "cuda", "13.0")
+    with loading_report(lambda _: None) as report:
+        torch_device("auto")
+    [device] = report.devices
+    assert device.pop("driver", "") is None or device  # that of this machine, if it has one
+    assert device == {
+        "kind": "cuda",
+        "device": "cuda",
+        "torch": torch.__version__,
+        "name": "NVIDIA H100",
+        "memory_mib": 81920,
+        "cuda": "13.0",
+    }
+
+
+class FakeJax:
+    """A JAX whose plugin for GPUs did not load."""
+
+    __version__ = "0.5.3"
+    config = SimpleNamespace(jax_compilation_cache_dir="set")
+
+    def devices(self, kind: str = "cpu") -> list[Any]:
+        if kind != "cpu":
+            raise RuntimeError("Unknown backend: 'gpu' requested, but no platforms are present.")
+        return [SimpleNamespace(platform="cpu", device_kind="cpu")]
+
+
+def test_a_gpu_that_jax_cannot_use_is_an_error_with_jaxs_reason(monkeypatch: Any) -> None:
+    monkeypatch.setitem(sys.modules, "jax", FakeJax())
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    assert jax_device("auto").platform == "cpu"
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "1")
+    with pytest.raises(ConfigError, match=r"given GPU 1 .*jax 0\.5\.3 cannot use: Unknown backend: 'gpu'"):
+        jax_device("auto")
+    assert jax_device("cpu").platform == "cpu"
+
+
+@pytest.mark.parametrize(
+    ("error", "exhausted", "failed"),
+    [
+        (torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB."), True, False),
+        (RuntimeError("CUDA error: out of memory\nCUDA kernel errors might be reported later"), True, False),
+        (RuntimeError("CUDA error: CUBLAS_STATUS_ALLOC_FAILED when calling `cublasCreate(handle)`"), True, False),
+        (RuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 8589934592 bytes."), True, False),
+        (torch.AcceleratorError("CUDA error: device-side assert triggered", 710), False, True),
+        (RuntimeError("CUDA error: an illegal memory access was encountered"), False, True),
+        (RuntimeError("cuDNN error: CUDNN_STATUS_EXECUTION_FAILED"), False, True),
+        (RuntimeError("INTERNAL: CUDA_ERROR_ILLEGAL_ADDRESS: an illegal memory access"), False, True),
+        (RuntimeError("The size of tensor a (3) must match the size of tensor b (4)"), False, False),
+        (ValueError("CUDA error: of a name"), False, False),
+        (MemoryError("out of memory"), False, False),
+    ],
+)
+def test_errors_of_accelerators_are_told_apart(error: Exception, exhausted: bool, failed: bool) -> None:
+    assert (is_out_of_memory(error), is_device_failure(error)) == (exhausted, failed)
+
+
+class Crowded(ModelPolicy):
+    """A model on a GPU whose memory holds a few rows; its actions are noise."""
+
+    Config = ModelConfig
+    fits = 3
+
+    @property
+    def contract(self) -> Contract:
+        return Contract(state={"joints": StateSpec(DIM)}, action=ActionSpec(dim=DIM), chunk=self.chunk(HORIZON))
+
+    def load(self) -> Any:
+        report_device({"kind": "cuda"})
+        return {"passes": []}
+
+    def perceive(self, obs: Obs) -> np.ndarray:
+        return state_vector(obs, ["joints"], DIM)
+
+    def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
+        self.model["passes"].append(len(rows))
+        noise = [row.noise(HORIZON, DIM) for row in rows]
+        if len(rows) > self.fits:
+            raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.")
+        return [Prediction(one) for one in noise]
+
+
+class Roomy(Crowded):
+    """The same model on a larger GPU."""
+
+    fits = 10**6
+
+
+def made(kind: type[Crowded], **config: Any) -> Crowded:
+    policy = kind.from_config({"checkpoint": "none", **config})
+    policy.initialize()
+    policy.model["passes"].clear()
+    return policy
+
+
+def acted(policy: Crowded, number: int, samples: int = 0) -> list[Act]:
+    sessions = [copy.copy(policy) for _ in range(number)]
+    view = Obs(state={"joints": np.zeros(DIM, np.float32)}, info={SAMPLES: samples} if samples else {})
+    for seed, session in enumerate(sessions):
+        session.reset(view, "go", seed=seed)
+    acts = policy.act_batch([view] * number, sessions)
+    assert all(isinstance(act, Act) for act in acts)
+    return acts  # type: ignore[return-value]
+
+
+def test_a_row_and_a_full_batch_run_while_a_model_loads_on_an_accelerator() -> None:
+    policy = Roomy.from_config({"checkpoint": "none", "max_rows": 12})
+    policy.initialize()
+    assert policy.model["passes"] == [1, 12]
+
+
+def test_a_full_batch_that_does_not_fit_is_found_while_a_model_loads(caplog: pytest.LogCaptureFixture) -> None:
+    policy = Crowded.from_config({"checkpoint": "none", "max_rows": 12})
+    policy.initialize()
+    assert policy.model["passes"] == [1, 12, 6, 3, 3, 3, 3]
+    assert policy.most_rows == 3
+    assert "out of memory in a forward pass of 12 rows: of at most 6 rows from now on" in caplog.text
+    assert "Lower batch.max_size, max_rows or batch_sizes" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("sizes", "passes", "later"), [(None, [5, 2, 2, 1], [2, 2, 1]), ([1, 2, 5, 8], [5, 2, 2, 1], [2, 2, 1])]
+)
+def test_a_batch_that_does_not_fit_is_halved_and_acts_as_if_it_had(
+    monkeypatch: pytest.MonkeyPatch, sizes: list[int] | None, passes: list[int], later: list[int]
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(Crowded, "fits", 8)
+        policy = made(Crowded, max_rows=8, batch_sizes=sizes)
+    emptied: list[bool] = []
+    monkeypatch.setattr(torch.cuda, "is_initialized", lambda: True)
+    monkeypatch.setattr(torch.cuda, "empty_cache", lambda: emptied.append(True))
+    acts = acted(policy, 5)
+    assert (policy.model["passes"], len(emptied)) == (passes, 1)
+    policy.model["passes"].clear()
+    acted(policy, 5)
+    assert policy.model["passes"] == later
+    for one, other in zip(acts, acted(made(Roomy), 5), strict=True):
+        np.testing.assert_array_equal(one.action, other.action)
+
+
+def test_samples_that_do_not_fit_are_those_that_would_have_fitted() -> None:
+    policy = made(Crowded, max_rows=3)
+    policy.config = policy.config.model_copy(update={"max_rows": 64})
+    for one, other in zip(acted(policy, 2, samples=6), acted(made(Roomy), 2, samples=6), strict=True):
+        np.testing.assert_array_equal(one.action, other.action)
+        np.testing.assert_array_equal(one.info[DISTRIBUTION]["samples"], other.info[DISTRIBUTION]["samples"])
+    assert policy.most_rows == 3
+
+
+def test_one_row_that_does_not_fit_is_an_error_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    policy = Crowded.from_config({"checkpoint": "none", "max_rows": 12})
+    engine = Engine(policy)
+    engine.start()
+    try:
+        assert engine.stats.collect().out_of_memory == 2  # the full batch, and half of it, while it loaded
+        monkeypatch.setattr(Crowded, "fits", 0)
+        with pytest.raises(torch.OutOfMemoryError):
+            acted(policy, 3)
+        assert engine.stats.collect().out_of_memory == 2
+        engine.check_health()
+    finally:
+        engine.close()

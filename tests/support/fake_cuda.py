@@ -1,0 +1,241 @@
+"""A CUDA of two devices on a CPU: streams, graphs and errors as torch has them, for tests without a GPU.
+
+A tensor of `FakeCuda.tensor` computes on the CPU and says that it is on a GPU. While a graph is captured, the
+operations of its stream are recorded, and their results are then overwritten, as a capture computes nothing; a replay
+computes them again from the same tensors. The rules are CUDA's, or stricter:
+
+- A capture fails, on both threads, if another thread waits for its device or makes a tensor there.
+- An operation on another stream or device than the captured one runs at once and is not recorded.
+- `torch.cuda.graph` has one stream for all captures of a process, on the device of the first.
+- After `fail`, every call fails. A tensor of more than `most_rows` rows does not fit into memory.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import pytest
+import torch
+from torch.utils._pytree import tree_leaves, tree_map
+
+_EMPTY = (
+    "The CUDA Graph is empty. This usually means that the graph was attempted to be captured on wrong device or stream."
+)
+_GARBAGE = 55  # in memory that a capture has not written
+
+
+class FakeCuda:
+    """The GPUs of the process; `install` puts it in the place of torch's own."""
+
+    def __init__(self) -> None:
+        self.capture: Capture | None = None  # the open one
+        self.failure = ""
+        self.most_rows = sys.maxsize
+        self.emptied = 0  # calls of `empty_cache`
+        self._local = threading.local()
+        self._default = [Stream(self, index) for index in range(2)]
+        self._capture_stream: Stream | None = None
+
+    def install(self, patch: pytest.MonkeyPatch) -> None:
+        """Replace what policies use of `torch.cuda`, and compile nothing."""
+        for name, value in {
+            "is_available": lambda: True,
+            "is_initialized": lambda: True,
+            "Stream": lambda device=None: Stream(self, self._index(device)),
+            "stream": self._on_stream,
+            "device": self._on_device,
+            "current_stream": self.current_stream,
+            "synchronize": self.synchronize,
+            "empty_cache": self._empty_cache,
+            "CUDAGraph": lambda: Capture(self),
+            "graph": self._graph,
+        }.items():
+            patch.setattr(torch.cuda, name, value)
+        patch.setattr(torch, "compile", lambda function, **_: function)
+
+    def tensor(self, values: torch.Tensor, index: int = 0) -> GpuTensor:
+        """Return a tensor of these values on a GPU."""
+        return GpuTensor(values, self, index)
+
+    def fail(self, said: str = "CUDA error: device-side assert triggered") -> None:
+        """Let all further calls fail."""
+        self.failure = said
+
+    def current_stream(self, device: Any = None) -> Stream:
+        """Return this thread's current stream on a device."""
+        index = self._index(device)
+        stream: Stream = self._streams().get(index, self._default[index])
+        return stream
+
+    def synchronize(self, device: Any = None) -> None:
+        """Wait for a device, which ends a capture on it."""
+        self._require(self._index(device))
+
+    def run(self, index: int, call: Callable[[], Any], inputs: list[Any]) -> Any:
+        """Run an operation on a device, and record it if its stream is captured."""
+        capture = self.capture
+        if capture is None or capture.thread != threading.get_ident():
+            self._require(index)
+        result = call()
+        if any(isinstance(one, torch.Tensor) and one.ndim and len(one) > self.most_rows for one in tree_leaves(result)):
+            raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB. GPU 0 has 1.00 GiB free")
+        if capture is not None and capture.stream is self.current_stream(index):
+            capture.calls.append((call, result, inputs))
+        return result
+
+    def _require(self, index: int) -> None:
+        if self.failure:
+            raise torch.AcceleratorError(self.failure, 710)
+        if (capture := self.capture) is not None and capture.stream.index == index:
+            capture.broken = True
+            raise torch.AcceleratorError("CUDA error: operation not permitted when stream is capturing", 900)
+
+    def _streams(self) -> dict[int, Stream]:
+        streams: dict[int, Stream] = self._local.__dict__.setdefault("streams", {})
+        return streams
+
+    def _index(self, device: Any) -> int:
+        current: int = self._local.__dict__.get("device", 0)
+        if device is None or isinstance(device, int):
+            return current if device is None else device
+        return torch.device(device).index or 0
+
+    def _empty_cache(self) -> None:
+        self.emptied += 1
+
+    @contextmanager
+    def _on_device(self, device: Any) -> Iterator[None]:
+        before, self._local.device = self._index(None), self._index(device)
+        try:
+            yield
+        finally:
+            self._local.device = before
+
+    @contextmanager
+    def _on_stream(self, stream: Stream) -> Iterator[None]:
+        before = self.current_stream(self._gpu(stream))
+        self._streams()[stream.index] = stream
+        try:
+            yield
+        finally:
+            self._streams()[stream.index] = before
+
+    @contextmanager
+    def _graph(
+        self, capture: Capture, stream: Stream | None = None, capture_error_mode: str = "global"
+    ) -> Iterator[None]:
+        self._capture_stream = self._capture_stream or Stream(self, self._index(None))
+        capture.stream = stream or self._capture_stream
+        self.synchronize()
+        self._empty_cache()
+        before = self.current_stream(self._gpu(capture.stream))
+        self._streams()[capture.stream.index] = capture.stream
+        capture.thread, self.capture = threading.get_ident(), capture
+        try:
+            yield
+        finally:
+            self.capture = None
+            capture.end()  # torch does not restore the stream if this fails
+            self._streams()[capture.stream.index] = before
+
+    @staticmethod
+    def _gpu(stream: Stream) -> torch.device:
+        return torch.device("cuda", stream.index)
+
+
+@dataclass(eq=False)
+class Stream:
+    """A stream of one GPU, on which operations run at once."""
+
+    cuda: FakeCuda
+    index: int
+
+    def wait_stream(self, other: Stream) -> None:
+        """Do nothing, since no operation is ever outstanding."""
+
+    def synchronize(self) -> None:
+        """Wait for the stream, which is an error if it is captured."""
+        if self.cuda.failure or (self.cuda.capture is not None and self.cuda.capture.stream is self):
+            self.cuda._require(self.index)
+
+
+@dataclass(eq=False)
+class Capture:
+    """A `torch.cuda.CUDAGraph`."""
+
+    cuda: FakeCuda
+    calls: list[tuple[Callable[[], Any], Any, list[Any]]] = field(default_factory=list)  # with result and arguments
+    broken: bool = False
+    thread: int = 0
+    stream: Any = None
+
+    def end(self) -> None:
+        """Raise if the capture was ended by another thread; overwrite all results, as none was computed."""
+        if self.broken:
+            raise torch.AcceleratorError("CUDA error: operation failed due to a previous error during capture", 901)
+        if not self.calls:
+            warnings.warn(_EMPTY, stacklevel=2)
+        for _, result, inputs in self.calls:
+            own = {one.untyped_storage().data_ptr() for one in inputs}
+            for one in tree_leaves(result):
+                if isinstance(one, torch.Tensor) and one.untyped_storage().data_ptr() not in own:
+                    one.fill_(_GARBAGE)
+
+    def replay(self) -> None:
+        """Compute all results again, in their memory."""
+        self.cuda._require(self.stream.index)
+        for call, result, _ in self.calls:
+            for old, new in zip(tree_leaves(result), tree_leaves(call()), strict=True):
+                if isinstance(old, torch.Tensor) and old.data_ptr() != new.data_ptr():
+                    old.copy_(new)
+
+
+class GpuTensor(torch.Tensor):
+    """A tensor whose operations go through a `FakeCuda`."""
+
+    __torch_function__ = torch._C._disabled_torch_function_impl
+    values: torch.Tensor  # on the CPU
+    cuda_of: FakeCuda
+    index: int
+
+    @staticmethod
+    def __new__(cls: Any, values: torch.Tensor, cuda: FakeCuda, index: int) -> GpuTensor:
+        made: GpuTensor = torch.Tensor._make_wrapper_subclass(
+            cls, values.shape, strides=values.stride(), storage_offset=values.storage_offset(), dtype=values.dtype
+        )
+        made.values, made.cuda_of, made.index = values, cuda, index
+        return made
+
+    @property
+    def device(self) -> Any:  # type: ignore[override]
+        return torch.device("cuda", self.index)
+
+    @property
+    def is_cuda(self) -> bool:  # type: ignore[override]
+        return True
+
+    @classmethod
+    def __torch_dispatch__(cls, op: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        own = [one for one in tree_leaves((args, kwargs)) if isinstance(one, GpuTensor)]
+        cuda, index = own[0].cuda_of, own[0].index
+        args, kwargs = tree_map(_values, (args, kwargs or {}))
+        inputs = [one.values for one in own]
+        result = cuda.run(index, lambda: op(*args, **kwargs), inputs)
+        wrappers = {id(one.values): one for one in own}  # of what an operation in place returns
+
+        def wrapped(one: Any) -> Any:
+            if not isinstance(one, torch.Tensor):
+                return one
+            return wrappers[id(one)] if id(one) in wrappers else GpuTensor(one, cuda, index)
+
+        return tree_map(wrapped, result)
+
+
+def _values(one: Any) -> Any:
+    return one.values if isinstance(one, GpuTensor) else one
