@@ -13,8 +13,7 @@ from in_process_replicas import Replicas
 from scripted_leader import ScriptedLeader
 
 from vlagents_ray import Act, ActionSpec, Agent, ConfigError, Contract, Obs, PolicyFailed
-from vlagents_ray.chunking.player import ChunkPlayer
-from vlagents_ray.chunking.takeover import Takeover, uncertainty
+from vlagents_ray.chunking.player import ChunkPlayer, uncertainty
 from vlagents_ray.errors import InvalidAction, InvalidObservation
 from vlagents_ray.interface import DELAY, EXECUTED, INTERVENTION, LEFTOVER, SAFE, SAMPLES, WANTED
 from vlagents_ray.robot import Guard
@@ -114,11 +113,11 @@ def test_the_hand_over_takes_one_tick_in_both_directions(make: Any, options: dic
     leader.held = True
     at = arm.pose.copy()
     act = arm.tick()
-    assert (arm.player.takeover.state, act.info[INTERVENTION]) == ("human", True)
+    assert (arm.player.control.state, act.info[INTERVENTION]) == ("human", True)
     assert act.action == pytest.approx(at + 0.05)
     leader.held = False
     assert INTERVENTION not in arm.tick().info
-    assert arm.player.takeover.state == "autonomous"
+    assert arm.player.control.state == "autonomous"
 
 
 @pytest.mark.parametrize("options", MODES)
@@ -340,17 +339,17 @@ def test_a_pause_holds_the_robot_until_it_is_over(make: Any) -> None:
     agent = Near()
     arm, _ = make(agent, mode="async")
     arm.tick()
-    arm.player.takeover.pause()
+    arm.player.control.pause()
     at, asked = arm.pose.copy(), len(agent.asked)
     for _ in range(9):
         act = arm.tick()
         arm.settle()
         assert act.info[SAFE] == "paused by an operator"
         assert act.action == pytest.approx(at)
-    assert arm.player.takeover.state == "paused"
+    assert arm.player.control.state == "paused"
     assert len(agent.asked) > asked + 7, "its answers may bring the command to go on"
     assert len(arm.player._plan._chunks) <= 1
-    arm.player.takeover.resume()
+    arm.player.control.resume()
     asked = len(agent.asked)
     assert SAFE in arm.tick().info
     arm.settle()
@@ -364,7 +363,7 @@ def test_no_answer_that_comes_in_a_pause_is_executed(make: Any, options: dict[st
     agent = Near()
     arm, _ = make(agent, **options)
     arm.tick()
-    arm.player.takeover.pause()
+    arm.player.control.pause()
     at, asked = arm.pose.copy(), len(agent.asked)
     for _ in range(HORIZON + 2):
         assert arm.tick().action == pytest.approx(at)
@@ -399,14 +398,14 @@ def test_an_episode_begins_without_what_was_executed_in_the_last_one(make: Any) 
 
 def test_a_human_takes_over_from_a_pause_and_gives_back_to_the_policy(make: Any) -> None:
     arm, leader = make(Near())
-    takeover = arm.player.takeover
+    control = arm.player.control
     states = []
-    for held, command in ((False, None), (False, takeover.pause), (True, None), (True, None), (False, None)):
+    for held, command in ((False, None), (False, control.pause), (True, None), (True, None), (False, None)):
         leader.held = held
         if command is not None:
             command()
         arm.tick()
-        states.append(takeover.state)
+        states.append(control.state)
     assert states == ["autonomous", "paused", "human", "human", "autonomous"]
 
 
@@ -414,7 +413,7 @@ def test_a_pause_while_a_human_moves_the_robot_begins_when_he_lets_go(make: Any)
     arm, leader = make(Near())
     leader.held = True
     arm.tick()
-    arm.player.takeover.pause("look first")
+    arm.player.control.pause("look first")
     assert SAFE not in arm.tick().info
     leader.held = False
     assert arm.tick().info[SAFE] == "look first"
@@ -429,7 +428,7 @@ def test_a_leader_that_breaks_pauses_the_robot(make: Any) -> None:
     leader.wants = unplugged
     assert "no such device" in arm.tick().info[SAFE]
     leader.wants = lambda: False
-    arm.player.takeover.resume()
+    arm.player.control.resume()
     assert SAFE not in arm.tick().info
     leader.held = True
     leader.command = lambda _: 1 / 0
@@ -440,7 +439,7 @@ def test_without_an_action_that_keeps_it_still_a_robot_is_not_paused_but_the_loo
     with ChunkPlayer(Near()) as player:
         arm = Arm(player)
         arm.tick()
-        player.takeover.pause()
+        player.control.pause()
         with pytest.raises(InvalidAction, match="paused by an operator"):
             arm.tick()
 
@@ -465,7 +464,7 @@ def test_an_uncertain_chunk_pauses_before_any_of_it_is_executed(make: Any) -> No
     assert act.info[SAFE] == "asks for help: its uncertainty is 0.7, above 0.5"
     assert act.action == pytest.approx(at)
     arm.tick()
-    assert arm.player.takeover.state == "paused"
+    assert arm.player.control.state == "paused"
     leader.held = True
     arm.tick()
     leader.held = False
@@ -490,4 +489,4 @@ def test_help_cannot_be_asked_for_by_a_policy_that_states_no_uncertainty(make: A
     with pytest.raises(ConfigError, match="samples"):
         arm.tick()
     with pytest.raises(ConfigError, match="ask_for_help"):
-        Takeover(ask_for_help=float("nan"))
+        ChunkPlayer(Near(), ask_for_help=float("nan"))
