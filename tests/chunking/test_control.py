@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 from collections.abc import Iterator
 from typing import Any
@@ -13,6 +14,7 @@ from in_process_replicas import Replicas
 from scripted_leader import ScriptedLeader
 
 from vlagents_ray import Act, ActionSpec, Agent, ConfigError, Contract, Obs, PolicyFailed
+from vlagents_ray.chunking.control import Control
 from vlagents_ray.chunking.player import ChunkPlayer, uncertainty
 from vlagents_ray.errors import InvalidAction, InvalidObservation
 from vlagents_ray.interface import DELAY, EXECUTED, INTERVENTION, LEFTOVER, SAFE, SAMPLES, WANTED
@@ -490,3 +492,47 @@ def test_help_cannot_be_asked_for_by_a_policy_that_states_no_uncertainty(make: A
         arm.tick()
     with pytest.raises(ConfigError, match="ask_for_help"):
         ChunkPlayer(Near(), ask_for_help=float("nan"))
+
+
+def lines_of(function: Any) -> list[int]:
+    return sorted({line for _, _, line in function.__code__.co_lines() if line is not None})
+
+
+# From the second line on: a pause of before the tick is one that a human takes over from.
+@pytest.mark.parametrize("line", range(2, len(lines_of(Control.update))))
+@pytest.mark.parametrize("command", ["pause", "stop"])
+def test_a_command_between_any_two_lines_of_a_tick_is_not_lost(line: int, command: str) -> None:
+    leader = ScriptedLeader(ahead)
+    leader.held = True
+    control = Control(leader)
+    wanted, threads = lines_of(Control.update)[line], []
+
+    def trace(frame: Any, event: str, _: object) -> Any:
+        if frame.f_code is not Control.update.__code__:
+            return None
+        if event == "line" and frame.f_lineno == wanted and not threads:
+            threads.append(threading.Thread(target=getattr(control, command), args=("by the operator",)))
+            threads[0].start()
+            threads[0].join(0.01)  # longer if the state is locked; then it is the next one that counts
+        return trace
+
+    before = sys.gettrace()
+    sys.settrace(trace)
+    control.update()
+    sys.settrace(before)
+    for thread in threads:
+        thread.join()
+    leader.held = False
+    control.update()
+    if threads:
+        assert control.state == ("paused" if command == "pause" else "stopped")
+        assert control.held is not None
+
+
+def test_a_stop_that_is_over_before_the_loop_looks_still_drops_the_plan() -> None:
+    control = Control()
+    control.update()
+    control.stop("by the operator")
+    assert control.restart()
+    assert control.hold() is not None
+    assert control.hold() is None

@@ -128,10 +128,10 @@ class Control:
                 self._barked = True
                 self._silent.add(silent)
 
-    def heard(self, source: str | None = None) -> None:
-        """Note that a silence is over; None: that of all sources. The robot stays stopped."""
+    def heard(self, source: str) -> None:
+        """Note that the silence of a source is over. The robot stays stopped."""
         with self._lock:
-            self._silent = set() if source is None else self._silent - {source}
+            self._silent.discard(source)
 
     def restart(self) -> bool:
         """Allow motion again after a stop; may also be called from a signal handler.

@@ -86,11 +86,11 @@ class Execution:
 
         Returns:
             `EXECUTED`, if other actions than the policy's were executed; while the server is watched also `PLAYED`. Its
-            entries are `step`: `executed`, the step for which the first row of the answer is; `rows`: (n, D) float32, the policy's actions that were executed since the
-            request before; `steps`: (n,) int64, their steps; `age_ms`: the age of the observation from which the last
-            one was computed, when it was executed; `safe`: the reason of the last tick's safe action, "" if it had one
-            of the policy's; and of the episode `safe_ticks`, `safe_spells` (runs of such ticks), `late` (requests
-            without an answer in time), and `reconnects`.
+            entries are `step`: `executed`, the step for which the first row of the answer is; `rows`: (n, D) float32,
+            the policy's actions that were executed since the request before; `steps`: (n,) int64, their steps;
+            `age_ms`: the age of the observation from which the last one was computed, when it was executed; `safe`: the
+            reason of the last tick's safe action, "" if it had one of the policy's; and of the episode `safe_ticks`,
+            `safe_spells` (runs of such ticks), `late` (requests without an answer in time), and `reconnects`.
         """
         stated: dict[str, Any] = {EXECUTED: np.stack(self._in_place)} if self._in_place else {}
         self._in_place.clear()

@@ -242,12 +242,13 @@ class Watchdog:
             return self._control.restart()
 
     def start(self) -> None:
-        """Start the thread and the time limits of all sources; does nothing if they run. A stop lasts."""
+        """Start the thread and the time limits of all sources; does nothing if they run. Stops and silences last."""
         with self._changed:
             if self._thread is not None:
                 return
             self._heard = dict.fromkeys(self._limits, time.monotonic())
-            self._control.heard()
+            for name in set(self._control.silent) - self._limits.keys():
+                self._control.heard(name)  # no later sign of life would end its silence
             self._thread = threading.Thread(target=self._watch, name="vlagents-ray-watchdog", daemon=True)
         self._thread.start()
 
