@@ -18,7 +18,8 @@ Consumer = Callable[[str], bool]  # gets a key in lower case; returns whether it
 class Terminal:
     """A terminal whose keys go to the consumer that began last, such as a keyboard that moves the robot.
 
-    A key that has no meaning for it goes to the one before. Two objects of one terminal share its consumers.
+    A key that has no meaning for it goes to the one before, and last to one that reads in the background. Two objects
+    of one terminal share its consumers.
 
     Args:
         descriptor: The file descriptor of the terminal; default: that of standard input.
@@ -88,7 +89,7 @@ class Terminal:
 
     @contextlib.contextmanager
     def read_in_background(self, consumer: Consumer) -> Iterator[None]:
-        """Let a thread give the keys to a consumer, within the context and while it is the last one."""
+        """Let a consumer get the keys that no other one takes; a thread reads them while there is no other one."""
         over = threading.Event()
 
         def read() -> None:
@@ -96,13 +97,16 @@ class Terminal:
                 pass
 
         thread = threading.Thread(target=read, name="vlagents-ray-terminal", daemon=True)
-        with self.consumed_by(consumer):
-            thread.start()
-            try:
-                yield
-            finally:
-                over.set()
-                thread.join()
+        with self._lock:
+            self._own.insert(0, consumer)
+        thread.start()
+        try:
+            yield
+        finally:
+            over.set()
+            thread.join()
+            with self._lock:
+                self._own.remove(consumer)
 
     def _is_in_foreground(self) -> bool:
         """Whether this process may read: to read from the terminal in the background would suspend it."""
