@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 from unittest.mock import patch
 
@@ -46,6 +46,20 @@ class SimulatedTime:
 
     def sleep(self, seconds: float) -> None:
         self.now += max(seconds, 1e-4)
+
+
+def event(**drawn: Any) -> Callable[[Callable[..., None]], Any]:
+    """Make a rule of what happens between two ticks, with up to two ticks after it."""
+
+    def decorate(function: Callable[..., None]) -> Any:
+        def happen(machine: Machine, after: int, **values: Any) -> None:
+            function(machine, **values)
+            machine.tick(after)
+
+        happen.__name__ = function.__name__
+        return rule(after=st.integers(0, 2), **drawn)(happen)
+
+    return decorate
 
 
 class Machine(RuleBasedStateMachine):
@@ -195,7 +209,6 @@ class Machine(RuleBasedStateMachine):
         self.thread.start()
         assert self.ready.acquire(timeout=ENDING_S)
 
-    @rule(times=st.integers(1, 4))
     def tick(self, times: int) -> None:
         """Make ticks, in another run if the last one is over."""
         for _ in range(times):
@@ -205,45 +218,45 @@ class Machine(RuleBasedStateMachine):
                 self.go.release()
                 assert self.ready.acquire(timeout=ENDING_S)
 
-    @rule()
+    @event()
     def end_the_run(self) -> None:
         if not self.over:
             self.ending = True
             self.tick(1)
             assert self.over
 
-    @rule()
+    @event()
     def fail(self) -> None:
         self.failing = True
 
-    @rule()
+    @event()
     def pause(self) -> None:
         self.control.pause()
         self.paused = True
 
-    @rule()
+    @event()
     def resume(self) -> None:
         self.control.resume()
         self.paused = False
 
-    @rule(trip=st.booleans())
+    @event(trip=st.booleans())
     def stop_at_the_robot(self, *, trip: bool) -> None:
         (self.watchdog.trip if trip else self.control.stop)("a person is in the way")
         self.commanded_stop = True
 
-    @rule(source=st.sampled_from(["server", "camera"]))
+    @event(source=st.sampled_from(["server", "camera"]))
     def bark(self, source: str) -> None:
         self.control.stop(f"{source}: silent", silent=source)
         self.barked.add(source)
         self.ticked = False
 
-    @rule()
+    @event()
     def end_of_the_silence(self) -> None:
         self.watchdog.heard("camera")
         if self.simulated:
             self.barked.discard("camera")
 
-    @rule()
+    @event()
     def restart(self) -> None:
         silent = bool(self.control.silent)
         assert self.watchdog.restart() is not silent
@@ -251,31 +264,33 @@ class Machine(RuleBasedStateMachine):
             self.commanded_stop = False
             self.barked.clear()
 
-    @rule()
+    @event()
     def mark(self) -> None:
         self.control.mark("success")
 
-    @rule()
+    @event()
     def instruct_by_a_topic(self) -> None:
         self.control.instruct("fold")
 
-    @rule(held=st.booleans())
+    @event(held=st.booleans())
     def take_over_or_release(self, *, held: bool) -> None:
         self.held = held
 
-    @rule(broken=st.booleans())
+    @event(broken=st.booleans())
     def break_the_device(self, *, broken: bool) -> None:
         self.broken = broken and self.played
 
-    @rule(wild=st.booleans())
+    @event(wild=st.booleans())
     def be_wild(self, *, wild: bool) -> None:
         self.wild = wild
 
-    @rule(do=st.sampled_from(["pause", "stop", "success", "failure", "resume", "instruct", "restart", "begin", "move"]))
+    @event(
+        do=st.sampled_from(["pause", "stop", "success", "failure", "resume", "instruct", "restart", "begin", "move"])
+    )
     def command_from_afar(self, do: str) -> None:
         self.from_afar.append({"id": do, "do": do, "text": "fold"})
 
-    @rule(info=st.dictionaries(st.sampled_from(OF_THE_LOOP), GARBAGE, max_size=4))
+    @event(info=st.dictionaries(st.sampled_from(OF_THE_LOOP), GARBAGE, max_size=4))
     def state_garbage(self, info: dict[str, Any]) -> None:
         self.info = info
 
