@@ -13,6 +13,7 @@ import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule, run_state_machine_as_test
+from in_process_replicas import Replicas
 from many import many
 
 from vlagents_ray import Act, ActionSpec, Agent, Contract, Obs
@@ -265,6 +266,20 @@ class Machine(RuleBasedStateMachine):
             self.barked.clear()
 
     @event()
+    def set_everything_going(self) -> None:
+        self.wild = self.broken = self.held = False
+        self.end_of_the_silence_of_all()
+        assert self.watchdog.restart()
+        self.control.resume()
+        self.commanded_stop = self.paused = False
+        self.barked.clear()
+        self.tick(2)
+
+    def end_of_the_silence_of_all(self) -> None:
+        for source in self.control.silent:
+            self.watchdog.heard(source)
+
+    @event()
     def mark(self) -> None:
         self.control.mark("success")
 
@@ -285,7 +300,9 @@ class Machine(RuleBasedStateMachine):
         self.wild = wild
 
     @event(
-        do=st.sampled_from(["pause", "stop", "success", "failure", "resume", "instruct", "restart", "begin", "move"])
+        do=st.sampled_from(
+            ["pause", "stop", "stop", "success", "failure", "resume", "instruct", "restart", "begin", "move"]
+        )
     )
     def command_from_afar(self, do: str) -> None:
         self.from_afar.append({"id": do, "do": do, "text": "fold"})
@@ -326,8 +343,6 @@ class Loop(Agent):
 
 @contextlib.contextmanager
 def _played(info: dict[str, Any], *, served: bool) -> Iterator[ChunkPlayer]:
-    from in_process_replicas import Replicas
-
     if not served:
         with ChunkPlayer(Loop(info)) as player:
             yield player
@@ -336,6 +351,18 @@ def _played(info: dict[str, Any], *, served: bool) -> Iterator[ChunkPlayer]:
     with ChunkPlayer(replicas.agent()) as player:
         yield player
     replicas.close()
+
+
+def test_no_answer_of_a_server_has_a_name_of_the_loop() -> None:
+    replicas = Replicas([Loop({**dict.fromkeys(OF_THE_LOOP, 1.0), "other": 1})])
+    with replicas.agent() as agent:
+        agent.reset(Obs())
+        answers = [agent.act(Obs()), *agent.act_stream(Obs()), *agent.act_batch([Obs()], [agent])]
+    replicas.close()
+    for act in answers:
+        assert isinstance(act, Act)
+        assert not set(OF_THE_LOOP) & set(act.info)
+        assert act.info["other"] == 1
 
 
 @pytest.mark.parametrize("served", [False, True])

@@ -135,6 +135,9 @@ def test_a_protective_stop_outlives_the_run(stop: str) -> None:
         before = len(applied(arm))
         run_loop(arm, Commanding(inbox, {}), hz=200, watchdog=dog, seconds=0.05, instruction="fold the cloth")
         assert len(applied(arm)) == before
+    assert dog.restart() is (stop == "trip")
+    dog.heard("camera")
+    assert dog.stopped is (stop == "bark")
     assert dog.restart()
     run_loop(arm, Commanding(inbox, {}), hz=200, watchdog=dog, seconds=0.05)
     assert len(applied(arm)) > before
