@@ -240,13 +240,12 @@ class Machine(RuleBasedStateMachine):
         self.control.resume()
         self.paused = False
 
-    @event(trip=st.booleans())
-    def stop_at_the_robot(self, *, trip: bool) -> None:
-        (self.watchdog.trip if trip else self.control.stop)("a person is in the way")
-        self.commanded_stop = True
-
-    @event(source=st.sampled_from(["server", "camera"]))
-    def bark(self, source: str) -> None:
+    @event(source=st.sampled_from(["server", "camera", "trip", "own program"]))
+    def stop_at_the_robot(self, source: str) -> None:
+        if source in ("trip", "own program"):
+            (self.watchdog.trip if source == "trip" else self.control.stop)("a person is in the way")
+            self.commanded_stop = True
+            return
         self.control.stop(f"{source}: silent", silent=source)
         self.barked.add(source)
         self.ticked = False
@@ -265,15 +264,22 @@ class Machine(RuleBasedStateMachine):
             self.commanded_stop = False
             self.barked.clear()
 
-    @event()
-    def set_everything_going(self) -> None:
-        self.wild = self.broken = self.held = False
+    @event(held=st.booleans())
+    def set_everything_going(self, *, held: bool) -> None:
+        self.wild = self.broken = self.failing = False
+        self.held = held
         self.end_of_the_silence_of_all()
         assert self.watchdog.restart()
         self.control.resume()
         self.commanded_stop = self.paused = False
         self.barked.clear()
         self.tick(2)
+
+    @event(do=st.sampled_from(["pause", "stop"]), held=st.booleans())
+    def hold_from_afar_what_moves(self, do: str, *, held: bool) -> None:
+        self.set_everything_going(after=0, held=held)
+        self.from_afar = [{"id": do, "do": do}]
+        self.tick(3)
 
     def end_of_the_silence_of_all(self) -> None:
         for source in self.control.silent:
