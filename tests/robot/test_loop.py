@@ -468,8 +468,10 @@ def test_a_person_restarts_the_command_by_a_signal() -> None:
         watchdog._limits["loop"] = 60.0
         watchdog.heard("loop")
         assert watchdog.stopped
+        watchdog.control.pause("paused from the live page")
         os.kill(os.getpid(), signal.SIGUSR1)
         assert not watchdog.stopped
+        assert watchdog.control.reason is None
     assert signal.getsignal(signal.SIGUSR1) == signal.SIG_DFL
 
 

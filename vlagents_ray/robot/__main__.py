@@ -169,7 +169,7 @@ def _leader(
     device = _DEVICES[options.leader]()
     stack.enter_context(device)
     if isinstance(device, Keyboard):
-        print(f"{HELP}; C restarts the robot after a stop", flush=True)  # noqa: T201
+        print(f"{HELP}; C restarts the robot after a stop or a pause", flush=True)  # noqa: T201
     return AxesLeader(contract, device, step=options.step, measure=measured_state(options.measure))
 
 
@@ -211,15 +211,21 @@ def _played(play: Callable[..., LoopReport], instruction: str | None, say: Calla
 
 @contextlib.contextmanager
 def _restarting(watchdog: Watchdog, say: Callable[[str], None]) -> Iterator[None]:
-    """Let a person restart motion after a stop: by Enter or C at the terminal, or by SIGUSR1."""
+    """Let a person restart motion after a stop or a pause: by Enter or C at the terminal, or by SIGUSR1."""
+
+    def restarted() -> bool:
+        if not watchdog.restart():
+            return False
+        watchdog.control.resume()
+        return True
 
     def typed(key: str) -> bool:
         if key not in RESTART_KEYS:
             return False
-        stopped = watchdog.stopped
-        if not watchdog.restart():
+        stood = watchdog.stopped or watchdog.control.reason is not None
+        if not restarted():
             say(f"not restarted: still no signal from the {' and the '.join(watchdog.silent)}")
-        elif stopped:
+        elif stood:
             say("restarted")
         return True
 
@@ -227,7 +233,7 @@ def _restarting(watchdog: Watchdog, say: Callable[[str], None]) -> Iterator[None
         with contextlib.suppress(ConfigError):  # there is no terminal
             undo.enter_context(Terminal().read_in_background(typed))
         if threading.current_thread() is threading.main_thread() and hasattr(signal, "SIGUSR1"):
-            before = signal.signal(signal.SIGUSR1, lambda *_: watchdog.restart() and None)
+            before = signal.signal(signal.SIGUSR1, lambda *_: restarted() and None)
             undo.callback(signal.signal, signal.SIGUSR1, before)
         yield
 
