@@ -563,9 +563,12 @@ def at_a_terminal(code: str, *options: str) -> Iterator[tuple[Any, Callable[[str
         preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),  # noqa: PLW1509 - nothing else is started meanwhile
     ) as process:
         assert process.stdout is not None
+        too_long = threading.Timer(30, process.kill)  # then no further line comes
+        too_long.start()
         try:
             yield process, lambda keys: os.write(ours, keys.encode()), map(str.strip, process.stdout)
         finally:
+            too_long.cancel()
             process.kill()
     os.close(ours)
     os.close(its)
