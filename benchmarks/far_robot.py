@@ -186,7 +186,7 @@ def drive(
         found = {
             "ticks": asdict(robot.ticks),
             "missed": report.jitter["missed"],
-            "safe": report.safe,
+            "safe": {**report.safe, "waiting": report.waiting},
             "barks": report.barks,
             "transport": agent.transport,
             "codec": str(agent.codec),

@@ -32,9 +32,9 @@ def main(url):
     # In "async" the next chunk is asked for while the last one is executed, so that no tick waits for the network.
     with ChunkPlayer(agent, mode="async", safe="hold", check=guard) as player:
         report = run_loop(arm, player, hz=50, seconds=2, instruction="stack the cups", watchdog=watchdog)
-    refused = {reason: ticks for reason, ticks in report.safe.items() if reason.startswith("action")}
-    print(f"{sum(refused.values())} of {report.jitter['ticks']} actions refused, such as:", next(iter(refused), "none"))
-    print(f"{report.safe_ticks} ticks with the safe action for this or another reason")
+    refused = report.safe.get("max_step", 0)
+    print(f"{refused} of {report.jitter['ticks']} actions refused, such as:", report.reasons.get("max_step"))
+    print(f"{report.safe_ticks} ticks without an action of the policy, for this or another reason: {report.safe}")
     print(f"punctual within 2 ms: {report.jitter['on_time']:.1%} of the ticks")
     print(f"watchdog: {report.barks or 'never barked'}")
 

@@ -46,7 +46,7 @@ was received, what was expected, and how to cure it.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 
 class VLAgentsError(Exception):
@@ -209,6 +209,10 @@ class InvalidAction(PolicyFailed):
     """The policy returned an action that must not reach a robot: not an array, a wrong shape, or NaN."""
 
     code = "invalid_action"
+
+    def __init__(self, *args: object, cause: Literal["invalid", "limits", "max_step", "leader"] = "invalid") -> None:
+        super().__init__(*args)
+        self.cause = cause  # see `vlagents_ray.chunking.fallback.Cause`
 
 
 class CheckpointFailed(PolicyFailed):

@@ -57,12 +57,16 @@ EXECUTED = "executed_actions"  # in an observation, (N, D): others than the poli
 POLICY = "policy"
 # In the Act of a chunk player:
 SAFE = "safe"  # str: the reason why this is the safe action; absent if the action is the policy's
+CAUSE = "safe_cause"  # str: the kind of that reason, see `vlagents_ray.chunking.fallback.Cause`
 INTERVENTION = "intervention"  # True: a human's action; absent if it is not
 WANTED = "policy_action"  # (D,) float32: what the policy wanted in place of the human's action; absent if unknown
 AGE = "age_ticks"  # int: ticks since the observation from which the action was computed
-PLANNED = "planned"  # (H, D) float32: the chunk that the action comes from; `chunk` and `row` are its number and row
+PLANNED = "planned"  # (H, D) float32: the chunk that the action comes from
+CHUNK, ROW = "chunk", "row"  # int: its number in the episode, and the row of the action
 AGE_MS = "age_ms"  # float: the same in ms, from its capture until the player returned the action
 SILENT = "silent_s"  # float: seconds since the oldest unanswered request, retries included; 0.0 if there is none
+OF_THE_LOOP = (SAFE, CAUSE, INTERVENTION, WANTED, AGE, PLANNED, CHUNK, ROW, AGE_MS, SILENT)
+"""The names of `Act.info` by which a control loop goes. An answer that comes from a server has none of them."""
 
 
 @dataclass(slots=True)

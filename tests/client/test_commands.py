@@ -7,31 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from vlagents_ray.chunking.control import Control
 from vlagents_ray.client.commands import COMMAND, COMMANDED, CommandInbox
 from vlagents_ray.errors import ConfigError, PolicyFailed
 from vlagents_ray.interface import Act, Obs
-
-
-class Robot:
-    """Notes what it is to do; refuses to resume."""
-
-    def __init__(self) -> None:
-        self.did: list[str] = []
-
-    def pause(self) -> None:
-        self.did.append("pause")
-
-    def resume(self) -> None:
-        raise ConfigError("not now")
-
-    def stop(self, by: str) -> None:
-        self.did.append(f"stop by {by}")
-
-    def mark(self, label: str) -> None:
-        self.did.append(label)
-
-    def instruct(self, text: str) -> None:
-        self.did.append(f"instruct {text}")
 
 
 def told(do: str, **more: str) -> Act:
@@ -39,15 +18,15 @@ def told(do: str, **more: str) -> Act:
 
 
 def test_commands_are_obeyed_and_answered_once_an_answer_has_come() -> None:
-    inbox, robot = CommandInbox(), Robot()
-    for act in (told("pause"), told("stop", by="lab"), told("success"), told("instruct", text="fold"), told("resume")):
+    inbox, control = CommandInbox(), Control()
+    for act in (told("pause"), told("stop", by="lab"), told("success")):
         assert inbox.asking(Obs()).info == {}
         inbox.came(act)
         assert act.info == {"other": 1}
-    done = inbox.obey(robot)
-    assert robot.did == ["pause", "stop by lab", "success", "instruct fold"]
-    assert [command.do for command in done] == ["pause", "stop", "success", "instruct"]
-    answers = {f"id of {do}": "" for do in ("pause", "stop", "success", "instruct")} | {"id of resume": "not now"}
+    assert [command.do for command in inbox.obey(control)] == ["pause", "stop", "success"]
+    assert (control.stops, control.reason) == (["the live page by lab"], "paused from the live page")
+    assert control.over
+    answers = {f"id of {do}": "" for do in ("pause", "stop", "success")}
     assert inbox.asking(Obs(info={"a": 1})).info == {"a": 1, COMMANDED: answers}
     inbox.came(PolicyFailed("lost"))
     assert inbox.asking(Obs()).info == {COMMANDED: answers}  # again, as the first may not have arrived
@@ -55,23 +34,31 @@ def test_commands_are_obeyed_and_answered_once_an_answer_has_come() -> None:
     assert inbox.asking(Obs()).info == {}
 
 
-def test_what_is_not_allowed_or_unknown_is_refused() -> None:
-    inbox, robot = CommandInbox(allow=["stop"]), Robot()
-    for act in (told("pause"), told("dance"), told("stop")):
+@pytest.mark.parametrize("do", ["resume", "instruct", "restart", "take over", "move", "dance"])
+def test_a_command_that_could_start_a_motion_does_not_exist(do: str) -> None:
+    inbox, control = CommandInbox(), Control()
+    control.pause("by the operator")
+    control.stop("by the operator")
+    inbox.came(told(do, text="fold the cloth"))
+    assert inbox.obey(control) == []
+    assert (control.stopped, control.reason, control.over) == (True, "by the operator", False)
+    assert "no such command" in inbox.asking(Obs()).info[COMMANDED][f"id of {do}"]
+
+
+def test_what_is_not_allowed_is_refused() -> None:
+    inbox, control = CommandInbox(allow=["stop"]), Control()
+    for act in (told("pause"), told("stop")):
         inbox.came(act)
-    inbox.obey(robot)
-    assert robot.did == ["stop by "]
-    answers = inbox.asking(Obs()).info[COMMANDED]
-    assert "not allowed" in answers["id of pause"]
-    assert "not allowed" in answers["id of dance"]
+    inbox.obey(control)
+    assert (control.stopped, control.reason) == (True, None)
+    assert "not allowed" in inbox.asking(Obs()).info[COMMANDED]["id of pause"]
     with pytest.raises(ConfigError, match="dance"):
         CommandInbox(allow=["dance"])
 
 
 @pytest.mark.parametrize("stated", [None, "stop", {"do": "stop"}, {"id": 1, "do": "stop"}])
 def test_a_command_of_another_form_is_left_out(stated: Any) -> None:
-    inbox, robot = CommandInbox(), Robot()
+    inbox = CommandInbox()
     inbox.came(Act(np.zeros(2, np.float32), info={COMMAND: stated}))
-    inbox.obey(robot)
-    assert robot.did == []
+    assert inbox.obey(Control()) == []
     assert inbox.asking(Obs()).info == {}

@@ -118,16 +118,17 @@ def test_a_correction_of_a_second_is_recorded_from_its_first_tick_with_both_acti
 
 
 def test_pauses_are_counted_apart_from_ticks_that_the_policy_missed(clock: SimulatedTime) -> None:
-    arm = Arm()
-    with ChunkPlayer(Going(), override=ScriptedLeader(back)) as player:
+    arm, leader = Arm(), ScriptedLeader(back)
+    with ChunkPlayer(Going(), override=leader) as player:
 
         def over() -> bool:
-            if len(arm.commanded) == 5:
-                player.takeover.pause()
-            return len(arm.commanded) == 40
+            if leader.polls == 5:
+                player.control.pause()
+            return leader.polls == 40
 
         report = run_loop(arm, player, hz=HZ, until=over)
-    assert (report.paused, report.safe, report.mostly_safe) == (35, {}, None)
+    assert (report.paused, report.safe, report.waiting, report.mostly_safe) == (35, {}, 0, None)
+    assert len(arm.commanded) == 5, "a paused robot gets no command"
 
 
 def test_a_silent_server_stops_no_robot_that_a_human_moves() -> None:

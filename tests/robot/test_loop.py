@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import gc
+import itertools
 import os
 import pty
 import re
@@ -14,6 +16,7 @@ import termios
 import threading
 import time
 import weakref
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -115,7 +118,7 @@ def test_a_robot_that_must_not_move_is_stopped_and_goes_on_by_itself_with_a_new_
 
     ticks: list[int] = []
     report = run_loop(robot, ChunkPlayer(Asked()), hz=HZ, until=until)
-    assert report.safe == {"the camera hangs": 10}
+    assert (report.safe, report.reasons) == ({"robot": 10}, {"robot": "the camera hangs"})
     assert robot.stops == 2  # as it began to hold, and at the end
     assert len(robot.commanded) == 10
     assert asked[0] == 0
@@ -316,7 +319,8 @@ def test_a_robot_that_the_watchdog_stopped_stays_so_until_the_server_is_heard_ag
     applied = [tick for tick in ticks if at_bark[0] + 1 < tick < at_bark[0] + 19]
     assert applied == []
     assert ticks[-1] >= at_bark[0] + 25  # and goes on then
-    assert sum(n for reason, n in report.safe.items() if "no signal from the server" in reason) >= 17
+    assert report.safe["stopped"] >= 17
+    assert "no signal from the server" in report.reasons["stopped"]
 
 
 class Hardware(Watched):
@@ -375,7 +379,7 @@ def test_after_a_protective_stop_hardware_moves_only_when_it_is_told(restart: An
         assert barked_at[0] + 18 <= again < barked_at[0] + 30
     else:
         assert again >= told[1][1] - 1
-        assert sum(n for reason, n in report.safe.items() if "waiting for a restart" in reason) >= 20
+        assert report.safe["stopped"] >= 20
     assert agent.interrupts >= again - barked_at[0] - 3  # nothing of what it returned meanwhile was executed
     assert len(watchdog.barks) == 1
 
@@ -399,6 +403,56 @@ def test_a_simulated_robot_restarts_by_itself() -> None:
     assert round(100 * robot.commanded[-1]) > stopped_at[0] + 20
 
 
+@pytest.mark.parametrize("silent_s", [float("nan"), float("inf"), -5.0, "long", None, [1]])
+def test_a_silence_that_is_no_time_counts_as_an_answer_of_now(silent_s: Any) -> None:
+    class Strange(Going):
+        def act(self, obs: Obs) -> Act:
+            return Act(super().act(obs).action, info={"silent_s": silent_s})
+
+    watchdog = Watchdog(lambda _: None, {"server": 60.0})
+    report = run_loop(Watched(Going.contract), Strange(), hz=200, seconds=0.1, watchdog=watchdog)
+    assert (report.barks, report.safe_ticks) == ([], 0)
+
+
+@pytest.mark.parametrize(
+    ("jumps", "limits", "cause"),
+    [((0.3, 0.4, 0.5), {"max_step": 0.1}, "max_step"), ((2.0, 3.0, 4.0), {"high": 1.0}, "limits")],
+)
+def test_a_report_counts_refused_actions_by_cause_whatever_their_numbers(
+    jumps: tuple[float, ...], limits: dict[str, float], cause: str
+) -> None:
+    class Jumping(Going):
+        def act(self, obs: Obs) -> Act:
+            self.tick += 1
+            value = jumps[self.tick % len(jumps)] if self.tick > 1 else 0.0
+            return Act(np.full(2, value, np.float32))
+
+    agent = Jumping()
+    with ChunkPlayer(agent, check=Guard(Going.contract, **limits), deadline_s=30.0) as player:
+        report = run_loop(Watched(Going.contract), player, hz=200, until=lambda: agent.tick > 12)
+    assert set(report.safe) == {cause}
+    assert report.safe[cause] == report.safe_ticks >= 10
+    assert report.reasons[cause].startswith("action[0]: got")
+
+
+def test_waiting_for_the_next_chunk_is_counted_apart_from_safe_actions() -> None:
+    gate = threading.Event()
+
+    class Late(Going):
+        def act(self, obs: Obs) -> Act:
+            if self.tick:
+                gate.wait(30)
+            return super().act(obs)
+
+    robot = Watched(Going.contract)
+    with ChunkPlayer(Late(), mode="async") as player:
+        report = run_loop(robot, player, hz=200, seconds=0.2)
+        gate.set()
+    assert (report.safe, report.waiting) == ({}, report.safe_ticks)
+    assert report.waiting > 10
+    assert "waiting for an answer" in str(report.mostly_safe)
+
+
 def test_an_unknown_restart_is_refused() -> None:
     with pytest.raises(ConfigError, match="want one of"):
         run_loop(Watched(), Going(), hz=HZ, restart="later")  # type: ignore[arg-type]
@@ -414,8 +468,10 @@ def test_a_person_restarts_the_command_by_a_signal() -> None:
         watchdog._limits["loop"] = 60.0
         watchdog.heard("loop")
         assert watchdog.stopped
+        watchdog.control.pause("paused from the live page")
         os.kill(os.getpid(), signal.SIGUSR1)
         assert not watchdog.stopped
+        assert watchdog.control.reason is None
     assert signal.getsignal(signal.SIGUSR1) == signal.SIG_DFL
 
 
@@ -440,9 +496,66 @@ with Watchdog(lambda _: stopped.set(), {"loop": 0.05}) as watchdog, _restarting(
     assert restarted.wait(30)
     assert not watchdog.stopped
 """
+    with at_a_terminal(code) as (process, type_keys, lines):
+        assert next(lines) == "stopped"
+        type_keys("\n")
+        assert next(lines) == "restarted"
+        assert process.wait(30) == 0
+
+
+def test_with_a_keyboard_as_leader_each_key_has_one_consumer_and_enter_restarts_nothing() -> None:
+    """The command line of docs/interventions.md, whose server is a policy in its process."""
+    code = """
+import sys
+import vlagents_ray.robot.__main__ as command
+from vlagents_ray import Act, ActionSpec, Agent, Contract
+from vlagents_ray.robot.teleoperation import Keyboard
+import numpy as np
+
+class Still(Agent):
+    contract = Contract(action=ActionSpec(dim=6, delta=True))
+    transport = "local"
+
+    def __init__(self, *_, **__): ...
+
+    def act(self, obs):
+        return Act(np.zeros(6, np.float32))
+
+class Seen(Keyboard):
+    def _press(self, key):
+        taken = super()._press(key)
+        print("keyboard", repr(key), taken, flush=True)
+        return taken
+
+class Stopped(command.Watchdog):
+    def start(self):
+        super().start()
+        self.trip("a person is in the way")
+
+command.RemoteAgent, command.Watchdog, command._DEVICES["keyboard"] = Still, Stopped, Seen
+sys.exit(command.main(sys.argv[1:]))
+"""
+    options = ["http://gpu-box:8000", "--leader", "keyboard", "--step", "0.01", "--baseline", "0"]
+    with at_a_terminal(code, *options) as (process, type_keys, lines):
+        while "a person is in the way" not in next(lines):
+            pass
+        for _ in range(20):
+            type_keys("w")
+        type_keys("\n\nc")
+        said = list(itertools.islice(lines, 24))
+        assert said[:20] == ["keyboard 'w' True"] * 20
+        assert said[20:22] == [r"keyboard '\n' True"] * 2, "Enter gives back and takes over"
+        assert said[22:] == ["keyboard 'c' False", "restarted"]
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(30) == 128 + signal.SIGTERM
+
+
+@contextlib.contextmanager
+def at_a_terminal(code: str, *options: str) -> Iterator[tuple[Any, Callable[[str], object], Iterator[str]]]:
+    """Run Python code at a terminal of its own: its process, what types keys there, and the lines that it prints."""
     ours, its = pty.openpty()
     with subprocess.Popen(
-        [sys.executable, "-c", code],
+        [sys.executable, "-c", code, *options],
         stdin=its,
         stdout=subprocess.PIPE,
         text=True,
@@ -450,10 +563,13 @@ with Watchdog(lambda _: stopped.set(), {"loop": 0.05}) as watchdog, _restarting(
         preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),  # noqa: PLW1509 - nothing else is started meanwhile
     ) as process:
         assert process.stdout is not None
-        assert process.stdout.readline() == "stopped\n"
-        os.write(ours, b"\n")
-        assert process.stdout.readline() == "restarted\n"
-        assert process.wait(30) == 0
+        too_long = threading.Timer(30, process.kill)  # then no further line comes
+        too_long.start()
+        try:
+            yield process, lambda keys: os.write(ours, keys.encode()), map(str.strip, process.stdout)
+        finally:
+            too_long.cancel()
+            process.kill()
     os.close(ours)
     os.close(its)
 
@@ -495,7 +611,7 @@ def test_before_the_first_action_no_safe_one_is_commanded() -> None:
     robot = Watched(Going.contract)
     report = run_loop(robot, Waiting(), hz=HZ, until=lambda: len(robot.commanded) >= 3)
     assert robot.commanded[:2] == [0.04, 0.05]
-    assert report.safe == {"waiting": 4}
+    assert (report.safe, report.reasons) == ({"other": 4}, {"other": "waiting"})
 
 
 def test_an_action_that_a_hanging_loop_was_late_with_is_not_applied() -> None:
@@ -530,7 +646,7 @@ def test_a_loop_that_runs_for_days_keeps_no_more_than_it_needs(monkeypatch: pyte
     ticks = report.jitter["ticks"]
     assert ticks + report.jitter["missed"] == 1000
     assert most <= 60  # 50 ticks, which are collected together, and those of a collection
-    assert len(report.safe) <= 101
+    assert len(report.safe) == len(report.reasons) == 1
     assert report.safe_ticks == ticks
     pacer = Pacer(1000)
     for _ in range(30):

@@ -151,6 +151,13 @@ def test_news_that_is_old_already_does_not_end_a_silence() -> None:
         assert barks.heard.empty()
 
 
+@pytest.mark.parametrize("ago_s", [float("nan"), float("inf"), -0.1])
+def test_a_sign_of_life_of_no_time_is_refused(ago_s: float) -> None:
+    watchdog = Watchdog(print, {"server": 1.0})
+    with pytest.raises(ConfigError, match="want a finite number from 0"):
+        watchdog.heard("server", ago_s)
+
+
 def test_a_stop_hook_that_fails_does_not_end_the_watch() -> None:
     calls: queue.SimpleQueue[str] = queue.SimpleQueue()
 

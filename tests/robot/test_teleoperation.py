@@ -1,4 +1,4 @@
-"""What a human moves a robot with: keys of a terminal, a SpaceMouse, commands from elsewhere."""
+"""What a human moves a robot with: keys of a terminal, a SpaceMouse."""
 
 from __future__ import annotations
 
@@ -14,13 +14,11 @@ import numpy as np
 import pytest
 from manual_clock import Clock
 
-from vlagents_ray import Act, ActionSpec, Agent, ConfigError, Contract, Obs
-from vlagents_ray.chunking.player import ChunkPlayer
+from vlagents_ray import ActionSpec, ConfigError, Contract, Obs
 from vlagents_ray.envs import make_env
-from vlagents_ray.errors import InvalidAction, MissingDependency, MissingState
-from vlagents_ray.interface import INTERVENTION, SAFE
+from vlagents_ray.errors import MissingDependency, MissingState
 from vlagents_ray.robot import run_loop
-from vlagents_ray.robot.teleoperation import AxesLeader, Keyboard, RelayedLeader, SpaceMouse, TeleoperatedAgent
+from vlagents_ray.robot.teleoperation import AxesLeader, Keyboard, SpaceMouse, TeleoperatedAgent
 from vlagents_ray.robot.teleoperation.environment import EnvRobot
 
 DELTAS = Contract(
@@ -32,8 +30,7 @@ JOINTS = Contract(action=ActionSpec(dim=3, delta=False, low=-1.0, high=1.0))
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     clock = Clock()
-    for module in ("keyboard", "relay"):
-        monkeypatch.setattr(f"vlagents_ray.robot.teleoperation.{module}.time.monotonic", clock)
+    monkeypatch.setattr("vlagents_ray.robot.teleoperation.keyboard.time.monotonic", clock)
     return clock
 
 
@@ -223,68 +220,6 @@ def test_without_a_spacemouse_or_its_library_the_cure_is_named(monkeypatch: pyte
     monkeypatch.setitem(sys.modules, "pyspacemouse", library)
     with pytest.raises(ConfigError, match="plug one in"):
         SpaceMouse()
-
-
-def test_a_relayed_command_counts_until_its_deadline(clock: Clock) -> None:
-    leader = RelayedLeader(0.2)
-    assert not leader.engaged()
-    assert leader.command(np.ones(2))
-    clock.now = 0.19
-    assert leader.engaged()
-    assert leader.action(Obs()).tolist() == [1, 1]
-    clock.now = 0.5
-    assert leader.engaged(), "only a human lets the policy go on"
-    with pytest.raises(InvalidAction, match=r"no command for 0\.50 s"):
-        leader.action(Obs())
-    assert leader.command(np.zeros(2), ago_s=0.1)
-    assert leader.action(Obs()).tolist() == [0, 0]
-
-
-def test_a_relayed_command_that_comes_too_late_or_out_of_order_does_not_count(clock: Clock) -> None:
-    clock.now = 1.0
-    leader = RelayedLeader(0.2)
-    assert not leader.command(np.ones(2), ago_s=0.3)
-    assert not leader.engaged()
-    assert leader.command(np.ones(2), ago_s=0.05)
-    assert not leader.command(np.zeros(2), ago_s=0.1)
-    assert leader.action(Obs()).tolist() == [1, 1]
-    leader.release()
-    assert not leader.command(np.ones(2), ago_s=0.01), "one from before the release takes no robot back"
-    assert not leader.engaged()
-
-
-def test_a_silent_human_can_give_the_robot_back(clock: Clock) -> None:
-    leader = RelayedLeader(0.2, silence="release")
-    leader.command(np.ones(2))
-    clock.now = 0.1
-    assert leader.engaged()
-    clock.now = 0.3
-    assert not leader.engaged()
-    with pytest.raises(InvalidAction):
-        leader.action(Obs())
-    for wrong in ({"deadline_s": 0.0}, {"silence": "stop"}):
-        with pytest.raises(ConfigError, match="want"):
-            RelayedLeader(**wrong)  # type: ignore[arg-type]
-
-
-def test_a_robot_whose_human_is_silent_holds_still(clock: Clock) -> None:
-    class Standing(Agent):
-        contract = Contract(action=ActionSpec(dim=2, delta=False))
-
-        def act(self, obs: Obs) -> Act:
-            return Act(np.zeros(2, np.float32))
-
-    leader = RelayedLeader(0.2)
-    with ChunkPlayer(Standing(), override=leader) as player:
-        player.reset(Obs(), "stack")
-        leader.command(np.ones(2))
-        assert player.act(Obs()).action.tolist() == [1, 1]
-        clock.now = 0.5
-        act = player.act(Obs())
-        assert (act.action.tolist(), act.info[INTERVENTION]) == ([1, 1], True)
-        assert "no command" in act.info[SAFE]
-        leader.release()
-        assert player.act(Obs()).action.tolist() == [0, 0]
 
 
 def test_a_human_drives_an_environment_through_the_same_loop() -> None:

@@ -17,7 +17,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 
 from vlagents_ray.errors import ConfigError, PolicyFailed
-from vlagents_ray.interface import AGE, AGE_MS, DELAY, LEFTOVER, PLANNED, SILENT, Act
+from vlagents_ray.interface import AGE, AGE_MS, CHUNK, DELAY, LEFTOVER, PLANNED, ROW, SILENT, Act
 
 Mode = Literal["open_loop", "ensemble", "async"]
 Merge = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -69,8 +69,8 @@ class Step(NamedTuple):
         about = {
             AGE: tick - chunk.tick,
             AGE_MS: (time.monotonic() - chunk.seen_at) * 1e3,
-            "chunk": chunk.number,
-            "row": self.row,
+            CHUNK: chunk.number,
+            ROW: self.row,
             PLANNED: chunk.rows,
             SILENT: silent_s,
         }

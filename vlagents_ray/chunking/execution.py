@@ -1,4 +1,4 @@
-"""What a chunk player executed, stated in its requests while somebody watches the server: that makes them dearer."""
+"""The record of what a chunk player executed, for the policy and, while the server is watched, for its viewers."""
 
 from __future__ import annotations
 
@@ -8,12 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from vlagents_ray.chunking.fallback import Held, unanswered
 from vlagents_ray.errors import DeadlineExceeded, VLAgentsError
-from vlagents_ray.interface import AGE_MS, SAFE, Act, Agent
+from vlagents_ray.interface import AGE_MS, EXECUTED, SAFE, Act, Agent
 
 PLAYED = "played"  # the entry of `Obs.info`
 WATCHED = "watched"  # the entry of `Act.info` with which a server says that somebody watches; it repeats that
 _WATCHED_S = 10.0  # time after which that is over unless it is said again
+_IN_PLACE = 256  # most actions between two requests that were executed in place of the policy's
 _ROWS = 64  # most actions between two requests that are stated; older ones are left out
 
 
@@ -27,6 +29,17 @@ class Execution:
         self._safe = ""
         self._safe_ticks = self._spells = self._late = 0
         self._watched_until = float("-inf")
+        self._in_place: deque[np.ndarray] = deque(maxlen=_IN_PLACE)
+        self._noted = False  # an action was noted in place of the policy's at this tick
+
+    def tick(self) -> None:
+        """Begin a tick."""
+        self._noted = False
+
+    def note_in_place(self, action: np.ndarray) -> None:
+        """Note an action, (D,), that is executed in place of the policy's; the next request says so."""
+        self._in_place.append(action)
+        self._noted = True
 
     def heard(self, answer: Act) -> None:
         """Note whether somebody watches, as an answer of the policy says."""
@@ -50,15 +63,19 @@ class Execution:
         return act
 
     def interrupt(self, reason: str) -> None:
-        """Note that the last action was not executed, since the robot was stopped or moved."""
-        if not self._safe and self._rows:
-            self._rows.pop()
-        self._note_safe(reason)
+        """Note that the action of this tick was not executed, since the robot was stopped or moved."""
+        if self._noted:
+            self._in_place.pop()
+            self._noted = False
+        if not self._safe:
+            if self._rows:
+                self._rows.pop()
+            self._note_safe(reason)
 
-    def failed(self, error: VLAgentsError) -> str:
-        """Note a request without an answer; return the reason for the ticks without an action."""
+    def failed(self, error: VLAgentsError) -> Held:
+        """Note a request without an answer; return why the ticks have no action."""
         self._late += isinstance(error, DeadlineExceeded)
-        return f"{error.code}: {error}"
+        return unanswered(error)
 
     def report(self, executed: int, agent: Agent) -> dict[str, Any]:
         """Return what the next request states.
@@ -68,15 +85,17 @@ class Execution:
             agent: The policy; a `RemoteAgent` knows how often it has connected again.
 
         Returns:
-            Nothing while nobody watches; else `PLAYED` with these entries. `step`: `executed`, the step for which the
-            first row of the answer is; `rows`: (n, D) float32, the policy's actions that were executed since the
-            request before; `steps`: (n,) int64, their steps; `age_ms`: the age of the observation from which the last
-            one was computed, when it was executed; `safe`: the reason of the last tick's safe action, "" if it had one
-            of the policy's; and of the episode `safe_ticks`, `safe_spells` (runs of such ticks), `late` (requests
-            without an answer in time), and `reconnects`.
+            `EXECUTED`, if other actions than the policy's were executed; while the server is watched also `PLAYED`. Its
+            entries are `step`: `executed`, the step for which the first row of the answer is; `rows`: (n, D) float32,
+            the policy's actions that were executed since the request before; `steps`: (n,) int64, their steps;
+            `age_ms`: the age of the observation from which the last one was computed, when it was executed; `safe`: the
+            reason of the last tick's safe action, "" if it had one of the policy's; and of the episode `safe_ticks`,
+            `safe_spells` (runs of such ticks), `late` (requests without an answer in time), and `reconnects`.
         """
+        stated: dict[str, Any] = {EXECUTED: np.stack(self._in_place)} if self._in_place else {}
+        self._in_place.clear()
         if time.monotonic() > self._watched_until:
-            return {}
+            return stated
         rows, self._rows = self._rows, deque(maxlen=_ROWS)
         played = {
             "step": executed,
@@ -89,7 +108,7 @@ class Execution:
             "late": self._late,
             "reconnects": getattr(agent, "reconnects", 0),
         }
-        return {PLAYED: played}
+        return {**stated, PLAYED: played}
 
     def _note_safe(self, reason: str) -> None:
         self._spells += not self._safe

@@ -3,24 +3,69 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
 from vlagents_ray.contract import ActionSpec
-from vlagents_ray.errors import ConfigError, InvalidAction
+from vlagents_ray.errors import (
+    ConfigError,
+    ConnectionLost,
+    DeadlineExceeded,
+    InvalidAction,
+    PolicyUnavailable,
+    VLAgentsError,
+)
 from vlagents_ray.interface import Obs
 
 SafeName = Literal["auto", "hold", "zero"]
-# The reasons of safe actions.
-WAITING = "waiting for an answer: the last one's rows are executed"
-LATE = "the answer came so late that others had been executed in place of all its rows"
-OLD = "what was planned is older than max_age_s"
-STALE = (
+Cause = Literal[
+    "waiting",  # the rows of the last answer are used up, and the next answer has not come: not counted as `safe`
+    "late",  # the answer came after others had been executed in place of all its rows
+    "old",  # the plan is older than max_age_s
+    "stale",  # the observation is older than max_age_s
+    "lost",  # the server gave no answer: no connection, or not in time
+    "failed",  # the policy raised an error
+    "limits",  # the guard refused the action: beyond a limit
+    "max_step",  # the guard refused the action: too far from the one before
+    "invalid",  # the action is NaN, has a wrong shape, or was refused by another check
+    "leader",  # the human's device gave no action
+    "robot",  # the robot must not move (`holds`), such as for a camera that hangs
+    "stopped",  # the robot was stopped, and not restarted yet
+    "paused",  # counted apart
+    "other",  # an agent other than the chunk player gave a safe action
+]
+
+
+class Held(NamedTuple):
+    """Why a robot holds still at a tick."""
+
+    cause: Cause
+    reason: str  # in words, with numbers
+
+
+WAITING = Held("waiting", "waiting for an answer: all rows of the last one have been executed")
+LATE = Held("late", "the answer came so late that others had been executed in place of all its rows")
+OLD = Held("old", "what was planned is older than max_age_s")
+STALE = Held(
+    "stale",
     "the observation is older than max_age_s, or of a clock that is ahead: look for a camera that hangs, for robot and "
-    "sensors with different clocks, or for an info['captured_at'] that is not time.time()"
+    "sensors with different clocks, or for an info['captured_at'] that is not time.time()",
 )
-STOPPED = "the robot was stopped since the observation that was answered last"
+STOPPED = Held("waiting", "the robot was stopped since the observation that was answered last")
+RELEASED = Held("waiting", "a human has released the robot, or a pause is over: waiting for a new answer")
+_LOST = (ConnectionLost, PolicyUnavailable, DeadlineExceeded)
+
+
+def refused(error: InvalidAction) -> Held:
+    """Return why the robot holds still in place of an action that was refused."""
+    return Held(error.cause, str(error))
+
+
+def unanswered(error: VLAgentsError) -> Held:
+    """Return why the robot holds still after a request that ended with an error."""
+    return Held("lost" if isinstance(error, _LOST) else "failed", f"{error.code}: {error}")
+
 
 Safe = SafeName | np.ndarray | Callable[[Obs], np.ndarray]
 

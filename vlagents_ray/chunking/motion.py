@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from vlagents_ray.chunking.fallback import SafeAction
+from vlagents_ray.chunking.fallback import Held, SafeAction
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import InvalidAction
 from vlagents_ray.interface import Obs
@@ -30,7 +30,7 @@ class Motion:
     def __init__(self, check: Check | None, contract: Contract | None = None, safe: SafeAction | None = None) -> None:
         self._check, self._contract, self._safe = check, contract, safe
         self._last: np.ndarray | None = None  # the last commanded action
-        self._before: np.ndarray | None = None  # the one before it
+        self._before: np.ndarray | None = None  # the last one of the ticks before
         self._state: Literal["stopped", "moving", "held"] = "stopped"
 
     @property
@@ -38,8 +38,12 @@ class Motion:
         """Whether an action is known that keeps the robot still."""
         return self._safe is not None
 
+    def tick(self) -> None:
+        """Begin a tick, at which one action may be commanded."""
+        self._before = self._last
+
     def stop(self) -> None:
-        """Note that the robot was stopped, and did not execute the last command."""
+        """Note that the robot was stopped, and did not execute a command of this tick."""
         self._last = self._before
         self._state = "stopped"
 
@@ -53,29 +57,29 @@ class Motion:
         self._state = "moving"
         return self._command(action)
 
-    def hold(self, obs: Obs, reason: str) -> tuple[np.ndarray, str]:
-        """Return the action that keeps the robot still, (D,) float32, and the reason with what was refused meanwhile.
+    def hold(self, obs: Obs, why: Held) -> tuple[np.ndarray, Held]:
+        """Return the action that keeps the robot still, (D,) float32, and why, with what was refused meanwhile.
 
         Raises:
             InvalidAction: There is none, or none that passes the check.
         """
         if self._safe is None:
-            raise InvalidAction(f"no action for this tick: {reason}")
+            raise InvalidAction(f"no action for this tick: {why.reason}")
         last = self._standing(obs) if self._state == "stopped" else self._last
         try:
             action = self._checked(self._safe(obs, last), last)
         except InvalidAction as refused:
-            reason = f"{reason}; the safe action is refused, too: {refused}"
+            why = why._replace(reason=f"{why.reason}; the safe action is refused, too: {refused}")
             if last is None or not self._safe.holds:
                 raise InvalidAction(
-                    f"no action for this tick: {reason}; let the guard pass it, or give another one (safe=)"
+                    f"no action for this tick: {why.reason}; let the guard pass it, or give another one (safe=)"
                 ) from refused
             action = self._checked(last, last)
         self._state = "held" if self._state == "moving" else self._state
-        return self._command(action).copy(), reason
+        return self._command(action).copy(), why
 
     def _command(self, action: np.ndarray) -> np.ndarray:
-        self._before, self._last = self._last, action
+        self._last = action
         return action
 
     def _passed(self, action: np.ndarray, obs: Obs) -> np.ndarray:

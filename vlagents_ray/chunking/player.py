@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -14,14 +14,41 @@ from vlagents_ray.chunking.answer import LastAnswer
 from vlagents_ray.chunking.background import AsyncCaller, parts_of
 from vlagents_ray.chunking.buffer import DELAYS, ENSEMBLE, ENSEMBLE_M, ChunkBuffer, Merge, Mode, Step, require_settings
 from vlagents_ray.chunking.capture_clock import CaptureClock, stamped
+from vlagents_ray.chunking.control import Control, Leader
 from vlagents_ray.chunking.execution import Execution
-from vlagents_ray.chunking.fallback import LATE, OLD, STALE, STOPPED, WAITING, Safe, SafeAction
+from vlagents_ray.chunking.fallback import (
+    LATE,
+    OLD,
+    RELEASED,
+    STALE,
+    STOPPED,
+    WAITING,
+    Held,
+    Safe,
+    SafeAction,
+    refused,
+)
 from vlagents_ray.chunking.motion import Check, Motion
-from vlagents_ray.chunking.takeover import RELEASED, Leader, Takeover
 from vlagents_ray.contract import ActionSpec, Contract
-from vlagents_ray.errors import InvalidAction, InvalidInput, NotReset, VLAgentsError
-from vlagents_ray.interface import DEADLINE, SAFE, SILENT, Act, Agent, Obs, copied
+from vlagents_ray.errors import ConfigError, InvalidAction, InvalidInput, NotReset, VLAgentsError
+from vlagents_ray.interface import (
+    CAUSE,
+    DEADLINE,
+    DISTRIBUTION,
+    INTERVENTION,
+    OF_THE_LOOP,
+    SAFE,
+    SAMPLES,
+    SILENT,
+    WANTED,
+    Act,
+    Agent,
+    Obs,
+    copied,
+)
 from vlagents_ray.validation import check_action
+
+UNCERTAINTY = "uncertainty"  # in the info of an Act, if the policy states it: a number, or one for each row
 
 
 class ChunkPlayer(Agent):
@@ -33,10 +60,11 @@ class ChunkPlayer(Agent):
     and, with a deadline, waits for the first chunk.
 
     In mode "async", and in the others with `deadline_s`, `act` returns within `deadline_s`: the policy's action, or the
-    `safe` one where there is none, with the reason in `act.info["safe"]`. `info` also tells `age_ticks`, `chunk`,
-    `row`, and `silent_s`, for how long an answer has been waited for. Errors that asking again will not cure
-    (`InvalidInput`, and any that is not this package's) are raised by the next `act`; the others are the reason of safe
-    actions until the policy answers. Without a deadline, errors are raised.
+    `safe` one where there is none, with the reason in `act.info["safe"]` and its kind in
+    `act.info["safe_cause"]`. `info` also tells `age_ticks`, `chunk`, `row`, and `silent_s`, for how long an answer has
+    been waited for. Errors that asking again will not cure (`InvalidInput`, and any that is not this package's) are
+    raised by the next `act`; the others are the reason of safe actions until the policy answers. Without a deadline,
+    errors are raised.
     """
 
     def __init__(
@@ -85,12 +113,14 @@ class ChunkPlayer(Agent):
                 a `Guard` with `measure` takes the measured pose where there is none, and after safe actions.
             override: What a human moves the robot with. While it is engaged, `act` returns its actions with
                 `info["intervention"]` and, where known, `info["policy_action"]`. They pass `check`, too.
-            ask_for_help: The uncertainty above which the robot pauses (see `vlagents_ray.chunking.takeover`).
+            ask_for_help: The uncertainty above which the robot pauses (see `uncertainty`).
             samples: The number of samples to ask for, from whose spread a policy's uncertainty is computed.
 
         Raises:
             ConfigError: Settings do not go together.
         """
+        if ask_for_help is not None and not ask_for_help >= 0:
+            raise ConfigError(f"ask_for_help: got {ask_for_help}, want 0 or above, or None")
         require_settings(mode, execute, horizon, max_age_s, merge, real_time_chunking)
         self._agent = agent
         self._mode: Mode = mode
@@ -100,7 +130,8 @@ class ChunkPlayer(Agent):
         self._horizon, self._max_age_s = horizon, max_age_s
         self._safe_choice, self._grippers = safe, grippers
         self.check = check
-        self.takeover = Takeover(override, ask_for_help, samples)
+        self.control = Control(override)
+        self._ask_for_help, self._samples = ask_for_help, samples
         self._real_time = real_time_chunking
         self._plan = ChunkBuffer(ENSEMBLE if mode == "ensemble" else merge, ensemble_m)
         self._asker: AsyncCaller | None = None
@@ -116,7 +147,8 @@ class ChunkPlayer(Agent):
         self._captured = CaptureClock()
         self._delays: deque[int] = deque(maxlen=DELAYS)
         self._motion = Motion(self.check)
-        self.takeover.begin()
+        self._judged: Mapping[str, Any] | None = None  # the info of the last chunk whose uncertainty was looked at
+        self._helped = False  # since the last certain chunk, a human has looked at the scene
 
     @property
     def contract(self) -> Contract | None:
@@ -153,12 +185,11 @@ class ChunkPlayer(Agent):
         """Drop the plan: the robot was stopped or moved, and did not execute the last action of `act`.
 
         Earlier observations are not acted on any more, so the policy is asked again. `run_loop` calls this at each tick
-        at which the watchdog has the robot stopped; call it in your own loop when you stop or take over the robot.
+        at which it holds the robot; call it in your own loop when you stop or take over the robot.
         """
         self._begin_again(STOPPED)
-        self._execution.interrupt(STOPPED)
+        self._execution.interrupt(STOPPED.reason)
         self._motion.stop()
-        self.takeover.note_stopped()
 
     def observe(self, obs: Obs, action: np.ndarray | None = None) -> None:
         """Show the policy an observation for which no action is needed.
@@ -177,7 +208,7 @@ class ChunkPlayer(Agent):
             self._read_part(self._answer.rest, self._tick or 0)
         self._agent.observe(obs)
         if action is not None and self._tick is not None:
-            self.takeover.note_executed(self._motion.move(action, obs))
+            self._execution.note_in_place(self._motion.move(action, obs))
             self._plan.advance()
             self._tick += 1
 
@@ -187,20 +218,22 @@ class ChunkPlayer(Agent):
         if tick is None:
             raise NotReset("act before reset; reset first")
         begun = time.monotonic()
-        if self.takeover.update():
+        self._motion.tick()
+        self._execution.tick()
+        if self.control.update():
             self._begin_again(RELEASED)
-        led = self.takeover.state == "human"
+            self._helped = True
+        led = self.control.state == "human"
         try:
             self._ask(obs, tick, begun)
         except Exception as error:
             if not led:
                 raise
-            self._trouble = str(error)  # the human goes on, and what the policy wants is not known
+            self._trouble = Held("failed", str(error))  # the human goes on, and the policy's action is not known
         self._tick = tick + 1
-        if not led:
-            return self._execution.note(self._chosen(obs, tick), self._plan.executed)
-        act = self.takeover.act(obs, self._next(), self._motion)
-        if SAFE not in act.info:  # the human's action is executed in place of a row
+        act = self._led(obs) if led else self._chosen(obs, tick)
+        if led and SAFE not in act.info:  # the human's action is executed in place of a row
+            self._execution.note_in_place(act.action)
             self._plan.advance()
         return self._execution.note(act, self._plan.executed)
 
@@ -221,15 +254,15 @@ class ChunkPlayer(Agent):
             if wanted:
                 self._note_asked(tick, obs)
                 self._read_part(parts_of(self._agent, stamped(obs, self._extras())), tick)
-        else:  # nobody waits for an action that is not executed
-            wait_s = self._deadline_s if self.takeover.state == "autonomous" else 0.0
+        else:  # no tick waits for an action that is not executed
+            wait_s = self._deadline_s if self.control.state == "autonomous" else 0.0
             self._ask_in_time(self._asker, obs, tick, begun + wait_s)
 
     def _choose_safe(self) -> None:
         """Choose the safe action; raises `ConfigError` if it does not fit the policy's actions."""
         self._contract = self._agent.contract
         spec = ActionSpec() if self._contract is None else self._contract.action
-        wanted = self._deadline_s is not None or self.takeover.used
+        wanted = self._deadline_s is not None or self.control.leader is not None or self._ask_for_help is not None
         safe = SafeAction(self._safe_choice, spec, self._grippers) if wanted else None
         self._motion = Motion(self.check, self._contract, safe)
 
@@ -286,7 +319,7 @@ class ChunkPlayer(Agent):
                     self._take(answer, tick)
                 self._waiting_since = time.monotonic() if answer.more else None
             except InvalidAction as error:
-                self._trouble = str(error)
+                self._trouble = refused(error)
             return
         if isinstance(answer, InvalidInput) or not isinstance(answer, VLAgentsError):
             raise answer
@@ -294,6 +327,7 @@ class ChunkPlayer(Agent):
 
     def _take(self, act: Act, now: int) -> None:
         answer = self._answer
+        act = replace(act, info={key: value for key, value in act.info.items() if key not in OF_THE_LOOP})
         self._execution.heard(act)
         try:
             rows = Act(check_action(act.action, self._contract)).rows()
@@ -311,18 +345,38 @@ class ChunkPlayer(Agent):
         self._trouble = WAITING if added or act.more else LATE
 
     def _extras(self) -> dict[str, Any]:
-        extras = self.takeover.extras() | self._execution.report(self._plan.executed, self._agent)
+        extras = self._execution.report(self._plan.executed, self._agent)
+        if self._samples is not None:
+            extras[SAMPLES] = self._samples
         if self._timeout_s is not None:
             extras[DEADLINE] = self._timeout_s * 1e3
-        if self._real_time and self.takeover.state != "human":  # who executes other actions than those of the plan
+        if self._real_time and self.control.state != "human":  # who executes other actions than those of the plan
             extras |= self._plan.continuation(self._delays)
         return extras
 
+    def _led(self, obs: Obs) -> Act:
+        """Return the action of the human who has the robot, or the safe one where that is refused."""
+        info: dict[str, Any] = {INTERVENTION: True, SILENT: 0.0}  # the policy's silence stops no human
+        if (planned := self._next()) is not None:
+            info[WANTED] = planned.action.copy()
+        try:
+            try:
+                action = np.array(self.control.leader.action(obs), np.float32)  # type: ignore[union-attr]
+            except Exception as error:
+                raise InvalidAction(f"leader: {error}", cause="leader") from error
+            action = self._motion.move(action, obs)
+        except InvalidAction as error:
+            action, held = self._motion.hold(obs, refused(error))
+            info |= {SAFE: held.reason, CAUSE: held.cause}
+        return Act(action.copy(), info=info)
+
     def _chosen(self, obs: Obs, tick: int) -> Act:
-        step = None if self.takeover.state == "paused" else self._next()
-        reason = STALE if self._is_old(self._captured(obs)) else self._trouble
-        if step is not None and self.takeover.needs_help(step.chunk.info):
-            step = None
+        held = self.control.held
+        step = None if held is not None else self._next()
+        why = held or (STALE if self._is_old(self._captured(obs)) else self._trouble)
+        if step is not None and self._needs_help(step.chunk.info):
+            step, held = None, self.control.held
+            why = held or why
         if step is not None:
             try:
                 action = self._motion.move(step.action, obs)
@@ -332,18 +386,65 @@ class ChunkPlayer(Agent):
                 self._plan.drop()  # the rest was planned from where this action would have led
                 if self._answer.parts:
                     self._answer.drop()
-                reason = str(error)
+                why = refused(error)
                 if not self._motion.can_hold:
                     raise
-        action, reason = self._motion.hold(obs, self.takeover.reason or reason)
-        self.takeover.note_held(action)
-        return Act(action, info={SAFE: reason, SILENT: self._silent_s()})
+        if held is not None and self.control.running:  # the loop commands nothing
+            action = np.zeros(0, np.float32)
+        else:
+            action, why = self._motion.hold(obs, why)
+            if held is not None:  # the policy's action is not to be expected any more
+                self._execution.note_in_place(action)
+        return Act(action, info={SAFE: why.reason, CAUSE: why.cause, SILENT: self._silent_s()})
 
-    def _begin_again(self, reason: str) -> None:
+    def _needs_help(self, info: Mapping[str, Any]) -> bool:
+        """Pause if a chunk is too uncertain, and return whether it is.
+
+        After a pause the policy may continue once with an uncertain chunk: help is asked for again when there was a
+        certain one in between.
+        """
+        if self._ask_for_help is None or info is self._judged:
+            return False
+        self._judged = info
+        value = uncertainty(info)
+        if value is None:
+            raise ConfigError(
+                "ask_for_help: the policy states no uncertainty; ask it for samples (samples=8), or add "
+                f"act.info[{UNCERTAINTY!r}] to its answers"
+            )
+        if value <= self._ask_for_help:
+            self._helped = False
+        elif not self._helped:
+            self.control.pause(f"asks for help: its uncertainty is {value:.3g}, above {self._ask_for_help:.3g}")
+            return True
+        return False
+
+    def _begin_again(self, why: Held) -> None:
         """Let the next action be of the answer to a new observation."""
         self._plan.drop()
         self._answer.drop()
-        self._trouble = reason
+        self._trouble = why
 
     def _silent_s(self) -> float:
         return 0.0 if self._waiting_since is None else time.monotonic() - self._waiting_since
+
+
+def uncertainty(info: Mapping[str, Any]) -> float | None:
+    """Return how uncertain a policy is of a chunk.
+
+    Args:
+        info: The info of the policy's `Act`.
+
+    Returns:
+        `info["uncertainty"]` if the policy states it; else the mean standard deviation of its samples, in the units of
+        the action; None if there are none.
+
+    Raises:
+        InvalidAction: What it states is not a number.
+    """
+    try:
+        if UNCERTAINTY in info:
+            return float(np.max(info[UNCERTAINTY]))
+        return float(np.mean(info[DISTRIBUTION]["std"])) if DISTRIBUTION in info else None
+    except (TypeError, ValueError, KeyError) as error:
+        raise InvalidAction(f'uncertainty: got {error}, want a number, or samples with their "std"') from error

@@ -1,57 +1,34 @@
-"""Commands from the live page to a robot: they come in the answers to its requests, and its own computer decides."""
+"""Commands from the live page to a robot, which come in the answers to its requests; they can only make it stop."""
 
 from __future__ import annotations
 
+import logging
 from collections import deque
 from collections.abc import Collection
 from dataclasses import dataclass, replace
-from typing import Protocol
 
-from vlagents_ray.errors import ConfigError, InvalidInput, VLAgentsError
+from vlagents_ray.chunking.control import Control
+from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Act, Obs
 
-COMMAND = "command"  # the entry of `Act.info` with a command: {"id", "do", "text", "by"}, str each
+COMMAND = "command"  # the entry of `Act.info` with a command: {"id", "do", "by"}, str each
 COMMANDED = "commanded"  # the entry of `Obs.info` with the answers: by id, why it was refused, "" if it was obeyed
-COMMANDS = ("pause", "resume", "stop", "success", "failure", "instruct")
-_REFUSAL = 200  # most characters of a refusal
+COMMANDS = ("pause", "stop", "success", "failure")  # none of them can start a motion
+logger = logging.getLogger(__name__)
+_BY = 80  # most characters of a name that are kept
 
 
 @dataclass(frozen=True, slots=True)
 class Command:
     """A command from the live page."""
 
-    id: str  # by which the server knows the answer; empty if the command is not the server's
+    id: str  # by which the server knows the answer
     do: str  # one of `COMMANDS`
-    text: str = ""  # of "instruct": the new instruction
     by: str = ""  # name of the key whose holder pressed the button; empty on a server without keys
 
 
-class Operated(Protocol):
-    """What obeys commands; a method that cannot, raises one of this package's errors, which the page shows."""
-
-    def pause(self) -> None:
-        """Hold the robot still until `resume`."""
-        ...
-
-    def resume(self) -> None:
-        """Let the policy go on after `pause`, from where the robot is."""
-        ...
-
-    def stop(self, by: str) -> None:
-        """Stop the robot; whoever stands at it starts it again."""
-        ...
-
-    def mark(self, label: str) -> None:
-        """End the episode as a "success" or a "failure"."""
-        ...
-
-    def instruct(self, text: str) -> None:
-        """End the episode, and begin the next one with another instruction."""
-        ...
-
-
 class CommandInbox:
-    """The commands for one session, from `RemoteAgent(url, commands=inbox)` to whatever obeys them.
+    """The commands for one session, from `RemoteAgent(url, commands=inbox)` to the state of the robot.
 
     The agent's thread puts commands in and takes answers out; `obey` runs on the thread of the control loop.
     """
@@ -60,6 +37,7 @@ class CommandInbox:
         """Create an inbox; commands that are not in `allow` are refused. Raises `ConfigError` for an unknown one."""
         if unknown := sorted(set(allow) - set(COMMANDS)):
             raise ConfigError(f"allow: got {unknown}, want some of {list(COMMANDS)}")
+        self.control = Control()  # that of the last run
         self._allow = frozenset(allow)
         self._waiting: deque[Command] = deque()
         self._answers: dict[str, str] = {}  # refusal by id of a command, empty if it was obeyed
@@ -79,51 +57,32 @@ class CommandInbox:
         stated = act.info.pop(COMMAND, None)
         if not isinstance(stated, dict) or not all(isinstance(stated.get(name), str) for name in ("id", "do")):
             return
-        command = Command(stated["id"], stated["do"], str(stated.get("text", "")), str(stated.get("by", "")))
+        command = Command(stated["id"], stated["do"], str(stated.get("by", ""))[:_BY])
         if command.do in self._allow:
             self._waiting.append(command)
-        else:
+        elif command.do in COMMANDS:
             self._answers[command.id] = f"{command.do}: not allowed here"
-
-    def put(self, do: str, text: str = "") -> None:
-        """Add a command that this machine gives by itself, such as an instruction that came on a topic of ROS.
-
-        Args:
-            do: One of `COMMANDS`.
-            text: The new instruction, of "instruct".
-        """
-        self._waiting.append(Command("", do, text))
+        else:
+            self._answers[command.id] = f"{command.do[:_BY]!r}: no such command, want one of {list(COMMANDS)}"
 
     @property
     def waiting(self) -> list[Command]:
         """The commands that have come and were not obeyed yet, oldest first."""
         return list(self._waiting)
 
-    def obey(self, operated: Operated) -> list[Command]:
-        """Let `operated` do what has come since the last call; return those commands that it did."""
+    def obey(self, control: Control) -> list[Command]:
+        """Give the commands that have come since the last call to the state of the robot, and return them."""
         done = []
         while self._waiting:
-            command, refused = self._waiting.popleft(), ""
-            try:
-                _do(command, operated)
-                done.append(command)
-            except VLAgentsError as refusal:
-                refused = str(refusal)[:_REFUSAL]
-            if command.id:
-                self._answers[command.id] = refused
+            command = self._waiting.popleft()
+            by = f" by {command.by}" if command.by else ""
+            if command.do == "pause":
+                control.pause(f"paused from the live page{by}")
+            elif command.do == "stop":
+                control.stop(f"the live page{by}")
+                logger.warning("stopped from the live page%s", by)
+            else:
+                control.mark(command.do)
+            done.append(command)
+            self._answers[command.id] = ""
         return done
-
-
-def _do(command: Command, operated: Operated) -> None:
-    if command.do == "pause":
-        operated.pause()
-    elif command.do == "resume":
-        operated.resume()
-    elif command.do == "stop":
-        operated.stop(command.by)
-    elif command.do == "instruct":
-        operated.instruct(command.text)
-    elif command.do in ("success", "failure"):
-        operated.mark(command.do)
-    else:
-        raise InvalidInput(f"{command.do}: unknown here")

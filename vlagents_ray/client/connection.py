@@ -20,6 +20,7 @@ from vlagents_ray.errors import (
     UnknownApp,
     VLAgentsError,
 )
+from vlagents_ray.interface import OF_THE_LOOP
 from vlagents_ray.protocol.messages import PROTOCOL_VERSION, Reply, Request, boot_id
 
 if TYPE_CHECKING:
@@ -134,6 +135,8 @@ class Connection:
             if isinstance(error, DeadlineExceeded):
                 self._note_silence(begun)
             replies = [Reply(request.request_id, error=error) for request in requests]
+        for reply in replies:
+            _without_names_of_the_loop(reply)
         if len(replies) == len(requests) and not any(map(_changes_connection, replies)):
             return replies
         return self._noted(requests, replies)
@@ -148,6 +151,7 @@ class Connection:
             if isinstance(error, DeadlineExceeded):
                 self._note_silence(begun)
             reply = Reply(request.request_id, error=error)
+        _without_names_of_the_loop(reply)
         return self._noted([request], [reply])[0]
 
     def _note_silence(self, begun: float) -> None:
@@ -189,6 +193,13 @@ class Connection:
         if self._old_transport is not None:
             threading.Thread(target=self._old_transport.close, daemon=True).start()
             self._old_transport = None
+
+
+def _without_names_of_the_loop(reply: Reply) -> None:
+    """Remove what a server has no say in: why a tick has no action of the policy, and who moves the robot."""
+    if reply.act is not None:
+        for name in OF_THE_LOOP:
+            reply.act.info.pop(name, None)
 
 
 def _changes_connection(reply: Reply) -> bool:

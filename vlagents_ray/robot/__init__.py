@@ -1,7 +1,8 @@
 """The control loop of a robot, with its guard, watchdog and recorder; its dependencies are those of `client`."""
 
+from vlagents_ray.chunking.control import Control
 from vlagents_ray.client.commands import CommandInbox
 from vlagents_ray.robot.loop import LoopReport, Robot, run_loop
 from vlagents_ray.robot.safety import Guard, Watchdog
 
-__all__ = ["CommandInbox", "Guard", "LoopReport", "Robot", "Watchdog", "run_loop"]
+__all__ = ["CommandInbox", "Control", "Guard", "LoopReport", "Robot", "Watchdog", "run_loop"]

@@ -7,22 +7,20 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import os
 import re
-import select
 import signal
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import get_args
 
 from vlagents_ray.chunking.buffer import ENSEMBLE, MERGES
+from vlagents_ray.chunking.control import Leader
 from vlagents_ray.chunking.player import ChunkPlayer
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.commands import CommandInbox
-from vlagents_ray.contract import require_match
+from vlagents_ray.contract import Contract, require_match
 from vlagents_ray.errors import ConfigError, VLAgentsError
 from vlagents_ray.robot.loop import LoopReport, Restart, Robot, import_class, run_loop
 from vlagents_ray.robot.pacing import empty_loop
@@ -30,12 +28,15 @@ from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.ros import RosRobot, read_settings
 from vlagents_ray.robot.safety import Guard, Watchdog, measured_state
 from vlagents_ray.robot.simulated import SimulatedRobot
-from vlagents_ray.robot.teleoperation import RemoteLeader
+from vlagents_ray.robot.teleoperation import AxesLeader, Keyboard, SpaceMouse
+from vlagents_ray.robot.teleoperation.keyboard import HELP
+from vlagents_ray.robot.terminal import Terminal
 from vlagents_ray.viewers.targets import open_viewers
 
 MOSTLY_SAFE = 3  # exit status
 WAIT_S = 1.0  # deadline of a tick in the modes that wait for an answer; half of the default of --silent-s
-_TYPED_S = 0.2
+_DEVICES: dict[str, type[Keyboard | SpaceMouse]] = {"keyboard": Keyboard, "spacemouse": SpaceMouse}
+RESTART_KEYS = "c\n"  # Enter is the keyboard's own while that moves the robot
 _HEADER = ("", "ticks", "missed", "within 2 ms", "p50 ms", "p99 ms", "max ms")
 
 
@@ -76,21 +77,16 @@ def _run(options: argparse.Namespace) -> LoopReport:
     say: Callable[[str], None] = lambda line: print(line, flush=True)  # noqa: E731, T201
     deadline_s = options.deadline_ms / 1e3 if options.deadline_ms is not None else WAIT_S * (options.mode != "async")
     make_robot = import_class("--robot", options.robot) if options.robot else None
-    leader = import_class("--leader", options.leader)() if options.leader else None
+    make_leader = import_class("--leader", options.leader) if ":" in (options.leader or "") else None
     with contextlib.ExitStack() as stack:
         topics = _topics(options, stack)
-        commands = CommandInbox() if options.operate or topics is not None else None
+        commands = CommandInbox() if options.operate else None
         agent = RemoteAgent(  # the player closes it
-            options.url,
-            transport=options.transport,
-            timeout_s=options.timeout_s,
-            commands=commands if options.operate else None,
+            options.url, transport=options.transport, timeout_s=options.timeout_s, commands=commands
         )
         agent.initialize()
         contract = agent.contract
-        if options.remote:
-            measure = measured_state(options.measure)
-            leader = stack.enter_context(RemoteLeader(agent, local=leader, step=options.step, measure=measure))
+        leader = _leader(options, make_leader, contract, stack)
         stated = contract is not None and contract.action.relative is not None
         if options.safe == "auto" and not options.robot and topics is None and not stated:
             options.safe = "hold"  # the simulated robot uses such actions as absolute targets
@@ -126,7 +122,7 @@ def _run(options: argparse.Namespace) -> LoopReport:
         if topics is not None:
             require_match(contract, topics.contract)
             options.instruction = options.instruction or topics.first_instruction(say)
-            topics.watchdog, topics.commands = watchdog, commands
+            topics.watchdog, topics.control = watchdog, player.control
         stack.enter_context(_restarting(watchdog, say))
         if options.baseline > 0:
             say(_line(_HEADER))
@@ -148,24 +144,49 @@ def _run(options: argparse.Namespace) -> LoopReport:
         if options.baseline <= 0:
             say(_line(_HEADER))
         say(_row(f"{options.mode}, {agent.transport}", report.jitter))
-        say(
-            f"from a tick until its action is applied: p50 {report.work_p50_ms:.2f} ms, p99 {report.work_p99_ms:.2f} ms"
-        )
-        if leader is not None:
-            say(f"ticks at which a human moved the robot: {report.interventions}; ticks paused: {report.paused}")
-        say(f"ticks without an action of the policy: {report.safe_ticks} of {report.jitter['ticks']:.0f}")
-        for reason, ticks in sorted(report.safe.items(), key=lambda one: -one[1])[:5]:
-            say(f"  {ticks} x {reason}")
-        if report.mostly_safe is not None:  # `run_loop` has logged why, and the cure
-            say(f"MOSTLY SAFE ACTIONS, exit status {MOSTLY_SAFE}")
-        for bark in report.barks:
-            say(f"watchdog: {bark}")
-        say(f"against jitter: {', '.join(report.means)}")
+        _say_outcome(report, say, led=leader is not None)
     if recorder is not None:  # closed, so everything is written
         say(f"recorded: {recorder.episodes} episodes in {options.record}, {recorder.dropped} frames dropped")
     for viewer in viewers:
         say(viewer.report())
     return report
+
+
+def _leader(
+    options: argparse.Namespace,
+    make: Callable[[], Leader] | None,
+    contract: Contract | None,
+    stack: contextlib.ExitStack,
+) -> Leader | None:
+    """Return what a human moves the robot with, opened."""
+    if options.leader is None:
+        return None
+    if make is not None:
+        leader = make()
+        return stack.enter_context(leader) if isinstance(leader, contextlib.AbstractContextManager) else leader
+    if options.leader not in _DEVICES:
+        raise ConfigError(f"--leader: got {options.leader!r}, want one of {list(_DEVICES)}, or MODULE:CLASS")
+    device = _DEVICES[options.leader]()
+    stack.enter_context(device)
+    if isinstance(device, Keyboard):
+        print(f"{HELP}; C restarts the robot after a stop or a pause", flush=True)  # noqa: T201
+    return AxesLeader(contract, device, step=options.step, measure=measured_state(options.measure))
+
+
+def _say_outcome(report: LoopReport, say: Callable[[str], None], *, led: bool) -> None:
+    say(f"from a tick until its action is applied: p50 {report.work_p50_ms:.2f} ms, p99 {report.work_p99_ms:.2f} ms")
+    if led:
+        say(f"ticks at which a human moved the robot: {report.interventions}; ticks paused: {report.paused}")
+    say(f"ticks without an action of the policy: {report.safe_ticks} of {report.jitter['ticks']:.0f}")
+    causes = {**report.safe, "waiting": report.waiting}
+    for cause, ticks in sorted(causes.items(), key=lambda one: -one[1]):
+        if ticks:
+            say(f"  {ticks} x {cause}, first: {report.reasons[cause]}")
+    if report.mostly_safe is not None:  # `run_loop` has logged why, and the cure
+        say(f"MOSTLY SAFE ACTIONS, exit status {MOSTLY_SAFE}")
+    for bark in report.barks:
+        say(f"stopped: {bark}")
+    say(f"against jitter: {', '.join(report.means)}")
 
 
 def _topics(options: argparse.Namespace, stack: contextlib.ExitStack) -> RosRobot | None:
@@ -177,7 +198,7 @@ def _topics(options: argparse.Namespace, stack: contextlib.ExitStack) -> RosRobo
 
 
 def _played(play: Callable[..., LoopReport], instruction: str | None, say: Callable[[str], None]) -> LoopReport:
-    """Play an episode, and a further one whenever the live page asks for one; return the last report."""
+    """Play an episode, and a further one for each new instruction; return the last report."""
     while True:
         report = play(instruction=instruction)
         if report.outcome:
@@ -185,50 +206,36 @@ def _played(play: Callable[..., LoopReport], instruction: str | None, say: Calla
         if report.next_instruction is None:
             return report
         instruction = report.next_instruction
-        say(f"the live page asks for another episode: {instruction!r}")
+        say(f"another episode begins: {instruction!r}")
 
 
 @contextlib.contextmanager
 def _restarting(watchdog: Watchdog, say: Callable[[str], None]) -> Iterator[None]:
-    """Let a person restart motion after a stop: by Enter at a terminal, or by SIGUSR1."""
+    """Let a person restart motion after a stop or a pause: by Enter or C at the terminal, or by SIGUSR1."""
 
-    over = threading.Event()
+    def restarted() -> bool:
+        if not watchdog.restart():
+            return False
+        watchdog.control.resume()
+        return True
 
-    def at_terminal() -> None:
-        while not over.is_set():
-            if not _line_typed(sys.stdin.fileno()):
-                continue
-            stopped = watchdog.stopped
-            if not watchdog.restart():
-                say(f"not restarted: still no signal from the {' and the '.join(watchdog.silent)}")
-            elif stopped:
-                say("restarted")
+    def typed(key: str) -> bool:
+        if key not in RESTART_KEYS:
+            return False
+        stood = watchdog.stopped or watchdog.control.reason is not None
+        if not restarted():
+            say(f"not restarted: still no signal from the {' and the '.join(watchdog.silent)}")
+        elif stood:
+            say("restarted")
+        return True
 
     with contextlib.ExitStack() as undo:
-        if sys.stdin is not None and sys.stdin.isatty() and hasattr(os, "tcgetpgrp"):
-            thread = threading.Thread(target=at_terminal, name="vlagents-ray-restart", daemon=True)
-            thread.start()
-            undo.callback(thread.join)
-            undo.callback(over.set)
+        with contextlib.suppress(ConfigError):  # there is no terminal
+            undo.enter_context(Terminal().read_in_background(typed))
         if threading.current_thread() is threading.main_thread() and hasattr(signal, "SIGUSR1"):
-            before = signal.signal(signal.SIGUSR1, lambda *_: watchdog.restart() and None)
+            before = signal.signal(signal.SIGUSR1, lambda *_: restarted() and None)
             undo.callback(signal.signal, signal.SIGUSR1, before)
         yield
-
-
-def _line_typed(terminal: int) -> bool:
-    """Whether Enter was pressed within 0.2 s; in the background nothing is read, as that would suspend the process."""
-    try:
-        ready, _, _ = select.select([terminal], [], [], _TYPED_S)
-        if not ready or os.tcgetpgrp(terminal) != os.getpgrp():
-            time.sleep(_TYPED_S if ready else 0)
-            return False
-        if typed := os.read(terminal, 1024):
-            return b"\n" in typed
-    except OSError:
-        pass
-    time.sleep(_TYPED_S)  # the terminal is closed, or not this process's
-    return False
 
 
 def _number(kind: type[float] | type[int] = float, *, least: float = 0, above: bool = False) -> Callable[[str], float]:
@@ -271,9 +278,12 @@ def _parser() -> argparse.ArgumentParser:
         help="your class of the robot, created without arguments; default: a simulated one",
     )
     add("--ros", metavar="FILE", help="a robot behind topics of ROS 2, from this file; see docs/ros.md")
-    add("--leader", metavar="MODULE:CLASS", help="your class of what a human moves the robot with, see Leader")
-    add("--remote", action="store_true", help="let a human at the server's live page take over")
-    add("--step", type=_number(above=True), help="what a remote human adds to a number of the action at a tick")
+    add(
+        "--leader",
+        metavar="LEADER",
+        help="what a human takes over with: keyboard, spacemouse, or MODULE:CLASS of yours, see Leader",
+    )
+    add("--step", type=_number(above=True), help="what a key or axis of these adds to a number of the action at a tick")
     add("--mode", choices=("open_loop", "ensemble", "async"), default="async", help="see ChunkPlayer (%(default)s)")
     add("--execute", type=_number(int, least=1), metavar="N", help="rows of a chunk to execute before asking again")
     add("--horizon", type=_number(int, least=1), metavar="N", help="rows of a chunk that may be executed at all")
@@ -303,7 +313,7 @@ def _parser() -> argparse.ArgumentParser:
     add(
         "--restart",
         choices=get_args(Restart),
-        help="how motion restarts after a stop by the watchdog: by Enter or SIGUSR1, or by itself "
+        help="how motion restarts after a stop by the watchdog: by Enter, C or SIGUSR1, or by itself "
         "(default: manual; auto for a simulated robot)",
     )
     add(
@@ -324,7 +334,11 @@ def _parser() -> argparse.ArgumentParser:
     add(
         "--foxglove", metavar="DIR", help="write an .mcap file there for Foxglove, or 'live': let it connect to the run"
     )
-    add("--operate", action="store_true", help="obey the buttons of the server's live page: pause, stop, ...")
+    add(
+        "--operate",
+        action="store_true",
+        help="obey the buttons of the server's live page: pause, stop, success, failure",
+    )
     add("--real-time", action="store_true", help="ask for SCHED_FIFO in place of a nice value")
     add(
         "--baseline",

@@ -6,6 +6,7 @@ import contextlib
 import gc
 import importlib
 import logging
+import math
 import os
 import time
 from collections import deque
@@ -15,11 +16,11 @@ from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
 
-from vlagents_ray.chunking.takeover import Takeover
+from vlagents_ray.chunking.control import Control
+from vlagents_ray.chunking.fallback import Cause, Held
 from vlagents_ray.client.commands import CommandInbox
 from vlagents_ray.errors import ConfigError, InvalidAction
-from vlagents_ray.interface import CAPTURED, INTERVENTION, SAFE, SILENT, WANTED, Agent, Obs
-from vlagents_ray.robot.operation.operated_loop import OperatedLoop
+from vlagents_ray.interface import CAPTURED, CAUSE, INTERVENTION, SAFE, SILENT, WANTED, Act, Agent, Obs
 from vlagents_ray.robot.pacing import KEPT_TICKS, SPIN_S, Pacer, jitter, undisturbed
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.safety import Guard, Watchdog
@@ -29,7 +30,6 @@ from vlagents_ray.viewers.viewer import EpisodeViewer
 Restart = Literal["manual", "auto"]
 logger = logging.getLogger(__name__)
 
-_REASONS = 100  # counted apart in a report
 _COLLECT_S = 2.0
 
 
@@ -88,19 +88,21 @@ class LoopReport:
     jitter: dict[str, float] = field(default_factory=dict)  # see `vlagents_ray.robot.pacing.jitter`
     work_p50_ms: float = 0.0  # from the time a tick was due until its action was applied
     work_p99_ms: float = 0.0
-    safe: dict[str, int] = field(default_factory=dict)  # reason -> ticks with the safe action or without any
-    barks: list[str] = field(default_factory=list)  # the watchdog's reasons to stop the robot
+    safe: dict[Cause, int] = field(default_factory=dict)  # ticks with the safe action or without any, by cause
+    reasons: dict[Cause, str] = field(default_factory=dict)  # the first reason of each cause, in words
+    waiting: int = 0  # ticks at which the robot held still as all rows were used up, and the next answer had not come
+    barks: list[str] = field(default_factory=list)  # why the robot was stopped, by the watchdog or a command
     interventions: int = 0  # ticks at which a human moved the robot
-    paused: int = 0  # ticks at which the robot was paused (see `vlagents_ray.chunking.takeover`); not among `safe`
+    paused: int = 0  # ticks at which the robot was paused (see `vlagents_ray.chunking.control`); not among `safe`
     done: bool = False  # the policy considered its task finished
     means: list[str] = field(default_factory=list)  # the measures taken against jitter
     outcome: str = ""  # "success" or "failure", if it was marked on the live page
-    next_instruction: str | None = None  # the live page asked for another episode with this instruction
+    next_instruction: str | None = None  # that of the next episode, by `Control.instruct` or a topic of ROS
 
     @property
     def safe_ticks(self) -> int:
-        """The number of ticks without an action of the policy."""
-        return sum(self.safe.values())
+        """The number of ticks without an action of the policy: `waiting`, and those of `safe`."""
+        return self.waiting + sum(self.safe.values())
 
     @property
     def mostly_safe(self) -> str | None:
@@ -108,27 +110,24 @@ class LoopReport:
         ticks = int(self.jitter.get("ticks", 0))
         if 2 * self.safe_ticks <= ticks:
             return None
-        reason = max(self.safe, key=lambda one: self.safe[one])
+        cause: Cause = max(self.safe, key=lambda one: self.safe[one], default="waiting")
+        if self.waiting >= self.safe.get(cause, 0):
+            cause = "waiting"
         return (
             f"the policy hardly drove the robot: {self.safe_ticks} of {ticks} ticks had no action of it, most often: "
-            f"{reason}. If answers come too late, use a lower rate (hz), a policy with longer chunks, or let a tick "
-            "wait for its answer (deadline_s, --deadline-ms)"
+            f"{self.reasons.get(cause, cause)}. If answers come too late, use a lower rate (hz), a policy with longer "
+            "chunks, or let a tick wait for its answer (deadline_s, --deadline-ms)"
         )
 
-    def count(self, reason: str, *, paused: bool = False) -> None:
-        """Count a tick without an action of the policy.
-
-        Args:
-            reason: The reason. After a hundred different ones, which may contain numbers, new ones are counted
-                together.
-            paused: Whether the robot was paused.
-        """
-        if paused:
+    def count(self, held: Held) -> None:
+        """Count a tick without an action of the policy."""
+        self.reasons.setdefault(held.cause, held.reason)
+        if held.cause == "paused":
             self.paused += 1
-            return
-        if reason not in self.safe and len(self.safe) >= _REASONS:
-            reason = "other reasons"
-        self.safe[reason] = self.safe.get(reason, 0) + 1
+        elif held.cause == "waiting":
+            self.waiting += 1
+        else:
+            self.safe[held.cause] = self.safe.get(held.cause, 0) + 1
 
 
 def run_loop(
@@ -168,18 +167,19 @@ def run_loop(
             agent's contract.
         watchdog: Runs during the loop. Each tick is a sign of life of "loop", and the agent's answers
             (`act.info["silent_s"]`) are those of "server". After it has stopped the robot, nothing is commanded until
-            motion is restarted. A chunk player then has discarded its plan (`ChunkPlayer.interrupt`), so that the first
-            command is computed from new observations; a guard with `measure` compares it with the measured pose.
+            motion is restarted, in this run or a later one. A chunk player then has discarded its plan
+            (`ChunkPlayer.interrupt`), so that the first command is computed from new observations; a guard with
+            `measure` compares it with the measured pose.
         restart: With "manual" motion is restarted by a call of `watchdog.restart()`, made by a person who sees the
-            robot; it has no effect while the silence lasts. With "auto" the end of the silence restarts it. The default
-            is "auto" for a simulated robot and "manual" for any other.
+            robot; it has no effect while the silence lasts. With "auto" the end of the silence restarts it; a stop by a
+            command still needs the call. The default is "auto" for a simulated robot and "manual" for any other.
         recorder: Records the run as one episode, also if it ends by an exception. A player with `override` wants one
             with `interventions=True`.
         viewers: Show the run as one episode (see `vlagents_ray.viewers`).
         real_time: Run the thread with SCHED_FIFO (see `vlagents_ray.robot.pacing.undisturbed`).
         spin_s: How long before each tick the thread spins instead of sleeping, s.
         until: Ends the loop when it returns True; called before each tick, and after the last one.
-        commands: What the live page has the loop do, from `RemoteAgent(url, commands=...)`; see `OperatedLoop`.
+        commands: The commands of the live page, from `RemoteAgent(url, commands=...)`: pause, stop, mark.
 
     Returns:
         The timing of the loop, and the reasons of the ticks without an action of the policy.
@@ -195,16 +195,17 @@ def run_loop(
         raise ConfigError(f"restart: got {restart!r}, want one of {list(get_args(Restart))}")
     if seconds is not None and not seconds > 0:
         raise ConfigError(f"seconds: got {seconds}, want above 0, or None")
-    takeover: Takeover | None = getattr(agent, "takeover", None)
-    if takeover is not None and takeover.leader is not None and recorder is not None and not recorder.interventions:
+    control = _shared_control(agent, watchdog, commands)
+    if control.leader is not None and recorder is not None and not recorder.interventions:
         raise ConfigError(
             "recorder: got one without interventions for a player with override=; want Recorder(…, interventions=True)"
         )
     report = LoopReport(hz)
-    barks = len(watchdog.barks) if watchdog is not None else 0
+    barks = len(control.stops)
     agent.initialize()
     guard = _guard(agent, guard)
     with contextlib.ExitStack() as stack:
+        control.begin(auto=restart == "auto")
         try:
             agent.reset(_observed(robot), instruction, **(reset_options or {}))
             if recorder is not None:
@@ -214,15 +215,15 @@ def run_loop(
             report.means = stack.enter_context(undisturbed(real_time=real_time))
             if watchdog is not None:
                 stack.enter_context(watchdog)
-            operated = OperatedLoop(commands, watchdog, manual=restart == "manual", takeover=takeover)
             pacer = Pacer(hz, spin_s)
-            _drive(robot, agent, guard, watchdog, recorder, shown, report, pacer, seconds, until, operated)
+            _drive(robot, agent, guard, watchdog, recorder, shown, report, pacer, seconds, until, control, commands)
+            report.outcome, report.next_instruction = control.end()
             if report.outcome and recorder is not None and recorder.interventions:
                 recorder.label("success" if report.outcome == "success" else "failure")
         finally:
+            control.running = False
             robot.stop()  # before the watchdog and the recorder end
-    if watchdog is not None:
-        report.barks = watchdog.barks[barks:]
+    report.barks = control.stops[barks:]
     if report.mostly_safe is not None:
         logger.warning("%s", report.mostly_safe)
     return report
@@ -239,7 +240,8 @@ def _drive(
     pacer: Pacer,
     seconds: float | None,
     until: Callable[[], bool],
-    operated: OperatedLoop,
+    control: Control,
+    commands: CommandInbox | None,
 ) -> None:
     work_s: deque[float] = deque(maxlen=KEPT_TICKS)
     collected = time.monotonic()
@@ -247,7 +249,7 @@ def _drive(
     last: np.ndarray | None = None
     guarded = getattr(agent, "check", None) is guard  # the agent has checked the action before `act` returns
     interrupt = getattr(agent, "interrupt", lambda: None)
-    takeover: Takeover | None = getattr(agent, "takeover", None)
+    decides = getattr(agent, "control", None) is control  # as a chunk player does, at each tick
     standing = True  # before the first action, and after a stop until the next one
     try:
         while not (until() or report.done):
@@ -257,30 +259,31 @@ def _drive(
                 pacer.forget(ticks)
                 break
             obs = _observed(robot)
+            if not decides:
+                control.update()
             act = agent.act(obs)
             if act.action.ndim != 1:
                 raise InvalidAction(f"action: got {act.action.shape}, want one row; wrap the agent in a ChunkPlayer")
             report.done = act.done
             led = bool(act.info.get(INTERVENTION))
-            reason = act.info.get(SAFE)
+            safe = _safe(act)
             # Before this tick counts as a sign of life: it may be late.
-            stop = operated.holds() or getattr(robot, "holds", None)
-            if operated.over:
+            stop = _held(robot, control, commands, safe)
+            if control.over:
                 break
             if watchdog is not None:
                 watchdog.heard("loop")
-                watchdog.heard("server", act.info.get(SILENT, 0.0))
+                watchdog.heard("server", _silent_s(act))
             if stop is not None:
                 if not standing:
                     robot.stop()  # again, as the watchdog may have stopped it just before the last action
                 standing = True
                 interrupt()
                 report.count(stop)
-                operated.stood()
-                shown.add(obs, act, None, tick, pacer.since_tick_s(), stop)
+                shown.add(obs, act, None, tick, pacer.since_tick_s(), stop.reason)
                 continue
-            if reason is not None:
-                report.count(reason, paused=takeover is not None and takeover.reason is not None)
+            if safe is not None:
+                report.count(safe)
                 if standing:  # a robot at rest gets no command
                     continue
             action = act.action
@@ -291,15 +294,50 @@ def _drive(
             work_s.append(pacer.since_tick_s())
             report.interventions += led
             if recorder is not None:
-                safe, wanted = reason is not None, act.info.get(WANTED)
-                recorder.add(obs, action, tick=tick, safe=safe, intervention=led, wanted=wanted)
+                wanted = act.info.get(WANTED)
+                recorder.add(obs, action, tick=tick, safe=safe is not None, intervention=led, wanted=wanted)
             shown.add(obs, act, action, tick, work_s[-1])
     finally:
-        report.outcome, report.next_instruction = operated.outcome, operated.next_instruction
         report.jitter = jitter(pacer.late_s, pacer.missed, pacer.ticks)
         if work_s:
             report.work_p50_ms = float(np.median(work_s)) * 1e3
             report.work_p99_ms = float(np.quantile(work_s, 0.99)) * 1e3
+
+
+def _shared_control(agent: Agent, watchdog: Watchdog | None, commands: CommandInbox | None) -> Control:
+    """Return the one state of this robot: the player's, else the watchdog's, else that of the commands."""
+    control: Control | None = getattr(agent, "control", None)
+    if control is None:
+        control = watchdog.control if watchdog is not None else commands.control if commands is not None else Control()
+    if watchdog is not None:
+        watchdog.share(control)
+    if commands is not None and commands.control is not control:
+        control.adopt(commands.control)
+        commands.control = control
+    return control
+
+
+def _held(robot: Robot, control: Control, commands: CommandInbox | None, safe: Held | None) -> Held | None:
+    """Obey the commands that have come; return why nothing is commanded at this tick, None if something may be."""
+    if commands is not None:
+        commands.obey(control)
+    held, why = control.hold(), getattr(robot, "holds", None)
+    if held is None and why is not None:
+        return Held("robot", str(why))
+    if held is None and safe is not None and safe.cause in ("stopped", "paused"):
+        return safe  # which is over since the player decided this tick
+    return held
+
+
+def _safe(act: Act) -> Held | None:
+    """Return why the action of an agent is the safe one; None if it is the policy's, or a human's."""
+    return Held(act.info.get(CAUSE, "other"), str(act.info[SAFE])) if SAFE in act.info else None
+
+
+def _silent_s(act: Act) -> float:
+    """Return for how long the agent has waited for an answer, s; without a number, the action is an answer of now."""
+    silent_s = act.info.get(SILENT)
+    return float(silent_s) if isinstance(silent_s, (int, float)) and 0 <= silent_s < math.inf else 0.0
 
 
 def _collect_after(collected: float) -> float:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable, Mapping
 
 import numpy as np
 
+from vlagents_ray.chunking.control import Control
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import ConfigError, InvalidAction, MissingState
 from vlagents_ray.interface import Obs
@@ -104,7 +106,9 @@ class Guard:
             if bound is not None and (over := wrong(action, bound)).any():
                 i = int(np.argmax(over))
                 limit = float(np.broadcast_to(bound, action.shape)[i])
-                raise InvalidAction(f"action[{i}]: got {action[i]:g}, {name} the limit {limit:g}; see the contract")
+                raise InvalidAction(
+                    f"action[{i}]: got {action[i]:g}, {name} the limit {limit:g}; see the contract", cause="limits"
+                )
         if self._max_step is not None and last is not None:
             if last.shape != action.shape:
                 raise InvalidAction(
@@ -114,7 +118,8 @@ class Guard:
             if (excess > 0).any():
                 i = int(np.argmax(excess))
                 raise InvalidAction(
-                    f"action[{i}]: got {action[i]:g} after {last[i]:g}, a larger step than max_step allows"
+                    f"action[{i}]: got {action[i]:g} after {last[i]:g}, a larger step than max_step allows",
+                    cause="max_step",
                 )
         return action
 
@@ -152,9 +157,8 @@ class Watchdog:
         Watchdog(robot.stop, {"server": 1.0, "loop": 0.2})  # s
 
     `stop` is called once for each silence, on the watchdog's own thread, so that a control loop that hangs is noticed.
-    The time limits begin to run at `start` (or `with`). After a stop, `stopped` is true until `restart` is called, by a
-    person or by the control loop (see `run_loop`). If `stop` raises an exception, it is kept in `error`, and the
-    watchdog continues.
+    The time limits begin to run at `start` (or `with`). After a stop, `stopped` is true until `restart` is called, also
+    in later runs of the control loop. If `stop` raises an exception, it is kept in `error`, and the watchdog continues.
 
     Args:
         stop: Stops the robot; it gets the reason as text, which is also appended to `barks`.
@@ -170,11 +174,10 @@ class Watchdog:
                 raise ConfigError(f"watchdog: got {limit_s} s for {name!r}, want above 0")
         self.barks: list[str] = []  # the reasons given to `stop`
         self.error: Exception | None = None
+        self._control = Control()
         self._stop = stop
         self._limits = dict(silent_s)
         self._heard = dict.fromkeys(silent_s, 0.0)
-        self._barked: set[str] = set()
-        self._stopped = False
         self._changed = threading.Condition()
         self._thread: threading.Thread | None = None
 
@@ -184,32 +187,48 @@ class Watchdog:
         Args:
             name: The source; a name that is not watched is ignored.
             ago_s: How long ago the sign was seen, s.
+
+        Raises:
+            ConfigError: `ago_s` is negative or not finite.
         """
+        if not 0 <= ago_s < math.inf:
+            raise ConfigError(f"heard: got {ago_s} s ago for {name!r}, want a finite number from 0")
         at = time.monotonic() - ago_s
         heard = self._heard.get(name)
         if heard is None or at <= heard:
             return
         with self._changed:
             self._heard[name] = at
-            if name in self._barked and ago_s < self._limits[name]:
-                self._barked.discard(name)
+            if name in self._control.silent and ago_s < self._limits[name]:
+                self._control.heard(name)
                 self._changed.notify_all()
+
+    @property
+    def control(self) -> Control:
+        """The state of the robot, which `run_loop` lets it share with a chunk player."""
+        return self._control
 
     @property
     def silent(self) -> list[str]:
         """The sources whose silence stopped the robot and that are still silent, by name."""
-        with self._changed:
-            return sorted(self._barked)
+        return self._control.silent
 
     @property
     def stopped(self) -> bool:
         """Whether the robot was stopped and motion has not been restarted since."""
-        return self._stopped
+        return self._control.stopped
+
+    def share(self, control: Control) -> None:
+        """Use the state of a chunk player, which gets the stops of before."""
+        with self._changed:
+            if control is not self._control:
+                control.adopt(self._control)
+                self._control = control
 
     def trip(self, reason: str) -> None:
-        """Stop the robot now, on the caller's thread; motion is restarted as after a silence."""
+        """Stop the robot now, on the caller's thread; motion is restarted by `restart` alone."""
         with self._changed:
-            self._stopped = True
+            self._control.stop(reason)
         self.barks.append(reason)
         self._stop(reason)
 
@@ -220,18 +239,16 @@ class Watchdog:
             Whether motion is allowed. It is not while a source is silent (see `silent`); call this again afterwards.
         """
         with self._changed:
-            if not self._barked:
-                self._stopped = False
-            return not self._stopped
+            return self._control.restart()
 
     def start(self) -> None:
-        """Start the thread and the time limits of all sources; does nothing if they run."""
+        """Start the thread and the time limits of all sources; does nothing if they run. Stops and silences last."""
         with self._changed:
             if self._thread is not None:
                 return
             self._heard = dict.fromkeys(self._limits, time.monotonic())
-            self._barked.clear()
-            self._stopped = False
+            for name in set(self._control.silent) - self._limits.keys():
+                self._control.heard(name)  # no later sign of life would end its silence
             self._thread = threading.Thread(target=self._watch, name="vlagents-ray-watchdog", daemon=True)
         self._thread.start()
 
@@ -259,12 +276,12 @@ class Watchdog:
                     if self._thread is not me:
                         return
                     now = time.monotonic()
-                    waiting = {n: self._heard[n] + s - now for n, s in self._limits.items() if n not in self._barked}
+                    silent = self._control.silent
+                    waiting = {n: self._heard[n] + s - now for n, s in self._limits.items() if n not in silent}
                     name = min(waiting, key=lambda n: waiting[n]) if waiting else None
                     if name is not None and waiting[name] <= 0:
-                        self._barked.add(name)
-                        self._stopped = True
                         reason = f"{name}: silent for {now - self._heard[name]:.2f} s"
+                        self._control.stop(reason, silent=name)
                     else:
                         self._changed.wait(None if name is None else waiting[name])
             self.barks.append(reason)

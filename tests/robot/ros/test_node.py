@@ -23,7 +23,7 @@ import vlagents_ray.robot.__main__ as command
 from vlagents_ray import Act, ActionSpec, Agent, CameraSpec, ChunkPlayer, Contract, Obs, StateSpec
 from vlagents_ray.errors import ConfigError, InvalidAction
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, PROTOCOL_VERSION
-from vlagents_ray.robot import CommandInbox, Guard, Watchdog, run_loop
+from vlagents_ray.robot import Guard, Watchdog, run_loop
 from vlagents_ray.robot.loop import LoopReport
 from vlagents_ray.robot.ros import RosRobot
 from vlagents_ray.robot.ros.settings import settings_from
@@ -177,8 +177,7 @@ def test_no_action_reaches_the_arm_that_the_guard_has_not_seen() -> None:
     for one in drive.commands:
         assert one in SeeingGuard.passed or one in drive.arm.poses  # a stop is where the arm is
         assert FAR not in one
-    assert drive.reports[0].safe  # the wild rows were asked for, and refused
-    assert any("above the limit" in reason for reason in drive.reports[0].safe)
+    assert drive.reports[0].safe["limits"]  # the wild rows were asked for, and refused
 
 
 def test_a_hanging_camera_holds_the_arm_still_until_it_goes_on() -> None:
@@ -196,7 +195,7 @@ def test_a_hanging_camera_holds_the_arm_still_until_it_goes_on() -> None:
         drive.arm.broken = set()
         drive.moves()
         wait_for(lambda: drive.alive)
-    assert f"no new message of {CAMERA} for more than 0.3 s" in drive.reports[0].safe
+    assert drive.reports[0].reasons["robot"] == f"no new message of {CAMERA} for more than 0.3 s"
 
 
 def test_an_image_that_is_sent_again_and_again_is_as_old_as_its_time_stamp() -> None:
@@ -244,7 +243,7 @@ def test_a_lost_rosbridge_holds_the_arm_and_tells_it_so_as_soon_as_it_is_back() 
         assert sent > 0
         assert drive.commands[0] == pytest.approx([0.5, -0.5])
         assert np.abs(np.diff(drive.commands, axis=0)).max() <= MAX_STEP
-    assert "the connection to the rosbridge was lost" in drive.reports[0].safe
+    assert drive.reports[0].reasons["robot"] == "the connection to the rosbridge was lost"
 
 
 class Wire:
@@ -346,15 +345,33 @@ def test_the_first_instruction_is_waited_for_and_a_new_one_begins_another_episod
         with RosRobot(settings) as robot, ChunkPlayer(agent, check=Guard(agent.contract)) as player:
             assert robot.first_instruction(say) == "fold"
             assert said == [f"waiting for an instruction on {TOLD}"]
-            robot.commands = CommandInbox(allow=[])  # the live page may command nothing
+            robot.control = player.control
             teller = threading.Thread(
                 target=lambda: (wait_for(lambda: agent.acts > 10), setattr(arm, "told", "unfold"))
             )
             teller.start()
-            report = run_loop(robot, player, hz=50, instruction=robot.instruction, commands=robot.commands)
+            report = run_loop(robot, player, hz=50, instruction=robot.instruction)
             teller.join()
     assert agent.acts > 10  # the same instruction again begins no other episode
     assert report.next_instruction == "unfold"
+
+
+@pytest.mark.parametrize("held", ["pause", "stop"])
+def test_a_new_instruction_moves_no_arm_that_stands(held: str) -> None:
+    wire, agent = Wire(), Ahead()
+    settings = settings_from(ros_arm.settings("ws://arm", instruction={"topic": TOLD}), "arm.yaml")
+    with RosRobot(settings, wire) as robot, ChunkPlayer(agent, check=Guard(agent.contract)) as player:
+        robot.control = player.control
+        getattr(player.control, held)("by the operator")
+        wire.takes[TOLD]({"data": "unfold"})
+        for _ in range(2):  # the second one is the episode of the new instruction
+            report = run_loop(robot, player, hz=100, seconds=0.1, instruction=robot.instruction)
+            assert all(one == [0.0, 0.0] for one in wire.commands), "where the arm stands"
+            assert report.paused + report.safe.get("stopped", 0) >= 5
+        player.control.resume()
+        assert player.control.restart()
+        run_loop(robot, player, hz=100, seconds=0.1, instruction=robot.instruction)
+        assert any(one != [0.0, 0.0] for one in wire.commands)
 
 
 @pytest.mark.parametrize(

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from vlagents_ray.chunking.buffer import Mode
+from vlagents_ray.chunking.control import Control, Leader
 from vlagents_ray.chunking.player import ChunkPlayer
-from vlagents_ray.chunking.takeover import Leader, Takeover
 from vlagents_ray.cli.console import out
 from vlagents_ray.cli.robot.terminal_view import TerminalView
 from vlagents_ray.client.agent import RemoteAgent
@@ -29,7 +29,11 @@ from vlagents_ray.robot.teleoperation.keyboard import HELP
 DEVICES = ("keyboard", "spacemouse")
 KEYS = "p pauses and continues; y success, n failure, x discard end the episode; q quits"
 _HZ = 10.0  # of environments that state no rate
-_MOVES = {"autonomous": "the policy moves the robot", "human": "you move the robot", "paused": "nobody moves the robot"}
+_MOVES = {
+    "autonomous": "the policy moves the robot",
+    "human": "you move the robot",
+    "paused": "nothing moves the robot",
+}
 
 
 class EnvPolicy(Wrapper):
@@ -78,7 +82,7 @@ class RobotRun:
     samples: int | None
     verdict: Label | None = field(default=None, init=False)  # of the running episode, once a human has given it
     over: bool = field(default=False, init=False)  # the human wants no further episode
-    _takeover: Takeover | None = field(default=None, init=False)
+    _control: Control | None = field(default=None, init=False)
     _view: TerminalView | None = field(default=None, init=False)
     _said: str | None = field(default=None, init=False)  # who moves the robot, or why nobody does, as printed
 
@@ -94,7 +98,7 @@ class RobotRun:
             hz = self.hz or env.contract.control_hz or _HZ
             leader = self._leader(env.contract, stack)
             agent = stack.enter_context(self._agent(env.contract, leader))
-            self._takeover = agent.takeover if isinstance(agent, ChunkPlayer) else None
+            self._control = agent.control if isinstance(agent, ChunkPlayer) else None
             recorder = None
             if self.record is not None:
                 recorder = stack.enter_context(Recorder(self.record, hz, interventions=leader is not None))
@@ -178,18 +182,20 @@ class RobotRun:
         )
 
     def _pause(self) -> None:
-        if self._takeover is None:
+        if self._control is None:
             return
-        if self._takeover.reason is None:
-            self._takeover.pause()
+        if self._control.reason is None:
+            self._control.pause()
         else:
-            self._takeover.resume()
+            self._control.resume()
 
     def _say_who_moves(self, begun: bool) -> None:
-        reason = None if self._takeover is None else self._takeover.reason
-        if self._takeover is None or not (begun or reason):
+        reason = None if self._control is None else self._control.reason
+        if self._control is None or not (begun or reason):
             return
-        now = f"{reason}; p continues" if reason is not None else _MOVES[self._takeover.state]
+        now = (
+            f"{reason}; p continues" if reason is not None else _MOVES.get(self._control.state, "the robot is stopped")
+        )
         if now != self._said:
             if reason is not None:
                 out.bell()

@@ -13,12 +13,8 @@ import numpy as np
 from vlagents_ray.chunking.player import ChunkPlayer
 from vlagents_ray.errors import (
     CheckpointFailed,
-    ConnectionLost,
-    DeadlineExceeded,
     EnvFailed,
     InvalidAction,
-    NoReplica,
-    OutcomeUnknown,
     PolicyFailed,
     PolicyUnavailable,
 )
@@ -38,7 +34,6 @@ from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.safety import measured_state
 
 _WAIT_S = 1.0  # deadline of a tick in the modes that wait for an answer
-_LOST = {one.code for one in (PolicyUnavailable, NoReplica, ConnectionLost, DeadlineExceeded, OutcomeUnknown)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -232,6 +227,5 @@ def _require_alive(report: LoopReport) -> None:
         if bark.startswith("server"):
             raise PolicyUnavailable(f"the policy's server was silent: {bark}")
         raise EnvFailed(f"robot: the control loop was held up: {bark}")
-    lost = sum(ticks for reason, ticks in report.safe.items() if reason.partition(":")[0] in _LOST)
-    if 2 * lost > report.jitter.get("ticks", 0):
-        raise PolicyUnavailable(f"the policy's server could not be reached in {lost} ticks: {sorted(report.safe)}")
+    if 2 * report.safe.get("lost", 0) > report.jitter.get("ticks", 0):
+        raise PolicyUnavailable(f"the policy's server could not be reached: {report.reasons['lost']}")

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from vlagents_ray.chunking.capture_clock import SKEW_S
-from vlagents_ray.client.commands import CommandInbox
+from vlagents_ray.chunking.control import Control
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.errors import ConfigError, InvalidAction, VLAgentsError
 from vlagents_ray.interface import CAPTURED, Obs
@@ -79,8 +79,8 @@ class RosRobot:
         self.watchdog: Watchdog | None = None
         """The watchdog of the control loop, with `silent_s` among its sources."""
         self.instruction: str | None = None  # the newest on its topic
-        self.commands: CommandInbox | None = None
-        """The commands of the control loop, which a new instruction on its topic is added to."""
+        self.control: Control | None = None
+        """The state of the control loop, which a new instruction on its topic is given to."""
         self._link: Link = link or (Ros2() if settings.link == ROS2 else Rosbridge(settings.link, settings.compression))
         by_stamp = settings.clock == "stamp"
         self._readers = {id(reading): TopicReader(reading, by_stamp) for reading in settings.sensors}
@@ -212,7 +212,7 @@ class RosRobot:
             if reader.age_s > limit:
                 self.holds = self.holds or f"no new message of {reading.topic} for more than {limit:g} s"
             if self.watchdog is not None and reader.age_s < math.inf:
-                self.watchdog.heard(reading.topic, reader.age_s)
+                self.watchdog.heard(reading.topic, max(0.0, reader.age_s))
         if self._stop_unsent and self.holds is None:
             self.stop()
 
@@ -252,8 +252,8 @@ class RosRobot:
             return
         if text != self.instruction:  # which may be published again and again
             self.instruction = text
-            if self.commands is not None:
-                self.commands.put("instruct", text)
+            if self.control is not None:
+                self.control.instruct(text)
 
     def _wait_for_messages(self) -> None:
         deadline = time.monotonic() + self.settings.ready_s

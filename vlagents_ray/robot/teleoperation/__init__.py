@@ -1,11 +1,9 @@
 """What a human moves a robot with: leaders for `ChunkPlayer(..., override=leader)`."""
 
-from vlagents_ray.chunking.takeover import Leader
+from vlagents_ray.chunking.control import Leader
 from vlagents_ray.robot.teleoperation.agent import TeleoperatedAgent
 from vlagents_ray.robot.teleoperation.axes import AxesDevice, AxesLeader
 from vlagents_ray.robot.teleoperation.keyboard import Keyboard
-from vlagents_ray.robot.teleoperation.relay import RelayedLeader
-from vlagents_ray.robot.teleoperation.remote import RemoteLeader
 from vlagents_ray.robot.teleoperation.spacemouse import SpaceMouse
 
 __all__ = [
@@ -13,8 +11,6 @@ __all__ = [
     "AxesLeader",
     "Keyboard",
     "Leader",
-    "RelayedLeader",
-    "RemoteLeader",
     "SpaceMouse",
     "TeleoperatedAgent",
 ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from vlagents_ray.chunking.takeover import Leader
+from vlagents_ray.chunking.control import Leader
 from vlagents_ray.contract import Contract
 from vlagents_ray.interface import INTERVENTION, Act, Agent, Obs
 

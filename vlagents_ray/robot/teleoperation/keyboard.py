@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import contextlib
-import os
-import select
-import sys
 import time
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vlagents_ray.errors import ConfigError
+from vlagents_ray.robot.terminal import Terminal
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -46,39 +44,24 @@ class Keyboard:
         self._keys = dict(keys or {})
         if taken := sorted(self._keys.keys() & {*AXES, GRIPPER, TAKE}):
             raise ConfigError(f"keyboard: {taken} move the robot, so they cannot do something else")
-        if terminal is None and sys.stdin is not None:
-            with contextlib.suppress(OSError):  # what stands in for standard input need not be a file
-                terminal = sys.stdin.fileno()
-        if terminal is None or not os.isatty(terminal):
-            raise ConfigError("keyboard: there is no terminal to read keys from; run this in one")
-        self._terminal = terminal
+        self._terminal = Terminal(terminal)
         self._until = np.zeros((6, 2))  # s of `time.monotonic`: until when a key counts, for each axis and direction
         self._presses = 0
         self._taken = False
-        self._before: list[Any] | None = None
+        self._open = contextlib.ExitStack()
 
     def __enter__(self) -> Self:
-        import termios
-        import tty
-
-        self._before = termios.tcgetattr(self._terminal)
-        tty.setcbreak(self._terminal)  # keys at once, without echo; Ctrl-C stays
+        self._open.enter_context(self._terminal.keys_at_once())
+        self._open.enter_context(self._terminal.consumed_by(self._press))
         return self
 
     def __exit__(self, *exc: object) -> None:
-        import termios
-
-        if self._before is not None:
-            termios.tcsetattr(self._terminal, termios.TCSADRAIN, self._before)
+        self._open.close()
 
     def engaged(self) -> bool:
-        """Read the keys that were pressed, and return whether the human wants to move the robot."""
-        while select.select([self._terminal], [], [], 0)[0]:
-            typed = os.read(self._terminal, 1024)
-            if not typed:  # the terminal is closed
-                raise ConnectionError("the terminal is closed")
-            for key in typed.decode(errors="replace").lower().replace("\r", "\n"):
-                self._press(key)
+        """Read the keys that were pressed, and return whether the human moves the robot."""
+        if not self._terminal.read(self._press):
+            raise ConnectionError("the terminal is closed")
         return self._taken
 
     def axes(self) -> np.ndarray:
@@ -91,7 +74,7 @@ class Keyboard:
         presses, self._presses = self._presses, 0
         return presses
 
-    def _press(self, key: str) -> None:
+    def _press(self, key: str) -> bool:
         if key in AXES:
             axis, sign = AXES[key]
             side = 0 if sign > 0 else 1
@@ -105,3 +88,6 @@ class Keyboard:
             self._until[:] = 0.0
         elif key in self._keys:
             self._keys[key]()
+        else:
+            return False
+        return True

@@ -1,4 +1,4 @@
-"""What commands from the live page have a control loop do."""
+"""Stops, pauses and marks: what moves the robot again, and what never does."""
 
 from __future__ import annotations
 
@@ -12,10 +12,8 @@ from scripted_leader import ScriptedLeader
 from vlagents_ray.chunking.player import ChunkPlayer
 from vlagents_ray.client.commands import COMMAND, CommandInbox
 from vlagents_ray.contract import ActionSpec, Contract
-from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.robot.loop import LoopReport, run_loop
-from vlagents_ray.robot.operation.operated_loop import OperatedLoop
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.safety import Watchdog
 
@@ -49,7 +47,7 @@ class Commanding(Agent):
         self._asked += 1
         act = Act(np.zeros(2, np.float32))
         if do := self._told.get(self._asked):
-            act.info[COMMAND] = {"id": do, "do": do, "text": "fold" if do == "instruct" else ""}
+            act.info[COMMAND] = {"id": do, "do": do, "text": "fold"}
         self._inbox.came(act)
         return act
 
@@ -77,11 +75,20 @@ def applied(arm: Arm) -> list[int]:
     return [tick - 1 for tick, did in arm.did if did == "apply"]  # the first observation is that of the reset
 
 
-def test_a_paused_robot_stands_still_until_it_resumes() -> None:
-    arm, report, _ = run({5: "pause", 12: "resume"})
+def test_a_paused_robot_stands_still_until_it_resumes_at_the_robot() -> None:
+    arm, inbox = Arm(simulated=True), CommandInbox()
+
+    def over() -> bool:
+        if arm.ticks == 12:
+            inbox.control.resume()
+        return arm.ticks > 20
+
+    report = run_loop(
+        arm, Commanding(inbox, {5: "pause", 8: "resume", 9: "instruct"}), hz=200, commands=inbox, until=over
+    )
     assert not set(range(5, 12)) & set(applied(arm))
     assert {4, 12} <= set(applied(arm))
-    assert report.safe == {"paused from the live page": 7}
+    assert (report.safe, report.paused, report.next_instruction) == ({}, 7, None)
 
 
 @pytest.mark.parametrize("label", ["success", "failure"])
@@ -92,49 +99,48 @@ def test_a_mark_ends_the_loop_before_another_action(label: str) -> None:
     assert arm.did[-1][1] == "stop"
 
 
-def test_another_instruction_ends_the_loop() -> None:
-    arm, report, _ = run({6: "instruct"})
-    assert (report.next_instruction, report.outcome) == ("fold", "")
-    assert applied(arm)[-1] == 5
+@pytest.mark.parametrize("simulated", [False, True])
+@pytest.mark.parametrize("watched", [False, True])
+def test_a_stop_from_the_page_is_over_when_a_person_restarts(*, simulated: bool, watched: bool) -> None:
+    dog = Watchdog(lambda _: None, {"loop": 10.0}) if watched else None
+    arm, inbox = Arm(simulated=simulated), CommandInbox()
+    agent = Commanding(inbox, {5: "stop", 8: "resume", 9: "instruct", 12: "success"})
+    report = run_loop(arm, agent, hz=200, commands=inbox, watchdog=dog)
+    assert (report.outcome, report.barks, applied(arm)) == ("success", ["the live page"], [1, 2, 3, 4])
+    again = Arm(simulated=simulated)
+
+    def over() -> bool:
+        if again.ticks == 5:
+            assert inbox.control.restart()
+        return again.ticks > 8
+
+    run_loop(again, agent, hz=200, commands=inbox, watchdog=dog, until=over)
+    assert applied(again)[0] == 5, "not a tick before the restart"
 
 
-def test_a_stopped_simulation_holds_until_it_resumes() -> None:
-    arm, report, _ = run({5: "stop", 12: "resume"})
-    assert not set(range(5, 12)) & set(applied(arm))
-    assert 12 in applied(arm)
-    assert report.safe == {"stopped from the live page": 7}
+@pytest.mark.parametrize("stop", ["trip", "bark"])
+def test_a_protective_stop_outlives_the_run(stop: str) -> None:
+    dog = Watchdog(lambda _: None, {"camera": 0.05 if stop == "bark" else 60.0})
+    arm = Arm(simulated=False)
+    inbox = CommandInbox()
 
+    def over() -> bool:
+        if stop == "trip" and arm.ticks == 5:
+            dog.trip("a person is in the way")
+        return dog.stopped
 
-def test_a_stopped_robot_without_a_watchdog_ends_its_loop() -> None:
-    arm, _, _ = run({5: "stop"}, simulated=False)
-    assert applied(arm)[-1] == 4
-    assert arm.did[-1][1] == "stop"
-
-
-def test_a_stopped_robot_is_started_by_a_person_and_not_from_the_page() -> None:
-    stopped: list[str] = []
-    arm, report, inbox = run(
-        {5: "stop", 12: "resume"}, simulated=False, watchdog=Watchdog(stopped.append, {"loop": 10.0})
-    )
-    assert stopped == ["stopped from the live page"]
-    assert applied(arm)[-1] == 4
-    assert report.barks == stopped
-    assert "start it where it stands" in inbox.asking(Obs()).info["commanded"]["resume"]
-
-
-def test_a_person_restarts_a_tripped_watchdog() -> None:
-    with Watchdog(lambda _: None, {"loop": 10.0}) as watchdog:
-        loop = OperatedLoop(None, watchdog, manual=True)
-        loop.stop("lab")
-        assert watchdog.barks == ["stopped from the live page by lab"]
-        assert "waiting for a restart" in str(loop.holds())
-        with pytest.raises(ConfigError):
-            loop.resume()
-        assert watchdog.restart()
-        assert loop.holds() is None
-        loop.pause()
-        loop.resume()
-        assert loop.holds() is None
+    run_loop(arm, Commanding(inbox, {}), hz=200, watchdog=dog, until=over)
+    dog._limits["camera"] = 60.0
+    for _ in range(2):
+        before = len(applied(arm))
+        run_loop(arm, Commanding(inbox, {}), hz=200, watchdog=dog, seconds=0.05, instruction="fold the cloth")
+        assert len(applied(arm)) == before
+    assert dog.restart() is (stop == "trip")
+    dog.heard("camera")
+    assert dog.stopped is (stop == "bark")
+    assert dog.restart()
+    run_loop(arm, Commanding(inbox, {}), hz=200, watchdog=dog, seconds=0.05)
+    assert len(applied(arm)) > before
 
 
 def test_a_loop_without_commands_is_as_before() -> None:
@@ -155,31 +161,33 @@ def test_a_human_takes_over_in_a_pause_from_the_page_and_the_mark_labels_the_epi
     player = ChunkPlayer(agent, override=leader)
 
     def state() -> bool:
-        states.append(player.takeover.state)
+        states.append(player.control.state)
         return False
 
     with player, Recorder(tmp_path, 200, interventions=True) as recorder:
         report = run_loop(arm, player, hz=200.0, seconds=60.0, commands=inbox, recorder=recorder, until=state)
     changes = [state for state, before in zip(states[1:], states, strict=False) if state != before]
-    assert changes == ["paused", "human", "autonomous", "paused", "autonomous"]
+    assert changes == ["paused", "human", "autonomous", "paused"]
     assert (report.interventions, report.outcome) == (4, "success")
-    assert report.paused >= 5
-    assert (1, "stop") not in arm.did[:-1], "the safe action holds it"
+    assert report.paused >= 10
     [about] = pq.read_table(next(tmp_path.glob("meta/episodes/*/*.parquet"))).to_pylist()
     assert about["label"] == "success"
 
 
-def test_the_page_lets_a_policy_go_on_that_asked_for_help() -> None:
-    class Doubting(Commanding):
+def test_a_pause_that_ends_between_the_players_decision_and_the_loops_moves_nothing() -> None:
+    class Doubting(Agent):
         contract = Contract(action=ActionSpec(dim=2, delta=True))
 
         def act(self, obs: Obs) -> Act:
+            return Act(np.ones(2, np.float32), info={"uncertainty": 1.0})
+
+    class Resumed(ChunkPlayer):
+        def act(self, obs: Obs) -> Act:
             act = super().act(obs)
-            act.info["uncertainty"] = 1.0
+            self.control.resume()
             return act
 
-    arm, inbox = Arm(simulated=False), CommandInbox()
-    with ChunkPlayer(Doubting(inbox, {6: "resume", 12: "success"}), ask_for_help=0.5) as player:
-        report = run_loop(arm, player, hz=200.0, seconds=60.0, commands=inbox)
-    assert report.outcome == "success"
-    assert 5 <= report.paused <= 7
+    arm = Arm(simulated=False)
+    with Resumed(Doubting(), ask_for_help=0.5) as player:
+        report = run_loop(arm, player, hz=200.0, until=lambda: arm.ticks > 6)
+    assert (report.paused, applied(arm)) == (6, []), "it asks again at each tick, as no human has looked"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 from collections.abc import Iterator
 from typing import Any
@@ -13,8 +14,8 @@ from in_process_replicas import Replicas
 from scripted_leader import ScriptedLeader
 
 from vlagents_ray import Act, ActionSpec, Agent, ConfigError, Contract, Obs, PolicyFailed
-from vlagents_ray.chunking.player import ChunkPlayer
-from vlagents_ray.chunking.takeover import Takeover, uncertainty
+from vlagents_ray.chunking.control import Control
+from vlagents_ray.chunking.player import ChunkPlayer, uncertainty
 from vlagents_ray.errors import InvalidAction, InvalidObservation
 from vlagents_ray.interface import DELAY, EXECUTED, INTERVENTION, LEFTOVER, SAFE, SAMPLES, WANTED
 from vlagents_ray.robot import Guard
@@ -114,11 +115,11 @@ def test_the_hand_over_takes_one_tick_in_both_directions(make: Any, options: dic
     leader.held = True
     at = arm.pose.copy()
     act = arm.tick()
-    assert (arm.player.takeover.state, act.info[INTERVENTION]) == ("human", True)
+    assert (arm.player.control.state, act.info[INTERVENTION]) == ("human", True)
     assert act.action == pytest.approx(at + 0.05)
     leader.held = False
     assert INTERVENTION not in arm.tick().info
-    assert arm.player.takeover.state == "autonomous"
+    assert arm.player.control.state == "autonomous"
 
 
 @pytest.mark.parametrize("options", MODES)
@@ -340,17 +341,17 @@ def test_a_pause_holds_the_robot_until_it_is_over(make: Any) -> None:
     agent = Near()
     arm, _ = make(agent, mode="async")
     arm.tick()
-    arm.player.takeover.pause()
+    arm.player.control.pause()
     at, asked = arm.pose.copy(), len(agent.asked)
     for _ in range(9):
         act = arm.tick()
         arm.settle()
         assert act.info[SAFE] == "paused by an operator"
         assert act.action == pytest.approx(at)
-    assert arm.player.takeover.state == "paused"
+    assert arm.player.control.state == "paused"
     assert len(agent.asked) > asked + 7, "its answers may bring the command to go on"
     assert len(arm.player._plan._chunks) <= 1
-    arm.player.takeover.resume()
+    arm.player.control.resume()
     asked = len(agent.asked)
     assert SAFE in arm.tick().info
     arm.settle()
@@ -364,7 +365,7 @@ def test_no_answer_that_comes_in_a_pause_is_executed(make: Any, options: dict[st
     agent = Near()
     arm, _ = make(agent, **options)
     arm.tick()
-    arm.player.takeover.pause()
+    arm.player.control.pause()
     at, asked = arm.pose.copy(), len(agent.asked)
     for _ in range(HORIZON + 2):
         assert arm.tick().action == pytest.approx(at)
@@ -399,14 +400,14 @@ def test_an_episode_begins_without_what_was_executed_in_the_last_one(make: Any) 
 
 def test_a_human_takes_over_from_a_pause_and_gives_back_to_the_policy(make: Any) -> None:
     arm, leader = make(Near())
-    takeover = arm.player.takeover
+    control = arm.player.control
     states = []
-    for held, command in ((False, None), (False, takeover.pause), (True, None), (True, None), (False, None)):
+    for held, command in ((False, None), (False, control.pause), (True, None), (True, None), (False, None)):
         leader.held = held
         if command is not None:
             command()
         arm.tick()
-        states.append(takeover.state)
+        states.append(control.state)
     assert states == ["autonomous", "paused", "human", "human", "autonomous"]
 
 
@@ -414,7 +415,7 @@ def test_a_pause_while_a_human_moves_the_robot_begins_when_he_lets_go(make: Any)
     arm, leader = make(Near())
     leader.held = True
     arm.tick()
-    arm.player.takeover.pause("look first")
+    arm.player.control.pause("look first")
     assert SAFE not in arm.tick().info
     leader.held = False
     assert arm.tick().info[SAFE] == "look first"
@@ -429,7 +430,7 @@ def test_a_leader_that_breaks_pauses_the_robot(make: Any) -> None:
     leader.wants = unplugged
     assert "no such device" in arm.tick().info[SAFE]
     leader.wants = lambda: False
-    arm.player.takeover.resume()
+    arm.player.control.resume()
     assert SAFE not in arm.tick().info
     leader.held = True
     leader.command = lambda _: 1 / 0
@@ -440,7 +441,7 @@ def test_without_an_action_that_keeps_it_still_a_robot_is_not_paused_but_the_loo
     with ChunkPlayer(Near()) as player:
         arm = Arm(player)
         arm.tick()
-        player.takeover.pause()
+        player.control.pause()
         with pytest.raises(InvalidAction, match="paused by an operator"):
             arm.tick()
 
@@ -465,7 +466,7 @@ def test_an_uncertain_chunk_pauses_before_any_of_it_is_executed(make: Any) -> No
     assert act.info[SAFE] == "asks for help: its uncertainty is 0.7, above 0.5"
     assert act.action == pytest.approx(at)
     arm.tick()
-    assert arm.player.takeover.state == "paused"
+    assert arm.player.control.state == "paused"
     leader.held = True
     arm.tick()
     leader.held = False
@@ -490,4 +491,68 @@ def test_help_cannot_be_asked_for_by_a_policy_that_states_no_uncertainty(make: A
     with pytest.raises(ConfigError, match="samples"):
         arm.tick()
     with pytest.raises(ConfigError, match="ask_for_help"):
-        Takeover(ask_for_help=float("nan"))
+        ChunkPlayer(Near(), ask_for_help=float("nan"))
+
+
+def lines_of(function: Any) -> list[int]:
+    return sorted({line for _, _, line in function.__code__.co_lines() if line is not None})
+
+
+# From the second line on: a pause of before the tick is one that a human takes over from.
+@pytest.mark.parametrize("line", range(2, len(lines_of(Control.update))))
+@pytest.mark.parametrize("command", ["pause", "stop"])
+def test_a_command_between_any_two_lines_of_a_tick_is_not_lost(line: int, command: str) -> None:
+    leader = ScriptedLeader(ahead)
+    leader.held = True
+    control = Control(leader)
+    wanted, threads = lines_of(Control.update)[line], []
+
+    def trace(frame: Any, event: str, _: object) -> Any:
+        if frame.f_code is not Control.update.__code__:
+            return None
+        if event == "line" and frame.f_lineno == wanted and not threads:
+            threads.append(threading.Thread(target=getattr(control, command), args=("by the operator",)))
+            threads[0].start()
+            threads[0].join(0.01)  # longer if the state is locked; then it is the next one that counts
+        return trace
+
+    before = sys.gettrace()
+    sys.settrace(trace)
+    control.update()
+    sys.settrace(before)
+    for thread in threads:
+        thread.join()
+    leader.held = False
+    control.update()
+    if threads:
+        assert control.state == ("paused" if command == "pause" else "stopped")
+        assert control.held is not None
+
+
+def test_a_stop_that_is_over_before_the_loop_looks_still_drops_the_plan() -> None:
+    control = Control()
+    control.update()
+    control.stop("by the operator")
+    assert control.restart()
+    assert control.hold() is not None
+    assert control.hold() is None
+
+
+@pytest.mark.parametrize("held", ["pause", "stop", "human"])
+def test_a_new_instruction_ends_the_episode_only_when_the_policy_moves_the_robot(held: str) -> None:
+    leader = ScriptedLeader(ahead)
+    control = Control(leader)
+    if held == "human":
+        leader.held = True
+    else:
+        getattr(control, held)("by the operator")
+    control.update()
+    control.instruct("fold")
+    assert not control.over
+    leader.held = False
+    control.resume()
+    assert control.restart()
+    control.update()
+    control.hold()
+    assert control.over
+    assert control.end() == ("", "fold")

@@ -1,0 +1,242 @@
+"""Who may move a robot: one state for its stops, pauses, take-overs and episodes, decided on the robot's computer."""
+
+from __future__ import annotations
+
+import copy
+import threading
+from typing import Any, Literal, Protocol, get_args
+
+import numpy as np
+
+from vlagents_ray.chunking.fallback import Held
+from vlagents_ray.errors import ConfigError, VLAgentsError
+from vlagents_ray.interface import Obs
+
+ControlState = Literal["autonomous", "paused", "human", "stopped"]
+Outcome = Literal["success", "failure"]
+PAUSED = "paused by an operator"
+
+
+class Leader(Protocol):
+    """The interface of what a human moves a robot with: a keyboard, a SpaceMouse, a second arm."""
+
+    def engaged(self) -> bool:
+        """Return at once whether the human moves the robot at this tick."""
+        ...
+
+    def action(self, obs: Obs) -> np.ndarray:
+        """Return the human's action at once, for a tick at which `engaged` was true.
+
+        Args:
+            obs: The observation of the tick.
+
+        Returns:
+            The action, (D,) float32, in the units of the policy's contract.
+
+        Raises:
+            InvalidAction: There is none at this tick; the robot holds still.
+        """
+        ...
+
+
+class Control:
+    """The state machine of a robot.
+
+    | state | who moves the robot | it ends by |
+    |---|---|---|
+    | "autonomous" | the policy | any of the others |
+    | "human" | the leader that is engaged | its release: then the policy continues, or the robot is paused |
+    | "paused" | nothing | `resume`, or a leader that is engaged |
+    | "stopped" | nothing | `restart` |
+
+    The state is decided once a tick, by `update`. All methods may be called from any thread: a pause counts from the
+    next action on, a stop at once. Stops, pauses and a new instruction last from one run of the control loop into the
+    next. Over a network only `pause`, `stop` and `mark` are called (see `vlagents_ray.client.commands`): `resume` and
+    `restart` are for the operator at the robot, and for its own program.
+
+    Args:
+        leader: What a human moves the robot with; None if there is nothing.
+    """
+
+    def __init__(self, leader: Leader | None = None) -> None:
+        self.leader = leader
+        self.stops: list[str] = []
+        """The reasons of all stops, oldest first."""
+        self.running = False
+        """Whether `run_loop` drives the robot, which commands nothing while it is paused or stopped."""
+        self._lock = threading.RLock()  # a signal handler may interrupt its owner
+        self._state: ControlState = "autonomous"
+        self._stop: str | None = None  # the reason of a stop that was commanded
+        self._barked = False  # stopped by a silence
+        self._silent: set[str] = set()  # sources whose silence stopped the robot, and which are still silent
+        self._unseen = False  # the loop has not held the robot for the last stop yet
+        self._auto = False
+        self._pause: str | None = None
+        self._pauses = 0
+        self._engaged = False  # at the last update
+        self._outcome: Outcome | None = None
+        self._instruction: str | None = None
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Control:
+        return Control(copy.deepcopy(self.leader, memo))  # that of another robot
+
+    @property
+    def state(self) -> ControlState:
+        """Who moves the robot at this tick."""
+        return self._state
+
+    @property
+    def reason(self) -> str | None:
+        """Why the robot is paused, or will be when the human lets go; None if it is not."""
+        return self._pause
+
+    @property
+    def stopped(self) -> bool:
+        """Whether the robot was stopped and motion has not been restarted since."""
+        return self._stop is not None or self._barked
+
+    @property
+    def silent(self) -> list[str]:
+        """The sources whose silence stopped the robot and that are still silent, by name."""
+        with self._lock:
+            return sorted(self._silent)
+
+    def pause(self, reason: str = PAUSED) -> None:
+        """Hold the robot still until `resume`, or until a human takes over; a human who moves it is not interrupted."""
+        with self._lock:
+            self._pause = reason
+            self._pauses += 1
+
+    def resume(self) -> None:
+        """Let the policy continue from the next tick on, with a new answer."""
+        with self._lock:
+            self._pause = None
+
+    def stop(self, reason: str, *, silent: str | None = None) -> None:
+        """Stop the robot until `restart`.
+
+        Args:
+            reason: The reason, for `stops`.
+            silent: The source whose silence is the reason; `heard` ends the silence.
+        """
+        with self._lock:
+            self._unseen = True
+            self.stops.append(reason)
+            if silent is None:
+                self._stop = reason
+            else:
+                self._barked = True
+                self._silent.add(silent)
+
+    def heard(self, source: str) -> None:
+        """Note that the silence of a source is over. The robot stays stopped."""
+        with self._lock:
+            self._silent.discard(source)
+
+    def restart(self) -> bool:
+        """Allow motion again after a stop; may also be called from a signal handler.
+
+        Returns:
+            Whether motion is allowed. It is not while a source is silent (see `silent`); call this again afterwards.
+        """
+        with self._lock:
+            if not self._silent:
+                self._stop, self._barked = None, False
+            return not self.stopped
+
+    def mark(self, label: str) -> None:
+        """End the episode as a "success" or a "failure"; raises `ConfigError` for another label."""
+        if label not in get_args(Outcome):
+            raise ConfigError(f"mark: got {label!r}, want one of {list(get_args(Outcome))}")
+        with self._lock:
+            self._outcome = "success" if label == "success" else "failure"
+
+    def instruct(self, text: str) -> None:
+        """Begin another episode with this instruction: at once if the policy moves the robot, else when it does."""
+        with self._lock:
+            self._instruction = text
+
+    def adopt(self, other: Control) -> None:
+        """Take over the stop, the pause and the instruction of another control, which is not used any more."""
+        with other._lock, self._lock:
+            self._stop, self._barked = self._stop or other._stop, self._barked or other._barked
+            self._silent |= other._silent
+            self._unseen |= other._unseen
+            self.stops += other.stops
+            self._pause = self._pause or other._pause
+            self._instruction = self._instruction or other._instruction
+
+    def begin(self, *, auto: bool) -> None:
+        """Begin a run of the control loop.
+
+        Args:
+            auto: Whether the end of a silence restarts the robot; a stop that was commanded stays until `restart`.
+        """
+        with self._lock:
+            self._auto, self._outcome, self.running = auto, None, True
+
+    def end(self) -> tuple[str, str | None]:
+        """End a run; return its outcome, "" without one, and the instruction of the next one, if there is one."""
+        with self._lock:
+            ended = self._outcome or "", self._instruction
+            self._instruction, self.running = None, False
+            return ended
+
+    def update(self) -> bool:
+        """Decide at the beginning of a tick who moves the robot.
+
+        Returns:
+            Whether the plan of the policy is void, since a human moved the robot, or nothing does.
+        """
+        pauses, engaged = self._pauses, False
+        if self.leader is not None:
+            try:
+                engaged = self.leader.engaged()
+            except Exception as error:  # noqa: BLE001 - a broken device must not end the loop
+                own = isinstance(error, VLAgentsError)
+                self.pause(str(error) if own else f"the leader failed: {error!r}")
+        with self._lock:
+            before = self._state
+            if engaged and not self._engaged and pauses == self._pauses:  # no pause since the human took over
+                self._pause = None
+            self._engaged = engaged
+            if self.stopped:
+                self._state = "stopped"
+            elif engaged:
+                self._state = "human"
+            else:
+                self._state = "autonomous" if self._pause is None else "paused"
+            return self._state in ("paused", "stopped") or self._state == "autonomous" != before
+
+    @property
+    def held(self) -> Held | None:
+        """Why the robot must not move, by the last `update` and what came since; None if it may move."""
+        with self._lock:
+            if self._state == "stopped" or self.stopped or self._unseen:
+                return Held("stopped", f"stopped: {self._stop or self._silence()}")
+            if self._state == "paused" or (self._pause is not None and self._state != "human"):
+                return Held("paused", self._pause or PAUSED)
+            return None
+
+    def hold(self) -> Held | None:
+        """Return `held`, once a tick for the control loop, which then commands nothing.
+
+        After any stop the loop holds the robot for a tick at least, and so drops what was planned before.
+        """
+        with self._lock:
+            held = self.held
+            self._unseen = False
+            if self._auto and not self._silent:
+                self._barked = False
+            return held
+
+    @property
+    def over(self) -> bool:
+        """Whether the episode ends: it was marked, or a new instruction came and the policy moves the robot."""
+        with self._lock:
+            changed = self._instruction is not None and self._state == "autonomous" and self.held is None
+            return self._outcome is not None or changed
+
+    def _silence(self) -> str:
+        silent = f"no signal from the {' and the '.join(sorted(self._silent))}"
+        return silent if self._silent else "waiting for a restart (Watchdog.restart)"

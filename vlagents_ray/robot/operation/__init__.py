@@ -1,1 +1,0 @@
-"""A control loop under the commands of people who watch it."""
