@@ -135,7 +135,7 @@ def test_the_page_holds_no_data_and_may_load_nothing(server: LiveServer) -> None
 
 
 def test_the_scripts_of_the_page_share_no_name_since_they_share_one_scope() -> None:
-    html, _ = endpoint.live_page()
+    html, *_ = endpoint.live_page()
     names = re.findall(r"^(?:const|let|class|(?:async )?function) (\w+)", html, re.MULTILINE)
     assert {"showEvaluation", "showFleet"} < set(names)
     assert {name for name in names if names.count(name) > 1} == set()
