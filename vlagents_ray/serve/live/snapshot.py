@@ -106,7 +106,8 @@ class ReplicaView:
             described["state"] = {part: _numbers(values[:VALUES]) for part, values in seen.state.items()}
             if name in shown and time.thread_time() - begun < ENCODING_SHARE / RATE:
                 described["pictures"] = _pictures(seen, snapshot.files)
-                self._pictured[name] = seen.number
+                if described["pictures"]:
+                    self._pictured[name] = seen.number
         snapshot.document = {
             **self._about,
             **self._state(),
