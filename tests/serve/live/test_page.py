@@ -7,13 +7,14 @@ import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from browser import Page, browser
 from eval_fakes import wait_for
 from in_memory_keys import ChangingKeys
-from live_server import Address, LiveServer, live_server
+from live_server import Address, LiveServer, ask, live_server
 
 from vlagents_ray import Obs, RemoteAgent
 from vlagents_ray.chunking.player import ChunkPlayer
@@ -257,3 +258,82 @@ def test_it_says_so_when_the_server_is_gone(page: Page) -> None:
         show(page, server)
         until(page, STATUS, "Live")
     until(page, f"{STATUS} !== 'Live'", want=True)
+
+
+NO_SOCKET = """
+  window.sockets = [];
+  window.WebSocket = class {
+    constructor() { this.asked = 0; window.sockets.push(this); }
+    send() { this.asked++; }
+  };
+  WebSocket.OPEN = 1;
+"""
+DELIVER = """((good, changes) => {
+  const socket = window.sockets[window.sockets.length - 1], wrong = [];
+  const copy = (value) => JSON.parse(JSON.stringify(value));
+  let step = 100;
+  const deliver = (said) => {
+    const text = new TextEncoder().encode(JSON.stringify(said)), asked = socket.asked;
+    const data = new ArrayBuffer(4 + text.length);
+    new DataView(data).setUint32(0, text.length, true);
+    new Uint8Array(data, 4).set(text);
+    socket.onmessage({ data });
+    return socket.asked === asked + 1;
+  };
+  const next = (later) => {
+    const said = copy(good);
+    said.time = good.time += later;
+    step++;
+    for (const session of said.replicas[0].sessions) session.step = step;
+    return said;
+  };
+  const shows = (id) => [...document.querySelectorAll("article")].map((one) => one.textContent)
+    .some((text) => text.includes(id) && text.includes(`step${step}`));
+  const live = () => document.getElementById("connection").textContent === "Live";
+  socket.onopen();
+  for (const [path, removed, value] of changes) {
+    const said = next(0.1), keys = copy(path), last = keys.pop(), inside = keys.reduce((part, one) => part[one], said);
+    if (removed) delete inside[last]; else inside[last] = value;
+    const told = JSON.stringify([path, removed ? "removed" : value]);
+    if (!deliver(said)) wrong.push(`${told}: asks for nothing more`);
+    const own = path[2] === "sessions" && path.length > 3;
+    if (own && !shows("second")) wrong.push(`${told}: another card is not shown`);
+    if (!deliver(next(own ? 0.1 : 20)) || !shows("first") || !live())
+      wrong.push(`${told}: the next message is not shown`);
+  }
+  return wrong;
+})"""
+VALUES = [None, True, -1, 1e300, "", "text", [], [None], [[None]], ["text"], {}, {"a": {}}]
+
+
+def every_place(value: object, path: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
+    """The path of each value of a document, of lists the first ones."""
+    if path:
+        yield path
+    parts = value.items() if isinstance(value, dict) else enumerate(value[:1]) if isinstance(value, list) else ()
+    for key, part in parts:
+        yield from every_place(part, (*path, key))
+
+
+def test_a_page_goes_on_whatever_a_message_says(page: Page, server: LiveServer) -> None:
+    with operated(server), server.viewer() as viewer:
+        session: dict[str, Any] = {}
+        while not {"played", "state", "last"} < session.keys() or not session["played"]["rows"]:
+            said, _ = ask(viewer)
+            for one in said["replicas"][0]["sessions"]:
+                session = {**session, **one}
+    session |= {"pictures": {}, "commands": [{"id": "a-1", "do": "stop", "by": "", "state": "done", "why": ""}]}
+    said["replicas"][0]["sessions"] = [session | {"id": name} for name in ("first", "second")]
+    changes = [
+        (list(path), removed, value)
+        for path in every_place(said)
+        if path[:1] not in (("files",), ("time",)) and path[2:3] != ("name",)
+        for removed, value in ((True, None), *((False, value) for value in VALUES))
+    ]
+    assert len(changes) > 500
+    script = page.call("Page.addScriptToEvaluateOnNewDocument", source=NO_SOCKET)["identifier"]
+    try:
+        show(page, server)
+        assert page.value(f"{DELIVER}({json.dumps(said)}, {json.dumps(changes)})") == []
+    finally:
+        page.call("Page.removeScriptToEvaluateOnNewDocument", identifier=script)
