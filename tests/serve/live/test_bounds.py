@@ -202,14 +202,17 @@ class Saves:
 
     def __init__(self, folder: Path, frames: int, **options: Any) -> None:
         self.settings = LiveArgs(folder=str(folder), **options)
-        self.watched = LiveTap(lambda _: None)
-        self.ring = Ring(self.watched, SimpleNamespace(ids=lambda: ["s"], all=list), self.settings, "r")  # type: ignore[arg-type]
+        clock = Clock()
+        clock.now = time.monotonic()
+        self.watched = LiveTap(lambda _: None, clock)
+        sessions: Any = SimpleNamespace(ids=lambda: ["s"], all=list)
+        self.ring = Ring(self.watched, sessions, self.settings, "r")
         image = np.zeros((8, 8, 3), np.uint8)
         for _ in range(frames):
             files: DecodedFiles = {id(image): (image, memoryview(FILE))}
             send(self.watched, "s", (Obs({"front": image}), acted()), files)
             self.ring.read()
-            time.sleep(1.05 / tap.RATE)
+            clock.now += 1.05 / tap.RATE
 
 
 @pytest.fixture(scope="module")
@@ -246,15 +249,11 @@ def test_one_session_is_saved_at_a_time(saves: Saves, monkeypatch: pytest.Monkey
     saves.ring.save("s")
 
 
-def test_nothing_is_saved_into_a_full_folder(saves: Saves) -> None:
-    saves.ring.save("s")
-    full = saves.settings.model_copy(update={"most_gb": 1e-9})
-    saves.ring._settings, kept = full, saves.settings
-    try:
-        with pytest.raises(StorageFailed, match="want less than most_gb: 1e-09; make room"):
-            saves.ring.save("s")
-    finally:
-        saves.ring._settings = kept
+def test_nothing_is_saved_into_a_full_folder(tmp_path: Path) -> None:
+    small = Saves(tmp_path, 2, most_gb=1e-9)
+    small.ring.save("s")
+    with pytest.raises(StorageFailed, match="want less than most_gb: 1e-09; make room"):
+        small.ring.save("s")
 
 
 def test_a_save_that_fails_leaves_no_files_and_the_next_one_works(

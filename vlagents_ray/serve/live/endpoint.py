@@ -11,7 +11,7 @@ commands, but videos:
     GET /v1/live/videos/7   a video to which the document refers by its number
 
 The viewer asks for each message, with the sessions whose pictures it shows: {"shown": ["arm-1", …]}. So a slow viewer
-misses what is old, and delays nobody. The answer is the length of a JSON document (32 bits, little-endian), the
+misses old messages, and delays no other. The answer is the length of a JSON document (32 bits, little-endian), the
 document, and the files to which it refers by their index in `files`, the list of their lengths.
 
 A page in a browser cannot set a header: it states its key among the WebSocket's subprotocols, as "vlagents.key.KEY".
@@ -235,7 +235,7 @@ def require_watch_keys(host: str, keys: Keys | None) -> None:
     """Raise `ConfigError` if other machines would reach a page on `host` without a key."""
     if keys is None and not is_loopback(host):
         raise ConfigError(
-            f"live page on {host}: whoever reaches it would see all cameras. Make a key (`vlagents-ray keys new NAME "
+            f"live page on {host}: without keys all cameras would be public. Make a key (`vlagents-ray keys new NAME "
             f"--scope watch --file keys.json`) and set VLAGENTS_RAY_KEYS_FILE=keys.json; or stay on loopback, and look "
             f"at it through `ssh -L`"
         )

@@ -25,7 +25,7 @@ _PERIOD_S = 0.05
 _SHARE = 0.1  # of a core, at most
 _NICE = 5  # the thread runs after the policy's
 _CLOSING_S = 5.0
-_NAME = 8  # characters of a session's id in the name of a file: whoever lists the folder does not learn it
+_NAME = 8  # characters of a session's id in the name of a file: a list of the folder does not state it
 
 
 @dataclass(slots=True)
@@ -38,9 +38,9 @@ class _SessionEpisode:
 class SessionRecordings:
     """Writes an episode for each `reset` of a session, until the next one or the session's end.
 
-    One thread reads the tap twenty times a second, and writes every answer with its chunk and times, ten of them a
-    second with the states and pictures that they answer. It takes at most a tenth of a core; when that is too little,
-    what the tap no longer has is not shown.
+    One thread reads the tap twenty times a second, and writes every answer with its times and its chunk (as far as the
+    tap keeps it, `ROWS` x `VALUES`), ten of them a second with the states and pictures that they answer. It takes at
+    most a tenth of a core; where that is too little, older answers are left out.
     """
 
     def __init__(self, engine: Engine, tap: LiveTap, targets: Mapping[str, str]) -> None:

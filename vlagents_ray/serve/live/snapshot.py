@@ -198,7 +198,7 @@ def _act(answer: Answer) -> dict[str, Any]:
 
 
 def _numbers(values: np.ndarray) -> list[Any]:
-    """Return the values, without those digits that nobody sees."""
+    """Return the values, rounded to the digits that a page shows."""
     found: list[Any] = plain_values(np.round(values.astype(float), 4))
     return found
 

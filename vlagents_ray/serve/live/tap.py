@@ -27,7 +27,7 @@ from vlagents_ray.serve.live.commands import CommandBoard
 
 ENCODING_SHARE = 0.04  # of a core, for encoding pictures
 RATE = 10.0  # observations a second and session that are kept
-LEASE_S = 2.0  # time after the last reading at which nobody watches any more
+LEASE_S = 2.0  # time after the last reading at which nothing is kept any more
 ANSWER_BYTES = 2**25  # most bytes of the answers that are kept
 SEEN_BYTES = 2**28  # most bytes of the observations that are kept: 70 sessions of four unencoded VGA cameras
 VALUES = 64  # most numbers of one part of a state, or of one action
@@ -42,7 +42,7 @@ _MOST = 2**53  # largest number that JSON keeps
 _OBJECTS = 1000  # bytes of an answer or an observation besides its arrays, files and texts, estimated
 _ENCODING = threading.Lock()
 _TELL_S = 2.0  # interval at which a client is told that it is watched
-_KEPT_S = 1.0  # time for which the pictures of an observation are kept if nobody reads them
+_KEPT_S = 1.0  # time for which pixels are kept for a reader
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,7 +133,7 @@ class LiveTap:
         clock: Callable[[], float] = time.monotonic,
         commands: CommandBoard | None = None,
     ) -> None:
-        """Create a tap that nobody reads.
+        """Create a tap without a reader.
 
         Args:
             show: Makes the tap one of the engine's watchers, or takes it away (None).
@@ -174,7 +174,7 @@ class LiveTap:
             self._show(self)
 
     def expire(self) -> None:
-        """Drop everything if nobody watches any more, and pictures that nobody reads; called every half second."""
+        """Drop everything after the last lease, and pixels that were not read; called every half second."""
         if not self.watched and self._shown:
             self._shown = False
             self._show(None)
