@@ -334,6 +334,7 @@ def test_a_page_goes_on_whatever_a_message_says(page: Page, server: LiveServer) 
     script = page.call("Page.addScriptToEvaluateOnNewDocument", source=NO_SOCKET)["identifier"]
     try:
         show(page, server)
-        assert page.value(f"{DELIVER}({json.dumps(said)}, {json.dumps(changes)})") == []
+        wrong = page.value(f"{DELIVER}({json.dumps(said)}, {json.dumps(changes)})")
+        assert wrong == [], "\n".join(wrong)
     finally:
         page.call("Page.removeScriptToEvaluateOnNewDocument", identifier=script)

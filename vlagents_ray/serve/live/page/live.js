@@ -100,13 +100,19 @@ function read(data) {
 function show(said, files) {
   mayOperate = said.may_operate;
   const present = new Set();
+  let failed = null; // by one session, beside which the others are shown
   for (const replica of said.replicas) {
     count(replica, said.time);
     for (const session of replica.sessions) {
-      present.add(session.id);
-      if (!cards.has(session.id)) cards.set(session.id, new Card(session.id));
-      const card = cards.get(session.id);
-      try { card.update(session, files, replica.ring_s); } catch (error) { card.error.textContent = `Not shown: ${error.message}`; }
+      try {
+        present.add(session.id);
+        if (!cards.has(session.id)) cards.set(session.id, new Card(session.id));
+        cards.get(session.id).update(session, files, replica.ring_s);
+      } catch (error) {
+        failed = error;
+        cards.get(session?.id)?.remove(); // the next message makes another
+        cards.delete(session?.id);
+      }
     }
   }
   const names = new Set(said.replicas.map((one) => one.name));
@@ -118,6 +124,7 @@ function show(said, files) {
   showTimes();
   byId("session-count").textContent = cards.size ? `(${cards.size})` : "";
   byId("nothing").hidden = cards.size > 0;
+  if (failed) throw failed;
 }
 
 function count(said, now) {
@@ -232,8 +239,8 @@ class Card {
     this.root = element("article", {}, element("div", { className: "title" }, this.instruction, this.badge), name, this.error, this.cameras, this.operated, this.numbers);
     this.instruction.id = `session-${unique}`;
     this.root.setAttribute("aria-labelledby", `session-${unique} name-${unique}`);
-    byId("sessions").append(this.root);
     this.filter();
+    byId("sessions").append(this.root);
   }
 
   update(said, files, ring) {
