@@ -202,7 +202,7 @@ class Saves:
 
     def __init__(self, folder: Path, frames: int, **options: Any) -> None:
         self.settings = LiveArgs(folder=str(folder), **options)
-        clock = Clock()
+        self.clock = clock = Clock()
         clock.now = time.monotonic()
         self.watched = LiveTap(lambda _: None, clock)
         sessions: Any = SimpleNamespace(ids=lambda: ["s"], all=list)
@@ -218,6 +218,20 @@ class Saves:
 @pytest.fixture(scope="module")
 def saves(tmp_path_factory: pytest.TempPathFactory) -> Saves:
     return Saves(tmp_path_factory.mktemp("kept") / "kept", 12)
+
+
+@pytest.mark.parametrize(
+    "kind", ["a large state", "a large image", "a small image of a large message", "a wide action"]
+)
+def test_the_ring_holds_no_more_than_its_memory(tmp_path: Path, kind: str) -> None:
+    held = Saves(tmp_path, 0, memory_mb=2)
+    with Kept() as kept:
+        for _ in range(20):
+            send(held.watched, "s", MESSAGES[kind]())
+            held.ring.read()
+            held.clock.now += 1.05 / tap.RATE
+        assert kept.bytes() < 2e6 + 2 * LARGE + SLACK  # the ring, and the last observation in the tap
+        assert held.ring.bytes <= 2e6
 
 
 def test_a_save_decodes_one_frame_at_a_time(saves: Saves) -> None:
