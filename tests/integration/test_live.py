@@ -3,24 +3,20 @@
 from __future__ import annotations
 
 import json
-import threading
 import urllib.request
 from collections.abc import Iterator
-from contextlib import ExitStack, closing, suppress
-from urllib.parse import urlsplit
+from contextlib import ExitStack, closing
 
 import numpy as np
 import pytest
 from live_server import ask
-from remote_human import remote_human
 from websockets.sync.client import connect
 
 from tests.integration.conftest import serving
-from vlagents_ray import ActionSpec, Contract, Obs, RemoteAgent, VLAgentsError
+from vlagents_ray import Obs, RemoteAgent
 from vlagents_ray.client.commands import CommandInbox
 from vlagents_ray.client.credentials import Credentials
 from vlagents_ray.client.transports.websocket import open_websocket
-from vlagents_ray.robot.teleoperation import RemoteLeader
 from vlagents_ray.serve.launch.server import Server
 
 TRANSPORTS = ("shm", "plasma", "websocket", "http", "handle")
@@ -89,30 +85,3 @@ def test_its_messages_are_not_compressed_again(server: Server) -> None:
         assert "permessage-deflate" in socket.request.headers["sec-websocket-extensions"]
         assert socket.response is not None
         assert "sec-websocket-extensions" not in socket.response.headers
-
-
-def test_a_human_moves_a_robot_whichever_replica_the_two_are_at(server: Server) -> None:
-    contract, seen = Contract(action=ActionSpec(2, delta=True)), Obs()
-    over, moved = threading.Event(), threading.Event()
-    with RemoteAgent(server.url) as agent, RemoteLeader(agent, contract, step=0.5) as leader:
-        agent.reset(seen, "wait")
-
-        def drive() -> None:
-            while not over.wait(0.01):
-                with suppress(VLAgentsError):  # nothing came for too long
-                    if leader.engaged() and leader.action(seen).tolist() == [0, 0.5]:
-                        moved.set()
-
-        robot = threading.Thread(target=drive)
-        robot.start()
-        try:
-            for _ in range(8):  # the proxy chooses
-                with remote_human(urlsplit(server.url).port or 80, agent.session) as human:
-                    human.move(0.0, 1.0)
-                    assert moved.wait(30)
-                    human.release()
-                    assert human.ended() == "given back"
-                moved.clear()
-        finally:
-            over.set()
-            robot.join()

@@ -208,12 +208,9 @@ NOTHING_TO_DECODE = {
     "own port, another path",  # is refused
     "`WS /v1/weights`",  # is refused without the scope
     "`POST /v1/live/command`",  # is refused without the scope
-    "`POST /v1/live/command`, scope `operate`",  # a name, a word and a text, in 16 KiB at most
+    "`POST /v1/live/command`, scope `operate`",  # a name and a word, in 16 KiB at most
     "`WS /v1/live`",  # is refused without the scope
     "`WS /v1/live`, scope `watch`",  # a viewer sends only names
-    "`WS /v1/live/control`",  # is refused without the scope
-    "`WS /v1/live/control`, scope `operate`",  # numbers, of which 2,000 characters are read, 100 times a second
-    "`WS /v1/live/robot`",  # likewise
 }
 NO_KEY = {
     "vlagents' gateway, `without_key: true`",

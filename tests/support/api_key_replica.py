@@ -565,19 +565,6 @@ def _read_seen(data: bytes | str) -> str:
     return "200" if isinstance(data, bytes) else str(BY_CODE[json.loads(data)["code"]].status)
 
 
-def _take_over(_mark: str) -> bytes:
-    return b'{"session": "robot-1"}'
-
-
-def _beat(_mark: str) -> bytes:
-    return b'{"session": "robot-1", "beat": 1, "hold": "", "moves": false, "why": "", "ended": ["", ""]}'
-
-
-def _read_told(data: bytes | str) -> str:
-    said = json.loads(data)
-    return str(BY_CODE[said["code"]].status) if "code" in said else "200"
-
-
 def _stream_message(mark: str) -> bytes:
     return encode_request(Request("reset", Obs(), mark))
 
@@ -628,11 +615,6 @@ WAYS: dict[str, Way] = {
     ),
     "`WS /v1/live`": over_websocket("/v1/live", _watch, _read_seen),
     "`WS /v1/live`, scope `watch`": _with_scope("watch", over_websocket("/v1/live", _watch, _read_seen)),
-    "`WS /v1/live/control`": over_websocket("/v1/live/control", _take_over, _read_told),
-    "`WS /v1/live/control`, scope `operate`": _with_scope(
-        "operate", over_websocket("/v1/live/control", _take_over, _read_told)
-    ),
-    "`WS /v1/live/robot`": over_websocket("/v1/live/robot", _beat, _read_told),
     "own port": over_websocket("own", _stream_message, _read_reply),
     "own port, another path": over_websocket("own/x", _stream_message, _read_reply),
     "shared memory": over_shm,

@@ -15,7 +15,6 @@ import sys
 import warnings
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 ROOT = Path(__file__).parents[2]
@@ -162,7 +161,7 @@ def paths() -> Iterator[str]:
     http = importlib.import_module("vlagents_ray.serve.endpoints.http")
     live = importlib.import_module("vlagents_ray.serve.live.endpoint")
     weights = importlib.import_module("vlagents_ray.serve.endpoints.weights")
-    watched = live.live_routes(SimpleNamespace(robots=object()), open_to_network=False)
+    watched = live.live_routes(None, open_to_network=False)
     pushed = weights.weights_routes(None, 0.0, open_to_network=False)
     app = http.build_http_app(None, dict, None, others=[*watched, *pushed])
     for route in app.routes:

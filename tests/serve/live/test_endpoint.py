@@ -123,19 +123,16 @@ def test_the_document_is_there_without_a_websocket(server: LiveServer) -> None:
     assert replica["waiting"] == {"robot": 0, "simulation": 0}
 
 
-def test_the_page_holds_no_data_and_may_load_nothing(server: LiveServer) -> None:
-    status, text, headers = get(f"{server.url}/live")
+def test_the_page_holds_no_data_and_no_addresses(server: LiveServer) -> None:
+    status, text, _ = get(f"{server.url}/live")
     assert status == 200
     assert b"org/model" not in text
-    policy = headers["content-security-policy"]
-    assert policy.startswith("default-src 'none'")
-    assert "unsafe" not in policy
     assert b"http:" not in text.replace(b"http://www.w3.org/2000/svg", b"")
     assert b"https:" not in text.replace(b'"https:"', b"")
 
 
 def test_the_scripts_of_the_page_share_no_name_since_they_share_one_scope() -> None:
-    html, _ = endpoint.live_page()
+    html, *_ = endpoint.live_page()
     names = re.findall(r"^(?:const|let|class|(?:async )?function) (\w+)", html, re.MULTILINE)
     assert {"showEvaluation", "showFleet"} < set(names)
     assert {name for name in names if names.count(name) > 1} == set()
@@ -163,8 +160,26 @@ def test_a_viewer_who_asks_for_nothing_is_let_go(server: LiveServer, monkeypatch
         assert "within 0.1 s" in json.loads(viewer.recv(10))["detail"]
 
 
-def test_another_sites_page_sees_nothing(server: LiveServer) -> None:
-    assert get(f"{server.url}/v1/live", {"origin": "http://evil.example"})[0] == 403
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"origin": "http://evil.example"},
+        {"sec-fetch-site": "cross-site", "sec-fetch-mode": "no-cors"},  # as an image: without an origin
+        {"sec-fetch-site": "cross-site", "sec-fetch-mode": "navigate"},
+        {"sec-fetch-site": "same-site"},  # another port of this machine
+    ],
+)
+def test_another_sites_page_sees_nothing_and_does_not_start_the_tap(
+    server: LiveServer, headers: dict[str, str]
+) -> None:
+    wait_for(lambda: server.engine.watchers.one is None)
+    assert get(f"{server.url}/v1/live", headers)[0] == 403
+    assert server.engine.watchers.one is None
+    assert not server.fleet.watched
+
+
+def test_its_own_page_may_ask(server: LiveServer) -> None:
+    assert get(f"{server.url}/v1/live", {"sec-fetch-site": "same-origin"})[0] == 200
 
 
 def test_a_server_open_to_the_network_shows_nothing() -> None:

@@ -18,8 +18,8 @@ from recorded_results import record, runs
 from vlagents_ray.evaluate.plan.cases import EvalCase, cells
 from vlagents_ray.evaluate.report.progress_document import ProgressDocument
 from vlagents_ray.serve.access.api_keys import Keys
+from vlagents_ray.serve.live.endpoint import page_server
 from vlagents_ray.serve.live.fleet import Fleet
-from vlagents_ray.serve.live.page_server import page_server
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
@@ -45,7 +45,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @contextmanager
-def served(read: Callable[[], dict[str, Any]], videos: Any = None, keys: Keys | None = None) -> Iterator[str]:
+def served(read: Callable[[], dict[str, Any]], videos: Any = {}.get, keys: Keys | None = None) -> Iterator[str]:
     """The address of the page of such a document."""
     with page_server(Fleet(None, beside=read), ("127.0.0.1", 0), keys, name="eval", videos=videos) as url:
         yield url

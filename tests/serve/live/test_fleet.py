@@ -14,9 +14,8 @@ from vlagents_ray.errors import UnknownSession
 from vlagents_ray.policies.noop import Noop
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.live import fleet
-from vlagents_ray.serve.live.fleet import Exchange, Fleet, Other
-from vlagents_ray.serve.live.remote.robot_links import RobotLink, read_beat
-from vlagents_ray.serve.live.snapshot import ReplicaView, Snapshot
+from vlagents_ray.serve.live.fleet import Fleet, Other
+from vlagents_ray.serve.live.snapshot import PICTURES, ReplicaView, Snapshot
 
 
 class Others:
@@ -30,14 +29,8 @@ class Others:
     async def views(self) -> dict[str, Other]:
         return {name: partial(self._read, name) for name in self.names}
 
-    async def press(self, session: str, do: str, text: str, by: str) -> dict[str, Any] | None:
+    async def press(self, session: str, do: str, by: str) -> dict[str, Any] | None:
         return {"do": do, "by": by} if session == "of b" else None
-
-    async def exchange(self, session: str) -> Exchange | None:
-        return self._exchange if session == "of b" else None
-
-    async def _exchange(self, session: str, hold: str, message: dict[str, Any]) -> dict[str, Any] | None:
-        return {"by": "b"}
 
     async def _read(self, name: str, since: int, shown: Collection[str]) -> Snapshot:
         self.asked.append((name, since, shown))
@@ -75,11 +68,11 @@ def test_pictures_go_to_those_who_show_them(own: ReplicaView) -> None:
 
 def test_a_command_reaches_the_replica_that_has_the_session(own: ReplicaView) -> None:
     gathered = Fleet(own, Others("b"))
-    assert asyncio.run(gathered.press("of b", "stop", "", "lab")) == {"do": "stop", "by": "lab"}
+    assert asyncio.run(gathered.press("of b", "stop", "lab")) == {"do": "stop", "by": "lab"}
     with pytest.raises(UnknownSession):
-        asyncio.run(gathered.press("of c", "stop", "", "lab"))
+        asyncio.run(gathered.press("of c", "stop", "lab"))
     with pytest.raises(UnknownSession):
-        asyncio.run(Fleet(own).press("of b", "stop", "", "lab"))
+        asyncio.run(Fleet(own).press("of b", "stop", "lab"))
 
 
 def test_a_replica_that_does_not_answer_is_left_out_and_asked_again_from_where_it_was(own: ReplicaView) -> None:
@@ -171,40 +164,15 @@ def test_what_is_beside_the_replicas_is_sent_when_it_has_changed() -> None:
     assert first["replicas"] == []
 
 
-def test_what_a_robot_said_of_an_earlier_hold_is_not_told_of_the_next() -> None:
-    async def sent(message: dict[str, Any]) -> None: ...
+def test_the_pictures_that_wait_for_a_slow_viewer_are_bounded(own: ReplicaView) -> None:
+    async def watch() -> tuple[dict[str, Any], list[bytes]]:
+        viewer = fleet.Viewer()
+        viewer.shown = frozenset({"s"})
+        for number in range(100):
+            session = {"id": "s", "pictures": {"front": 0}}
+            viewer.put([Snapshot(number, {"name": str(number), "sessions": [session]}, [bytes(PICTURES)])])
+        return await viewer.next()
 
-    async def said() -> list[dict[str, Any]]:
-        link = RobotLink(sent)
-        beat = {"session": "a", "moves": True, "why": "", "ended": ["", ""]}
-        await link.take("first", "")
-        await link.hear(read_beat({**beat, "beat": 1, "hold": "first"}))
-        told = [await link.next("first", -1)]
-        await link.forward("first", {"do": "release"})
-        told.append(await link.next("first", 1))
-        await link.take("second", "")
-        told.append(await link.next("second", -1))
-        waits = asyncio.ensure_future(link.next("second", 1))
-        await asyncio.sleep(0)
-        await link.hear(read_beat({**beat, "beat": 2, "hold": "second"}))
-        return [*told, await waits]
-
-    first, over, early, late = asyncio.run(said())
-    assert (first, over) == ({"beat": 1, "moves": True, "why": ""}, {"over": "given back"})
-    assert (early, late) == ({"beat": 1, "moves": False, "why": ""}, {"beat": 2, "moves": True, "why": ""})
-
-
-def test_a_robot_is_found_at_whichever_replica_its_connection_is(own: ReplicaView) -> None:
-    async def sent(message: dict[str, Any]) -> None: ...
-
-    async def find() -> list[Exchange | None]:
-        own.robots.put("of a", RobotLink(sent))
-        gathered = Fleet(own, Others("b"))
-        return [await gathered.exchange(session) for session in ("of a", "of b", "of c")]
-
-    here, there, nowhere = asyncio.run(find())
-    assert here is not None
-    assert there is not None
-    assert nowhere is None
-    assert asyncio.run(here("of a", "1", {"do": "find"})) == {}
-    assert asyncio.run(there("of b", "1", {"do": "find"})) == {"by": "b"}
+    document, files = asyncio.run(watch())
+    assert document["replicas"][-1]["name"] == "99"
+    assert sum(map(len, files)) <= 2**26

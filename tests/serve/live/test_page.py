@@ -7,14 +7,14 @@ import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from browser import Page, browser
 from eval_fakes import wait_for
 from in_memory_keys import ChangingKeys
-from live_server import Address, LiveServer, live_server
-from remote_human import remote_human
+from live_server import Address, LiveServer, ask, live_server
 
 from vlagents_ray import Obs, RemoteAgent
 from vlagents_ray.chunking.player import ChunkPlayer
@@ -24,7 +24,6 @@ from vlagents_ray.policies.noop import Noop
 from vlagents_ray.protocol.messages import RankName
 from vlagents_ray.robot.loop import LoopReport, run_loop
 from vlagents_ray.robot.simulated import SimulatedRobot
-from vlagents_ray.robot.teleoperation import RemoteLeader
 from vlagents_ray.serve.access import api_keys
 from vlagents_ray.serve.config.live import LiveArgs
 
@@ -147,7 +146,7 @@ def test_sixteen_simulations_are_found_by_name(page: Page, server: LiveServer) -
     with acting(server, 16, "simulation"):
         show(page, server)
         until(page, CARDS, 16)
-        name = page.value("document.querySelector('article h3').textContent")
+        name = page.value("document.querySelector('article .name').textContent")
         page.value(
             f"(() => {{ const filter = document.getElementById('filter'); filter.value = '{name}';"
             "filter.dispatchEvent(new Event('input')); })()"
@@ -156,6 +155,8 @@ def test_sixteen_simulations_are_found_by_name(page: Page, server: LiveServer) -
             page.value("[...document.querySelectorAll('article')].filter((one) => one.checkVisibility()).length") == 1
         )
         assert "simulation" in page.value("document.querySelector('article').innerText")
+        buttons = "[...document.querySelectorAll('article button')].filter((one) => one.checkVisibility()).length"
+        assert page.value(buttons) == 0  # a simulation accepts no commands
 
 
 PRESS = "(text) => [...document.querySelectorAll('article button')].find((one) => one.textContent === text).click()"
@@ -192,115 +193,17 @@ def test_buttons_act_on_a_session(page: Page, server: LiveServer, width: int, sc
         until(page, outcome, "pause: done")
         until(page, "document.querySelector('article').innerText.includes('stopped')", want=True)
         assert page.value("document.documentElement.scrollWidth") <= width
-        page.value(f"({PRESS})('Resume')")
-        until(page, outcome, "resume: done")
         page.value(f"({PRESS})('Follow versions')")  # a robot is pinned unless it is told otherwise
         until(page, outcome, "follow: done")
         until(page, "[...document.querySelectorAll('article button')].some((one) => one.value === 'pin')", want=True)
-        page.value("document.querySelector('article input').value = 'fold the cloth'")
-        page.value(f"({PRESS})('Change')")
+        shown = "[...document.querySelectorAll('article button')].map((one) => one.textContent)"
+        assert page.value(shown)[:4] == ["Stop", "Pause", "Success", "Failure"]
+        page.value(f"({PRESS})('Failure')")
         wait_for(lambda: reports, 30)
-        assert reports[0].next_instruction == "fold the cloth"
+        assert reports[0].outcome == "failure"
         assert page.said == []
         outside = [url for url in page.asked if not url.startswith(("blob:", "data:", server.url))]
         assert outside == []
-
-
-class Reached(SimulatedRobot):
-    """Keeps where it was last commanded to."""
-
-    def __init__(self) -> None:
-        super().__init__(Contract(action=ActionSpec(7)))
-        self.at = np.zeros(7)
-
-    def apply(self, action: np.ndarray) -> None:
-        super().apply(action)
-        self.at = action.copy()
-
-
-@contextmanager
-def offered(server: LiveServer) -> Iterator[tuple[Reached, RemoteAgent]]:
-    """A simulated robot that a human at the page may move."""
-    over, robot, contract = threading.Event(), Reached(), Contract(action=ActionSpec(7, delta=False))
-    with (
-        RemoteAgent(server.url) as agent,
-        RemoteLeader(agent, contract, step=0.01, measure=lambda _: robot.at) as leader,
-        ChunkPlayer(agent, mode="async", safe="hold", override=leader) as player,
-    ):
-        thread = threading.Thread(target=lambda: run_loop(robot, player, hz=50, instruction="wipe", until=over.is_set))
-        thread.start()
-        try:
-            yield robot, agent
-        finally:
-            over.set()
-            thread.join()
-
-
-def typed(page: Page, kind: str, key: str) -> None:
-    text = {"Enter": "\r", "Escape": ""}.get(key, key)
-    code = {"Enter": 13, "Escape": 27}.get(key, ord(key.upper()[0]))
-    page.call("Input.dispatchKeyEvent", type=kind, key=key, text=text, windowsVirtualKeyCode=code)
-
-
-def pointed(page: Page, kind: str, key: str) -> None:
-    """A mouse at the button that does what a key does."""
-    where = page.value(
-        f"(() => {{ const one = document.querySelector('.pad button[value={key}]');"
-        "one.scrollIntoView({ block: 'center' }); const box = one.getBoundingClientRect();"
-        "return [box.x + box.width / 2, box.y + box.height / 2]; })()"
-    )
-    page.call("Input.dispatchMouseEvent", type=kind, x=where[0], y=where[1], button="left", clickCount=1)
-
-
-@pytest.mark.parametrize(("width", "scheme"), [(360, "light"), (1400, "dark")])
-def test_a_human_takes_over_with_keys_a_pointer_and_a_screen_readers_clicks(
-    page: Page, server: LiveServer, width: int, scheme: str
-) -> None:
-    outcome = "document.querySelector('article .operate > [role=status]')?.textContent"
-    status = "document.querySelector('.takeover [role=status]').textContent"
-    focus = "document.activeElement.ariaLabel || document.activeElement.getAttribute('aria-label') || ''"
-    with offered(server) as (robot, agent):
-        show(page, server, width=width, scheme=scheme)
-        takes = "document.querySelector('article .operate .row button:nth-child(4)')"
-        until(page, f"{takes}?.checkVisibility() && !{takes}.disabled", want=True)
-        page.value(f"{takes}.focus()")
-        typed(page, "keyDown", "Enter")
-        typed(page, "keyUp", "Enter")
-        until(page, status, "You move it.")
-        assert page.value(focus).startswith(f"Move {agent.session}: W and S along x")
-        assert page.value("document.documentElement.scrollWidth") <= width
-        assert (
-            page.value("[...document.querySelectorAll('.pad button')].every((one) => one.clientHeight >= 40)") is True
-        )
-        for axis, sign, down, up in (
-            (0, 1, lambda: typed(page, "keyDown", "w"), lambda: typed(page, "keyUp", "w")),
-            (1, -1, lambda: pointed(page, "mousePressed", "d"), lambda: pointed(page, "mouseReleased", "d")),
-        ):
-            before = robot.at.copy()
-            down()
-            wait_for(lambda a=axis, s=sign, b=before: s * (robot.at - b)[a] > 0.1, 30)
-            up()
-            until(page, "document.querySelectorAll('.pad .on').length", 0)
-            assert np.flatnonzero(np.abs(robot.at - before) > 1e-6).tolist() == [axis]
-        before = robot.at.copy()
-        page.value("document.querySelector('.pad button[value=r]').click()")  # as a screen reader does
-        wait_for(lambda: robot.at[2] - before[2] > 0.02, 30)
-        page.value("document.querySelector('.pad').focus()")
-        typed(page, "keyDown", "d")
-        until(page, "document.querySelectorAll('.pad .on').length", 1)
-        page.value(f"{takes}.parentElement.querySelector('button').focus()")  # the key is released elsewhere
-        until(page, "document.querySelectorAll('.pad .on').length", 0)
-        page.value("document.querySelector('.pad').focus()")
-        typed(page, "keyDown", "Escape")
-        until(page, outcome, "take over: given back; the policy goes on")
-        until(page, "document.querySelector('.takeover').hidden", want=True)
-        until(page, focus, f"Take over: {agent.session}")
-        with remote_human(server.port, agent.session) as other:
-            other.move(0.0)
-            until(page, f"{takes}.textContent", "Taken over by somebody")
-            assert page.value(f"{takes}.disabled") is True
-        assert page.said == []
-        assert [url for url in page.asked if not url.startswith(("blob:", "data:", server.url))] == []
 
 
 def test_it_asks_for_a_key_and_watches_with_one(page: Page) -> None:
@@ -317,7 +220,7 @@ def test_it_asks_for_a_key_and_watches_with_one(page: Page) -> None:
             )
             until(page, STATUS, told)
         until(page, PICTURES, 1)
-        assert "plain/" in page.value("document.querySelector('article h3').textContent")
+        assert "plain/" in page.value("document.querySelector('article .name').textContent")
 
 
 def test_a_session_is_saved(page: Page, tmp_path: Path) -> None:
@@ -335,7 +238,7 @@ def test_a_session_is_saved(page: Page, tmp_path: Path) -> None:
 def test_a_key_without_the_scope_sees_no_buttons(page: Page, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(api_keys, "_CHECK_S", 0.0)
     keys = ChangingKeys()
-    for name, scopes, buttons in (("watching", ["watch"], 0), ("lab", ["watch", "operate"], 7)):
+    for name, scopes, buttons in (("watching", ["watch"], 0), ("lab", ["watch", "operate"], 5)):
         key = keys.add(name, scopes=scopes)
         with live_server(Noop.from_config({"action_dim": 7}), keys=keys.keys) as server, operated(server, key):
             show(page, server)
@@ -355,3 +258,83 @@ def test_it_says_so_when_the_server_is_gone(page: Page) -> None:
         show(page, server)
         until(page, STATUS, "Live")
     until(page, f"{STATUS} !== 'Live'", want=True)
+
+
+NO_SOCKET = """
+  window.sockets = [];
+  window.WebSocket = class {
+    constructor() { this.asked = 0; window.sockets.push(this); }
+    send() { this.asked++; }
+  };
+  WebSocket.OPEN = 1;
+"""
+DELIVER = """((good, changes) => {
+  const socket = window.sockets[window.sockets.length - 1], wrong = [];
+  const copy = (value) => JSON.parse(JSON.stringify(value));
+  let step = 100;
+  const deliver = (said) => {
+    const text = new TextEncoder().encode(JSON.stringify(said)), asked = socket.asked;
+    const data = new ArrayBuffer(4 + text.length);
+    new DataView(data).setUint32(0, text.length, true);
+    new Uint8Array(data, 4).set(text);
+    socket.onmessage({ data });
+    return socket.asked === asked + 1;
+  };
+  const next = (later) => {
+    const said = copy(good);
+    said.time = good.time += later;
+    step++;
+    for (const session of said.replicas[0].sessions) session.step = step;
+    return said;
+  };
+  const shows = (id) => [...document.querySelectorAll("article")].map((one) => one.textContent)
+    .some((text) => text.includes(id) && text.includes(`step${step}`));
+  const live = () => document.getElementById("connection").textContent === "Live";
+  socket.onopen();
+  for (const [path, removed, value] of changes) {
+    const said = next(0.1), keys = copy(path), last = keys.pop(), inside = keys.reduce((part, one) => part[one], said);
+    if (removed) delete inside[last]; else inside[last] = value;
+    const told = JSON.stringify([path, removed ? "removed" : value]);
+    if (!deliver(said)) wrong.push(`${told}: asks for nothing more`);
+    const own = path[2] === "sessions" && path.length > 3;
+    if (own && !shows("second")) wrong.push(`${told}: another card is not shown`);
+    if (!deliver(next(own ? 0.1 : 20)) || !shows("first") || !live())
+      wrong.push(`${told}: the next message is not shown`);
+  }
+  return wrong;
+})"""
+VALUES = [None, True, -1, 1e300, "", "text", [], [None], [[None]], ["text"], {}, {"a": {}}]
+
+
+def every_place(value: object, path: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
+    """The path of each value of a document, of lists the first ones."""
+    if path:
+        yield path
+    parts = value.items() if isinstance(value, dict) else enumerate(value[:1]) if isinstance(value, list) else ()
+    for key, part in parts:
+        yield from every_place(part, (*path, key))
+
+
+def test_a_page_goes_on_whatever_a_message_says(page: Page, server: LiveServer) -> None:
+    with operated(server), server.viewer() as viewer:
+        session: dict[str, Any] = {}
+        while not {"played", "state", "last"} < session.keys() or not session["played"]["rows"]:
+            said, _ = ask(viewer)
+            for one in said["replicas"][0]["sessions"]:
+                session = {**session, **one}
+    session |= {"pictures": {}, "commands": [{"id": "a-1", "do": "stop", "by": "", "state": "done", "why": ""}]}
+    said["replicas"][0]["sessions"] = [session | {"id": name} for name in ("first", "second")]
+    changes = [
+        (list(path), removed, value)
+        for path in every_place(said)
+        if path[:1] not in (("files",), ("time",)) and path[2:3] != ("name",)
+        for removed, value in ((True, None), *((False, value) for value in VALUES))
+    ]
+    assert len(changes) > 500
+    script = page.call("Page.addScriptToEvaluateOnNewDocument", source=NO_SOCKET)["identifier"]
+    try:
+        show(page, server)
+        wrong = page.value(f"{DELIVER}({json.dumps(said)}, {json.dumps(changes)})")
+        assert wrong == [], "\n".join(wrong)
+    finally:
+        page.call("Page.removeScriptToEvaluateOnNewDocument", identifier=script)

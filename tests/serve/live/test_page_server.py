@@ -15,10 +15,11 @@ from in_memory_keys import ChangingKeys
 from vlagents_ray.client.credentials import Credentials
 from vlagents_ray.client.transports.websocket import open_websocket
 from vlagents_ray.errors import ConfigError
+from vlagents_ray.serve.live.endpoint import page_server
 from vlagents_ray.serve.live.fleet import Fleet
-from vlagents_ray.serve.live.page_server import page_server
 
 HERE = ("127.0.0.1", 0)
+NONE = dict[int, Path]().get
 
 
 def get(url: str, headers: Mapping[str, str] = {}) -> tuple[int, bytes]:
@@ -35,7 +36,7 @@ def fleet() -> Fleet:
 
 
 def test_it_is_there_until_the_end_of_the_context() -> None:
-    with page_server(fleet(), HERE, None, name="eval") as url:
+    with page_server(fleet(), HERE, None, name="eval", videos={}.get) as url:
         assert get(url)[0] == 200
         status, text = get(url.replace("/live", "/v1/live"))
         assert (status, json.loads(text)["evaluation"]) == (200, {"done": 1})
@@ -45,7 +46,7 @@ def test_it_is_there_until_the_end_of_the_context() -> None:
 
 
 def test_a_viewer_does_not_keep_it_from_ending() -> None:
-    with page_server(fleet(), HERE, None, name="eval") as url:
+    with page_server(fleet(), HERE, None, name="eval", videos={}.get) as url:
         viewer = open_websocket(url.replace("http", "ws").replace("/live", "/v1/live"), Credentials(""), 10)
     viewer.close()
 
@@ -66,13 +67,19 @@ def test_videos_are_files_by_number_for_those_who_may_watch(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("host", ["::", "192.0.2.1", "gpu-box"])
-def test_other_machines_want_a_key(host: str) -> None:
-    with pytest.raises(ConfigError, match="--scope watch"), page_server(fleet(), (host, 0), None, name="eval"):
+def test_other_machines_need_a_key(host: str) -> None:
+    with (
+        pytest.raises(ConfigError, match="--scope watch"),
+        page_server(fleet(), (host, 0), None, name="eval", videos={}.get),
+    ):
         pass
 
 
 def test_a_port_in_use_is_told() -> None:
     with socket.create_server(HERE) as taken:
         address = ("127.0.0.1", taken.getsockname()[1])
-        with pytest.raises(ConfigError, match="choose another port"), page_server(fleet(), address, None, name="eval"):
+        with (
+            pytest.raises(ConfigError, match="choose another port"),
+            page_server(fleet(), address, None, name="eval", videos={}.get),
+        ):
             pass

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from vlagents_ray import Obs, RemoteAgent
 from vlagents_ray.chunking.execution import PLAYED
 from vlagents_ray.chunking.player import ChunkPlayer
 from vlagents_ray.interface import Act, Agent
+from vlagents_ray.protocol.json_messages import plain_values
 from vlagents_ray.protocol.messages import Request
 from vlagents_ray.serve.live.tap import ROWS, VALUES, Played
 
@@ -69,6 +71,37 @@ def test_a_statement_of_another_form_is_left_out(changes: dict[str, Any]) -> Non
     assert Played.of(Request("act", Obs(info={PLAYED: GOOD | changes}))) is None
     assert Played.of(Request("act", Obs(info={PLAYED: [GOOD]}))) is None
     assert Played.of(Request("act", Obs())) is None
+
+
+@pytest.mark.parametrize("name", [*GOOD, "safe_ticks", "reconnects", "more"])
+@pytest.mark.parametrize(
+    "value",
+    [
+        "soon",
+        "",
+        b"7",
+        True,
+        None,
+        [7],
+        {"a": 1},
+        float("nan"),
+        float("inf"),
+        10**30,
+        np.float64(3),
+        np.zeros(3),
+        -1,
+        2.5,
+    ],
+)
+def test_entries_of_every_type_are_numbers_or_left_out(name: str, value: Any) -> None:
+    played = Played.of(Request("act", Obs(info={PLAYED: GOOD | {name: value}})))
+    if played is None:
+        assert name in ("steps", "rows")
+        return
+    text = json.dumps(plain_values({"steps": played.steps, "rows": played.rows, **played.said}), allow_nan=False)
+    said = {key: one for key, one in json.loads(text).items() if key not in ("steps", "rows", "safe")}
+    assert all(type(one) in (int, float) for one in said.values())
+    assert "more" not in said
 
 
 def test_a_statement_is_copied_and_bounded() -> None:

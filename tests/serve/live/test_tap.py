@@ -90,7 +90,7 @@ def test_unreadable_requests_are_kept_as_errors(watched: Watched) -> None:
     refused = Reply()
     watched.tap.note([""], [refused], {}, watched.replies.append)([refused])
     [answer] = watched.tap.answers(0)
-    assert (answer.op, answer.reply) == ("unknown", refused)
+    assert (answer.op, answer.session) == ("unknown", "")
 
 
 def test_observations_are_kept_ten_times_a_second_at_most(watched: Watched) -> None:

@@ -17,8 +17,8 @@ from vlagents_ray.evaluate.report.progress import Progress
 from vlagents_ray.evaluate.report.progress_document import ProgressDocument
 from vlagents_ray.evaluate.report.results_document import ResultsDocument
 from vlagents_ray.serve.access.api_keys import load_keys
+from vlagents_ray.serve.live.endpoint import page_server, require_watch_keys
 from vlagents_ray.serve.live.fleet import Fleet
-from vlagents_ray.serve.live.page_server import page_server, require_watch_keys
 from vlagents_ray.serve.ports import LOOPBACK, is_free
 from vlagents_ray.serve.scaling.replica_views import ReplicaViews
 

@@ -46,6 +46,17 @@ def require_own_page(headers: Mapping[str, str], hosts: Collection[str] = ()) ->
         )
 
 
+def require_same_origin(headers: Mapping[str, str]) -> None:
+    """Refuse GETs of other sites' pages, also those that carry no `origin`, such as the loading of an image.
+
+    Raises:
+        Forbidden: A browser states that another site's page sent it.
+    """
+    site = headers.get("sec-fetch-site", "none")
+    if site not in ("same-origin", "none"):
+        raise Forbidden(f"sec-fetch-site: got {site[:40]!r}, want 'same-origin'; open the live page itself")
+
+
 def _is_own(origin: str, host: str | None) -> bool:
     try:
         parts = urlsplit(origin)

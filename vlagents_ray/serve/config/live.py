@@ -20,6 +20,8 @@ class LiveArgs(BaseModel):
         default=256.0, gt=0, description="memory that all sessions of a replica take at most, MB; the oldest goes first"
     )
 
+    most_gb: float = Field(default=50.0, gt=0, description="size of the folder at which nothing more is saved, GB")
+
     @field_validator("folder")
     @classmethod
     def _absolute(cls, folder: str) -> str:

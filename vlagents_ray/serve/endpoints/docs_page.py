@@ -17,7 +17,7 @@ from vlagents_ray.protocol.messages import (
     STEP_HEADER,
 )
 
-_STYLE = """
+STYLE = """
 :root { color-scheme: light dark; font: 16px/1.5 system-ui, sans-serif; }
 body { max-width: 52rem; margin: 2rem auto; padding: 0 1rem; }
 pre, code { font: 0.9em/1.4 ui-monospace, monospace; }
@@ -106,7 +106,7 @@ def docs_page(metadata: dict[str, Any]) -> str:
     )
     return f"""<!doctype html><html lang="en"><head><meta charset="utf-8">
 <meta name="viewport" content="width=device-width"><title>vlagents_ray: {policy}</title>
-<style>{_STYLE}</style></head><body>
+<style>{STYLE}</style></head><body>
 <h1>{policy}</h1>
 <p>A policy served by vlagents_ray {html.escape(str(metadata["version"]))}, protocol {metadata["protocol"]}.
 Choose a session id for each robot or environment and send it as <code>{SESSION_HEADER}</code> with every request:

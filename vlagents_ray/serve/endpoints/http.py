@@ -24,7 +24,7 @@ from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.requests import Request as HttpRequest
-from starlette.responses import HTMLResponse, JSONResponse, PlainTextResponse, Response
+from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
@@ -44,11 +44,12 @@ from vlagents_ray.protocol.messages import (
     Request,
 )
 from vlagents_ray.serve.access.api_keys import current_caller
-from vlagents_ray.serve.endpoints.docs_page import docs_page
+from vlagents_ray.serve.endpoints.docs_page import STYLE, docs_page
 from vlagents_ray.serve.endpoints.http_messages import (
     RequestDecoder,
     deny,
     headers_of,
+    html_response,
     problem_response,
     request_id,
     session_id,
@@ -138,7 +139,7 @@ class _HttpEndpoint:
         return self._when_ready(http, lambda: JSONResponse(plain_values(self._metadata())))
 
     async def docs(self, http: HttpRequest) -> Response:
-        return self._when_ready(http, lambda: HTMLResponse(docs_page(self._metadata())))
+        return self._when_ready(http, lambda: html_response(docs_page(self._metadata()), styles=[STYLE]))
 
     async def probe(self, http: HttpRequest) -> Response:
         """Reply to a probe, without a session and without the policy."""

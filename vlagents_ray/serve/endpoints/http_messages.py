@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import math
 import uuid
+from collections.abc import Sequence
 from functools import partial
 from typing import cast
 
 from starlette.exceptions import HTTPException
 from starlette.formparsers import MultiPartException
 from starlette.requests import Request as HttpRequest
-from starlette.responses import JSONResponse, Response
+from starlette.responses import HTMLResponse, JSONResponse, Response
 from starlette.types import Message, Receive, Scope
 from starlette.websockets import WebSocket
 
@@ -250,6 +253,34 @@ async def deny(socket: WebSocket, error: VLAgentsError) -> None:
         await socket.send_denial_response(problem_response(error, ""))
     else:
         await socket.close(_POLICY_VIOLATION)
+
+
+def html_response(html: str, *, styles: Sequence[str] = (), scripts: Sequence[str] = (), more: str = "") -> Response:
+    """Return a page that loads nothing from elsewhere, and that no other site's page may frame.
+
+    Args:
+        html: The page.
+        styles: The texts of its style elements; no other style counts.
+        scripts: The texts of its script elements; no other script runs.
+        more: Further directives of its content security policy.
+    """
+    policy = [
+        f"{kind}-src {' '.join(map(_digest, texts))}"
+        for kind, texts in (("style", styles), ("script", scripts))
+        if texts
+    ]
+    policy = ["default-src 'none'", *policy, *filter(None, [more])]
+    headers = {
+        "content-security-policy": "; ".join([*policy, "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"]),
+        "cache-control": "no-cache",
+        "referrer-policy": "no-referrer",
+        "x-content-type-options": "nosniff",
+    }
+    return HTMLResponse(html, headers=headers)
+
+
+def _digest(text: str) -> str:
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
 
 
 def problem_response(error: VLAgentsError, request_id: str, status: int | None = None) -> Response:

@@ -1,8 +1,9 @@
-"""Commands to the sessions of a replica, from those who may operate them on the live page.
+"""Commands to the sessions of a replica, from keys that may operate them on the live page.
 
-A robot is reached by nothing but the answers to its own requests. So a command waits for the next one, but no longer
-than `_WAITS_S`, since a late one would surprise whoever stands at the robot. A later request of the robot says what
-became of it. What concerns the weights is done here.
+From a network a robot can only be made to stop: it is paused, stopped, or its episode is marked. What makes it move
+(resuming, another instruction, a human's motion) is done at the robot. A command travels in the answer to the next
+request of the robot, within `_WAITS_S` or never, since a late one would surprise the person beside it; a later request
+states the outcome. The server itself executes `HERE` and `SAVE`.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from vlagents_ray.client.commands import COMMAND, COMMANDED, COMMANDS
+from vlagents_ray.client.commands import COMMAND, COMMANDED
 from vlagents_ray.errors import InvalidInput, Overloaded, UnknownSession, VLAgentsError
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.models.loaded_model import LoadedModel
@@ -24,17 +25,19 @@ from vlagents_ray.serve.sessions import SessionTable
 
 logger = logging.getLogger(__name__)
 
+TO_ROBOT = ("pause", "stop", "success", "failure")
+"""The commands that are sent to a robot. None of them makes it move."""
 HERE = {"follow": True, "pin": False}
-"""The commands that the server itself obeys: whether a session's later episodes take the newest weights."""
+"""The commands that the server executes: whether a session's later episodes take the newest weights."""
 SAVE = "save"
 """The command that saves the session's last seconds, which the server does as well."""
+COMMANDS = (*TO_ROBOT, *HERE, SAVE)
 
-TRACKED_S = 15.0  # time for which the answer to a command is looked out for
+TRACKED_S = 15.0  # time for which the outcome of a command is awaited
 _WAITS_S = 5.0  # time within which a command has to reach the robot
 _SHOWN = 5  # last commands of a session that are shown
-_UNANSWERED = 3  # requests without an answer to a command, after which it counts as ignored
-_TEXT = 1000  # most characters of an instruction
-_REFUSAL = 200
+_UNANSWERED = 3  # requests without the outcome of a command, after which it counts as ignored
+_REFUSAL = 200  # most characters of a reason
 
 State = Literal["waiting", "sent", "saving", "done", "refused", "ignored", "too late"]
 
@@ -45,7 +48,6 @@ class Press:
 
     id: str
     do: str
-    text: str
     by: str  # name of the key; empty without keys
     pressed: float  # s, of the board's clock
     state: State = "waiting"
@@ -54,7 +56,7 @@ class Press:
 
     def describe(self) -> dict[str, Any]:
         """Return it for viewers."""
-        return {"id": self.id, "do": self.do, "text": self.text, "by": self.by, "state": self.state, "why": self.why}
+        return {"id": self.id, "do": self.do, "by": self.by, "state": self.state, "why": self.why}
 
 
 class CommandBoard:
@@ -84,34 +86,36 @@ class CommandBoard:
         self._presses: dict[str, list[Press]] = {}  # by session, oldest first
         self._lock = threading.Lock()
 
-    def press(self, session_id: str, do: str, text: str, by: str) -> dict[str, Any]:
-        """Take a command for a session, and return it as `of` does.
+    def press(self, session_id: str, do: str, by: str) -> dict[str, Any]:
+        """Accept a command for a session, and return it as `of` does.
 
         Args:
             session_id: Id of the session in the engine.
-            do: One of `COMMANDS` or `HERE`, or `SAVE`.
-            text: The new instruction, for "instruct".
+            do: One of `COMMANDS`.
             by: Name of the key whose holder commands.
 
         Raises:
             UnknownSession: The session is not here.
-            InvalidInput: There is no such command, or it lacks its text.
+            InvalidInput: There is no such command.
             Overloaded: Too many commands wait for the session's next request.
         """
-        if do not in (*COMMANDS, *HERE, SAVE):
-            raise InvalidInput(f"do: got {do[:40]!r}, want one of {[*COMMANDS, *HERE, SAVE]}")
-        if (do == "instruct") != bool(text) or len(text) > _TEXT:
-            raise InvalidInput(f"text: got {len(text)} characters, want 1 to {_TEXT} with 'instruct', else none")
+        if do not in COMMANDS:
+            raise InvalidInput(
+                f"do: got {do[:40]!r}, want one of {list(COMMANDS)}; resume a robot, change its instruction or move "
+                f"it at the robot"
+            )
         session = next((one for one in self._sessions.all() if one.id == session_id), None)  # `get` would mark it used
         if session is None:
             raise UnknownSession(f"session {session_id[:80]!r}: is not here; it ended, or has begun again elsewhere")
-        pressed = Press(f"{self._prefix}-{next(self._numbers)}", do, text, by, self._clock())
+        pressed = Press(f"{self._prefix}-{next(self._numbers)}", do, by, self._clock())
         self.forget_others(self._sessions.ids())
         with self._lock:
             held = self._presses.setdefault(session_id, [])
             self._expire(held)
             if len(held) == _SHOWN:
                 over = next((one for one in held if one.state not in ("waiting", "saving")), None)
+                if over is None and do == "stop":  # is never refused for commands that matter less
+                    over = next((one for one in held if one.state == "waiting" and one.do != "stop"), None)
                 if over is None:
                     raise Overloaded(f"session {session_id!r}: {_SHOWN} commands wait already for its robot's request")
                 held.remove(over)
@@ -127,7 +131,7 @@ class CommandBoard:
         return pressed.describe()
 
     def note(self, session_id: str, request: Request) -> None:
-        """Note what a session's request says of earlier commands."""
+        """Note the outcomes of earlier commands that a session's request states."""
         held = self._presses.get(session_id)
         if not held or request.obs is None:
             return
@@ -152,12 +156,12 @@ class CommandBoard:
             self._expire(held)
             for one in sorted(held, key=lambda one: one.do != "stop"):
                 if one.state == "waiting":
-                    reply.act.info[COMMAND] = {"id": one.id, "do": one.do, "text": one.text, "by": one.by}
+                    reply.act.info[COMMAND] = {"id": one.id, "do": one.do, "by": one.by}
                     one.state = "sent"
                     return
 
     def of(self, session_id: str) -> list[dict[str, Any]]:
-        """Return the last commands to a session, oldest first."""
+        """Return the last commands to a session, oldest first: `id`, `do`, `by`, `state` and `why` of each."""
         with self._lock:
             held = self._presses.get(session_id, [])
             self._expire(held)
@@ -178,7 +182,7 @@ class CommandBoard:
             pressed.why, pressed.state = str(error)[:_REFUSAL], "refused"
 
     def _expire(self, held: Collection[Press]) -> None:
-        """Give up what has waited for too long; the caller holds the lock."""
+        """Give up the commands that have waited for too long; the caller holds the lock."""
         oldest = self._clock() - _WAITS_S
         for one in held:
             if one.state == "waiting" and one.pressed < oldest:

@@ -4,11 +4,14 @@
     GET /v1/live   what the replicas do now, as JSON without pictures; keys need the scope "watch"
     WS  /v1/live   the same with pictures, at most ten times a second
     POST /v1/live/command   {"session": …, "do": "pause"}: see `CommandBoard.press`; keys need the scope "operate"
-    WS  /v1/live/control, /v1/live/robot    a human moves a robot: see `vlagents_ray.serve.live.remote.endpoint`
-    GET /v1/live/videos/7   a video to which the document refers by its number, where an evaluation is watched
+
+A process that is no replica, such as the driver of an evaluation, serves them by `page_server`. Its page offers no
+commands, but videos:
+
+    GET /v1/live/videos/7   a video to which the document refers by its number
 
 The viewer asks for each message, with the sessions whose pictures it shows: {"shown": ["arm-1", …]}. So a slow viewer
-misses what is old, and delays nobody. The answer is the length of a JSON document (32 bits, little-endian), the
+misses old messages, and delays no other. The answer is the length of a JSON document (32 bits, little-endian), the
 document, and the files to which it refers by their index in `files`, the list of their lengths.
 
 A page in a browser cannot set a header: it states its key among the WebSocket's subprotocols, as "vlagents.key.KEY".
@@ -17,35 +20,36 @@ A page in a browser cannot set a header: it states its key among the WebSocket's
 from __future__ import annotations
 
 import asyncio
-import base64
-import hashlib
 import json
-import logging
 import struct
-from collections.abc import Callable
-from contextlib import suppress
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from functools import cache
 from importlib.resources import files as package_files
 from pathlib import Path
+from socket import AF_INET, AF_INET6, create_server
 from typing import Any
 
+import uvicorn
+from starlette.applications import Starlette
 from starlette.requests import ClientDisconnect
 from starlette.requests import Request as HttpRequest
-from starlette.responses import FileResponse, HTMLResponse, JSONResponse, Response
+from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from vlagents_ray.errors import MalformedMessage, MessageTooLarge, Overloaded, VLAgentsError
+from vlagents_ray.client.credentials import is_loopback
+from vlagents_ray.errors import ConfigError, MalformedMessage, MessageTooLarge, Overloaded, VLAgentsError
 from vlagents_ray.protocol.json_messages import problem
-from vlagents_ray.serve.access.api_keys import Caller, current_caller
+from vlagents_ray.serve.access.api_keys import Caller, Keys, current_caller
 from vlagents_ray.serve.access.audit import log_pressed
+from vlagents_ray.serve.access.origin_check import require_same_origin
 from vlagents_ray.serve.access.scope_check import ScopeCheck, caller_name
-from vlagents_ray.serve.endpoints.access_middleware import LIVE_PAGE
-from vlagents_ray.serve.endpoints.http_messages import deny, problem_response, request_id
+from vlagents_ray.serve.endpoints.access_middleware import LIVE_PAGE, AccessMiddleware
+from vlagents_ray.serve.endpoints.http_messages import deny, html_response, problem_response, request_id
 from vlagents_ray.serve.live.fleet import Fleet, Viewer
-from vlagents_ray.serve.live.remote.endpoint import remote_routes
-
-logger = logging.getLogger(__name__)
 
 PATH = "/v1/live"
 _PROTOCOL = "vlagents.live"
@@ -54,9 +58,12 @@ _WATCH, _OPERATE = "watch", "operate"  # scopes of keys
 _COMMAND_BYTES = 2**14  # longest command
 _VIEWERS = 32  # most viewers at once
 _SILENT_S = 30.0  # longest time between two messages of a viewer
-_SCRIPTS = ("evaluation.js", "takeover.js", "live.js")
+_SCRIPTS = ("evaluation.js", "live.js")
 _CHARACTERS = 2**16  # longest message of a viewer
-_POLICY_VIOLATION, _TRY_AGAIN_LATER = 1008, 1013  # WebSocket close codes
+_POLICY_VIOLATION = 1008  # WebSocket close code
+_LAST_S = 0.5  # time for viewers to be sent how an evaluation ended
+_END_S = 1  # time limit for their connections to close, s
+_LEAVE_S = 5.0  # time limit for all of it
 
 VideoFiles = Callable[[int], Path | None]
 """Returns the file of the video with a number; None if there is none."""
@@ -67,19 +74,19 @@ def live_routes(fleet: Fleet, *, open_to_network: bool, videos: VideoFiles | Non
 
     Args:
         fleet: Gathers what the page shows.
-        open_to_network: Whether other machines reach this server without a key; nobody may then watch, as the pictures
-            of all robots would be public.
-        videos: Finds the videos to which the document refers, if it does.
+        open_to_network: Whether other machines reach this server without a key; watching is then refused, as the
+            pictures of all robots would be public.
+        videos: Finds the videos to which the document of an evaluation refers; None on a policy's server.
     """
     endpoint = _LiveEndpoint(fleet, open_to_network, videos)
     routes: list[BaseRoute] = [
         Route(LIVE_PAGE, _page),
         Route(PATH, endpoint.show),
         WebSocketRoute(PATH, endpoint.watch),
-        Route(_COMMAND, endpoint.press, methods=["POST"]),
     ]
-    routes += remote_routes(fleet, open_to_network=open_to_network)
-    return routes if videos is None else [*routes, Route(f"{PATH}/videos/{{number:int}}", endpoint.video)]
+    if videos is None:
+        return [*routes, Route(_COMMAND, endpoint.press, methods=["POST"])]
+    return [*routes, Route(f"{PATH}/videos/{{number:int}}", endpoint.video)]
 
 
 class _LiveEndpoint:
@@ -91,6 +98,7 @@ class _LiveEndpoint:
 
     async def show(self, http: HttpRequest) -> Response:
         try:
+            require_same_origin(http.headers)
             self._scopes.require(_WATCH)
         except VLAgentsError as error:
             return problem_response(error, request_id(http))
@@ -103,6 +111,7 @@ class _LiveEndpoint:
 
     async def video(self, http: HttpRequest) -> Response:
         try:
+            require_same_origin(http.headers)
             self._scopes.require(_WATCH)
         except VLAgentsError as error:
             return problem_response(error, request_id(http))
@@ -112,14 +121,14 @@ class _LiveEndpoint:
     async def press(self, http: HttpRequest) -> Response:
         try:
             self._scopes.require(_OPERATE)
-            session, do, text = _command(await _body(http))
+            session, do = _command(await _body(http))
             by = caller_name()
-            pressed = await self._fleet.press(session, do, text, by)
+            pressed = await self._fleet.press(session, do, by)
         except ClientDisconnect:
             return Response(status_code=499)
         except VLAgentsError as error:
             return problem_response(error, request_id(http))
-        log_pressed(by, f"{do!r} {text!r} for session {session!r}" if text else f"{do!r} for session {session!r}")
+        log_pressed(by, f"{do!r} for session {session!r}")
         return JSONResponse(pressed)
 
     async def watch(self, socket: WebSocket) -> None:
@@ -154,7 +163,8 @@ class _LiveEndpoint:
             viewer.shown = frozenset(await self._asked(socket))
             document, files = await viewer.next()
             self._scopes.require(_WATCH)
-            await socket.send_bytes(_message({**document, "may_operate": self._scopes.may(_OPERATE)}, files))
+            may_operate = self._videos is None and self._scopes.may(_OPERATE)
+            await socket.send_bytes(_message({**document, "may_operate": may_operate}, files))
 
     async def _asked(self, socket: WebSocket) -> list[str]:
         try:
@@ -186,16 +196,16 @@ async def _body(http: HttpRequest) -> bytes:
     return parts
 
 
-def _command(body: bytes) -> tuple[str, str, str]:
-    """Return session, command and text in a body."""
+def _command(body: bytes) -> tuple[str, str]:
+    """Return session and command in a body."""
     try:
         stated = json.loads(body)
-        found = stated["session"], stated["do"], stated.get("text", "")
-        if not all(isinstance(one, str) for one in found):
+        session, do = stated["session"], stated["do"]
+        if not isinstance(session, str) or not isinstance(do, str):
             raise TypeError
-    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
-        raise MalformedMessage(f'live: got {body[:80]!r}, want {{"session": ..., "do": ..., "text": ...}}') from error
-    return found
+    except (ValueError, TypeError, KeyError, RecursionError) as error:
+        raise MalformedMessage(f'live: got {body[:80]!r}, want {{"session": ..., "do": ...}}') from error
+    return session, do
 
 
 def _message(document: dict[str, Any], files: list[bytes]) -> bytes:
@@ -205,23 +215,70 @@ def _message(document: dict[str, Any], files: list[bytes]) -> bytes:
 
 
 async def _page(_: HttpRequest) -> Response:
-    html, policy = live_page()
-    return HTMLResponse(html, headers={"content-security-policy": policy, "cache-control": "no-cache"})
+    html, style, *scripts = live_page()
+    more = "connect-src 'self'; img-src blob: data:; media-src blob:"
+    return html_response(html, styles=[style], scripts=scripts, more=more)
 
 
 @cache
-def live_page() -> tuple[str, str]:
-    """Return the page with its style and script in it, and the policy that lets a browser load nothing else."""
+def live_page() -> list[str]:
+    """Return the page with its style and scripts in it, and these: the style first."""
     folder = package_files("vlagents_ray.serve.live") / "page"
     parts = {name: folder.joinpath(name).read_text(encoding="utf-8") for name in ("live.css", *_SCRIPTS)}
     html = folder.joinpath("live.html").read_text(encoding="utf-8")
     for name, part in parts.items():
         html = html.replace(f"/* {name} */", part)
-    scripts = " ".join(_digest(parts[name]) for name in _SCRIPTS)
-    own = f"script-src {scripts}; style-src {_digest(parts['live.css'])}; connect-src 'self'"
-    media = "img-src blob: data:; media-src blob:"
-    return html, f"default-src 'none'; {own}; {media}; base-uri 'none'; form-action 'none'"
+    return [html, *parts.values()]
 
 
-def _digest(text: str) -> str:
-    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+def require_watch_keys(host: str, keys: Keys | None) -> None:
+    """Raise `ConfigError` if other machines would reach a page on `host` without a key."""
+    if keys is None and not is_loopback(host):
+        raise ConfigError(
+            f"live page on {host}: without keys all cameras would be public. Make a key (`vlagents-ray keys new NAME "
+            f"--scope watch --file keys.json`) and set VLAGENTS_RAY_KEYS_FILE=keys.json; or stay on loopback, and look "
+            f"at it through `ssh -L`"
+        )
+
+
+@contextmanager
+def page_server(
+    fleet: Fleet, address: tuple[str, int], keys: Keys | None, *, name: str, videos: VideoFiles
+) -> Iterator[str]:
+    """Serve the live page of an evaluation on a thread for the length of the context.
+
+    Args:
+        fleet: Gathers what the page shows.
+        address: (host, port) to listen on; port 0 is any that is free.
+        keys: The keys of viewers; None admits all, which only loopback allows.
+        name: What the keys call this server, where they are for some applications alone.
+        videos: As for `live_routes`.
+
+    Yields:
+        The address of the page.
+
+    Raises:
+        ConfigError: Other machines would reach the page without a key, or the address is not free.
+    """
+    host, port = address
+    require_watch_keys(host, keys)
+    try:
+        listening = create_server((host, port), family=AF_INET6 if ":" in host else AF_INET)
+    except OSError as error:
+        raise ConfigError(
+            f"live page: cannot listen on {host}:{port} ({error.strerror}); choose another port"
+        ) from error
+    app = AccessMiddleware(Starlette(routes=live_routes(fleet, open_to_network=False, videos=videos)), keys, name)
+    config = uvicorn.Config(
+        app, log_config=None, lifespan="off", ws="websockets-sansio", timeout_graceful_shutdown=_END_S
+    )
+    server = uvicorn.Server(config)
+    thread = threading.Thread(target=lambda: asyncio.run(server.serve([listening])), name="live-page", daemon=True)
+    thread.start()
+    try:
+        yield f"http://{f'[{host}]' if ':' in host else host}:{listening.getsockname()[1]}{LIVE_PAGE}"
+    finally:
+        if fleet.watched:
+            time.sleep(_LAST_S)
+        server.should_exit = True
+        thread.join(_LEAVE_S)  # it may wait for a Ray that is lost

@@ -5,26 +5,23 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
+from collections import deque
 from collections.abc import Awaitable, Callable, Collection
 from contextlib import suppress
 from functools import partial
 from typing import Any, Protocol
 
 from vlagents_ray.errors import UnknownSession
-from vlagents_ray.serve.live.remote.robot_links import RobotLinks
 from vlagents_ray.serve.live.snapshot import ReplicaView, Snapshot
 from vlagents_ray.serve.live.tap import RATE
 
 logger = logging.getLogger(__name__)
 
 _BEHIND = 20  # most gathered snapshots that wait for a slow viewer; it misses the oldest
+_WAITING_BYTES = 2**26  # most bytes of pictures that wait for it
 
 Other = Callable[[int, Collection[str]], Awaitable[Snapshot]]
 """Returns another replica's snapshot: since which, and the sessions whose pictures are wanted."""
-
-
-Exchange = Callable[[str, str, dict[str, Any]], Awaitable[dict[str, Any] | None]]
-"""`vlagents_ray.serve.live.remote.robot_links.RobotLinks.exchange` of a replica."""
 
 Beside = Callable[[], dict[str, Any]]
 """Returns further entries of the document; the same object as before if nothing in them has changed."""
@@ -37,12 +34,8 @@ class OtherReplicas(Protocol):
         """Return the reader of the snapshots of each, by name."""
         ...
 
-    async def press(self, session: str, do: str, text: str, by: str) -> dict[str, Any] | None:
+    async def press(self, session: str, do: str, by: str) -> dict[str, Any] | None:
         """Give a command to a session of one of them, see `CommandBoard.press`; None if none has the session."""
-        ...
-
-    async def exchange(self, session: str) -> Exchange | None:
-        """Return `RobotLinks.exchange` of the one that has the connection of the session's robot; None if none has."""
         ...
 
 
@@ -51,22 +44,29 @@ class Viewer:
 
     def __init__(self) -> None:
         self.shown: frozenset[str] = frozenset()  # the sessions whose pictures it shows
-        self._waiting: asyncio.Queue[list[Snapshot]] = asyncio.Queue()
+        self._waiting: deque[list[Snapshot]] = deque()
+        self._came = asyncio.Event()
         self._beside: dict[str, Any] = {}  # what was last to be sent beside the snapshots
         self._sent = self._beside
 
     def put(self, snapshots: list[Snapshot], beside: dict[str, Any] | None = None) -> None:
         """Add what is to be sent, and drop the oldest of too much; `beside` is sent if it is another than before."""
-        if self._waiting.qsize() >= _BEHIND:
-            self._waiting.get_nowait()
-        self._waiting.put_nowait(snapshots)
+        self._waiting.append(snapshots)
+        self._came.set()
+        while len(self._waiting) > 1 and (len(self._waiting) > _BEHIND or self.waiting_bytes > _WAITING_BYTES):
+            self._waiting.popleft()
         self._beside = beside or self._beside
+
+    @property
+    def waiting_bytes(self) -> int:
+        """The bytes of the pictures that wait."""
+        return sum(len(file) for snapshots in self._waiting for one in snapshots for file in one.files)
 
     async def next(self) -> tuple[dict[str, Any], list[bytes]]:
         """Wait for snapshots; return all that wait as one document and the files that it refers to."""
-        gathered = [await self._waiting.get()]
-        while not self._waiting.empty():
-            gathered.append(self._waiting.get_nowait())
+        await self._came.wait()
+        self._came.clear()
+        gathered, self._waiting = self._waiting, deque()
         files: list[bytes] = []
         replicas = [_with_files(one, files, self.shown) for snapshots in gathered for one in snapshots]
         document = {"time": time.time(), "replicas": replicas}
@@ -110,26 +110,15 @@ class Fleet:
             self._gathering.cancel()
             self._gathering = None
 
-    async def press(self, session: str, do: str, text: str, by: str) -> dict[str, Any]:
+    async def press(self, session: str, do: str, by: str) -> dict[str, Any]:
         """Give a command to a session of any replica, see `CommandBoard.press`, and return it."""
         if self._own is not None:
             with suppress(UnknownSession):
-                return self._own.commands.press(session, do, text, by)
-        pressed = None if self._others is None else await self._others.press(session, do, text, by)
+                return self._own.commands.press(session, do, by)
+        pressed = None if self._others is None else await self._others.press(session, do, by)
         if pressed is None:
-            raise UnknownSession(f"session {session!r}: no replica has it; it has ended")
+            raise UnknownSession(f"session {session[:80]!r}: no replica has it; it has ended")
         return pressed
-
-    @property
-    def robots(self) -> RobotLinks | None:
-        """The connections of robots at this process; None if it is no replica."""
-        return None if self._own is None else self._own.robots
-
-    async def exchange(self, session: str) -> Exchange | None:
-        """Return the way to the robot of a session, at any replica; None if it lets nobody move it."""
-        if self._own is not None and await self._own.robots.exchange(session, "", {"do": "find"}) is not None:
-            return self._own.robots.exchange
-        return None if self._others is None else await self._others.exchange(session)
 
     async def _gather(self) -> None:
         while True:

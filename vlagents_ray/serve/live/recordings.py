@@ -11,8 +11,6 @@ from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import numpy as np
-
 from vlagents_ray.naming import plain
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.live.tap import Answer, LiveTap, Seen
@@ -27,7 +25,7 @@ _PERIOD_S = 0.05
 _SHARE = 0.1  # of a core, at most
 _NICE = 5  # the thread runs after the policy's
 _CLOSING_S = 5.0
-_NAME = 8  # characters of a session's id in the name of a file: whoever lists the folder does not learn it
+_NAME = 8  # characters of a session's id in the name of a file: a list of the folder does not state it
 
 
 @dataclass(slots=True)
@@ -40,9 +38,9 @@ class _SessionEpisode:
 class SessionRecordings:
     """Writes an episode for each `reset` of a session, until the next one or the session's end.
 
-    One thread reads the tap twenty times a second, and writes every answer with its chunk and times, ten of them a
-    second with the states and pictures that they answer. It takes at most a tenth of a core; when that is too little,
-    what the tap no longer has is not shown.
+    One thread reads the tap twenty times a second, and writes every answer with its times and its chunk (as far as the
+    tap keeps it, `ROWS` x `VALUES`), ten of them a second with the states and pictures that they answer. It takes at
+    most a tenth of a core; where that is too little, older answers are left out.
     """
 
     def __init__(self, engine: Engine, tap: LiveTap, targets: Mapping[str, str]) -> None:
@@ -83,6 +81,7 @@ class SessionRecordings:
             if answer.op in _SHOWN_OPS:
                 answers[answer.session].append(answer)
         sessions = {session.id: session.instruction for session in self._engine.sessions.all()}
+        self._tap.forget_others(sessions)
         for name, [*earlier, last] in answers.items():
             for answer in earlier:
                 self._write(name, sessions.get(name), answer, None)
@@ -92,12 +91,12 @@ class SessionRecordings:
 
     def _write(self, name: str, instruction: str | None, answer: Answer, seen: Seen | None) -> None:
         episode = self._episodes.get(name)
-        if episode is None and answer.reply.error is not None:  # there is no such session, maybe
+        if episode is None and answer.error:  # there is no such session, maybe
             return
         shown = 0 if episode is None else episode.seen
         if seen is not None and seen.number <= shown:
             seen = None
-        if episode is None or (answer.op == "reset" and answer.reply.error is None):
+        if episode is None or (answer.op == "reset" and not answer.error):
             self._end(name)
             episode = self._episodes[name] = _SessionEpisode(self._begun(name, instruction), shown)
         frame = _frame(episode, answer, seen)
@@ -141,8 +140,7 @@ class SessionRecordings:
 
 def _frame(episode: _SessionEpisode, answer: Answer, seen: Seen | None) -> ViewerFrame:
     """Return what an answer shows, with the observation if it is a new one; count them in the episode."""
-    act, error = answer.reply.act, answer.reply.error
-    rows = None if act is None else np.asarray(act.rows(), np.float32)
+    rows = answer.action
     frame = ViewerFrame(
         tick=episode.acts,
         time=time.time(),
@@ -150,9 +148,9 @@ def _frame(episode: _SessionEpisode, answer: Answer, seen: Seen | None) -> Viewe
         state={} if seen is None else seen.state,
         planned=None if rows is None else rows[0],
         chunk=rows,
-        numbers=dict(answer.reply.timing),
-        note="" if error is None else f"{error.code}: {error}",
+        numbers=dict(answer.timing),
+        note=f"{answer.error}: {answer.detail}" if answer.error else "",
     )
-    episode.acts += act is not None
+    episode.acts += rows is not None
     episode.seen = episode.seen if seen is None else seen.number
     return frame

@@ -2,32 +2,35 @@
 
 A thread reads the tap ten times a second, as a viewer does, and keeps pictures as files: those that clients sent as
 they came, others encoded with at most 4 % of a core, for which frames are left out. All sessions together hold at most
-`memory_mb`; beyond that the oldest frames go first.
+`memory_mb`; beyond that the oldest frames go first. One session is saved at a time, and one frame of it decoded at a
+time, until the folder holds `most_gb`.
 """
 
 from __future__ import annotations
 
 import hashlib
+import os
 import threading
 import time
 from collections import deque
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from vlagents_ray.dataset_contract import GRIPPER
-from vlagents_ray.errors import InvalidInput
+from vlagents_ray.errors import InvalidInput, Overloaded, StorageFailed
 from vlagents_ray.images.jpeg_png import decode
-from vlagents_ray.interface import CAPTURED, Obs
+from vlagents_ray.interface import Obs
 from vlagents_ray.registry import require
-from vlagents_ray.robot.record import Recorder
+from vlagents_ray.robot.dataset import Dataset
 from vlagents_ray.serve.config.live import LiveArgs
 from vlagents_ray.serve.live.tap import ENCODING_SHARE, RATE, LiveTap
 from vlagents_ray.serve.models.loaded_model import LoadedModel
 from vlagents_ray.serve.sessions import SessionTable
 
-_PIXELS = 2**24  # most of a picture that is decoded for an episode
+_PIXELS = 2**25  # most of all pictures of a frame
 _OBJECTS = 1000  # bytes of a frame besides its arrays and files, estimated
 
 
@@ -95,17 +98,17 @@ class Ring:
         """Keep what the tap has now, and drop what is too old or too much."""
         self._tap.renew()
         held = self._sessions.ids()
+        self._tap.forget_others(held)
         begun = time.thread_time()
         longest_without = sorted(held, key=self._newest)
         for name in longest_without:
             seen = self._tap.seen(name)
-            reply = None if seen is None else seen.reply
-            if seen is None or reply is None or reply.act is None or seen.number == self._newest(name):
+            if seen is None or seen.action is None or seen.number == self._newest(name):
                 continue
             if seen.cameras and time.thread_time() - begun >= ENCODING_SHARE / RATE:
                 continue
             at = time.time() - (time.monotonic() - seen.time)
-            frame = HeldFrame(seen.number, at, seen.state, seen.pictures(), np.array(reply.act.rows()[0]))
+            frame = HeldFrame(seen.number, at, seen.state, seen.pictures(), seen.action)
             with self._lock:
                 self._frames.setdefault(name, deque()).append(frame)
                 self.bytes += frame.size
@@ -117,24 +120,45 @@ class Ring:
 
         Raises:
             InvalidInput: Nothing of the session is held.
+            Overloaded: Another session is being saved.
+            StorageFailed: The folder is full.
             VLAgentsError: The episode cannot be written.
         """
+        if not self._saving.acquire(blocking=False):
+            raise Overloaded("save: another session is being saved; press again when that is done")
+        try:
+            return self._save(session)
+        finally:
+            self._saving.release()
+
+    def _save(self, session: str) -> str:
+        folder, most_gb = Path(self._settings.folder), self._settings.most_gb
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        size = _bytes_in(folder)
+        if size >= most_gb * 1e9:
+            raise StorageFailed(
+                f"live.folder: {folder} holds {size / 1e9:.3g} GB, want less than most_gb: {most_gb:g}; make room there"
+            )
         with self._lock:
-            frames = list(self._frames.get(session, ()))
-        frames = [one for one in frames if one.shapes == frames[-1].shapes]
+            held = list(self._frames.get(session, ()))
+        frames = deque(one for one in held if one.shapes == held[-1].shapes)
+        del held
         if not frames:
             raise InvalidInput(f"session {session!r}: nothing to save yet; it has acted on nothing")
         found = next((one for one in self._sessions.all() if one.id == session), None)
-        observations = [_observation(frame) for frame in frames]
-        sizes = {name: image.shape for name, image in observations[0].cameras.items()}
-        kind = hashlib.sha256(repr((frames[0].shapes, sorted(sizes.items()))).encode()).hexdigest()[:8]
-        root = Path(self._settings.folder) / f"{self._name}-{kind}"
-        with self._saving:
-            root.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-            instruction = "" if found is None else found.instruction
-            with Recorder(root, RATE, frames=len(frames)) as recorder, recorder.episode(instruction):
-                for obs, frame in zip(observations, frames, strict=True):
-                    recorder.add(obs, frame.action, tick=frame.number)
+        sizes = sorted((name, image.shape) for name, image in _observation(frames[0]).cameras.items())
+        kind = hashlib.sha256(repr((frames[0].shapes, sizes)).encode()).hexdigest()[:8]
+        root = folder / f"{self._name}-{kind}"
+        dataset = Dataset(root, RATE)
+        episode = dataset.begin("" if found is None else found.instruction)
+        try:
+            while frames:
+                frame = frames.popleft()
+                episode.add(_observation(frame), frame.action, frame.at, frame.number, safe=False)
+            dataset.save(episode.finish())
+        except BaseException:
+            episode.abandon()
+            raise
         return str(root)
 
     def _run(self) -> None:
@@ -158,8 +182,20 @@ class Ring:
             self.bytes -= first.popleft().size
 
 
+def _bytes_in(folder: Path) -> int:
+    size = 0
+    for inside, _, names in os.walk(folder):
+        for name in names:
+            with suppress(OSError):  # another replica has just renamed it
+                size += os.lstat(os.path.join(inside, name)).st_size
+    return size
+
+
 def _observation(frame: HeldFrame) -> Obs:
-    cameras = {name: decode(file, _PIXELS) for name, file in frame.files.items()}
+    cameras, left = {}, _PIXELS
+    for name, file in frame.files.items():
+        cameras[name] = decode(file, left)
+        left -= cameras[name].shape[0] * cameras[name].shape[1]
     state = dict(frame.state)
     gripper = float(state.pop(GRIPPER)[0]) if GRIPPER in state else None
-    return Obs(cameras, gripper, state, {CAPTURED: frame.at})
+    return Obs(cameras, gripper, state)

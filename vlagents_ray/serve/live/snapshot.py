@@ -10,15 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.chunking.execution import WATCHED
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.protocol.json_messages import plain_values
-from vlagents_ray.protocol.messages import Reply
 from vlagents_ray.serve.config.live import LiveArgs
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.metrics_buffer import SAMPLE, STAGES, LoadMeter
 from vlagents_ray.serve.live.commands import CommandBoard
-from vlagents_ray.serve.live.remote.robot_links import RobotLinks
 from vlagents_ray.serve.live.ring import Ring
 from vlagents_ray.serve.live.tap import ENCODING_SHARE, RATE, ROWS, VALUES, Answer, LiveTap, Played, Seen
 from vlagents_ray.serve.models.loaded_model import LoadedModel
@@ -26,11 +23,10 @@ from vlagents_ray.serve.periodic import each_half_second
 from vlagents_ray.serve.sessions import Session
 
 _SESSIONS = 256  # most sessions of a replica that are described
-_TEXT = 200  # most characters of a text in an act's info
+_INSTRUCTION = 1000  # most characters of an instruction
+PICTURES = 2**24  # most bytes of the pictures in a snapshot; further sessions have none
 _STATE_S = 0.5  # time for which slow things are not looked up again
 _SHOWN_OPS = ("act", "reset")
-_INFO = 24  # most entries of an act's info
-_HIDDEN = (WATCHED, "timing", "policy", "behaviour", "distribution")  # of an act's info: shown elsewhere, or our own
 
 
 @dataclass(slots=True)
@@ -61,7 +57,6 @@ class ReplicaView:
         self._about = {"name": name, "node": node, "ring_s": None if settings is None else settings.ring_s}
         self._metadata = metadata
         self.commands = CommandBoard(engine.sessions, self._see_all, save=self._save)
-        self.robots = RobotLinks()
         self.tap = LiveTap(self._show, commands=self.commands)
         self.ring = None if settings is None else Ring(self.tap, engine.sessions, settings, name)
         self._meter: LoadMeter | None = None
@@ -111,7 +106,8 @@ class ReplicaView:
             described["state"] = {part: _numbers(values[:VALUES]) for part, values in seen.state.items()}
             if name in shown and time.thread_time() - begun < ENCODING_SHARE / RATE:
                 described["pictures"] = _pictures(seen, snapshot.files)
-                self._pictured[name] = seen.number
+                if described["pictures"]:
+                    self._pictured[name] = seen.number
         snapshot.document = {
             **self._about,
             **self._state(),
@@ -119,7 +115,6 @@ class ReplicaView:
             "waiting": {rank.name.lower(): depth for rank, depth in engine.queue.depth_by_rank().items()},
             "sessions": list(sessions.values()),
             "sessions_held": len(engine.sessions),
-            "robots": self.robots.describe(),
         }
         return snapshot
 
@@ -166,7 +161,7 @@ def _session(session: Session[LoadedModel], last: Answer | None, played: list[Pl
         "id": session.id,
         "transport": session.transport,
         "step": session.steps - session.first,
-        "instruction": session.instruction,
+        "instruction": session.instruction[:_INSTRUCTION],
         "silent_s": round(time.monotonic() - session.used, 2),
         "version": None if weights is None else weights.number,
         "follows": session.follows,
@@ -183,62 +178,39 @@ def _session(session: Session[LoadedModel], last: Answer | None, played: list[Pl
 def _pictures(seen: Seen, files: list[bytes]) -> dict[str, int]:
     """Add the pictures of an observation to `files`, encoding those that came as pixels; return their indices."""
     found = seen.pictures()
+    if sum(map(len, files)) + sum(map(len, found.values())) > PICTURES:
+        return {}
     files += found.values()
     return dict(zip(found, range(len(files) - len(found), len(files)), strict=True))
 
 
 def _act(answer: Answer) -> dict[str, Any]:
     """Return an answer as a viewer needs it."""
-    reply = answer.reply
-    found: dict[str, Any] = {"n": answer.number, "op": answer.op, "ms": _times(reply)}
-    if reply.error is not None:
-        return found | {"error": reply.error.code, "detail": str(reply.error)[:_TEXT]}
-    if reply.act is not None:
-        rows = reply.act.rows()
-        found |= {
-            "rows": len(rows),
-            "action": _numbers(rows[:ROWS, :VALUES]),
-            "done": reply.act.done,
-            "info": _info(reply.act.info),
-        }
+    ms = {name: round(value, 3) for name, value in answer.timing.items()}
+    found: dict[str, Any] = {"n": answer.number, "op": answer.op, "ms": ms}
+    if answer.error:
+        return found | {"error": answer.error, "detail": answer.detail}
+    if answer.action is not None:
+        found |= {"rows": answer.rows, "action": _numbers(answer.action), "done": answer.done}
+        found["info"] = plain_values(answer.info)
         if answer.played is not None:
             found["at"] = answer.played.said.get("step")
     return found
 
 
-def _times(reply: Reply) -> dict[str, float]:
-    return {name: round(value, 3) for name, value in dict(reply.timing).items()}  # still being completed, maybe
-
-
-def _info(info: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the entries of an act's info that are numbers or short texts."""
-    told: dict[str, Any] = {}
-    for name, value in info.items():
-        if name in _HIDDEN or len(told) == _INFO:
-            continue
-        if isinstance(value, str):
-            told[name] = value[:_TEXT]
-        elif isinstance(value, (bool, int, float)) or np.isscalar(value):
-            told[name] = plain_values(value)
-    return told
-
-
 def _numbers(values: np.ndarray) -> list[Any]:
-    """Return the values, without those digits that nobody sees."""
+    """Return the values, rounded to the digits that a page shows."""
     found: list[Any] = plain_values(np.round(values.astype(float), 4))
     return found
 
 
 def _counted(answers: list[Answer]) -> dict[str, Any]:
     """Return the acts and errors among the answers, the sizes of the acts' batches, and times of all acts, ms."""
-    acts = [one.reply for one in answers if one.op == "act" and one.reply.error is None]
-    errors = Counter(one.reply.error.code for one in answers if one.reply.error is not None)
+    acts = [one.timing for one in answers if one.op == "act" and not one.error]
     sample = acts[:: max(1, len(acts) // SAMPLE)]
     return {
         "acts": len(acts),
-        "errors": dict(errors),
-        "batch_sizes": [int(reply.timing.get("batch_size", 1)) for reply in sample],
-        "ms": {
-            name: [round(reply.timing.get(f"{name}_ms", 0.0), 3) for reply in sample] for name in (*STAGES, "total")
-        },
+        "errors": dict(Counter(one.error for one in answers if one.error)),
+        "batch_sizes": [int(timing.get("batch_size", 1)) for timing in sample],
+        "ms": {name: [round(timing.get(f"{name}_ms", 0.0), 3) for timing in sample] for name in (*STAGES, "total")},
     }

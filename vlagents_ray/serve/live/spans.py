@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from vlagents_ray import tracing
@@ -18,13 +18,18 @@ from vlagents_ray.serve.periodic import each_half_second
 _KEPT = 4096  # most answers between two half seconds; older ones have no spans
 _STAGES = ("queue", "inference")  # one after the other, from the end of decoding on
 _OPS = ("act", "reset")
+_TEXT = 200  # most characters of an error, or of what a client states
 
 
 class _ServedRequest(NamedTuple):
+    """What is kept of a request and its answer: nothing that its client may make large."""
+
     session: str
-    request: Request
+    op: str
+    rank: str
     traceparent: str
-    reply: Reply
+    timing: Mapping[str, float]  # ms by stage; still completed when the answer was sent
+    error: str
     decoded_ns: int  # since 1970: when the request was read
     answered_ns: int
 
@@ -64,7 +69,10 @@ class RequestSpans:
             now_ns = time.time_ns()
             for session, item, parent, reply in zip(sessions, items, traced, replies, strict=True):
                 if isinstance(item, Request) and parent is not None and item.op in _OPS:
-                    self._answered.append(_ServedRequest(session, item, parent, reply, decoded_ns, now_ns))
+                    error = "" if reply.error is None else f"{reply.error.code}: {reply.error}"[:_TEXT]
+                    self._answered.append(
+                        _ServedRequest(session, item.op, item.rank, parent, reply.timing, error, decoded_ns, now_ns)
+                    )
 
         return answer
 
@@ -74,16 +82,16 @@ class RequestSpans:
             self._make(self._answered.popleft())
 
     def _make(self, one: _ServedRequest) -> None:
-        timing, error = one.reply.timing, one.reply.error
+        timing = one.timing
         begun_ns = one.decoded_ns - _ns(timing.get("decode_ms", 0.0))
-        about: dict[str, str | int] = {"replica": self._replica, "session": one.session, "rank": one.request.rank}
+        about: dict[str, str | int] = {"replica": self._replica, "session": one.session, "rank": one.rank}
         if "batch_size" in timing:
             about["batch_size"] = int(timing["batch_size"])
         parent = self._propagator.extract({tracing.TRACEPARENT: one.traceparent}) if one.traceparent else None
-        name, kind = f"vlagents {one.request.op}", self._trace.SpanKind.SERVER
+        name, kind = f"vlagents {one.op}", self._trace.SpanKind.SERVER
         whole = self._tracer.start_span(name, parent, kind=kind, attributes=about, start_time=begun_ns)
-        if error is not None:
-            whole.set_status(self._trace.StatusCode.ERROR, f"{error.code}: {error}")
+        if one.error:
+            whole.set_status(self._trace.StatusCode.ERROR, one.error)
         inside = self._trace.set_span_in_context(whole, parent)
         self._stage("decode", inside, begun_ns, one.decoded_ns)
         at_ns = one.decoded_ns
@@ -113,7 +121,7 @@ def open_spans(engine: Engine, replica: str) -> RequestSpans | None:
 def _traceparent(request: Request) -> str:
     """Return the trace that a request states, which may come from anybody; "" if it states none."""
     stated = "" if request.obs is None else request.obs.info.get(tracing.TRACEPARENT, "")
-    return stated if isinstance(stated, str) else ""
+    return stated[:_TEXT] if isinstance(stated, str) else ""
 
 
 def _ns(milliseconds: float) -> int:

@@ -54,13 +54,9 @@ class ReplicaLive:
         """Return what happened here since a snapshot, with pictures of the sessions `shown`."""
         return await asyncio.to_thread(self._view.read, since, shown)
 
-    async def press(self, session: str, do: str, text: str, by: str) -> dict[str, Any] | None:
+    async def press(self, session: str, do: str, by: str) -> dict[str, Any] | None:
         """Give a command to a session, for another replica; None if the session is not here."""
         try:
-            return self._view.commands.press(session, do, text, by)
+            return self._view.commands.press(session, do, by)
         except UnknownSession:
             return None
-
-    async def exchange(self, session: str, hold: str, message: dict[str, Any]) -> dict[str, Any] | None:
-        """Pass on what a human does to a robot, for another replica, see `RobotLinks.exchange`."""
-        return await self._view.robots.exchange(session, hold, message)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Awaitable, Callable, Collection
+from collections.abc import Collection
 from functools import partial
 from typing import Any
 
@@ -14,7 +14,7 @@ import ray
 from vlagents_ray.client.transports.serve_handle import call_replica
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.serve.config.deployment import POLICY
-from vlagents_ray.serve.live.fleet import Exchange, Other, OtherReplicas
+from vlagents_ray.serve.live.fleet import Other, OtherReplicas
 from vlagents_ray.serve.live.snapshot import Snapshot
 from vlagents_ray.serve.scaling.sibling_replicas import SiblingApi, replica_actors
 
@@ -43,37 +43,28 @@ class ReplicaViews(OtherReplicas):
             self._views = {name: partial(_view, actor) for name, actor in actors.items()}
         return self._views
 
-    async def press(self, session: str, do: str, text: str, by: str) -> dict[str, Any] | None:
-        """Give a command to a session of one of them, see `CommandBoard.press`; None if none has the session."""
-        pressed: dict[str, Any] | None = await self._first(
-            lambda actor: _answer(actor, SiblingApi.press, session, do, text, by)
-        )
-        return pressed
+    async def press(self, session: str, do: str, by: str) -> dict[str, Any] | None:
+        """Give a command to a session of one of them, see `CommandBoard.press`; None if none has the session.
 
-    async def exchange(self, session: str) -> Exchange | None:
-        """Return `RobotLinks.exchange` of the one that has the connection of the session's robot; None if none has."""
-
-        async def found(actor: Any) -> Exchange | None:
-            exchange = partial(_exchange, actor)
-            return None if await exchange(session, "", {"do": "find"}) is None else exchange
-
-        exchange: Exchange | None = await self._first(found)
-        return exchange
-
-    async def _first(self, ask: Callable[[Any], Awaitable[Any]]) -> Any:
-        """Ask all of them, and return the first answer that is not None; raises what a replica itself raised."""
+        Raises:
+            VLAgentsError: The replica that has the session refused the command.
+        """
         actors = await asyncio.to_thread(self._look_up)
-        for answer in asyncio.as_completed([ask(actor) for actor in actors.values()]):
+        asked = [
+            asyncio.wait_for(call_replica(actor, SiblingApi.press, session, do, by), _PRESS_S)
+            for actor in actors.values()
+        ]
+        for answer in asyncio.as_completed(asked):
             try:
-                found = await answer
+                pressed: dict[str, Any] | None = await answer
             except (ray.exceptions.RayError, TimeoutError, asyncio.TimeoutError) as error:
                 cause = getattr(error, "cause", None)  # what the replica itself raised
                 if isinstance(cause, VLAgentsError):
                     raise cause from error
                 logger.info("another replica does not answer: %s", error)
                 continue
-            if found is not None:
-                return found
+            if pressed is not None:
+                return pressed
         return None
 
     def _look_up(self) -> dict[str, Any]:
@@ -84,16 +75,3 @@ class ReplicaViews(OtherReplicas):
 async def _view(actor: Any, since: int, shown: Collection[str]) -> Snapshot:
     snapshot: Snapshot = await asyncio.wait_for(call_replica(actor, SiblingApi.live, since, shown), _ANSWER_S)
     return snapshot
-
-
-async def _answer(actor: Any, method: Callable[..., Any], *args: Any) -> dict[str, Any] | None:
-    answer: dict[str, Any] | None = await asyncio.wait_for(call_replica(actor, method, *args), _PRESS_S)
-    return answer
-
-
-async def _exchange(actor: Any, session: str, hold: str, message: dict[str, Any]) -> dict[str, Any] | None:
-    try:
-        return await _answer(actor, SiblingApi.exchange, session, hold, message)
-    except (ray.exceptions.RayError, TimeoutError, asyncio.TimeoutError) as error:
-        logger.info("another replica does not answer: %s", error)
-        return None  # the robot is not reached

@@ -50,12 +50,8 @@ class SiblingApi(Protocol):
         """Return what happened since a snapshot, with pictures of the sessions `shown`."""
         ...
 
-    async def press(self, session: str, do: str, text: str, by: str) -> dict[str, Any] | None:
+    async def press(self, session: str, do: str, by: str) -> dict[str, Any] | None:
         """Give a command to a session from the live page; None if the session is not here."""
-        ...
-
-    async def exchange(self, session: str, hold: str, message: dict[str, Any]) -> dict[str, Any] | None:
-        """Pass on what a human at the live page does to a robot; None if its connection is not here."""
         ...
 
 

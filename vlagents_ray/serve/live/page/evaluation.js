@@ -30,7 +30,7 @@ function svgNode(tag, attributes) {
 
 function showEvaluation(said, now) {
   evaluation = said;
-  byId("evaluation").hidden = false;
+  byId("evaluation").hidden = byId("progress").hidden = false;
   byId("policy").textContent = `${said.goes_on ? "Training" : "Evaluation"}: ${said.name}`;
   byId("checkpoint").textContent = "";
   const progress = byId("episodes-played");
@@ -62,8 +62,8 @@ function showCells(said) {
   const older = said.contenders.length - shown.length;
   byId("older").textContent = older ? `${older} earlier ones are in the learning curve alone.` : "";
   byId("interval").textContent = said.cells.some((cell) => cell.sequence)
-    ? "Intervals: a confidence sequence where a cell may stop early, else Wilson's of 95 %."
-    : "Intervals: Wilson's of 95 %.";
+    ? "Upper bar: success, with a confidence sequence where a cell may stop early, else Wilson's interval of 95 %. Lower bar: episodes done."
+    : "Upper bar: success, with Wilson's interval of 95 %. Lower bar: episodes done.";
   const cells = new Map(said.cells.map((cell) => [`${cell.task}\n${cell.policy}`, cell]));
   byId("cell-policies").replaceChildren(element("th", { scope: "col" }, "Task"), ...shown.map((name) => element("th", { scope: "col" }, name)));
   byId("cells").replaceChildren(...said.tasks.map((task) =>
@@ -72,13 +72,12 @@ function showCells(said) {
 
 function cellOf(cell) {
   if (!cell) return element("td", { className: "cell" }, "–");
-  const share = cell.planned ? cell.done / cell.planned : 1;
-  const counts = `${cell.done} of ${cell.planned}${cell.stopped ? ", certain enough" : ""}`;
-  const made = cell.rate === null
-    ? element("td", { className: "cell" }, element("b", {}, "–"), intervalBar(null), element("span", { className: "note" }, counts))
-    : element("td", { className: "cell" }, element("b", {}, percent(cell.rate)), intervalBar(cell), element("span", { className: "note" }, `${interval(cell)}; ${counts}`));
-  made.style.setProperty("--done", share);
-  return made;
+  const known = cell.rate !== null;
+  const counts = `${cell.done} of ${cell.planned} episodes${cell.stopped ? ", certain enough" : ""}`;
+  return element("td", { className: "cell" }, element("b", {}, known ? percent(cell.rate) : "–"),
+    element("span", { className: "note" }, known ? ` ${interval(cell)}` : ""), intervalBar(known ? cell : null),
+    element("progress", { max: cell.planned || 1, value: cell.planned ? cell.done : 1, ariaLabel: counts }),
+    element("span", { className: "note", ariaHidden: "true" }, counts));
 }
 
 function intervalBar(cell) {
@@ -146,8 +145,8 @@ function failureCard(one) {
   const title = element("h3", { id: `failure-${one.key}` }, name);
   const about = [one.policy, `seed ${one.seed}`, `${one.steps} steps`, new Date(1000 * one.finished).toLocaleTimeString()];
   const card = element("article", {},
-    element("div", {}, title, element("span", { className: "badge" }, FAILURE_NAMES[one.outcome] || one.outcome)),
     ...one.videos.map((number) => videoOf(number, name)),
+    element("div", { className: "title" }, title, element("span", { className: "badge" }, FAILURE_NAMES[one.outcome] || one.outcome)),
     element("p", { className: "instruction" }, one.instruction ? `“${one.instruction}”` : ""),
     element("p", { className: "bad" }, one.error),
     element("p", { className: "note" }, about.join(", ")));

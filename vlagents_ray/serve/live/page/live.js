@@ -36,13 +36,17 @@ function connect() {
   socket.onopen = () => { forgetFailures(); ask(); };
   socket.onmessage = (event) => {
     if (typeof event.data === "string") return say(JSON.parse(event.data).detail, false);
-    if (!heard) say("Live", true);
     heard = true;
     wait = 500;
     byId("key").hidden = true;
     document.querySelector("main").hidden = false;
-    show(...read(event.data));
-    ask();
+    try {
+      show(...read(event.data));
+      if (byId("connection").textContent !== "Live") say("Live", true); // it is read aloud
+    } catch (error) {
+      console.error(error);
+      say("Live, but a part of the last message is not shown", false);
+    } finally { ask(); }
   };
   socket.onclose = (event) => {
     if (!heard) askForKey();
@@ -96,16 +100,21 @@ function read(data) {
 function show(said, files) {
   mayOperate = said.may_operate;
   const present = new Set();
+  let failed = null; // by one session, beside which the others are shown
   for (const replica of said.replicas) {
     count(replica, said.time);
     for (const session of replica.sessions) {
-      present.add(session.id);
-      if (!cards.has(session.id)) cards.set(session.id, new Card(session.id));
-      cards.get(session.id).update(session, files, replica.ring_s);
+      try {
+        present.add(session.id);
+        if (!cards.has(session.id)) cards.set(session.id, new Card(session.id));
+        cards.get(session.id).update(session, files, replica.ring_s);
+      } catch (error) {
+        failed = error;
+        cards.get(session?.id)?.remove(); // the next message makes another
+        cards.delete(session?.id);
+      }
     }
   }
-  const robots = Object.assign({}, ...[...replicas.values()].map((one) => one.said.robots)); // at another replica than its session, maybe
-  for (const card of cards.values()) card.takeover.update(robots[card.id]);
   const names = new Set(said.replicas.map((one) => one.name));
   for (const [name, one] of replicas) if (!names.has(name) && said.time - one.time > 3) replicas.delete(name);
   for (const [id, card] of cards) if (!present.has(id) && ++card.missed > 5) { card.remove(); cards.delete(id); }
@@ -115,6 +124,7 @@ function show(said, files) {
   showTimes();
   byId("session-count").textContent = cards.size ? `(${cards.size})` : "";
   byId("nothing").hidden = cards.size > 0;
+  if (failed) throw failed;
 }
 
 function count(said, now) {
@@ -181,7 +191,7 @@ const OUTCOMES = { // what became of a command
   saving: (said) => `${pressed(said)}: being written`,
   done: (said) => `${pressed(said)}: done${said.why ? `, in ${said.why}` : ""}`,
   refused: (said) => `${pressed(said)}: refused: ${said.why}`,
-  ignored: (said) => `${pressed(said)}: ignored; the robot obeys no commands`,
+  ignored: (said) => `${pressed(said)}: ignored; the robot accepts no commands`,
   "too late": (said) => `${pressed(said)}: not sent, as the robot made no request for 5 s`,
 };
 const number = (value) => String(Number(value.toPrecision(3)));
@@ -206,12 +216,13 @@ class Card {
   constructor(id) {
     this.id = id;
     this.missed = 0;
-    this.values = { error: null, step: null, server: null, "batch of": null, "weights version": null, "last request": null };
+    this.values = { step: null, server: null, "batch of": null, "weights version": null, "last request": null };
     this.series = new Map(); // by part of the state: its last rows
     this.plots = new Map(); // by name
     this.images = new Map(); // by camera
     this.badge = element("span", { className: "badge" });
-    this.instruction = element("p", { className: "instruction" });
+    this.instruction = element("h3", {}, "No instruction");
+    this.error = element("p", { className: "bad" });
     this.cameras = element("div", { className: "cameras" });
     this.drawn = element("div", { className: "plots" });
     this.told = element("dl");
@@ -220,20 +231,28 @@ class Card {
     this.joint = element("select", { onchange: () => this.compare() });
     this.compared = element("figure", { className: "compared", hidden: true }, svgElement(),
       element("figcaption", {}, element("label", {}, "Planned and executed, joint ", this.joint), element("span")));
-    const title = element("h3", { id: `session-${cards.size}-${Date.now()}` }, id);
+    const unique = `${cards.size}-${Date.now()}`;
+    const name = element("p", { id: `name-${unique}`, className: "name" }, id);
     this.outcome = element("p", { className: "note", role: "status" });
-    this.takeover = new Takeover(this);
     this.operated = this.buttons();
-    this.root = element("article", {}, element("div", {}, title, this.badge), this.instruction, this.cameras, this.drawn, this.compared, this.told, this.operated);
-    this.root.setAttribute("aria-labelledby", title.id);
-    byId("sessions").append(this.root);
+    this.numbers = element("details", {}, element("summary", {}, "Numbers"), this.drawn, this.compared, this.told);
+    this.root = element("article", {}, element("div", { className: "title" }, this.instruction, this.badge), name, this.error, this.cameras, this.operated, this.numbers);
+    this.instruction.id = `session-${unique}`;
+    this.root.setAttribute("aria-labelledby", `session-${unique} name-${unique}`);
     this.filter();
+    byId("sessions").append(this.root);
   }
 
   update(said, files, ring) {
     this.missed = 0;
-    if (said.rank) this.badge.textContent = `${said.rank === "robot" ? "robot" : "simulation"}, ${said.transport}`;
-    this.instruction.textContent = said.instruction ? `“${said.instruction}”` : "";
+    if (said.rank && said.rank !== this.rank) {
+      this.rank = said.rank;
+      this.badge.textContent = `${said.rank === "robot" ? "robot" : "simulation"}, ${said.transport}`;
+      this.numbers.open = said.rank === "robot";
+      byId(said.rank === "robot" ? "sessions" : "simulations").append(this.root);
+    }
+    this.instruction.textContent = said.instruction ? `“${said.instruction}”` : "No instruction";
+    this.filter();
     for (const [camera, index] of Object.entries(said.pictures)) this.picture(camera, files[index]);
     for (const [part, values] of Object.entries(said.state || {})) {
       const rows = this.series.get(part) || [];
@@ -242,7 +261,7 @@ class Card {
       this.series.set(part, rows);
       this.plot(`state: ${part}`, rows);
     }
-    this.operated.hidden = !mayOperate;
+    this.operated.hidden = !mayOperate || this.rank !== "robot";
     this.follows.textContent = said.follows ? "Pin version" : "Follow versions";
     this.save.hidden = !ring;
     this.save.textContent = `Save last ${ring} s`;
@@ -256,7 +275,7 @@ class Card {
 
   act(act) {
     this.root.classList.toggle("failed", Boolean(act.error));
-    this.tell({ error: act.error ? `${act.error}: ${act.detail}` : null });
+    this.error.textContent = act.error ? `${act.error}: ${act.detail}` : "";
     if (act.action && act.at != null) this.plans = [...this.plans, { at: act.at, rows: act.action }].slice(-PLANS);
     if (act.action) this.plot(act.rows > 1 ? `plan: ${act.rows} rows` : "action", this.planned(act));
     const ms = act.ms;
@@ -266,31 +285,23 @@ class Card {
     this.tell(act.info || {});
   }
 
-  // ---- for those who may operate the session
+  // ---- for keys that may operate the session, and only if it is a robot's
 
   buttons() {
     const button = (text, command, className = "") => element("button", { type: "button", className, value: command,
       ariaLabel: `${text}: ${this.id}`, onclick: (event) => this.press(event.currentTarget.value) }, text);
-    const text = element("input", { name: "text", maxLength: 1000, required: true, placeholder: "another instruction", ariaLabel: `Instruction for ${this.id}` });
-    const instruct = element("form", { className: "row", onsubmit: (event) => {
-      event.preventDefault();
-      this.press("instruct", text.value.trim());
-      text.value = "";
-    } }, text, element("button", { className: "quiet" }, "Change"));
     this.follows = button("Pin version", "pin", "quiet");
     this.save = button("Save", "save", "quiet");
     return element("div", { className: "operate", hidden: true },
-      element("div", { className: "row" }, button("Stop", "stop", "stop"), button("Pause", "pause"), button("Resume", "resume"), this.takeover.button),
-      this.takeover.root,
-      element("div", { className: "row" }, button("Success", "success", "quiet"), button("Failure", "failure", "quiet"), this.follows, this.save),
-      instruct, this.outcome);
+      element("div", { className: "row" }, button("Stop", "stop", "stop"), button("Pause", "pause"), button("Success", "success", "quiet"), button("Failure", "failure", "quiet")),
+      element("div", { className: "row" }, this.follows, this.save), this.outcome);
   }
 
-  async press(command, text = "") {
+  async press(command) {
     this.say(`${command}: on its way`);
     const headers = { "content-type": "application/json", ...(key ? { authorization: `Bearer ${key}` } : {}) };
     try {
-      const answer = await fetch(`${path()}/command`, { method: "POST", headers, body: JSON.stringify({ session: this.id, do: command, text }) });
+      const answer = await fetch(`${path()}/command`, { method: "POST", headers, body: JSON.stringify({ session: this.id, do: command }) });
       const said = await answer.json();
       if (answer.ok) this.commands([said]); // what came of it may have been shown already; the next message shows it again
       else this.say(`${command}: ${said.detail}`, true);
@@ -400,11 +411,12 @@ class Card {
     Object.assign(this.values, values);
     const shown = Object.entries(this.values).filter(([, value]) => value !== null && value !== undefined);
     const text = (value) => typeof value === "number" && !Number.isInteger(value) ? value.toPrecision(4) : String(value);
-    this.told.replaceChildren(...shown.flatMap(([name, value]) => [element("dt", {}, name), element("dd", { className: name === "error" ? "bad" : "" }, text(value))]));
+    this.told.replaceChildren(...shown.flatMap(([name, value]) => [element("dt", {}, name), element("dd", {}, text(value))]));
   }
 
   filter() {
-    this.root.hidden = !this.id.toLowerCase().includes(byId("filter").value.trim().toLowerCase());
+    const sought = byId("filter").value.trim().toLowerCase();
+    this.root.hidden = ![this.id, this.instruction.textContent].some((text) => text.toLowerCase().includes(sought));
   }
 
   get visible() {
@@ -414,7 +426,6 @@ class Card {
   }
 
   remove() {
-    this.takeover.close();
     this.root.remove();
     for (const image of this.images.values()) URL.revokeObjectURL(image.src);
   }
