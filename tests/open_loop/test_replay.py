@@ -235,7 +235,8 @@ def test_the_command_writes_numbers_and_pictures(tmp_path: Path) -> None:
     assert document["by_joint"][0]["mae"] == pytest.approx(np.mean([1, 2, 3, 4, 5, 6]))
     page = (out / "open_loop.html").read_text()
     assert page.count("<svg") == 3
-    assert "http" not in page.replace("http://www.w3.org", "")
+    assert "http:" not in page.replace("http://www.w3.org", "")
+    assert "https:" not in page
 
 
 def policy_file(folder: Path) -> str:
