@@ -567,7 +567,7 @@ def test_a_message_that_is_read_again_elsewhere_counts_once() -> None:
     with pytest.raises(NeedsDecodingThread):
         read(message)
     assert all(isinstance(answer, Request) for answer in message.decode_on_thread(read).result(30))
-    assert counted == ["reset", "reset"]
+    assert counted == ["message", "reset"]
 
 
 def test_simulations_images_are_decoded_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -96,10 +96,17 @@ def _write_request(request: Request, writer: ValueWriter, codec: ImageCodec) -> 
 def decode_requests(data: Buffer, budget: Budget, ops: Sequence[Op] = OPS) -> list[Request | Reply]:
     """Return the requests in a frame, each one of `ops`; a refused request is replaced by the reply with its error.
 
-    `budget` is charged for each request before any of it is decoded.
+    `budget` is charged for the message before any of it is parsed, and for each further request before its images are
+    decoded.
+
+    Raises:
+        MalformedMessage: The data are not a frame of requests.
+        MessageTooLarge: The frame exceeds a limit.
+        TooManyRequests: The key of the sender is over its rate.
     """
+    budget.begin_message()
     limits = budget.limits
-    header, blobs = unpack(data, limits)
+    header, blobs = unpack(data, limits, budget)
     nodes = header.get("requests", [header])
     if not isinstance(nodes, list) or not nodes or not all(isinstance(node, dict) for node in nodes):
         raise MalformedMessage(f"requests: got {str(nodes)[:40]}, want a list of requests")

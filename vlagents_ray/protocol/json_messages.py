@@ -33,7 +33,7 @@ def request_from_parts(op: Op, text: str | bytes, images: Mapping[str, bytes], b
     """
     limits = budget.limits
     budget.begin(op)
-    document = parse_json(text, "obs:", _distinct)
+    document = parse_json(text, "obs:", _distinct, budget=budget)
     if not isinstance(document, dict):
         raise MalformedMessage(f"obs: got {type(document).__name__}, want an object")
     unknown = document.keys() - _KEYS

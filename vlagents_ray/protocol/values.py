@@ -193,7 +193,7 @@ def to_text(value: Any) -> str:
 
 def from_text(text: str, budget: Budget) -> Any:
     """Return the value of which `to_text` made the text; raises `MalformedMessage` if there is none."""
-    document = parse_json(text, "value:")
+    document = parse_json(text, "value:", long=True)
     try:
         blobs = [base64.b64decode(blob, validate=True) for blob in document.get("blobs", ())]
         return ValueReader(blobs, budget).value(document["value"])

@@ -26,7 +26,7 @@ from vlagents_ray.serve.access.api_keys import Caller, Identity
 from vlagents_ray.serve.endpoints.buffers import READ_BYTES, ReceiveBuffer, SendBuffer, receive
 from vlagents_ray.serve.engine import arrival
 from vlagents_ray.serve.engine.admission import MessageAdmission, NeedsDecodingThread, decode_in_background, image_bytes
-from vlagents_ray.serve.engine.dispatch import Dispatcher
+from vlagents_ray.serve.engine.dispatch import REFUSED, Dispatcher
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.metrics_buffer import RequestTrace
 
@@ -74,7 +74,9 @@ class WebSocketConnection:
         self._polled = True  # whether the batch queue polls the connection
         self._paused = False  # not polled until some of its messages are answered
         self._decoding = self._throttled = False  # not polled until a frame is decoded, or the key under its rate again
-        self._frames: deque[tuple[Frame, float]] = deque()  # received but unprocessed frames and their arrival times, s
+        # Received but unprocessed frames, their arrival times, s, and the admissions of those that came in parts.
+        self._frames: deque[tuple[Frame, float, MessageAdmission | None]] = deque()
+        self._partial: MessageAdmission | None = None  # admission of the message of which a part is here
         self._unanswered = self._unanswered_bytes = 0  # messages; bytes with the decoded images
         self._messages = 0  # number received so far
         self._ending = False  # `end` was called; bytes that arrive now are ignored
@@ -91,6 +93,9 @@ class WebSocketConnection:
             self.disconnect()
 
     def _read(self) -> None:
+        if self._sender is not None and self._sender.rated and self._is_throttled():
+            self._stop_polling()
+            return
         try:
             data, control = receive(self._connection, _HANDSHAKE_BYTES if self._sender is None else READ_BYTES)
             self._arrived = time.perf_counter() - arrival.waited_s(control)
@@ -132,8 +137,11 @@ class WebSocketConnection:
         for event in events:
             if isinstance(event, Frame) and event.opcode in (Opcode.BINARY, Opcode.TEXT, Opcode.CONT):
                 self._messages += 1
-                self._frames.append((event, self._arrived))
+                self._frames.append((event, self._arrived, self._partial))
+                self._partial = None
         self._process_frames()
+        if self._received.size and self._partial is None and self._sender is not None and not self._ended:
+            self._begin_partial(self._sender)
         if not data or self._protocol.state is State.CLOSED or self._protocol.close_rcvd is not None:
             self.disconnect()
             return
@@ -141,6 +149,26 @@ class WebSocketConnection:
             self._paused = self._is_backlogged() and self._protocol.state is State.OPEN
         if self._paused or self._decoding or self._throttled:
             self._stop_polling()
+
+    def _begin_partial(self, sender: Dispatcher) -> None:
+        """Count a message of which a part is here, before the rest is read; the rest stays unread over the rate."""
+        admission = sender.admission(self._limits)
+        try:
+            admission.begin_message()
+            self._partial = admission
+        except TooManyRequests:
+            self._is_throttled()
+            if sender.refused_too_often:
+                self.end(_POLICY_VIOLATION, REFUSED)
+        except VLAgentsError as error:
+            self.end(_POLICY_VIOLATION, str(error))
+
+    def _is_throttled(self) -> bool:
+        """Whether the key of the client is over its rate; if so, the connection is read again later."""
+        if not self._throttled and self._sender is not None and (wait_s := self._sender.throttled_s()) > 0:
+            self._throttled = True
+            self._engine.queue.call_later(wait_s, self._unthrottle)
+        return self._throttled
 
     def disconnect(self) -> None:
         """Stop polling the connection and close it; call it on the thread that polls."""
@@ -250,9 +278,13 @@ class WebSocketConnection:
 
     def _unthrottle(self) -> None:
         self._throttled = False
+        if self._ended or self._is_throttled():
+            return
+        if self._received.size and self._partial is None and self._sender is not None:
+            self._begin_partial(self._sender)
         self._continue()
 
-    def _process(self, frame: Frame, arrived: float) -> None:
+    def _process(self, frame: Frame, arrived: float, admission: MessageAdmission | None) -> None:
         if self._sender is None:  # nothing is read before the handshake is accepted
             raise VLAgentsError("stream: a message before the handshake was accepted")
         trace = RequestTrace(self._engine.stats, "websocket")
@@ -261,23 +293,25 @@ class WebSocketConnection:
                 self._protocol.fail(_UNSUPPORTED_DATA, "messages in fragments; send each in one frame")
                 self._flush()
             return
-        data, sender = bytes(frame.data), self._sender
-        probe = is_probe(data)
-        admission = sender.admission(self._limits, len(data), "simulation" if probe else "robot")
+        sender = self._sender
+        admission = admission or sender.admission(self._limits)
+        admission.size = len(frame.data)
         try:
+            admission.begin_message()
             if frame.opcode is Opcode.TEXT:
                 raise MalformedMessage("stream: got a text message, want a binary frame")
-            if probe:
+            data = bytes(frame.data)
+            if is_probe(data):
                 read_probe(data, admission)
                 self._send(answer(len(data)))
             else:
                 self._decode(_Message(sender, admission, trace, len(data), arrived), data)
         except VLAgentsError as error:
-            admission.count_unreadable()
             self._send(trace.frame([Reply(error=error)]))
-        if (throttled_s := sender.throttled_s()) > 0:
-            self._throttled = True
-            self._engine.queue.call_later(throttled_s, self._unthrottle)
+            if sender.refused_too_often:
+                self.end(_POLICY_VIOLATION, REFUSED)
+        if sender.rated:
+            self._is_throttled()
 
     def _decode(self, message: _Message, data: bytes) -> None:
         read = partial(decode_requests, data)

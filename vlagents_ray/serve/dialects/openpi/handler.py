@@ -31,6 +31,7 @@ from vlagents_ray.protocol.messages import Reply
 from vlagents_ray.serve.config.dialects import DialectConfig, MappingSetting
 from vlagents_ray.serve.dialects.base import (
     INTERNAL_ERROR,
+    POLICY_VIOLATION,
     RouteDialect,
     Stream,
     accept_or_refuse,
@@ -39,7 +40,7 @@ from vlagents_ray.serve.dialects.base import (
 )
 from vlagents_ray.serve.dialects.implicit_session import ImplicitSession, SessionObs, act_together
 from vlagents_ray.serve.dialects.openpi.rows import Rows, number_of_rows, unstacked
-from vlagents_ray.serve.engine.dispatch import Dispatcher
+from vlagents_ray.serve.engine.dispatch import REFUSED, Dispatcher
 from vlagents_ray.serve.engine.metrics_buffer import RequestTrace
 from vlagents_ray.wire.openpi import codec
 from vlagents_ray.wire.openpi.presets import PRESETS
@@ -259,6 +260,7 @@ class MapEndpoint:
         try:
             await socket.send_bytes(codec.encode(self._dialects[-1].first()))
             while True:
+                await gate.wait_unthrottled()
                 event = await asyncio.wait_for(socket.receive(), self._dialects[0].idle_s)
                 if event["type"] == "websocket.disconnect":
                     return
@@ -279,6 +281,7 @@ class MapEndpoint:
         trace, request_id = self._dialects[0].trace(), uuid.uuid4().hex
         admission = gate.admission(self._context.limits, 0 if data is None else len(data), self._dialects[0].rank)
         try:
+            admission.begin_message()
             if data is None:
                 raise MalformedMessage("message: got text, want a binary map")
             message = await decoded(lambda data, budget: codec.decode(data, budget.limits), data, admission)
@@ -294,8 +297,9 @@ class MapEndpoint:
             failure = self._dialects[0].failure(text)
             await (socket.send_text(text) if failure is None else socket.send_bytes(failure))
             if isinstance(problem, TooManyRequests):  # the connection stays open, as nothing was acted on
-                await asyncio.sleep(gate.throttled_s())
-                return True
+                if gate.refused_too_often:
+                    await socket.close(POLICY_VIOLATION, REFUSED)
+                return not gate.refused_too_often
             if failure is None:
                 await socket.close(INTERNAL_ERROR, "Internal server error.")
             return failure is not None
