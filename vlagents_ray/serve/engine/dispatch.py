@@ -100,8 +100,7 @@ class Dispatcher:
     def count_message(self) -> None:
         """Count a message that is sent without an admission, before it is parsed; raise `TooManyRequests`."""
         if self._caller is not None:
-            self.rated = self._caller is not None  # whether its key may be over a rate
-        self._paid = False
+            self._paid = False
             self._count_message(self._caller)
             self._paid = True
 
@@ -160,8 +159,7 @@ class Dispatcher:
             try:
                 if self._caller is not None:
                     self._admit(self._caller, item, counted=admission is not None or self._counted or self._paid)
-                    self.rated = self._caller is not None  # whether its key may be over a rate
-        self._paid = False
+                    self._paid = False
                 ready.append(self._ticket(collector, index, item, arrived))
             except VLAgentsError as error:
                 self._refuse(collector, index, item, error, arrived)
