@@ -19,7 +19,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -179,7 +179,7 @@ def _drain(connection: socket.socket) -> None:
 def _websocket(path: str) -> Attack:
     def attack(message: bytes, where: Where, key: str, end: float) -> None:
         port, place = (where["own"][0], where["own"][1]) if path == "own" else (where["port"], path)
-        head = bytes([0x82, 0x80 | 127]) + struct.pack(">Q", len(message)) + bytes(4)
+        head = bytes([0x82, 0x80 | 127]) + struct.pack(">Q", len(message)) + bytes(4)  # a mask of zeros
         with socket.create_connection(("127.0.0.1", port), timeout=5) as connection:
             protocol = ClientProtocol(parse_uri(f"ws://127.0.0.1:{port}{place}"))
             request = protocol.connect()
@@ -188,10 +188,13 @@ def _websocket(path: str) -> Attack:
             connection.sendall(b"".join(protocol.data_to_send()))
             while protocol.state is State.CONNECTING:
                 protocol.receive_data(connection.recv(65536))
+            if protocol.state is not State.OPEN:
+                return
             threading.Thread(target=_drain, args=(connection,), daemon=True).start()
             while (left_s := end - time.monotonic()) > 0:
                 connection.settimeout(left_s)
-                connection.sendall(head + message)
+                connection.sendall(head)
+                connection.sendall(message)
 
     return attack
 
@@ -204,21 +207,28 @@ def _post(path: str, kind: str) -> Attack:
         ).encode()
         with socket.create_connection(("127.0.0.1", where["port"]), timeout=5) as connection:
             while time.monotonic() < end:
-                connection.sendall(head + content)
+                connection.sendall(head)
+                connection.sendall(content)
                 if not connection.recv(65536):
                     return
 
     return attack
 
 
+@cache
+def _memory_file(message: bytes) -> int:
+    descriptor = os.memfd_create("flood", os.MFD_ALLOW_SEALING)
+    os.ftruncate(descriptor, len(message))
+    os.pwrite(descriptor, message, 0)
+    fcntl.fcntl(descriptor, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK)
+    return descriptor
+
+
 def _shared_memory(message: bytes, where: Where, key: str, end: float) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:
         connection.connect("\0" + where["local"]["socket"])
         connection.send(key.encode())
-        descriptor = os.memfd_create("flood", os.MFD_ALLOW_SEALING)
-        os.ftruncate(descriptor, len(message))
-        os.pwrite(descriptor, message, 0)
-        fcntl.fcntl(descriptor, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK)
+        descriptor = _memory_file(message)
         threading.Thread(target=_drain, args=(connection,), daemon=True).start()
         head = LocalAddress.REQUEST.pack(0, 0, len(message))
         socket.send_fds(connection, [head], [descriptor])
@@ -328,43 +338,50 @@ def percentile(taken: list[float], percent: float) -> float:
     return taken[int(percent / 100 * len(taken))]
 
 
-def table(seconds: float = 5.0) -> None:
-    """Print p50 and p99 of a robot's acts alone, beside an idle process, and beside each flood of frames."""
+def table(seconds: float = 4.0) -> None:
+    """Print p50 and p99 of a robot's acts beside each flood, with those alone right before and the processor's time."""
     with child("serve") as server:
         assert server.stdout is not None
         where = json.loads(server.stdout.readline())
         with robot(where) as transport:
             acts_ms(transport, 1.0)
-            _print("alone", "", 0, acts_ms(transport, seconds))
             for way in sys.argv[2:] or FRAMES:
-                for part, connections in (
-                    *(("images", n) for n in (1, 8, 32)),
-                    *(("header", n) for n in (1, 8, 32)),
-                    ("allowed header", 32),
-                    ("names", 8),
-                    ("blobs", 8),
-                    ("history", 8),
-                ):
-                    if part != "images" and way not in FRAMES:
-                        continue
+                for part, connections in CASES if way in FRAMES else [("images", 1), ("images", 8), ("images", 32)]:
+                    alone = acts_ms(transport, seconds / 2)
                     with child("attack", way, part, json.dumps(where), str(connections), "30") as attacker:
                         assert attacker.stdout is not None
                         attacker.stdout.readline()
                         time.sleep(1.5)
-                        _print(way, part, connections, acts_ms(transport, seconds))
+                        before = _cpu_s(server.pid), _cpu_s(attacker.pid)
+                        beside = acts_ms(transport, seconds)
+                        used = [
+                            100 * (_cpu_s(p.pid) - b) / seconds for p, b in zip((server, attacker), before, strict=True)
+                        ]
+                    numbers = " ".join(f"{percentile(t, n):8.2f}" for n in (50, 99) for t in (alone, beside))
+                    print(f"{way:23s}{part:15s}{connections:3d} {numbers}  {used[0]:4.0f} {used[1]:4.0f}", flush=True)
                     time.sleep(1.0)
-            _print("alone again", "", 0, acts_ms(transport, seconds))
 
 
-def _print(way: str, part: str, connections: int, taken: list[float]) -> None:
-    p50, p99 = percentile(taken, 50), percentile(taken, 99)
-    print(f"{way:24s}{part:16s}{connections:3d}  p50 {p50:7.2f}  p99 {p99:8.2f} ms  ({len(taken)} acts)", flush=True)
+CASES = (
+    *(("images", n) for n in (1, 8, 32)),
+    *(("header", n) for n in (1, 8, 32)),
+    ("allowed header", 32),
+    ("names", 8),
+    ("blobs", 8),
+    ("history", 8),
+)
+
+
+def _cpu_s(pid: int) -> float:
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 if __name__ == "__main__":
     if sys.argv[1] == "serve":
         serve()
     elif sys.argv[1] == "table":
+        print(f"{'':41s}{'p50 alone, beside':>18s}{'p99 alone, beside':>18s}  % of a core: server, attacker")
         table()
     else:
         attack(sys.argv[2], sys.argv[3], json.loads(sys.argv[4]), int(sys.argv[5]), float(sys.argv[6]))

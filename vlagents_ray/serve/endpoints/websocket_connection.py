@@ -34,6 +34,7 @@ logger = logging.getLogger(__name__)
 
 _HANDSHAKE_BYTES = 16 * 1024  # maximum size of a handshake
 _HANDSHAKE_S = 5.0  # maximum time of a handshake
+_REFUSED_S = 1.0  # maximum time for which the refusal of a handshake is delayed
 _END_OF_HEADERS = b"\r\n\r\n"
 _UNANSWERED = 256  # maximum of unanswered messages of one client: further ones stay unread in its connection
 _GOING_AWAY, _UNSUPPORTED_DATA, _POLICY_VIOLATION = 1001, 1003, 1008  # close codes
@@ -65,6 +66,7 @@ class WebSocketConnection:
         self._arrived = 0.0  # arrival time of the bytes read last, s
         self._protocol = ServerProtocol(max_size=STREAM_BYTES)
         self._head = b""  # received part of the handshake
+        self._refused_for_s = 0.0  # time after which the handshake would not be over the rate of its key
         self._sender: Dispatcher | None = None  # None until the handshake is accepted
         self.caller: Identity | None = None  # None until the handshake is accepted
         self._sending = threading.Lock()  # guards the protocol and the sending: other threads send replies
@@ -118,7 +120,7 @@ class WebSocketConnection:
                 return
             head, data = self._head[: end + len(_END_OF_HEADERS)], self._head[end + len(_END_OF_HEADERS) :]
             if end < 0 or not self._handshake(head):
-                self.disconnect()
+                self._refuse_handshake()
                 return
             self._head = b""
             if not data:
@@ -240,7 +242,7 @@ class WebSocketConnection:
                 self._connection.shutdown(socket.SHUT_RDWR)
 
     def _handshake(self, head: bytes) -> bool:
-        """Reply to the handshake; return False if it was refused."""
+        """Accept the handshake; return False if it is refused, with the response yet to be sent."""
         with self._sending:
             self._protocol.receive_data(head)
             events = self._protocol.events_received()
@@ -248,13 +250,28 @@ class WebSocketConnection:
             response = self._handshake_response(events[0])
             with self._sending:
                 self._protocol.send_response(response)
-        with self._sending:
-            self._flush()
         if self._protocol.state is not State.OPEN or self.caller is None:
             return False
+        with self._sending:
+            self._flush()
         self._received.attach(self._protocol)
         self._sender = Dispatcher(self._engine, self.name, caller=self.caller)
         return True
+
+    def _refuse_handshake(self) -> None:
+        """Refuse the handshake, after a moment if the key is over its rate, which bounds how often it is refused."""
+        self._stop_polling()
+
+        def refuse() -> None:
+            with self._sending:
+                if not self._ended:
+                    self._flush()
+            self.disconnect()
+
+        if self._refused_for_s > 0:
+            self._engine.queue.call_later(min(self._refused_for_s, _REFUSED_S), refuse)
+        else:
+            refuse()
 
     def _handshake_response(self, request: Handshake) -> Response:
         try:
@@ -264,6 +281,8 @@ class WebSocketConnection:
             response = self._protocol.reject(refused.status, f"{refused}\n")
             if isinstance(refused, TooManyRequests | PolicyUnavailable):
                 response.headers["Retry-After"] = "1"
+            if isinstance(refused, TooManyRequests):
+                self._refused_for_s = refused.retry_after_s
             return response
 
     def _process_frames(self) -> None:

@@ -183,29 +183,19 @@ class UnixConnection:
         except OSError as error:
             logger.info("local client: %s", error)
             size, control = 0, []
-        descriptors: list[int] = []
-        for _, kind, data in control:
-            if kind == socket.SCM_RIGHTS:
-                descriptors += array("i", data[: len(data) // 4 * 4])
+        descriptors = [
+            number
+            for _, kind, data in control
+            if kind == socket.SCM_RIGHTS
+            for number in array("i", data[: len(data) // 4 * 4])
+        ]
         try:
             if not size:
                 self._disconnect()
                 return
             sender = self._sender or self._authenticate(bytes(buffer[: min(size, _KEY_BYTES)]))
-            if sender is None:
-                return
-            waited_s = arrival.waited_s(control)
-            try:  # only locates the memory, and takes the client's new memory file also if the message is refused
-                memory, compact_form, text = self._payload.read(memoryview(buffer)[:size], descriptors)
-            except VLAgentsError:
-                sender.count_message()
-                raise
-            if compact_form:
-                if sender.rated:
-                    sender.count_message()
-                self._dispatch(sender, None, trace, waited_s, self._reader.read(text, memory))
-            else:
-                self._decode(sender, trace, waited_s, memory)
+            if sender is not None:
+                self._receive(sender, trace, arrival.waited_s(control), memoryview(buffer)[:size], descriptors)
         except VLAgentsError as error:
             self._answer(trace, [Reply(error=error)])
             if self._sender is not None and self._sender.refused_too_often:
@@ -215,6 +205,21 @@ class UnixConnection:
                 os.close(descriptor)
         if self._sender is not None and self._sender.rated:
             self._is_throttled()
+
+    def _receive(
+        self, sender: Dispatcher, trace: RequestTrace, waited_s: float, message: memoryview, descriptors: list[int]
+    ) -> None:
+        try:  # only locates the memory; a new memory file of the client is taken even if the message is refused
+            memory, compact_form, text = self._payload.read(message, descriptors)
+        except VLAgentsError:
+            sender.count_message()
+            raise
+        if not compact_form:
+            self._decode(sender, trace, waited_s, memory)
+            return
+        if sender.rated:
+            sender.count_message()
+        self._dispatch(sender, None, trace, waited_s, self._reader.read(text, memory))
 
     def _is_throttled(self) -> bool:
         """Whether the key of the client is over its rate; if so, the connection is read again later."""
