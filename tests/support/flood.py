@@ -186,8 +186,8 @@ def _websocket(path: str) -> Attack:
             request.headers["authorization"] = f"Bearer {key}"
             protocol.send_request(request)
             connection.sendall(b"".join(protocol.data_to_send()))
-            while protocol.state is State.CONNECTING:
-                protocol.receive_data(connection.recv(65536))
+            while protocol.state is State.CONNECTING and (answer := connection.recv(65536)):
+                protocol.receive_data(answer)
             if protocol.state is not State.OPEN:
                 return
             threading.Thread(target=_drain, args=(connection,), daemon=True).start()

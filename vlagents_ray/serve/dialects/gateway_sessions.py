@@ -38,6 +38,11 @@ class GatewaySessions:
         self._episodes: list[ImplicitEpisode] = []  # the episode of each of `_agents`
 
     @property
+    def known(self) -> bool:
+        """Whether the client has shown a valid key, or needs none."""
+        return self._caller is not None
+
+    @property
     def begun(self) -> bool:
         """Whether the client has a session."""
         return bool(self._agents)

@@ -44,6 +44,11 @@ class GR00TConnection:
         self._thread.start()
 
     @property
+    def known(self) -> bool:
+        """Whether the client has shown a valid key, or needs none."""
+        return self._session.known
+
+    @property
     def begun(self) -> bool:
         """Whether the client has a session."""
         return self._session.begun

@@ -26,7 +26,7 @@ import numpy as np
 from pydantic import Field
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from vlagents_ray.errors import MalformedMessage, TooManyRequests, VLAgentsError
+from vlagents_ray.errors import MalformedMessage, TooManyRequests, VLAgentsError, shown
 from vlagents_ray.protocol.messages import Reply
 from vlagents_ray.serve.config.dialects import DialectConfig, MappingSetting
 from vlagents_ray.serve.dialects.base import (
@@ -162,7 +162,7 @@ class OpenPiDialect(MapDialect):
         if message.keys() != {"reset"}:
             return None
         if message["reset"] is not True:
-            raise MalformedMessage(f"reset: got {str(message['reset'])[:40]!r}, want true")
+            raise MalformedMessage(f"reset: got {shown(message['reset'])}, want true")
         connection.end_episodes()
         return codec.encode(message) if self.config.answer_reset else b""
 
@@ -171,7 +171,7 @@ class OpenPiDialect(MapDialect):
             return unstacked(message, self.context.engine.sessions.limit) if self.config.answer == "row" else None
         batch = message["batch"]
         if not isinstance(batch, list) or not batch:
-            raise MalformedMessage(f"batch: got {str(batch)[:40]!r}, want a list of one observation or more")
+            raise MalformedMessage(f"batch: got {shown(batch)}, want a list of one observation or more")
         return batch
 
     def rows(self, reply: Reply) -> np.ndarray:

@@ -22,7 +22,7 @@ from starlette.routing import BaseRoute, Route
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from vlagents_ray.chunking.buffer import ChunkBuffer
-from vlagents_ray.errors import MalformedMessage, MessageTooLarge, PolicyUnavailable, VLAgentsError
+from vlagents_ray.errors import MalformedMessage, MessageTooLarge, PolicyUnavailable, VLAgentsError, shown
 from vlagents_ray.protocol.budget import Budget
 from vlagents_ray.protocol.messages import RankName
 from vlagents_ray.serve.config.dialects import DialectConfig, MappingSetting
@@ -119,7 +119,7 @@ class VlaEvalDialect(RouteDialect):
     def _hello(self, message: codec.Message) -> codec.Message:
         version = message.payload.get("protocol_version")
         if type(version) is not int or version != codec.PROTOCOL_VERSION:
-            error = MalformedMessage(f"protocol_version: got {str(version)[:20]}, want {codec.PROTOCOL_VERSION}")
+            error = MalformedMessage(f"protocol_version: got {shown(version, 20)}, want {codec.PROTOCOL_VERSION}")
             return _error(error, message.seq, uuid.uuid4().hex)
         known = self.context.metadata()
         payload: dict[str, Any] = {

@@ -22,7 +22,7 @@ from starlette.routing import BaseRoute, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from vlagents_ray.client.steering import ROBOT_PATH, SILENT_S, Steering
-from vlagents_ray.errors import MalformedMessage, VLAgentsError
+from vlagents_ray.errors import MalformedMessage, VLAgentsError, shown
 from vlagents_ray.protocol.json_messages import problem
 from vlagents_ray.serve.access.audit import log_pressed
 from vlagents_ray.serve.access.scope_check import ScopeCheck, caller_name
@@ -91,7 +91,7 @@ async def _control(fleet: Fleet, scopes: ScopeCheck, socket: WebSocket) -> None:
         first = await _received(socket, scopes, _OPERATE)
         session = first.get("session")
         if not isinstance(session, str):
-            raise MalformedMessage(f'live: got {first!r:.80}, want {{"session": ...}} first')
+            raise MalformedMessage(f'live: got {shown(first)}, want {{"session": ...}} first')
         exchange = await fleet.exchange(session)
         if exchange is None:
             await _end(socket, {"over": "nobody can take over this robot from here; start it with RemoteLeader"})

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from vlagents_ray.client.steering import SILENT_S
-from vlagents_ray.errors import MalformedMessage
+from vlagents_ray.errors import MalformedMessage, shown
 
 _WAIT_S = 1.0  # longest wait for a beat, after which the caller asks again
 _WHY = 200  # most characters of a reason
@@ -170,7 +170,7 @@ def read_beat(stated: object) -> dict[str, Any]:
     session, beat, hold, why, ended = (found.get(name) for name in ("session", "beat", "hold", "why", "ended"))
     texts = [session, hold, why, *(ended if isinstance(ended, list) and len(ended) == 2 else [None])]
     if not all(isinstance(text, str) for text in texts) or not 0 < len(str(session)) <= _NAME or type(beat) is not int:
-        raise MalformedMessage(f"robot: got {stated!r:.80}, want a beat with session, beat, hold, moves, why, ended")
+        raise MalformedMessage(f"robot: got {shown(stated)}, want a beat with session, beat, hold, moves, why, ended")
     _, hold, why, ended_hold, ended_why = (str(text) for text in texts)
     said = {"session": session, "beat": beat, "hold": hold, "moves": bool(found.get("moves")), "why": why[:_WHY]}
     return {**said, "ended": (ended_hold, ended_why[:_WHY])}
