@@ -338,7 +338,7 @@ def percentile(taken: list[float], percent: float) -> float:
     return taken[int(percent / 100 * len(taken))]
 
 
-def table(seconds: float = 4.0) -> None:
+def table(seconds: float = 3.0) -> None:
     """Print p50 and p99 of a robot's acts beside each flood, with those alone right before and the processor's time."""
     with child("serve") as server:
         assert server.stdout is not None
