@@ -19,7 +19,7 @@ from websockets.protocol import State
 from websockets.server import ServerProtocol
 
 from vlagents_ray.client.transports.probe import answer, is_probe, read_probe
-from vlagents_ray.errors import MalformedMessage, PolicyUnavailable, TooManyRequests, VLAgentsError
+from vlagents_ray.errors import MalformedMessage, Overloaded, PolicyUnavailable, TooManyRequests, VLAgentsError
 from vlagents_ray.protocol.frames import decode_requests
 from vlagents_ray.protocol.messages import STREAM_BYTES, Limits, Reply, Request
 from vlagents_ray.serve.access.api_keys import Caller, Identity
@@ -37,7 +37,7 @@ _HANDSHAKE_S = 5.0  # maximum time of a handshake
 _REFUSED_S = 1.0  # maximum time for which the refusal of a handshake is delayed
 _END_OF_HEADERS = b"\r\n\r\n"
 _UNANSWERED = 256  # maximum of unanswered messages of one client: further ones stay unread in its connection
-_GOING_AWAY, _UNSUPPORTED_DATA, _POLICY_VIOLATION = 1001, 1003, 1008  # close codes
+_GOING_AWAY, _UNSUPPORTED_DATA, _POLICY_VIOLATION, _TRY_AGAIN_LATER = 1001, 1003, 1008, 1013  # close codes
 
 
 class WebSocketConnection:
@@ -142,8 +142,8 @@ class WebSocketConnection:
                 self._frames.append((event, self._arrived, self._partial))
                 self._partial = None
         self._process_frames()
-        if self._received.size and self._partial is None and self._sender is not None and not self._ended:
-            self._begin_partial(self._sender)
+        if self._received.size and self._sender is not None and not self._ended:
+            self._hold_partial(self._sender)
         if not data or self._protocol.state is State.CLOSED or self._protocol.close_rcvd is not None:
             self.disconnect()
             return
@@ -152,18 +152,20 @@ class WebSocketConnection:
         if self._paused or self._decoding or self._throttled:
             self._stop_polling()
 
-    def _begin_partial(self, sender: Dispatcher) -> None:
-        """Count a message of which a part is here, before the rest is read; the rest stays unread over the rate."""
-        admission = sender.admission(self._limits)
+    def _hold_partial(self, sender: Dispatcher) -> None:
+        """Count a message of which a part is here for its key, before the rest is read, and its bytes as they come."""
         try:
-            admission.begin_message()
-            self._partial = admission
-        except TooManyRequests:
+            if self._partial is None:
+                admission = sender.admission(self._limits)
+                admission.begin_message()
+                self._partial = admission
+            self._partial.grow(self._received.size)
+        except TooManyRequests:  # the rest stays unread until the key is under its rate
             self._is_throttled()
             if sender.refused_too_often:
                 self.end(_POLICY_VIOLATION, REFUSED)
         except VLAgentsError as error:
-            self.end(_POLICY_VIOLATION, str(error))
+            self.end(_TRY_AGAIN_LATER if isinstance(error, Overloaded) else _POLICY_VIOLATION, str(error))
 
     def _is_throttled(self) -> bool:
         """Whether the key of the client is over its rate; if so, the connection is read again later."""
@@ -198,6 +200,8 @@ class WebSocketConnection:
             self._sender.release()
         with self._sending:
             self._ended = True  # the number of its descriptor may soon be reused
+            self._partial = None
+            self._received.discard()
             self._out.close()
             self._connection.close()
         self._on_close(self)
@@ -300,7 +304,7 @@ class WebSocketConnection:
         if self._ended or self._is_throttled():
             return
         if self._received.size and self._partial is None and self._sender is not None:
-            self._begin_partial(self._sender)
+            self._hold_partial(self._sender)
         self._continue()
 
     def _process(self, frame: Frame, arrived: float, admission: MessageAdmission | None) -> None:

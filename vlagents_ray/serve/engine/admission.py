@@ -184,13 +184,18 @@ class MessageAdmission(Budget):
                 raise refusal
         self.serial = not (self._robot or self._inline)
         if self.size:
-            self.receive(self.size)
+            self.grow(self.size)
             self.size = 0
 
     def receive(self, size: int) -> None:
         """Count bytes of the message itself as in flight; raises the errors of `Admission.hold`."""
         self._admission.hold(size, self._robot, self._held)
         self._held += size
+
+    def grow(self, size: int) -> None:
+        """Count the message as in flight with `size` bytes, of which some may be counted; raises as `receive`."""
+        if size > self._held:
+            self.receive(size - self._held)
 
     def hold(self, size: int) -> None:
         """See `Budget`; raises `NeedsDecodingThread` if decoding the message would take too long on this thread."""
