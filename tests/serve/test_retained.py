@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import queue
 import socket
 import struct
 import tracemalloc
@@ -18,15 +19,19 @@ from api_key_replica import KeyedReplica, keyed_replica
 from eval_fakes import wait_for
 from websockets.exceptions import InvalidStatus
 
+from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.credentials import Credentials
 from vlagents_ray.client.transports.direct_websocket import Stream
 from vlagents_ray.client.transports.local.shm import ShmTransport
-from vlagents_ray.errors import MessageTooLarge, TooManyRequests, VLAgentsError
+from vlagents_ray.errors import MessageTooLarge, Overloaded, PolicyUnavailable, TooManyRequests, VLAgentsError
 from vlagents_ray.interface import Obs
 from vlagents_ray.protocol.frames import decode_replies, encode_request
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, STREAM_BYTES, Request
 from vlagents_ray.serve.access import api_keys
+from vlagents_ray.serve.access.api_keys import NoKey
+from vlagents_ray.serve.dialects.base import GatewayContext
 from vlagents_ray.serve.dialects.gr00t import handler as gr00t
+from vlagents_ray.serve.engine.admission import Admission
 from vlagents_ray.serve.engine.dispatch import REFUSALS
 from vlagents_ray.wire.lerobot.upstream import read_chunk
 from vlagents_ray.wire.pickles.tensors import _CONSTANT
@@ -154,6 +159,26 @@ def test_parts_of_messages_before_a_key_are_bounded_at_groots_gateway(
     wait_for(lambda: _rss() - before < SLACK)
     for connection in held:
         connection.close()
+
+
+def test_requests_that_wait_at_groots_gateway_count_as_in_flight() -> None:
+    admission = Admission(3 * 10**6)
+    context = GatewayContext("app", _connect, DEFAULT_LIMITS, 8, 30.0, None, NoKey.OPEN, admission)
+    answers: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+    dialect = gr00t.GR00TDialect("gr00t", gr00t.GR00TDialectConfig(), context)
+    client = gr00t.GR00TConnection(context, dialect.mapping, answers.put)
+    with pytest.raises((Overloaded, MessageTooLarge)):
+        client.put(bytes(4 * 10**6))
+    assert client.put(bytes(10**6))
+    answers.get(timeout=10)
+    assert admission.held == 0
+    client.end()
+    client.join(10)
+    dialect.close()
+
+
+def _connect(*_: object) -> RemoteAgent:
+    raise PolicyUnavailable("there is no replica")
 
 
 def _ended(connection: socket.socket) -> bool:

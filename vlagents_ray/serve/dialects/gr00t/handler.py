@@ -15,7 +15,7 @@ from typing import Any
 
 from pydantic import Field
 
-from vlagents_ray.errors import PolicyUnavailable
+from vlagents_ray.errors import PolicyUnavailable, VLAgentsError
 from vlagents_ray.registry import require
 from vlagents_ray.serve.config.dialects import MappingSetting, PortConfig
 from vlagents_ray.serve.dialects.base import GatewayContext, PortDialect
@@ -179,8 +179,11 @@ class GR00TDialect(PortDialect):
                 return
         if self._strangers is not None:
             self._strangers.note_client(descriptor, client)
-        if not client.put(payload):
-            self.answer(envelope, codec.pack({"error": "malformed: wait for the answer before the next request"}))
+        try:
+            if not client.put(payload):
+                self.answer(envelope, codec.pack({"error": "malformed: wait for the answer before the next request"}))
+        except VLAgentsError as error:
+            self.answer(envelope, codec.pack({"error": f"{error.code}: {error}"}))
 
     def _forget_quiet(self) -> None:
         """End the sessions of idle clients and of clients whose key is no longer valid, twice a second."""
