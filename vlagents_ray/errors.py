@@ -46,7 +46,37 @@ was received, what was expected, and how to cure it.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from itertools import islice
 from typing import ClassVar, Literal
+
+_SHOWN_ITEMS = 8  # of a list or dict in an error
+
+
+def shown(value: object, most: int = 80) -> str:
+    """Return a short text of a value of the network, for an error, at most `most` characters.
+
+    Its time and memory do not depend on the size of the value, of which `repr` or `str` would write all first.
+    """
+    text = _shown(value, most, 3)
+    return text if len(text) <= most else f"{text[: most - 1]}…"
+
+
+def _shown(value: object, most: int, levels: int) -> str:
+    if isinstance(value, str | bytes | bytearray):
+        return repr(value[:most]) + ("…" if len(value) > most else "")
+    if value is None or isinstance(value, bool | float) or (isinstance(value, int) and value.bit_length() <= 128):
+        return repr(value)
+    if not isinstance(value, dict | list | tuple | set | frozenset):
+        shape = getattr(value, "shape", None)
+        return f"{type(value).__name__}{'' if shape is None else f' of shape {shape}'}"
+    parts = []
+    for item in islice(value, _SHOWN_ITEMS if levels else 0):
+        key = f"{_shown(item, most, 0)}: " if isinstance(value, dict) else ""
+        parts.append(key + _shown(value[item] if isinstance(value, dict) else item, most, levels - 1))
+    if len(value) > len(parts):
+        parts.append("…")
+    left, right = ("[", "]") if isinstance(value, list) else ("(", ")") if isinstance(value, tuple) else ("{", "}")
+    return f"{left}{', '.join(parts)}{right}"
 
 
 class VLAgentsError(Exception):

@@ -45,7 +45,7 @@ from vlagents_ray.errors import DeadlineExceeded, MessageTooLarge, Overloaded, T
 from vlagents_ray.images import codecs, jpeg_png
 from vlagents_ray.images.codecs import decode_files
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.protocol import frame_layout
+from vlagents_ray.protocol import frame_layout, json_messages
 from vlagents_ray.protocol.budget import Budget
 from vlagents_ray.protocol.frames import (
     CONTENT_TYPE,
@@ -67,6 +67,7 @@ from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.admission import Admission, MessageAdmission, NeedsDecodingThread
 from vlagents_ray.serve.engine.dispatch import Dispatcher
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.wire import json_numpy, msgpack
 from vlagents_ray.wire.gr00t import codec as gr00t_codec
 from vlagents_ray.wire.openpi import codec as openpi_codec
 from vlagents_ray.wire.openvla import codec as openvla_codec
@@ -104,10 +105,15 @@ def replica(tmp_path_factory: pytest.TempPathFactory) -> Iterator[KeyedReplica]:
 
 @pytest.fixture
 def decoded(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """By whom a message was decoded: images anywhere, or all of it by the readers of dialects of raw pixels."""
+    """The decoders that were called, and the parsers outside of the test's own thread, in which its clients run."""
     by: list[str] = []
     for module, name in (
         (jpeg_png, "decode"),
+        (frame_layout, "parse_json"),
+        (json_messages, "parse_json"),
+        (json_numpy, "loads"),
+        (json_numpy, "decode_base64"),
+        (msgpack, "unpack"),
         (api_key_replica, "read_header"),
         (openpi_codec, "decode"),
         (openvla_codec, "decode"),
@@ -116,7 +122,8 @@ def decoded(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         original = getattr(module, name)
 
         def noted(*args: Any, original: Any = original, name: str = name, **options: Any) -> Any:
-            by.append(name)
+            if name == "decode" or threading.current_thread() is not threading.main_thread():
+                by.append(name)
             return original(*args, **options)
 
         monkeypatch.setattr(module, name, noted)
@@ -203,7 +210,7 @@ CARRY: dict[str, list[Callable[[Visitor, str], str]]] = {
 }
 NOTHING_TO_DECODE = {
     *(way for way in WAYS if way.startswith("`GET")),
-    "`POST /v1/close`",  # is free, and nothing that it brings is decoded
+    "`POST /v1/close`",  # nothing that it brings is decoded
     "`POST /v1/probe`",
     "own port, another path",  # is refused
     "`WS /v1/weights`",  # is refused without the scope
@@ -564,7 +571,7 @@ def test_a_message_that_is_read_again_elsewhere_counts_once() -> None:
     with pytest.raises(NeedsDecodingThread):
         read(message)
     assert all(isinstance(answer, Request) for answer in message.decode_on_thread(read).result(30))
-    assert counted == ["reset", "reset"]
+    assert counted == ["message", "reset"]
 
 
 def test_simulations_images_are_decoded_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,8 @@
-"""A keyed replica in a process of its own, and one that floods it: `flood.py serve`, `flood.py attack WAY WHERE S`."""
+"""A keyed replica in a process of its own, and one that floods it.
+
+`flood.py serve`, `flood.py attack WAY PART WHERE CONNECTIONS S`, and `flood.py table`, which prints how long a robot's
+acts take beside each flood.
+"""
 
 from __future__ import annotations
 
@@ -9,12 +13,14 @@ import json
 import os
 import socket
 import struct
+import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict
-from functools import partial
+from functools import cache, partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,11 +30,13 @@ from websockets.client import ClientProtocol
 from websockets.protocol import State
 from websockets.uri import parse_uri
 
+from vlagents_ray.client.credentials import Credentials
+from vlagents_ray.client.transports.local.shm import ShmTransport
 from vlagents_ray.images import jpeg_png
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol import frame_layout
 from vlagents_ray.protocol.frames import CONTENT_TYPE
-from vlagents_ray.protocol.messages import Limits, LocalAddress
+from vlagents_ray.protocol.messages import Limits, LocalAddress, Request
 from vlagents_ray.serve.access.api_keys import Keys
 from vlagents_ray.serve.config.dialects import DialectArgs
 from vlagents_ray.serve.dialects.base import ReplicaContext
@@ -91,6 +99,37 @@ def _frame(op: str = "reset") -> bytes:
     return b"".join(frame_layout.pack({"op": op, "obs": seen[0], "history": seen[1:]}, [_jpeg()] * IMAGES))
 
 
+def _header() -> bytes:
+    """Many values in the header, none of which is ever read for a key over its rate."""
+    numbers = ",".join(["1.2345678901234"] * 900_000)
+    return _assembled(f'{{"op":"act","obs":{{"info":{{"x":[{numbers}]}}}},"blobs":[]}}')
+
+
+def _allowed_header() -> bytes:
+    """The longest header with the most values that a server parses."""
+    text = "\\u00e9" * 140_000
+    numbers = ",".join(["1"] * (frame_layout.VALUES - 20))
+    return _assembled(f'{{"op":"act","obs":{{"info":{{"t":"{text}","x":[{numbers}]}}}},"blobs":[]}}')
+
+
+def _names() -> bytes:
+    cameras = ",".join(f'"{i:06d}":{{"$":["img",0]}}' for i in range(400_000))
+    return _assembled(f'{{"op":"act","obs":{{"cameras":{{{cameras}}}}},"blobs":[]}}')
+
+
+def _blobs() -> bytes:
+    return _assembled(f'{{"op":"act","obs":{{}},"blobs":[{",".join(["0"] * 7_000_000)}]}}')
+
+
+def _history() -> bytes:
+    seen = ",".join(['{"state":{"a":{"$":["nd",0,"<f4",[1]]}}}'] * 300_000)
+    return _assembled(f'{{"op":"reset","obs":{{}},"history":[{seen}],"blobs":[4]}}') + bytes(4)
+
+
+def _assembled(header: str) -> bytes:
+    return b"".join(frame_layout.assemble(header, []))
+
+
 def _raw_frame() -> bytes:
     size = 2304 * 2400 * 3
     node = {"cameras": {"front": {"$": ["nd", 0, "|u1", [2304, 2400, 3]]}}}
@@ -140,19 +179,22 @@ def _drain(connection: socket.socket) -> None:
 def _websocket(path: str) -> Attack:
     def attack(message: bytes, where: Where, key: str, end: float) -> None:
         port, place = (where["own"][0], where["own"][1]) if path == "own" else (where["port"], path)
-        head = bytes([0x82, 0x80 | 127]) + struct.pack(">Q", len(message)) + bytes(4)
+        head = bytes([0x82, 0x80 | 127]) + struct.pack(">Q", len(message)) + bytes(4)  # a mask of zeros
         with socket.create_connection(("127.0.0.1", port), timeout=5) as connection:
             protocol = ClientProtocol(parse_uri(f"ws://127.0.0.1:{port}{place}"))
             request = protocol.connect()
             request.headers["authorization"] = f"Bearer {key}"
             protocol.send_request(request)
             connection.sendall(b"".join(protocol.data_to_send()))
-            while protocol.state is State.CONNECTING:
-                protocol.receive_data(connection.recv(65536))
+            while protocol.state is State.CONNECTING and (answer := connection.recv(65536)):
+                protocol.receive_data(answer)
+            if protocol.state is not State.OPEN:
+                return
             threading.Thread(target=_drain, args=(connection,), daemon=True).start()
             while (left_s := end - time.monotonic()) > 0:
                 connection.settimeout(left_s)
-                connection.sendall(head + message)
+                connection.sendall(head)
+                connection.sendall(message)
 
     return attack
 
@@ -165,21 +207,28 @@ def _post(path: str, kind: str) -> Attack:
         ).encode()
         with socket.create_connection(("127.0.0.1", where["port"]), timeout=5) as connection:
             while time.monotonic() < end:
-                connection.sendall(head + content)
+                connection.sendall(head)
+                connection.sendall(content)
                 if not connection.recv(65536):
                     return
 
     return attack
 
 
+@cache
+def _memory_file(message: bytes) -> int:
+    descriptor = os.memfd_create("flood", os.MFD_ALLOW_SEALING)
+    os.ftruncate(descriptor, len(message))
+    os.pwrite(descriptor, message, 0)
+    fcntl.fcntl(descriptor, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK)
+    return descriptor
+
+
 def _shared_memory(message: bytes, where: Where, key: str, end: float) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:
         connection.connect("\0" + where["local"]["socket"])
         connection.send(key.encode())
-        descriptor = os.memfd_create("flood", os.MFD_ALLOW_SEALING)
-        os.ftruncate(descriptor, len(message))
-        os.pwrite(descriptor, message, 0)
-        fcntl.fcntl(descriptor, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK)
+        descriptor = _memory_file(message)
         threading.Thread(target=_drain, args=(connection,), daemon=True).start()
         head = LocalAddress.REQUEST.pack(0, 0, len(message))
         socket.send_fds(connection, [head], [descriptor])
@@ -205,19 +254,134 @@ WAYS: dict[str, tuple[Callable[[], bytes], Attack]] = {
 }
 
 
-def attack(way: str, where: Where, seconds: float) -> None:
+PARTS: dict[str, Callable[[], bytes]] = {
+    "header": _header,
+    "allowed header": _allowed_header,
+    "names": _names,
+    "blobs": _blobs,
+    "history": _history,
+}
+"""The largest message in each part of the grammar of a frame; "images" is the largest that each way takes."""
+FRAMES = ("own port", "WS /v1/stream", "POST /v1/reset, frame", "shared memory")  # the ways that take a frame
+
+
+def attack(way: str, part: str, where: Where, connections: int, seconds: float) -> None:
     """Send the largest messages for so long, as fast as they are taken, whatever is answered."""
     make, send = WAYS[way]
-    message, end = make(), time.monotonic() + seconds
+    message, end = PARTS.get(part, make)(), time.monotonic() + seconds
+
+    def flood() -> None:
+        while time.monotonic() < end:
+            with contextlib.suppress(OSError):  # cut off: once more
+                send(message, where, key_of(way), end)
+            time.sleep(0.001)
+
+    threads = [threading.Thread(target=flood, daemon=True) for _ in range(connections)]
+    for thread in threads:
+        thread.start()
     print("begun", flush=True)
+    for thread in threads:
+        thread.join(max(0.0, end - time.monotonic()))
+
+
+@contextlib.contextmanager
+def child(*args: str) -> Iterator[subprocess.Popen[str]]:
+    """This file as a process, which has printed its first line to `stdout`."""
+    folders = [str(Path(__file__).parents[2]), str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]
+    process = subprocess.Popen(
+        [sys.executable, __file__, *args],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(folders)},
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    )
+    try:
+        yield process
+    finally:
+        if process.stdin is not None:
+            process.stdin.close()
+        if args[0] == "attack":
+            process.kill()
+        process.wait(30)
+
+
+IMAGE = np.zeros((224, 224, 3), np.uint8)
+OBS = Obs({"front": IMAGE, "wrist": IMAGE.copy()}, state={"joints": np.zeros(7, np.float32)})
+
+
+@contextlib.contextmanager
+def robot(where: Where) -> Iterator[ShmTransport]:
+    """A robot of the replica, in a session."""
+    transport = ShmTransport(where["local"], Credentials("robot"))
+    transport.connect(10)
+    [reply] = transport.call([Request("reset", OBS)], 30)
+    assert reply.error is None
+    yield transport
+    transport.close()
+
+
+def acts_ms(robot: ShmTransport, seconds: float) -> list[float]:
+    """Return how long a robot's acts took, sorted, one each 10 ms."""
+    taken, end = [], time.monotonic() + seconds
     while time.monotonic() < end:
-        with contextlib.suppress(OSError):  # cut off: once more
-            send(message, where, key_of(way), end)
-        time.sleep(0.001)
+        begun = time.perf_counter()
+        [reply] = robot.call([Request("act", OBS)], 60)
+        taken.append((time.perf_counter() - begun) * 1e3)
+        assert reply.error is None
+        time.sleep(0.01)
+    return sorted(taken)
+
+
+def percentile(taken: list[float], percent: float) -> float:
+    """Return the value below which so many percent of sorted values lie."""
+    return taken[int(percent / 100 * len(taken))]
+
+
+def table(seconds: float = 3.0) -> None:
+    """Print p50 and p99 of a robot's acts beside each flood, with those alone right before and the processor's time."""
+    with child("serve") as server:
+        assert server.stdout is not None
+        where = json.loads(server.stdout.readline())
+        with robot(where) as transport:
+            acts_ms(transport, 1.0)
+            for way in sys.argv[2:] or FRAMES:
+                for part, connections in CASES if way in FRAMES else [("images", 1), ("images", 8), ("images", 32)]:
+                    alone = acts_ms(transport, seconds / 2)
+                    with child("attack", way, part, json.dumps(where), str(connections), "30") as attacker:
+                        assert attacker.stdout is not None
+                        attacker.stdout.readline()
+                        time.sleep(1.5)
+                        before = _cpu_s(server.pid), _cpu_s(attacker.pid)
+                        beside = acts_ms(transport, seconds)
+                        used = [
+                            100 * (_cpu_s(p.pid) - b) / seconds for p, b in zip((server, attacker), before, strict=True)
+                        ]
+                    numbers = " ".join(f"{percentile(t, n):8.2f}" for n in (50, 99) for t in (alone, beside))
+                    print(f"{way:23s}{part:15s}{connections:3d} {numbers}  {used[0]:4.0f} {used[1]:4.0f}", flush=True)
+                    time.sleep(1.0)
+
+
+CASES = (
+    *(("images", n) for n in (1, 8, 32)),
+    *(("header", n) for n in (1, 8, 32)),
+    ("allowed header", 32),
+    ("names", 8),
+    ("blobs", 8),
+    ("history", 8),
+)
+
+
+def _cpu_s(pid: int) -> float:
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 if __name__ == "__main__":
     if sys.argv[1] == "serve":
         serve()
+    elif sys.argv[1] == "table":
+        print(f"{'':41s}{'p50 alone, beside':>18s}{'p99 alone, beside':>18s}  % of a core: server, attacker")
+        table()
     else:
-        attack(sys.argv[2], json.loads(sys.argv[3]), float(sys.argv[4]))
+        attack(sys.argv[2], sys.argv[3], json.loads(sys.argv[4]), int(sys.argv[5]), float(sys.argv[6]))

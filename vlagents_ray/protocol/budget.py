@@ -6,6 +6,8 @@ from vlagents_ray.errors import MessageTooLarge
 from vlagents_ray.images.codecs import DecodedFiles
 from vlagents_ray.protocol.messages import Limits
 
+_JSON_FACTOR = 4  # bytes of Python's objects for each byte of JSON within the limits of `frame_layout`
+
 
 class Budget:
     """The budget of one message: before an image is decoded or bytes are copied, its declared size is checked here.
@@ -27,8 +29,16 @@ class Budget:
         """The largest number of pixels of one image."""
         return self.limits.pixels
 
+    def begin_message(self) -> None:
+        """Count the message for its sender, before any of it is parsed; raises the error that refuses it."""
+
+    def parse(self, size: int) -> None:
+        """Count what the values of `size` bytes of JSON take, before they are parsed; raises as `hold`."""
+        self._left = self.limits.decoded_bytes
+        self.hold(_JSON_FACTOR * size)
+
     def begin(self, op: object, rank: object = "robot") -> None:
-        """Begin the next request of the message, before any of it is decoded; raises the error that refuses it."""
+        """Begin the next request of the message, whose header is parsed; raises the error that refuses it."""
         self._left = self.limits.decoded_bytes
 
     def count(self, size: int) -> None:

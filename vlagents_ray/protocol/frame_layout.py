@@ -15,12 +15,15 @@ from typing import Any
 
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge
 from vlagents_ray.protocol.arrays import Buffer
+from vlagents_ray.protocol.budget import Budget
 from vlagents_ray.protocol.messages import PROTOCOL_VERSION, Limits
 
 _PREFIX = struct.Struct("<3sBI")
 _ALIGN = 8
-_SHORT = 2**20  # bytes of JSON; a shorter text cannot need much memory
-_VALUES = 1_000_000  # most values in a longer text
+HEADER_BYTES = 2**20  # most bytes of the JSON of a request; the limits of a body hold for that of a reply
+VALUES = 20_000  # most values in the JSON of a request, which parses in about 2 ms
+_INLINE_BYTES = 64 * 1024  # longer JSON is parsed within a budget, which may move it to a decoding thread
+_LONG_VALUES = 1_000_000
 dump = json.JSONEncoder(separators=(",", ":")).encode  # created once, as `json.dumps` creates an encoder for each call
 
 
@@ -42,8 +45,13 @@ def assemble(header: str, blobs: list[Buffer]) -> list[Buffer]:
     return parts
 
 
-def unpack(data: Buffer, limits: Limits) -> tuple[dict[str, Any], list[Buffer]]:
+def unpack(data: Buffer, limits: Limits, budget: Budget | None = None) -> tuple[dict[str, Any], list[Buffer]]:
     """Return the header of a frame and views of its blobs.
+
+    Args:
+        data: The frame.
+        limits: The limits of its size.
+        budget: Of a request, whose header has further limits; None for a reply.
 
     Raises:
         MalformedMessage: The data are not a frame.
@@ -62,7 +70,7 @@ def unpack(data: Buffer, limits: Limits) -> tuple[dict[str, Any], list[Buffer]]:
     at = _PREFIX.size + length
     if at > len(view):
         raise MalformedMessage(f"frame: ends inside its header ({len(view)} of {at} bytes); it was truncated")
-    header = parse_json(bytes(view[_PREFIX.size : at]), "frame: the header is")
+    header = parse_json(view[_PREFIX.size : at], "frame: the header is", budget=budget, long=budget is None)
     lengths = header.get("blobs") if isinstance(header, dict) else None
     if not isinstance(lengths, list) or not all(type(n) is int and n >= 0 for n in lengths):
         raise MalformedMessage("frame: the header has no list 'blobs' of lengths")
@@ -78,21 +86,37 @@ def unpack(data: Buffer, limits: Limits) -> tuple[dict[str, Any], list[Buffer]]:
     return header, blobs
 
 
-def parse_json(text: bytes | str, what: str, pairs: Callable[[list[tuple[str, Any]]], Any] | None = None) -> Any:
+def parse_json(
+    text: Buffer | str,
+    what: str,
+    pairs: Callable[[list[tuple[str, Any]]], Any] | None = None,
+    *,
+    budget: Budget | None = None,
+    long: bool = False,
+) -> Any:
     """Return the value of a JSON text of the network.
 
     Args:
         text: The text; bytes are UTF-8.
         what: The beginning of the error message, such as "obs:".
         pairs: Makes the value of an object from its keys and values; a `ValueError` of it is a `MalformedMessage`.
+        budget: Is charged before a long text is parsed.
+        long: Whether it may be longer than a request: the reply of a server, or a file.
 
     Raises:
         MalformedMessage: It is not JSON, or has characters that no text can have: halves of surrogate pairs.
-        MessageTooLarge: It would need far more memory and time to read than its length suggests.
+        MessageTooLarge: It is too long, or has too many values.
     """
-    _require_few_values(text)
+    if len(text) > HEADER_BYTES and not long:
+        raise MessageTooLarge(
+            f"message: got {len(text)} bytes of JSON, the limit is {HEADER_BYTES}; send arrays and files as bytes"
+        )
+    if budget is not None and len(text) > _INLINE_BYTES:
+        budget.parse(len(text))
+    data = text if isinstance(text, str) else bytes(text)
+    _require_few_values(data, _LONG_VALUES if long else VALUES)
     try:
-        decoded = text if isinstance(text, str) else text.decode("utf-8-sig")
+        decoded = data if isinstance(data, str) else data.decode("utf-8-sig")
         value = json.loads(decoded, object_pairs_hook=pairs)
         if "\\u" in decoded:
             json.dumps(value, ensure_ascii=False).encode()  # raises an error for half of a pair
@@ -101,10 +125,10 @@ def parse_json(text: bytes | str, what: str, pairs: Callable[[list[tuple[str, An
     return value
 
 
-def _require_few_values(text: bytes | str) -> None:
+def _require_few_values(text: bytes | str, most: int) -> None:
     """Raise `MessageTooLarge` for JSON that would need far more memory and time to read than its length suggests."""
-    if len(text) <= _SHORT:
+    if len(text) <= 2 * most:  # each value takes two characters at least
         return
-    data = text.encode("utf-8", "replace") if isinstance(text, str) else text
-    if sum(map(data.count, (b",", b"[", b"{"))) > _VALUES:
-        raise MessageTooLarge(f"message: more than {_VALUES} values in its JSON; send arrays instead of lists")
+    marks: tuple[Any, ...] = (",", "[", "{") if isinstance(text, str) else (b",", b"[", b"{")
+    if sum(map(text.count, marks)) > most:
+        raise MessageTooLarge(f"message: more than {most} values in its JSON; send arrays instead of lists")

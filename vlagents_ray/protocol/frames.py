@@ -18,6 +18,7 @@ from vlagents_ray.errors import (
     TooManyRequests,
     VLAgentsError,
     from_code,
+    shown,
 )
 from vlagents_ray.images.codecs import RAW, ImageCodec
 from vlagents_ray.interface import Act
@@ -98,13 +99,20 @@ def _write_request(request: Request, writer: ValueWriter, codec: ImageCodec) -> 
 def decode_requests(data: Buffer, budget: Budget, ops: Sequence[Op] = OPS) -> list[Request | Reply]:
     """Return the requests in a frame, each one of `ops`; a refused request is replaced by the reply with its error.
 
-    `budget` is charged for each request before any of it is decoded.
+    `budget` is charged for the message before any of it is parsed, and for each further request before its images are
+    decoded.
+
+    Raises:
+        MalformedMessage: The data are not a frame of requests.
+        MessageTooLarge: The frame exceeds a limit.
+        TooManyRequests: The key of the sender is over its rate.
     """
+    budget.begin_message()
     limits = budget.limits
-    header, blobs = unpack(data, limits)
+    header, blobs = unpack(data, limits, budget)
     nodes = header.get("requests", [header])
     if not isinstance(nodes, list) or not nodes or not all(isinstance(node, dict) for node in nodes):
-        raise MalformedMessage(f"requests: got {str(nodes)[:40]}, want a list of requests")
+        raise MalformedMessage(f"requests: got {shown(nodes)}, want a list of requests")
     if len(nodes) > limits.requests:
         raise MessageTooLarge(f"requests: got {len(nodes)}, the limit is {limits.requests} in one frame")
     read: list[Request | Reply] = []
@@ -123,9 +131,9 @@ def decode_requests(data: Buffer, budget: Budget, ops: Sequence[Op] = OPS) -> li
 def _read_request(node: dict[str, Any], reader: ValueReader, limits: Limits, ops: Sequence[Op] = OPS) -> Request:
     unknown = node.keys() - _REQUEST_KEYS
     if unknown:
-        raise MalformedMessage(f"request: unknown keys {sorted(unknown)}, want some of {sorted(_REQUEST_KEYS)}")
+        raise MalformedMessage(f"request: unknown keys {shown(sorted(unknown))}, want some of {sorted(_REQUEST_KEYS)}")
     if node.get("op") not in ops:
-        raise MalformedMessage(f"op: got {str(node.get('op'))[:40]!r}, want one of {list(ops)}")
+        raise MalformedMessage(f"op: got {shown(node.get('op'))}, want one of {list(ops)}")
     if node["op"] == "close":  # costs nothing, and carries nothing
         node = {name: value for name, value in node.items() if name in _OF_CLOSE}
     obs, history = node.get("obs"), node.get("history") or []
@@ -177,16 +185,16 @@ def check_request(request: Request, limits: Limits) -> Request:
         if value is not None and not isinstance(value, dict):
             raise MalformedMessage(f"{name}: got {type(value).__name__}, want an object")
     if type(request.parts) is not bool:
-        raise MalformedMessage(f"parts: got {str(request.parts)[:40]}, want true or false")
+        raise MalformedMessage(f"parts: got {shown(request.parts)}, want true or false")
     if request.rank not in RANKS:
-        raise MalformedMessage(f"rank: got {str(request.rank)[:40]!r}, want one of {list(RANKS)}")
+        raise MalformedMessage(f"rank: got {shown(request.rank)}, want one of {list(RANKS)}")
     if request.step is not None and (type(request.step) is not int or request.step < 0):
-        raise MalformedMessage(f"step: got {str(request.step)[:40]}, want a whole number of acts")
+        raise MalformedMessage(f"step: got {shown(request.step)}, want a whole number of acts")
     if request.deadline_ms is not None and not (
         is_number(request.deadline_ms) and 0 < request.deadline_ms < MOST_DEADLINE_MS
     ):
         raise MalformedMessage(
-            f"deadline_ms: got {str(request.deadline_ms)[:40]}, want a number above 0 and below {MOST_DEADLINE_MS:g}"
+            f"deadline_ms: got {shown(request.deadline_ms)}, want a number above 0 and below {MOST_DEADLINE_MS:g}"
         )
     return request
 
@@ -253,7 +261,7 @@ def decode_replies(data: Buffer, limits: Limits = DEFAULT_LIMITS) -> list[Reply]
     header, blobs = unpack(data, limits)
     nodes = header.get("replies", [header])
     if not isinstance(nodes, list) or not nodes or not all(isinstance(node, dict) for node in nodes):
-        raise MalformedMessage(f"replies: got {str(nodes)[:40]}, want a list of replies")
+        raise MalformedMessage(f"replies: got {shown(nodes)}, want a list of replies")
     return [_read_reply(node, ValueReader(blobs, Budget(limits))) for node in nodes]
 
 
@@ -271,7 +279,7 @@ def _read_reply(node: dict[str, Any], reader: ValueReader) -> Reply:
             reply.act = Act(reader.blob(act["action"]), bool(act["done"]), reader.value(act["info"]))
             reply.act.more = act.get("more") is True
         except (KeyError, TypeError) as error:
-            raise MalformedMessage(f"reply: got {str(act)[:80]}, want action, done and info") from error
+            raise MalformedMessage(f"reply: got {shown(act)}, want action, done and info") from error
     else:
         reply.info = reader.value(node.get("info") or {})
     return reply

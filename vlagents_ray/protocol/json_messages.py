@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.errors import MalformedMessage, VLAgentsError
+from vlagents_ray.errors import MalformedMessage, VLAgentsError, shown
 from vlagents_ray.protocol.budget import Budget
 from vlagents_ray.protocol.frame_layout import parse_json
 from vlagents_ray.protocol.frames import check_request, describe_error
@@ -33,7 +33,7 @@ def request_from_parts(op: Op, text: str | bytes, images: Mapping[str, bytes], b
     """
     limits = budget.limits
     budget.begin(op)
-    document = parse_json(text, "obs:", _distinct)
+    document = parse_json(text, "obs:", _distinct, budget=budget)
     if not isinstance(document, dict):
         raise MalformedMessage(f"obs: got {type(document).__name__}, want an object")
     unknown = document.keys() - _KEYS
@@ -43,7 +43,7 @@ def request_from_parts(op: Op, text: str | bytes, images: Mapping[str, bytes], b
             "each image as a file 'cameras.<name>', JPEG or PNG"
         )
     if unknown:
-        raise MalformedMessage(f"obs: unknown keys {sorted(unknown)}, want some of {sorted(_KEYS)}")
+        raise MalformedMessage(f"obs: unknown keys {shown(sorted(unknown))}, want some of {sorted(_KEYS)}")
     names = [] if op == "close" else list(images)  # costs nothing, and carries nothing
     reader = ValueReader([images[name] for name in names], budget)
     obs = {key: document[key] for key in ("gripper", "state", "info") if key in document}

@@ -94,7 +94,7 @@ class Limits:
     depth: int = 8  # nesting of `info` and `kwargs`
     items: int = 10_000  # values in `info` and `kwargs` together
     text: int = 16_384  # characters of an instruction
-    requests: int = 4096  # in one frame
+    requests: int = 512  # in one frame
     history: int = 256  # observations that come with a reset
     reply_bytes: int = 16 * 2**20  # of the action and the info of one reply
     # of the images and bytes of one request, each counted as often as it is referred to

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.errors import InvalidObservation, MalformedMessage, MessageTooLarge
+from vlagents_ray.errors import InvalidObservation, MalformedMessage, MessageTooLarge, shown
 from vlagents_ray.images.codecs import ImageCodec, encode_files
 from vlagents_ray.interface import Obs
 from vlagents_ray.protocol.messages import NAME_CHARACTERS, Limits
@@ -21,7 +21,7 @@ def read_obs(node: Any, reader: ValueReader, limits: Limits) -> Obs:
         raise MalformedMessage(f"obs: got {type(node).__name__}, want an object")
     unknown = node.keys() - _OBS_KEYS
     if unknown:
-        raise MalformedMessage(f"obs: unknown keys {sorted(unknown)}, want some of {sorted(_OBS_KEYS)}")
+        raise MalformedMessage(f"obs: unknown keys {shown(sorted(unknown))}, want some of {sorted(_OBS_KEYS)}")
     cameras, state = node.get("cameras") or {}, node.get("state") or {}
     info, gripper = node.get("info") or {}, node.get("gripper")
     for name, value in (("cameras", cameras), ("state", state), ("info", info)):
@@ -35,7 +35,7 @@ def read_obs(node: Any, reader: ValueReader, limits: Limits) -> Obs:
                 f"obs: got a camera or state named {name[:40]!r}, want 1 to {NAME_CHARACTERS} printable characters"
             )
     if gripper is not None and not is_number(gripper):
-        raise InvalidObservation(f"gripper: got {str(gripper)[:40]!r}, want a number in [0, 1] where 1 = open")
+        raise InvalidObservation(f"gripper: got {shown(gripper)}, want a number in [0, 1] where 1 = open")
     reader.decode_images(cameras)
     return Obs(
         cameras={name: as_camera(name, reader.blob(image), limits) for name, image in cameras.items()},

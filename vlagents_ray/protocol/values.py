@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.errors import InvalidInput, MalformedMessage, MessageTooLarge
+from vlagents_ray.errors import InvalidInput, MalformedMessage, MessageTooLarge, shown
 from vlagents_ray.images.codecs import decode_files
 from vlagents_ray.protocol.arrays import Buffer, is_plain, read_array
 from vlagents_ray.protocol.budget import Budget
@@ -114,7 +114,7 @@ class ValueReader:
         """Return the array, image, bytes or number that `{"$": [...]}` refers to."""
         reference = _reference(node)
         if not reference or len(node) != 1:
-            raise MalformedMessage(f"reference: got {str(node)[:80]}, want {{'$': [kind, blob, ...]}}")
+            raise MalformedMessage(f"reference: got {shown(node)}, want {{'$': [kind, blob, ...]}}")
         kind, *rest = reference
         if kind == "nd" and len(rest) == 3:
             data = self._get(rest[0])
@@ -126,7 +126,7 @@ class ValueReader:
             return self._bytes_of(rest[0])
         if kind == "float" and rest in (["nan"], ["inf"], ["-inf"]):
             return float(rest[0])
-        raise MalformedMessage(f"reference: got {str(reference)[:80]}, want 'nd', 'img', 'bin' or 'float'")
+        raise MalformedMessage(f"reference: got {shown(reference)}, want 'nd', 'img', 'bin' or 'float'")
 
     def _image(self, index: Any) -> np.ndarray:
         data = self._get(index)
@@ -157,7 +157,7 @@ class ValueReader:
 
     def _get(self, index: Any) -> Buffer:
         if type(index) is not int or not 0 <= index < len(self._blobs):
-            raise MalformedMessage(f"reference: got blob {str(index)[:20]}, want a number below {len(self._blobs)}")
+            raise MalformedMessage(f"reference: got blob {shown(index, 20)}, want a number below {len(self._blobs)}")
         return self._blobs[index]
 
 
@@ -176,7 +176,7 @@ def require_plain(value: Any, depth: int) -> None:
             raise MessageTooLarge("message: nested too deep; flatten it")
         for key in value if isinstance(value, dict) else ():
             if not isinstance(key, str):
-                raise MalformedMessage(f"message: got key {str(key)[:40]!r}, want text")
+                raise MalformedMessage(f"message: got key {shown(key)}, want text")
         for item in value.values() if isinstance(value, dict) else value:
             require_plain(item, depth - 1)
     elif value is not None and not isinstance(value, (bool, int, float, str, bytes, np.ndarray, np.generic)):
@@ -193,7 +193,7 @@ def to_text(value: Any) -> str:
 
 def from_text(text: str, budget: Budget) -> Any:
     """Return the value of which `to_text` made the text; raises `MalformedMessage` if there is none."""
-    document = parse_json(text, "value:")
+    document = parse_json(text, "value:", long=True)
     try:
         blobs = [base64.b64decode(blob, validate=True) for blob in document.get("blobs", ())]
         return ValueReader(blobs, budget).value(document["value"])

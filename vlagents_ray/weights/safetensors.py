@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.errors import InvalidWeights, MalformedMessage
+from vlagents_ray.errors import InvalidWeights, MalformedMessage, shown
 
 MESSAGE_BYTES = 2**22  # longest message with weights: a header (some 40,000 values), or a part of their bytes
 PART_BYTES = 2**20  # of a part that is sent: while a replica takes a longer one, its acts wait for Python's lock
@@ -124,7 +124,7 @@ def _read_value(name: str, entry: Any) -> tuple[int, int, str, tuple[int, ...]]:
         raise MalformedMessage(f"safetensors: {name!r}: want 'dtype', 'shape' and 'data_offsets'")
     code, shape, offsets = entry["dtype"], entry["shape"], entry["data_offsets"]
     if not isinstance(code, str) or code not in _TYPES:
-        raise MalformedMessage(f"safetensors: {name!r}: got type {str(code)[:20]!r}, want one of {', '.join(_TYPES)}")
+        raise MalformedMessage(f"safetensors: {name!r}: got type {shown(code, 20)}, want one of {', '.join(_TYPES)}")
     if not _are_whole(shape) or len(shape) > _DIMENSIONS:
         raise MalformedMessage(f"safetensors: {name!r}: shape: want at most {_DIMENSIONS} whole numbers")
     if not _are_whole(offsets) or len(offsets) != 2:

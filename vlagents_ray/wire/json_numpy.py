@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.errors import InvalidInput, MalformedMessage, MessageTooLarge
+from vlagents_ray.errors import InvalidInput, MalformedMessage, MessageTooLarge, shown
 from vlagents_ray.protocol.arrays import read_array
 from vlagents_ray.protocol.messages import Limits
 from vlagents_ray.protocol.values import require_plain
@@ -65,7 +65,7 @@ def _hook(node: dict[str, Any]) -> Any:
     if "__numpy__" not in node:
         return node
     if node.keys() != _KEYS:
-        raise MalformedMessage(f"array: got keys {sorted(map(str, node))[:8]}, want {sorted(_KEYS)}")
+        raise MalformedMessage(f"array: got keys {shown(list(node))}, want {sorted(_KEYS)}")
     return read_array(decode_base64(node["__numpy__"], "array"), node["dtype"], node["shape"])
 
 

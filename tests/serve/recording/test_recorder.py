@@ -265,6 +265,17 @@ def test_requests_without_pictures_are_bounded_too(tmp_path: Path) -> None:
         assert [one is not None for one in waiting] == [True, True, False]
 
 
+def test_bytes_beside_pictures_count_too(tmp_path: Path) -> None:
+    with recorded(tmp_path) as server:
+        robot = server.robot()
+        robot.play(1)
+        wait_for(lambda: server.recorder._held == 0)
+        server.recorder._held_bytes = 10**6
+        request = Request("act", Obs(info={"a": [{"b": bytes(600_000)}], "c": np.zeros(10)}))
+        waiting = [server.recorder._asked("a", request) for _ in range(3)]
+        assert [one is not None for one in waiting] == [True, False, False]
+
+
 def test_what_does_not_fit_into_memory_is_dropped_and_counted(tmp_path: Path) -> None:
     with recorded(tmp_path) as server:
         robot = server.robot()

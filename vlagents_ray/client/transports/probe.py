@@ -35,10 +35,11 @@ def is_probe(message: Buffer) -> bool:
 
 
 def read_probe(message: bytes, budget: Budget) -> None:
-    """Count a probe as one request; raises `MalformedMessage` if the message is none."""
+    """Count a probe as one request of a simulation; raises `MalformedMessage` if the message is none."""
+    budget.begin_message()
     if len(message) < _HEAD.size or not is_probe(message):
         raise MalformedMessage(f"probe: got {message[:4]!r} at its start, want {_PROBE_TAG!r} and what follows it")
-    budget.begin("probe")
+    budget.begin("probe", "simulation")
 
 
 def answer(size: int) -> bytes:

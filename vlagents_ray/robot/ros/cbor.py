@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.errors import MalformedMessage
+from vlagents_ray.errors import MalformedMessage, shown
 
 _DEPTH = 16
 _HALF, _SINGLE, _DOUBLE = struct.Struct(">e"), struct.Struct(">f"), struct.Struct(">d")
@@ -100,7 +100,7 @@ class _Reader:
         for _ in range(count):
             key = self.item(depth)
             if not isinstance(key, str):
-                raise MalformedMessage(f"CBOR: got the key {key!r:.40}, want a field's name")
+                raise MalformedMessage(f"CBOR: got the key {shown(key)}, want a field's name")
             found[key] = self.item(depth)
         return found
 

@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from vlagents_ray.errors import InvalidObservation, MalformedMessage, MessageTooLarge, MissingState
+from vlagents_ray.errors import InvalidObservation, MalformedMessage, MessageTooLarge, MissingState, shown
 from vlagents_ray.images.jpeg_png import MAX_PIXELS, decode
 
 Values = Literal["position", "velocity", "effort"]
@@ -68,7 +68,7 @@ def image(message: Any) -> np.ndarray:
     encoding = field(message, "encoding")
     if not isinstance(encoding, str) or encoding not in _PIXEL:
         raise InvalidObservation(
-            f"image: got the encoding {encoding!r:.40}, want one of {list(_PIXEL)}; "
+            f"image: got the encoding {shown(encoding)}, want one of {list(_PIXEL)}; "
             f"have the camera's driver publish rgb8, and take no topic of depth for a camera"
         )
     height, width, step = (_whole(name, field(message, name)) for name in ("height", "width", "step"))
@@ -123,7 +123,7 @@ def joints(message: Any, names: Sequence[str] = (), values: Values = "position")
     """
     came = field(message, "name")
     if not isinstance(came, Sequence) or not all(isinstance(name, str) for name in came):
-        raise MalformedMessage(f"name: got {came!r:.80}, want a list of names; is the topic's type right?")
+        raise MalformedMessage(f"name: got {shown(came)}, want a list of names; is the topic's type right?")
     numbers = _numbers(values, field(message, values))
     if len(numbers) != len(came):
         raise MalformedMessage(
@@ -253,7 +253,7 @@ def _numbers(name: str, values: Any) -> np.ndarray:
     try:
         found = np.asarray(values if isinstance(values, np.ndarray) else list(values), np.float64)
     except (TypeError, ValueError) as error:
-        raise MalformedMessage(f"{name}: got {values!r:.80}, want an array of numbers") from error
+        raise MalformedMessage(f"{name}: got {shown(values)}, want an array of numbers") from error
     if found.ndim != 1:
         raise MalformedMessage(f"{name}: got an array of shape {found.shape}, want (D,)")
     return found

@@ -33,7 +33,7 @@ logger = logging.getLogger(__name__)
 
 FILE_VARIABLE, TEXT_VARIABLE = "VLAGENTS_RAY_KEYS_FILE", "VLAGENTS_RAY_KEYS"
 _KEY_PROTOCOL = "vlagents.key."  # begins the subprotocol of a WebSocket that states a key
-_THROTTLED_S = (0.05, 1.0)  # minimum and maximum time for which a sender over its rate is not read
+_THROTTLED_S = (0.05, 1.0)  # minimum and maximum time for which the senders of a key over its rate are not read
 _CHECK_S = 1.0  # minimum time between two checks of the file
 _WAIT_S = 0.25  # for a check: a network drive that hangs delays one request, which may be on the policy's thread
 _CLOSE_S = 300.0  # time for which the keys stay valid while the file cannot be read
@@ -121,10 +121,18 @@ class Keys:
             if bucket is None or bucket.rate != key.rate:
                 bucket = self._buckets[key.name] = _Bucket(key.rate)
             wait_s = bucket.take(time.monotonic())
+            if wait_s > 0:
+                least_s, most_s = _THROTTLED_S
+                bucket.unread_until = time.monotonic() + min(most_s, max(least_s, wait_s))
         if wait_s > 0:
             error = TooManyRequests(f"key {key.name!r}: over {key.rate:g} requests a second; wait {wait_s:.2g} s")
             error.retry_after_s = wait_s
             raise error
+
+    def throttled_s(self, name: str) -> float:
+        """Return for how long no sender with the key is read, s: over 0 if one of them was over the key's rate."""
+        bucket = self._buckets.get(name)
+        return 0.0 if bucket is None else max(0.0, bucket.unread_until - time.monotonic())
 
     def hold(self, name: str, number: int, most: int | None) -> None:
         """Count `number` more connections of a key; over `most` count none and raise `TooManyRequests`."""
@@ -239,6 +247,21 @@ class Caller:
             return str(error)
         return None
 
+    def throttled_s(self) -> float:
+        """Return for how long no sender with this key is read, s; 0 if all of them kept within its rate.
+
+        Each message that is refused costs its own reception, so that the time concerns the key and not a connection.
+        """
+        return self._keys.throttled_s(self.name)
+
+    def require_unthrottled(self) -> None:
+        """Raise `TooManyRequests` for a new connection while no sender with this key is read."""
+        if (wait_s := self.throttled_s()) > 0:
+            self._keys.audit.refused(self.name, TooManyRequests.code)
+            error = TooManyRequests(f"key {self.name!r}: over its rate; connect again after {wait_s:.2g} s")
+            error.retry_after_s = wait_s
+            raise error
+
     def hold(self, number: int = 1) -> None:
         """Count `number` more (or, negative, fewer) connections; raise `TooManyRequests` over the key's sessions."""
         try:
@@ -265,12 +288,6 @@ class Caller:
             self._keys.take(key)
 
 
-def throttled_s(refused: TooManyRequests) -> float:
-    """Return the time for which the server does not read a sender that was over its key's rate, to slow it down, s."""
-    least_s, most_s = _THROTTLED_S
-    return min(most_s, max(least_s, refused.retry_after_s))
-
-
 class _Bucket:
     """A token bucket with room for the tokens of one second, and for one token at least."""
 
@@ -278,6 +295,7 @@ class _Bucket:
         self.rate = rate  # requests/s
         self._tokens = self._capacity = max(1.0, rate)
         self._refilled = time.monotonic()
+        self.unread_until = 0.0  # senders with the key are not read before, s
 
     def take(self, now: float) -> float:
         """Take a token and return 0 if there is one; else return the time until there is one, s."""

@@ -22,7 +22,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-from vlagents_ray.errors import ConfigError
+from vlagents_ray.errors import ConfigError, shown
 from vlagents_ray.protocol.messages import RANKS, RankName
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
@@ -86,7 +86,7 @@ def parse_keys(text: str) -> list[Key]:
 
 def _parse(entry: Any) -> Key:
     if not isinstance(entry, dict) or not {"name", "sha256"} <= entry.keys():
-        raise ConfigError(f"keys: got {str(entry)[:80]!r}, want an object with 'name' and 'sha256' at least")
+        raise ConfigError(f"keys: got {shown(entry)}, want an object with 'name' and 'sha256' at least")
     known = {field.name for field in fields(Key)}
     if unknown := entry.keys() - known:
         raise ConfigError(f"key {entry['name']!r}: unknown {sorted(unknown)}, want some of {sorted(known)}")

@@ -246,6 +246,7 @@ def _route(endpoint: Callable[..., Any], method: str, path: str) -> BaseRoute:
 
 async def decoded(read: Callable[[bytes, Budget], T], data: bytes, admission: MessageAdmission) -> T:
     """Return the result of `read` on a message, which counts as one request of the key, even if it is invalid."""
+    admission.begin_message()
     admission.begin("act")
     return await admission.decoded(partial(read, data), long=len(data) > LONG_BYTES)
 

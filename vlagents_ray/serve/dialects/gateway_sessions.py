@@ -12,10 +12,9 @@ from typing import Any
 
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.contract import Contract
-from vlagents_ray.errors import TooManyRequests
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.protocol.messages import RankName
-from vlagents_ray.serve.access.api_keys import Caller, Identity, throttled_s
+from vlagents_ray.serve.access.api_keys import Caller, Identity
 from vlagents_ray.serve.dialects.implicit_session import ImplicitEpisode
 
 Connect = Callable[[str | None, RankName | None], RemoteAgent]
@@ -33,11 +32,15 @@ class GatewaySessions:
         self._caller: Identity | None = None
         self._key: str | None = None
         self._rank: RankName | None = None
-        self._throttled_s = 0.0
         self._counted = 0  # number of requests of the current message that were counted before it was read
         self._held = 0  # number of sessions that are counted for the key
         self._agents: list[RemoteAgent] = []
         self._episodes: list[ImplicitEpisode] = []  # the episode of each of `_agents`
+
+    @property
+    def known(self) -> bool:
+        """Whether the client has shown a valid key, or needs none."""
+        return self._caller is not None
 
     @property
     def begun(self) -> bool:
@@ -105,9 +108,8 @@ class GatewaySessions:
         self._counted = 1
 
     def throttled_s(self) -> float:
-        """Return the time for which not to read the client, s: over 0 if it exceeded its rate since the last call."""
-        wait_s, self._throttled_s = self._throttled_s, 0.0
-        return wait_s
+        """Return the time for which not to read the client, s: over 0 if its key is over its rate."""
+        return self._caller.throttled_s() if isinstance(self._caller, Caller) else 0.0
 
     def restart(self) -> None:
         """Have every session reset before its next action."""
@@ -146,12 +148,8 @@ class GatewaySessions:
         """Count requests for the key; raise `TooManyRequests` over its rate, before any of them is sent."""
         counted, self._counted = self._counted, 0
         if isinstance(self._caller, Caller):
-            try:
-                for _ in range(number - counted):
-                    self._caller.admit()
-            except TooManyRequests as error:
-                self._throttled_s = throttled_s(error)
-                raise
+            for _ in range(number - counted):
+                self._caller.admit()
 
 
 def _raise_first(found: Sequence[object]) -> None:

@@ -82,6 +82,9 @@ class AccessMiddleware:
                 require_own_page(headers, self._hosts)  # any page that the robot's user opens can reach loopback
             else:
                 key = caller = self._keys.check(token_of(headers), self._name)
+                if (wait_s := key.throttled_s()) > 0:  # bounds how often the key's requests are refused
+                    await asyncio.sleep(wait_s)
+                    key.require_unthrottled()
                 if scope["type"] == "http":
                     key.admit()
                 else:

@@ -54,13 +54,13 @@ from vlagents_ray.serve.endpoints.http_messages import (
     request_id,
     session_id,
 )
-from vlagents_ray.serve.engine.dispatch import Dispatcher
+from vlagents_ray.serve.engine.dispatch import REFUSED, Dispatcher
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.metrics_buffer import RequestTrace
 
 logger = logging.getLogger(__name__)
 
-_TRY_AGAIN_LATER = 1013  # a WebSocket close code
+_POLICY_VIOLATION, _TRY_AGAIN_LATER = 1008, 1013  # WebSocket close codes
 _HEALTH_S = 1.5  # `/healthz` replies within this time
 
 
@@ -203,12 +203,13 @@ class _HttpEndpoint:
             return
         sender = Dispatcher(self._engine, "websocket", caller=current_caller())
         try:
-            while True:
+            while not sender.refused_too_often:
+                await sender.wait_unthrottled()
                 message = await socket.receive()
                 if message["type"] == "websocket.disconnect":
                     return
                 await self._reply(socket, sender, message.get("bytes"))
-                await asyncio.sleep(sender.throttled_s())
+            await socket.close(_POLICY_VIOLATION, REFUSED)
         except WebSocketDisconnect:
             return
         finally:
@@ -231,12 +232,10 @@ class _HttpEndpoint:
         await _send_after(sending, socket, trace.frame(replies))
 
     def _probed(self, sender: Dispatcher, message: bytes) -> bytes:
-        admission = sender.admission(self._limits, len(message), "simulation")
         try:
-            read_probe(message, admission)
+            read_probe(message, sender.admission(self._limits, len(message), "simulation"))
             return answer(len(message))
         except VLAgentsError as error:
-            admission.count_unreadable()
             return encode_replies([Reply(error=error)])
 
     async def _answer(
@@ -244,13 +243,13 @@ class _HttpEndpoint:
     ) -> list[Reply]:
         admission = sender.admission(self._limits, 0 if frame is None else len(frame))
         try:
+            admission.begin_message()
             if frame is None:
                 raise MalformedMessage("stream: got a text message, want a binary frame")
             requests = await self._requests.decode(frame, admission)
             trace.decoded(requests)
             return await sender.ask(requests, admission, part)
         except VLAgentsError as error:
-            admission.count_unreadable()
             return [Reply(error=error)]
         except Exception:
             name = uuid.uuid4().hex

@@ -103,7 +103,7 @@ class WebSocketServer:
             UnknownApp: The path is another one.
             Unauthorized: The key is missing, unknown, revoked or expired.
             Forbidden: The key is for other applications, or the page is another site's.
-            TooManyRequests: The key has as many connections as it may hold sessions.
+            TooManyRequests: The key has as many connections as it may hold sessions, or is over its rate.
             PolicyUnavailable: The replica has as many connections as it may hold sessions.
         """
         if not secrets.compare_digest(request.path.encode(), self.path.encode()):
@@ -118,6 +118,7 @@ class WebSocketServer:
         if (full := self._full()) is not None:
             raise full
         if isinstance(caller, Caller):
+            caller.require_unthrottled()
             caller.hold()
             caller.note("let in by", client.name)
         del self._handshaking[client]

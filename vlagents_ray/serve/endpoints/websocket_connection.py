@@ -19,14 +19,14 @@ from websockets.protocol import State
 from websockets.server import ServerProtocol
 
 from vlagents_ray.client.transports.probe import answer, is_probe, read_probe
-from vlagents_ray.errors import MalformedMessage, PolicyUnavailable, TooManyRequests, VLAgentsError
+from vlagents_ray.errors import MalformedMessage, Overloaded, PolicyUnavailable, TooManyRequests, VLAgentsError
 from vlagents_ray.protocol.frames import decode_requests
 from vlagents_ray.protocol.messages import STREAM_BYTES, Limits, Reply, Request
 from vlagents_ray.serve.access.api_keys import Caller, Identity
 from vlagents_ray.serve.endpoints.buffers import READ_BYTES, ReceiveBuffer, SendBuffer, receive
 from vlagents_ray.serve.engine import arrival
 from vlagents_ray.serve.engine.admission import MessageAdmission, NeedsDecodingThread, decode_in_background, image_bytes
-from vlagents_ray.serve.engine.dispatch import Dispatcher
+from vlagents_ray.serve.engine.dispatch import REFUSED, Dispatcher
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.metrics_buffer import RequestTrace
 
@@ -34,9 +34,10 @@ logger = logging.getLogger(__name__)
 
 _HANDSHAKE_BYTES = 16 * 1024  # maximum size of a handshake
 _HANDSHAKE_S = 5.0  # maximum time of a handshake
+_REFUSED_S = 1.0  # maximum time for which the refusal of a handshake is delayed
 _END_OF_HEADERS = b"\r\n\r\n"
 _UNANSWERED = 256  # maximum of unanswered messages of one client: further ones stay unread in its connection
-_GOING_AWAY, _UNSUPPORTED_DATA, _POLICY_VIOLATION = 1001, 1003, 1008  # close codes
+_GOING_AWAY, _UNSUPPORTED_DATA, _POLICY_VIOLATION, _TRY_AGAIN_LATER = 1001, 1003, 1008, 1013  # close codes
 
 
 class WebSocketConnection:
@@ -65,6 +66,7 @@ class WebSocketConnection:
         self._arrived = 0.0  # arrival time of the bytes read last, s
         self._protocol = ServerProtocol(max_size=STREAM_BYTES)
         self._head = b""  # received part of the handshake
+        self._refused_for_s = 0.0  # time after which the handshake would not be over the rate of its key
         self._sender: Dispatcher | None = None  # None until the handshake is accepted
         self.caller: Identity | None = None  # None until the handshake is accepted
         self._sending = threading.Lock()  # guards the protocol and the sending: other threads send replies
@@ -74,7 +76,9 @@ class WebSocketConnection:
         self._polled = True  # whether the batch queue polls the connection
         self._paused = False  # not polled until some of its messages are answered
         self._decoding = self._throttled = False  # not polled until a frame is decoded, or the key under its rate again
-        self._frames: deque[tuple[Frame, float]] = deque()  # received but unprocessed frames and their arrival times, s
+        # Received but unprocessed frames, their arrival times, s, and the admissions of those that came in parts.
+        self._frames: deque[tuple[Frame, float, MessageAdmission | None]] = deque()
+        self._partial: MessageAdmission | None = None  # admission of the message of which a part is here
         self._unanswered = self._unanswered_bytes = 0  # messages; bytes with the decoded images
         self._messages = 0  # number received so far
         self._ending = False  # `end` was called; bytes that arrive now are ignored
@@ -91,6 +95,9 @@ class WebSocketConnection:
             self.disconnect()
 
     def _read(self) -> None:
+        if self._sender is not None and self._sender.rated and self._is_throttled():
+            self._stop_polling()
+            return
         try:
             data, control = receive(self._connection, _HANDSHAKE_BYTES if self._sender is None else READ_BYTES)
             self._arrived = time.perf_counter() - arrival.waited_s(control)
@@ -113,7 +120,7 @@ class WebSocketConnection:
                 return
             head, data = self._head[: end + len(_END_OF_HEADERS)], self._head[end + len(_END_OF_HEADERS) :]
             if end < 0 or not self._handshake(head):
-                self.disconnect()
+                self._refuse_handshake()
                 return
             self._head = b""
             if not data:
@@ -132,8 +139,11 @@ class WebSocketConnection:
         for event in events:
             if isinstance(event, Frame) and event.opcode in (Opcode.BINARY, Opcode.TEXT, Opcode.CONT):
                 self._messages += 1
-                self._frames.append((event, self._arrived))
+                self._frames.append((event, self._arrived, self._partial))
+                self._partial = None
         self._process_frames()
+        if self._received.size and self._sender is not None and not self._ended:
+            self._hold_partial(self._sender)
         if not data or self._protocol.state is State.CLOSED or self._protocol.close_rcvd is not None:
             self.disconnect()
             return
@@ -141,6 +151,28 @@ class WebSocketConnection:
             self._paused = self._is_backlogged() and self._protocol.state is State.OPEN
         if self._paused or self._decoding or self._throttled:
             self._stop_polling()
+
+    def _hold_partial(self, sender: Dispatcher) -> None:
+        """Count a message of which a part is here for its key, before the rest is read, and its bytes as they come."""
+        try:
+            if self._partial is None:
+                admission = sender.admission(self._limits)
+                admission.begin_message()
+                self._partial = admission
+            self._partial.grow(self._received.size)
+        except TooManyRequests:  # the rest stays unread until the key is under its rate
+            self._is_throttled()
+            if sender.refused_too_often:
+                self.end(_POLICY_VIOLATION, REFUSED)
+        except VLAgentsError as error:
+            self.end(_TRY_AGAIN_LATER if isinstance(error, Overloaded) else _POLICY_VIOLATION, str(error))
+
+    def _is_throttled(self) -> bool:
+        """Whether the key of the client is over its rate; if so, the connection is read again later."""
+        if not self._throttled and self._sender is not None and (wait_s := self._sender.throttled_s()) > 0:
+            self._throttled = True
+            self._engine.queue.call_later(wait_s, self._unthrottle)
+        return self._throttled
 
     def disconnect(self) -> None:
         """Stop polling the connection and close it; call it on the thread that polls."""
@@ -168,6 +200,8 @@ class WebSocketConnection:
             self._sender.release()
         with self._sending:
             self._ended = True  # the number of its descriptor may soon be reused
+            self._partial = None
+            self._received.discard()
             self._out.close()
             self._connection.close()
         self._on_close(self)
@@ -212,7 +246,7 @@ class WebSocketConnection:
                 self._connection.shutdown(socket.SHUT_RDWR)
 
     def _handshake(self, head: bytes) -> bool:
-        """Reply to the handshake; return False if it was refused."""
+        """Accept the handshake; return False if it is refused, with the response yet to be sent."""
         with self._sending:
             self._protocol.receive_data(head)
             events = self._protocol.events_received()
@@ -220,13 +254,28 @@ class WebSocketConnection:
             response = self._handshake_response(events[0])
             with self._sending:
                 self._protocol.send_response(response)
-        with self._sending:
-            self._flush()
         if self._protocol.state is not State.OPEN or self.caller is None:
             return False
+        with self._sending:
+            self._flush()
         self._received.attach(self._protocol)
         self._sender = Dispatcher(self._engine, self.name, caller=self.caller)
         return True
+
+    def _refuse_handshake(self) -> None:
+        """Refuse the handshake, after a moment if the key is over its rate, which bounds how often it is refused."""
+        self._stop_polling()
+
+        def refuse() -> None:
+            with self._sending:
+                if not self._ended:
+                    self._flush()
+            self.disconnect()
+
+        if self._refused_for_s > 0:
+            self._engine.queue.call_later(min(self._refused_for_s, _REFUSED_S), refuse)
+        else:
+            refuse()
 
     def _handshake_response(self, request: Handshake) -> Response:
         try:
@@ -236,6 +285,8 @@ class WebSocketConnection:
             response = self._protocol.reject(refused.status, f"{refused}\n")
             if isinstance(refused, TooManyRequests | PolicyUnavailable):
                 response.headers["Retry-After"] = "1"
+            if isinstance(refused, TooManyRequests):
+                self._refused_for_s = refused.retry_after_s
             return response
 
     def _process_frames(self) -> None:
@@ -250,9 +301,13 @@ class WebSocketConnection:
 
     def _unthrottle(self) -> None:
         self._throttled = False
+        if self._ended or self._is_throttled():
+            return
+        if self._received.size and self._partial is None and self._sender is not None:
+            self._hold_partial(self._sender)
         self._continue()
 
-    def _process(self, frame: Frame, arrived: float) -> None:
+    def _process(self, frame: Frame, arrived: float, admission: MessageAdmission | None) -> None:
         if self._sender is None:  # nothing is read before the handshake is accepted
             raise VLAgentsError("stream: a message before the handshake was accepted")
         trace = RequestTrace(self._engine.stats, "websocket")
@@ -261,23 +316,25 @@ class WebSocketConnection:
                 self._protocol.fail(_UNSUPPORTED_DATA, "messages in fragments; send each in one frame")
                 self._flush()
             return
-        data, sender = bytes(frame.data), self._sender
-        probe = is_probe(data)
-        admission = sender.admission(self._limits, len(data), "simulation" if probe else "robot")
+        sender = self._sender
+        admission = admission or sender.admission(self._limits)
+        admission.size = len(frame.data)
         try:
+            admission.begin_message()
             if frame.opcode is Opcode.TEXT:
                 raise MalformedMessage("stream: got a text message, want a binary frame")
-            if probe:
+            data = bytes(frame.data)
+            if is_probe(data):
                 read_probe(data, admission)
                 self._send(answer(len(data)))
             else:
                 self._decode(_Message(sender, admission, trace, len(data), arrived), data)
         except VLAgentsError as error:
-            admission.count_unreadable()
             self._send(trace.frame([Reply(error=error)]))
-        if (throttled_s := sender.throttled_s()) > 0:
-            self._throttled = True
-            self._engine.queue.call_later(throttled_s, self._unthrottle)
+            if sender.refused_too_often:
+                self.end(_POLICY_VIOLATION, REFUSED)
+        if sender.rated:
+            self._is_throttled()
 
     def _decode(self, message: _Message, data: bytes) -> None:
         read = partial(decode_requests, data)

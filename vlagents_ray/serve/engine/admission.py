@@ -3,11 +3,12 @@
 A message has a `MessageAdmission` from its arrival until it is answered. A decoder uses that as its `Budget`, so that
 these limits apply before anything is decoded:
 
-- Each request counts towards the rate limit of the caller's key (429).
+- The message counts towards the rate limit of the caller's key before any of it is parsed, and each further request
+  in it when its header is parsed (429).
 - Its decoded size is bounded by `limits.decoded_bytes` (413). With the rate limit, that bounds a key's bytes a second.
 - All messages of a replica together take at most `limits.in_flight_bytes`; a quarter is reserved for robots (503).
-- Images of more than a megapixel are decoded on separate threads, those of simulations on half of the cores, so that
-  neither the policy's thread nor an event loop waits for them.
+- Images of more than a megapixel and headers of more than 64 KiB are decoded on separate threads, those of simulations
+  on half of the cores, so that neither the policy's thread nor an event loop waits for them.
 """
 
 from __future__ import annotations
@@ -118,7 +119,7 @@ def decode_in_background(
 class MessageAdmission(Budget):
     """The admission of one message, until the message is answered or dropped. Not thread-safe."""
 
-    __slots__ = ("_admission", "_admit", "_decoded", "_held", "_index", "_inline", "_refusals", "_robot", "_size")
+    __slots__ = ("_admission", "_admit", "_decoded", "_held", "_index", "_inline", "_refusals", "_robot", "size")
 
     def __init__(
         self,
@@ -136,8 +137,8 @@ class MessageAdmission(Budget):
         Args:
             admission: The replica's bytes in flight.
             limits: Limits for decoding the message.
-            admit: Counts a request of an op for the sender's key, or raises; returns False if the request is
-                scheduled after those of robots. None if the sender has no key.
+            admit: Counts a "message", or a further request of an op, for the sender's key, or raises; returns False if
+                the request is scheduled after those of robots. None if the sender has no key.
             size: Bytes of the message itself, which the replica keeps while it works on the message.
             robot: Whether the message may use the bytes reserved for robots.
             inline: Whether the first decoding thread has other work waiting for it, so that large messages are decoded
@@ -148,7 +149,7 @@ class MessageAdmission(Budget):
         self.files = {} if keep_files else None
         self._admission = admission
         self._admit = admit
-        self._size = size  # size of the message, until it is counted
+        self.size = size  # size of the message, until it is counted
         self._robot = robot
         self._held = 0  # bytes counted as in flight
         self._decoded = 0  # decoded bytes among `_held`
@@ -156,8 +157,22 @@ class MessageAdmission(Budget):
         self._refusals: list[VLAgentsError | None] = []  # result of `admit` for each request
         self._inline = inline
 
-    def begin(self, op: object, rank: object = "robot") -> None:
+    def begin_message(self) -> None:
         """See `Budget`. A message that is decoded again, on another thread, counts once."""
+        if self._admit is not None:
+            if not self._refusals:
+                self._refusals.append(self._refusal_of(self._admit, "message"))
+            if (refusal := self._refusals[0]) is not None:
+                raise refusal
+
+    def parse(self, size: int) -> None:
+        """See `Budget`; raises `NeedsDecodingThread` on a thread with other work."""
+        if self._inline:
+            raise NeedsDecodingThread
+        super().parse(size)
+
+    def begin(self, op: object, rank: object = "robot") -> None:
+        """See `Budget`. The first request is counted with its message."""
         self._left = self.limits.decoded_bytes
         if rank == "simulation":
             self._robot = False
@@ -168,19 +183,19 @@ class MessageAdmission(Budget):
             if (refusal := self._refusals[self._index]) is not None:
                 raise refusal
         self.serial = not (self._robot or self._inline)
-        if self._size:
-            self.receive(self._size)
-            self._size = 0
-
-    def count_unreadable(self) -> None:
-        """Count an unreadable message once towards the rate limit."""
-        if self._admit is not None and not self._refusals:
-            self._refusals.append(self._refusal_of(self._admit, "unreadable"))
+        if self.size:
+            self.grow(self.size)
+            self.size = 0
 
     def receive(self, size: int) -> None:
         """Count bytes of the message itself as in flight; raises the errors of `Admission.hold`."""
         self._admission.hold(size, self._robot, self._held)
         self._held += size
+
+    def grow(self, size: int) -> None:
+        """Count the message as in flight with `size` bytes, of which some may be counted; raises as `receive`."""
+        if size > self._held:
+            self.receive(size - self._held)
 
     def hold(self, size: int) -> None:
         """See `Budget`; raises `NeedsDecodingThread` if decoding the message would take too long on this thread."""

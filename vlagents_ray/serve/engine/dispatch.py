@@ -16,7 +16,7 @@ from vlagents_ray.errors import (
     VLAgentsError,
 )
 from vlagents_ray.protocol.messages import Limits, Reply, Request
-from vlagents_ray.serve.access.api_keys import Caller, Identity, NoKey, throttled_s
+from vlagents_ray.serve.access.api_keys import Caller, Identity, NoKey
 from vlagents_ray.serve.engine.admission import MessageAdmission
 from vlagents_ray.serve.engine.arrival import count_wait
 from vlagents_ray.serve.engine.responses import Done, ReplyCollector, whole_answers
@@ -24,6 +24,10 @@ from vlagents_ray.serve.queue.batch_queue import PendingRequest
 
 if TYPE_CHECKING:
     from vlagents_ray.serve.engine.engine import Engine
+
+
+REFUSALS = 8  # of messages over the rate of the sender's key, one after the other, after which a connection ends
+REFUSED = f"over the rate of its key {REFUSALS} times in a row; send less, or raise the rate"
 
 
 class Dispatcher:
@@ -68,7 +72,9 @@ class Dispatcher:
         self._counted = not connected if counted is None else counted
         self._asked_to_reconnect = False  # whether the client was asked to reconnect, so that its sessions move
         self._caller = caller if isinstance(caller, Caller) else None
-        self._throttled_s = 0.0
+        self.rated = self._caller is not None  # whether its key may be over a rate
+        self._paid = False  # whether a message without an admission was counted, and with it its first request
+        self._refused = 0  # number of messages that were refused one after the other
         self._prefix = f"{caller.name}/" if isinstance(caller, Caller) else ""  # of its session ids in the engine
 
     def admission(self, limits: Limits, size: int = 0, rank: str = "robot") -> MessageAdmission:
@@ -81,7 +87,7 @@ class Dispatcher:
         def admit(op: object) -> bool:
             nonlocal counted
             free, counted = counted, False
-            return self._count(caller, op, free)
+            return self._count_message(caller) if op == "message" and not free else self._count(caller, op, free)
 
         return MessageAdmission(self._engine.admission, limits, admit, size, robot=robot, keep_files=keep)
 
@@ -91,13 +97,29 @@ class Dispatcher:
             for _ in range(requests):
                 self._count(self._caller, "act", counted=False)
 
+    def count_message(self) -> None:
+        """Count a message that is sent without an admission, before it is parsed; raise `TooManyRequests`."""
+        if self._caller is not None:
+            self._paid = False
+            self._count_message(self._caller)
+            self._paid = True
+
     def throttled_s(self) -> float:
         """Return for how long the server must not read from the sender, s; 0 if its key kept within its rate limit.
 
-        The delay covers the requests since the last call. It slows down a sender whose requests are refused anyway.
+        It slows down the senders of a key whose messages are refused anyway.
         """
-        throttled_s, self._throttled_s = self._throttled_s, 0.0
-        return throttled_s
+        return 0.0 if self._caller is None else self._caller.throttled_s()
+
+    async def wait_unthrottled(self) -> None:
+        """Wait until the server may read from the sender."""
+        while (wait_s := self.throttled_s()) > 0:
+            await asyncio.sleep(wait_s)
+
+    @property
+    def refused_too_often(self) -> bool:
+        """Whether so many messages were refused one after the other that the connection has to end."""
+        return self._refused >= REFUSALS
 
     def send(
         self,
@@ -136,7 +158,8 @@ class Dispatcher:
                 continue
             try:
                 if self._caller is not None:
-                    self._admit(self._caller, item, counted=admission is not None or self._counted)
+                    self._admit(self._caller, item, counted=admission is not None or self._counted or self._paid)
+                    self._paid = False
                 ready.append(self._ticket(collector, index, item, arrived))
             except VLAgentsError as error:
                 self._refuse(collector, index, item, error, arrived)
@@ -196,11 +219,16 @@ class Dispatcher:
 
     def _count(self, caller: Caller, op: object, counted: bool) -> bool:
         """Count a request for the key, unless it is `counted` or a close. False if the key has the simulation class."""
+        caller.admit(free=counted or op == "close")
+        return caller.rank != "simulation"
+
+    def _count_message(self, caller: Caller) -> bool:
         try:
-            caller.admit(free=counted or op == "close")
-        except TooManyRequests as error:
-            self._throttled_s = max(self._throttled_s, throttled_s(error))
+            caller.admit()
+        except TooManyRequests:
+            self._refused += 1
             raise
+        self._refused = 0
         return caller.rank != "simulation"
 
     def _admit(self, caller: Caller, request: Request, *, counted: bool) -> None:

@@ -121,6 +121,7 @@ def ingress_environment(folder: Path, binary: str, listener: PublicListener | No
     metrics, stats, fallback = free_ports(3)
     return {
         **ROBOTS,
+        "RAY_SERVE_HTTP_PROXY_CALLBACK_IMPORT_PATH": "vlagents_ray.serve.endpoints.front:middlewares",
         _BINARY: str(_launcher(folder, binary)),
         "RAY_SERVE_HAPROXY_METRICS_SOCKET_PATH": str(folder / "metrics"),
         "RAY_SERVE_HAPROXY_CONFIG_FILE_LOC": str(folder / "haproxy.cfg"),

@@ -30,7 +30,7 @@ logger = logging.getLogger(__name__)
 
 NO_VERSION = -1  # of an answer whose policy names no version of its weights
 _HELD_BYTES = 256 * 2**20  # most bytes of observations that wait to be written
-_OTHER_BYTES = 16 * 2**10  # counted for an act beside its pictures
+_OTHER_BYTES = 16 * 2**10  # counted for an act beside its pictures and the bytes in its `info`
 _CLOSING_S = 30.0  # time that the threads get to write what waits
 _NICE = 5  # the threads run after the policy's
 _LOOK_S = 1.0  # time after which ended sessions are looked up
@@ -157,7 +157,7 @@ class SessionRecorder:
             return None
         if item.op != "act" or item.obs is None:
             return _Asked(self, session, item, None, 0)
-        size = _OTHER_BYTES + sum(image.nbytes for image in item.obs.cameras.values())
+        size = _OTHER_BYTES + sum(image.nbytes for image in item.obs.cameras.values()) + _bytes_in(item.obs.info)
         if not self._hold(size):
             self.dropped += 1
             return None
@@ -298,6 +298,15 @@ def _frame(asked: _Asked, reply: Reply, first: int) -> RecordedAct:
         "answer": to_text(info) if info else "",
     }
     return RecordedAct(obs, act.rows(), float(obs.info[CAPTURED]), (reply.step or 0) - first - 1, columns)
+
+
+def _bytes_in(value: Any) -> int:
+    """Return about how many bytes the texts and arrays in a value take."""
+    if isinstance(value, dict):
+        return sum(map(_bytes_in, value.values()))
+    if isinstance(value, list):
+        return sum(map(_bytes_in, value))
+    return len(value) if isinstance(value, (str, bytes)) else int(getattr(value, "nbytes", 8))
 
 
 def _be_nice() -> None:

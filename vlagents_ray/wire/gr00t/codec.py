@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.errors import InvalidObservation, MalformedMessage, MessageTooLarge
+from vlagents_ray.errors import InvalidObservation, MalformedMessage, MessageTooLarge, shown
 from vlagents_ray.protocol.messages import Limits
 from vlagents_ray.registry import require
 from vlagents_ray.wire import msgpack, msgpack_numpy
@@ -89,7 +89,7 @@ def read_request(payload: bytes | memoryview, limits: Limits) -> GR00TRequest:
         raise MalformedMessage(f"gr00t: got {type(document).__name__}, want a map")
     endpoint, data, token = document.get("endpoint", "get_action"), document.get("data"), document.get("api_token")
     if not isinstance(endpoint, str) or endpoint not in ENDPOINTS:
-        raise MalformedMessage(f"gr00t: unknown endpoint {str(endpoint)[:40]!r}, want one of {list(ENDPOINTS)}")
+        raise MalformedMessage(f"gr00t: unknown endpoint {shown(endpoint)}, want one of {list(ENDPOINTS)}")
     if data is not None and not isinstance(data, dict):
         raise MalformedMessage(f"gr00t: data: got {type(data).__name__}, want a map")
     if token is not None and not isinstance(token, str):
@@ -205,7 +205,7 @@ def _arrays(group: Any, kind: str) -> dict[str, np.ndarray]:
         raise InvalidObservation(f"{kind}: got {type(group).__name__}, want a map of arrays")
     for name, array in group.items():
         if not isinstance(name, str) or not isinstance(array, np.ndarray):
-            raise InvalidObservation(f"{kind}.{str(name)[:40]}: got {type(array).__name__}, want an array")
+            raise InvalidObservation(f"{kind}.{shown(name)}: got {type(array).__name__}, want an array")
     return group
 
 
@@ -214,13 +214,13 @@ def _texts(language: Any, number: int) -> list[str | None]:
     if not isinstance(language, dict) or not language:
         return [None] * number
     if len(language) > 1:
-        raise InvalidObservation(f"language: got {sorted(map(str, language))[:8]}, want one instruction")
+        raise InvalidObservation(f"language: got {shown(list(language))}, want one instruction")
     [(key, value)] = language.items()
     texts = [value] * number if isinstance(value, str) else value
     if isinstance(texts, list) and len(texts) == 1:
         texts = texts * number
     if not isinstance(texts, list) or len(texts) != number:
-        raise InvalidObservation(f"{str(key)[:40]}: want {number} instructions, one for each observation")
+        raise InvalidObservation(f"{shown(key)}: want {number} instructions, one for each observation")
     return [_text(key, one) for one in texts]
 
 
@@ -228,5 +228,5 @@ def _text(key: Any, value: Any) -> str:
     while isinstance(value, list) and value:  # of a list by time, the newest text counts
         value = value[-1]
     if not isinstance(value, str):
-        raise InvalidObservation(f"{str(key)[:40]}: got {type(value).__name__}, want text")
+        raise InvalidObservation(f"{shown(key)}: got {type(value).__name__}, want text")
     return value

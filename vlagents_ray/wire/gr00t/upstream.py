@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.errors import MalformedMessage
+from vlagents_ray.errors import MalformedMessage, shown
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
 from vlagents_ray.wire import msgpack, msgpack_numpy
 from vlagents_ray.wire.gr00t import npy
@@ -90,7 +90,7 @@ def read_actions(reply: Any, number: int) -> list[dict[str, np.ndarray]]:
     for name, array in actions.items():
         if not isinstance(name, str) or not isinstance(array, np.ndarray) or array.ndim not in (2, 3):
             got = f"{array.shape}" if isinstance(array, np.ndarray) else type(array).__name__
-            raise MalformedMessage(f"gr00t: action {str(name)[:40]!r}: got {got}, want ({number}, H, D)")
+            raise MalformedMessage(f"gr00t: action {shown(name)}: got {got}, want ({number}, H, D)")
         if array.shape[0] != number:
             raise MalformedMessage(f"gr00t: action {name[:40]!r}: got {array.shape}, want ({number}, H, D)")
     return [

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from vlagents_ray.errors import InvalidObservation
+from vlagents_ray.errors import InvalidObservation, shown
 
 _SHOWN = 40  # maximum number of keys that an error lists, and of characters of a key
 _LONGEST = 200  # characters of a client's key that are compared
@@ -33,21 +33,21 @@ def lookup(nested: Mapping[Any, Any], path: str) -> Any:
 
 def keys(nested: Mapping[Any, Any]) -> list[str]:
     """Return the paths of all values that are not mappings, in order, at most 40, to be listed in an error."""
-    return [shown(path) for path, _ in leaves(nested)]
+    return [short_path(path) for path, _ in leaves(nested)]
 
 
-def shown(path: str) -> str:
+def short_path(path: str) -> str:
     """Return a path as an error may list it, each key cut to 40 characters."""
     return "/".join(key[:_SHOWN] for key in path.split("/"))
 
 
 def leaves(nested: Mapping[Any, Any], prefix: str = "") -> list[tuple[str, Any]]:
-    """Return the paths and values of all values that are not mappings, in order, at most 40; list paths by `shown`."""
+    """Return the paths and values of all values that are not mappings, in order, at most 40; see `short_path`."""
     found: list[tuple[str, Any]] = []
     for key, value in nested.items():
         if len(found) >= _SHOWN:
             break
-        path = f"{prefix}{str(key)[:_LONGEST]}"
+        path = f"{prefix}{(key if isinstance(key, str) else shown(key))[:_LONGEST]}"
         if isinstance(value, Mapping):
             found += leaves(value, f"{path}/")
         else:

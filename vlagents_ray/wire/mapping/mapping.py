@@ -60,7 +60,7 @@ from vlagents_ray.wire.mapping.key_paths import (
     matches,
     pick,
     reads,
-    shown,
+    short_path,
 )
 from vlagents_ray.wire.mapping.values import may_be_camera, may_be_state, read_image, read_state, read_text, read_vector
 
@@ -212,7 +212,9 @@ class KeyMapping:
         known = [one.key for one in self.cameras.values()] + [one.key for all_ in self.state.values() for one in all_]
         known += [*self.info.values(), *([] if self.gripper is None else [self.gripper.key])]
         return [
-            shown(path) for path, value in leaves(flat) if is_one(value) and not any(reads(key, path) for key in known)
+            short_path(path)
+            for path, value in leaves(flat)
+            if is_one(value) and not any(reads(key, path) for key in known)
         ]
 
     def _require_read(self, flat: Mapping[str, Any], obs: Obs) -> None:

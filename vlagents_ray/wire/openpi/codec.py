@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.errors import MalformedMessage, MessageTooLarge
+from vlagents_ray.errors import MalformedMessage, MessageTooLarge, shown
 from vlagents_ray.protocol.arrays import plain_dtype, read_array
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
 from vlagents_ray.wire.msgpack import pack, unpack
@@ -53,7 +53,7 @@ def _array(node: dict[Any, Any], most: int) -> Any:
                 raise OverflowError
             return dtype.type(value)
         except (OverflowError, ValueError) as error:
-            raise MalformedMessage(f"scalar: {str(value)[:40]} is no {dtype}") from error
+            raise MalformedMessage(f"scalar: {shown(value)} is no {dtype}") from error
     return node
 
 

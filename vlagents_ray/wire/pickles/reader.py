@@ -6,7 +6,7 @@ for the caller's own functions. An opcode, a name or a shape that is not listed 
 
 The opcodes are those that Python's own pickler writes in protocol 4 and 5 for dicts, lists, tuples, texts, numbers,
 numpy's arrays and data classes. `Limits` bound the number of opcodes (`items`), the nesting (`depth`) and the texts.
-Bytes are not copied, so that memory is bounded by the message.
+Bytes are not copied. Arrays that a call allocates count towards `decoded_bytes`, so that memory is bounded.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import struct
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from vlagents_ray.errors import MalformedMessage, MessageTooLarge
+from vlagents_ray.errors import MalformedMessage, MessageTooLarge, shown
 from vlagents_ray.protocol.arrays import Buffer
 from vlagents_ray.protocol.messages import Limits
 
@@ -44,10 +44,11 @@ class Record:
 class Reduced:
     """An object that a pickle makes by a call, and may describe afterwards."""
 
-    __slots__ = ("read_state", "value")
+    __slots__ = ("allocated", "read_state", "value")
 
-    def __init__(self, read_state: Callable[[Any], Any] | None = None, value: Any = None) -> None:
+    def __init__(self, read_state: Callable[[Any], Any] | None = None, value: Any = None, allocated: int = 0) -> None:
         self.read_state = read_state
+        self.allocated = allocated  # bytes beyond those of the message
         self.value = value  # None until it was described
 
 
@@ -103,6 +104,9 @@ class _StackMachine:
         self._stack: list[_StackValue] = []
         self._below: list[list[_StackValue]] = []  # the stacks below each open mark
         self._memo: list[_StackValue] = []
+        self._allocated = 0  # bytes beyond those of the message
+        # Name, first argument and result of the last call that allocated.
+        self._latest: tuple[Any, Any, Reduced] = None, None, Reduced()
 
     def whole(self) -> Any:
         """Read the pickle to its end."""
@@ -222,7 +226,20 @@ class _StackMachine:
         read = self._calls.get(name) if isinstance(name, Name) else None
         if read is None or type(arguments) is not tuple:
             raise MalformedMessage(f"pickle: got a call of {_kind(name)}, want a numpy array of numbers")
-        self.push(read(arguments))
+        first = arguments[0] if arguments else None
+        if (name, len(arguments)) == (self._latest[0], 1) and first is self._latest[1]:  # further tensors of a storage
+            self.push(self._latest[2])
+            return
+        found = read(arguments)
+        if isinstance(found, Reduced) and found.allocated:
+            self._allocated += found.allocated
+            if self._allocated > self._limits.decoded_bytes:
+                raise MessageTooLarge(
+                    f"pickle: takes over {self._limits.decoded_bytes} bytes, decoded; send less at once, or raise "
+                    "`limits.decoded_bytes`"
+                )
+            self._latest = name, first, found
+        self.push(found)
 
     def new(self) -> None:
         """Begin an object of a data class."""
@@ -238,7 +255,7 @@ class _StackMachine:
         if isinstance(target, Record) and target.fields is None and type(state.value) is dict:
             fields = self._records[target.name]
             if state.value.keys() != set(fields):
-                got = [str(key)[:_SHOWN] for key in state.value][: 2 * len(fields)]
+                got = shown(list(state.value))
                 raise MalformedMessage(f"pickle: {target.name.name}: got the fields {got}, want {list(fields)}")
             target.fields = state.value
             self._stack[-1] = _StackValue(target, state.depth + 1)

@@ -38,9 +38,11 @@ def _storage(arguments: tuple[Any, ...]) -> Reduced:
         case (memoryview() as data,) if (file := _FILE.match(data)) is not None:
             numbers, size = data[file.end() :], int.from_bytes(file["size"], "little")
             found = read_array(numbers, _DTYPES[file["kind"]], (size,))
-            if file["kind"] == b"BFloat16":  # the upper half of a float32
-                found = (found.astype("<u4") << 16).view("<f4")
-            return Reduced(value=found)
+            if file["kind"] != b"BFloat16":
+                return Reduced(value=found)
+            wide = found.astype("<u4")  # the upper half of a float32
+            wide <<= 16
+            return Reduced(value=wide.view("<f4"), allocated=wide.nbytes)
     raise MalformedMessage("pickle: torch: want a storage of floating-point numbers on the CPU")
 
 

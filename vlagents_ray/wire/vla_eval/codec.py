@@ -12,7 +12,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from vlagents_ray.errors import MalformedMessage, MessageTooLarge
+from vlagents_ray.errors import MalformedMessage, MessageTooLarge, shown
 from vlagents_ray.images.codecs import decode_files
 from vlagents_ray.protocol.arrays import read_array
 from vlagents_ray.protocol.budget import Budget
@@ -59,11 +59,11 @@ def decode(data: bytes, limits: Limits = DEFAULT_LIMITS) -> Message:
         raise MalformedMessage("message: want a map with type, payload and seq")
     kind, payload, seq = raw["type"], raw["payload"], raw["seq"]
     if not isinstance(kind, str) or kind not in get_args(Kind):
-        raise MalformedMessage(f"type: got {str(kind)[:40]!r}, want one of {list(get_args(Kind))}")
+        raise MalformedMessage(f"type: got {shown(kind)}, want one of {list(get_args(Kind))}")
     if not isinstance(payload, dict):
         raise MalformedMessage(f"payload: got {type(payload).__name__}, want a map")
     if type(seq) is not int or not 0 <= seq < 2**63:
-        raise MalformedMessage(f"seq: got {str(seq)[:40]}, want a whole number")
+        raise MalformedMessage(f"seq: got {shown(seq)}, want a whole number")
     return Message(kind, payload, seq)  # type: ignore[arg-type]  # the kind was checked above
 
 
@@ -109,7 +109,7 @@ def _image(node: dict[Any, Any]) -> np.ndarray | _File:
     if form == "raw":
         return read_array(data, node.get("dtype"), node.get("shape"))  # type: ignore[arg-type]  # it checks
     if form not in ("png", "jpeg") or not isinstance(data, bytes):
-        raise MalformedMessage(f"image: got format {str(form)[:20]!r}, want raw, png or jpeg, and bytes")
+        raise MalformedMessage(f"image: got format {shown(form, 20)}, want raw, png or jpeg, and bytes")
     return _File(data)
 
 

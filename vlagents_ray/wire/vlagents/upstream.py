@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.errors import MalformedMessage
+from vlagents_ray.errors import MalformedMessage, shown
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
 from vlagents_ray.protocol.observations import is_number
 from vlagents_ray.wire import json_numpy
@@ -59,7 +59,7 @@ def read(body: bytes | bytearray, compressed: bool, limit: int) -> tuple[int, An
         return None
     sequence, ok, content = message
     if not ok:
-        return sequence, RemoteError(str(content)[:_ERROR])
+        return sequence, RemoteError(content[:_ERROR] if isinstance(content, str) else shown(content, _ERROR))
     if not (isinstance(content, tuple) and len(content) == 2):
         raise MalformedMessage("rpyc: want (label, value)")
     return sequence, content[1]

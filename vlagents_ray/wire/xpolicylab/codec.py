@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.errors import MalformedMessage
+from vlagents_ray.errors import MalformedMessage, shown
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
 from vlagents_ray.protocol.observations import is_number
 from vlagents_ray.wire import msgpack, msgpack_numpy
@@ -121,5 +121,5 @@ def _is_row(value: Any) -> bool:
 
 def _text(name: Any) -> str:
     if not isinstance(name, str):
-        raise MalformedMessage(f"xpolicylab: actions: got the name {str(name)[:_SHOWN]!r}, want text")
+        raise MalformedMessage(f"xpolicylab: actions: got the name {shown(name)}, want text")
     return name

@@ -189,8 +189,8 @@ def test_an_environment_that_is_not_stacked_gets_no_row_of_stacked_ones() -> Non
     ("message", "said"),
     [
         (observation(task=9), r"'prompt|task_id': got 9, want one of"),
-        (observation() | {"__action_chunk_size__": 0}, "__action_chunk_size__: got '0'"),
-        (observation() | {"__action_chunk_size__": True}, "__action_chunk_size__: got 'True'"),
+        (observation() | {"__action_chunk_size__": 0}, "__action_chunk_size__: got 0"),
+        (observation() | {"__action_chunk_size__": True}, "__action_chunk_size__: got True"),
         (observation() | {"__action_chunk_size__": np.zeros(9)}, "__action_chunk_size__"),
         (observation() | {"task_id": np.zeros((2, 1), np.int64)}, "want 2 environments"),
         (observation() | {"task_id": np.zeros((0, 1), np.int64)}, "want 1 to 4 environments"),

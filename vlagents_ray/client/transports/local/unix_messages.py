@@ -138,6 +138,8 @@ class UnixTransport(ABC):
                     _wait(connection, select.POLLIN, deadline)
             replies = self._receive(connection)
             if is_answer(replies, requests):
+                if not replies[0].request_id:  # refused before it was parsed
+                    self._writer = shm_layout.ShmWriter()
                 self._answers_fast = time.perf_counter() - begun < _FAST_S
                 if self._answers_fast:
                     cpu_affinity.leave(self._core)

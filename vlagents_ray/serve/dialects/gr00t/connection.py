@@ -44,15 +44,24 @@ class GR00TConnection:
         self._thread.start()
 
     @property
+    def known(self) -> bool:
+        """Whether the client has shown a valid key, or needs none."""
+        return self._session.known
+
+    @property
     def begun(self) -> bool:
         """Whether the client has a session."""
         return self._session.begun
 
     def put(self, payload: bytes) -> bool:
-        """Queue a request; return False if too many are waiting."""
+        """Queue a request; return False if too many are waiting.
+
+        Raises `Overloaded` if the requests of all clients leave no memory for it.
+        """
         with self._lock:
             if self._pending >= WAITING:
                 return False
+            self._context.admission.hold(len(payload), True, 0)
             self._pending += 1
         self._requests.put(payload)
         return True
@@ -76,6 +85,7 @@ class GR00TConnection:
     def _run(self) -> None:
         while (payload := self._requests.get()) is not None:
             message = self._answer(payload)
+            self._context.admission.release(len(payload))
             with self._lock:
                 self._pending -= 1
                 self._used = time.monotonic()

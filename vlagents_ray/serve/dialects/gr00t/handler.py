@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import os
 import queue
 import socket
+import struct
 import threading
 import time
 from functools import partial
@@ -13,7 +15,7 @@ from typing import Any
 
 from pydantic import Field
 
-from vlagents_ray.errors import PolicyUnavailable
+from vlagents_ray.errors import PolicyUnavailable, VLAgentsError
 from vlagents_ray.registry import require
 from vlagents_ray.serve.config.dialects import MappingSetting, PortConfig
 from vlagents_ray.serve.dialects.base import GatewayContext, PortDialect
@@ -29,6 +31,11 @@ _ENVELOPE = 8  # maximum number of parts
 _HEARTBEAT_MS = 10_000
 _TICK_MS = 500
 _END_S = 3.0
+_STRANGERS = 64  # maximum number of connections without a valid key
+_STRANGERS_MS = 50  # period at which their bytes are counted
+_STRANGER_S = 30.0  # maximum time until a connection shows a valid key
+_RECEIVED = struct.Struct("<Q")  # `tcpi_bytes_received` in Linux' `struct tcp_info`
+_RECEIVED_AT = 128
 
 
 class GR00TDialectConfig(PortConfig):
@@ -59,6 +66,7 @@ class GR00TDialect(PortDialect):
         self._ring.setblocking(False)
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
+        self._strangers: _Strangers | None = None
 
     def serve(self, listener: socket.socket) -> None:
         require("zmq"), require("msgpack")
@@ -107,12 +115,17 @@ class GR00TDialect(PortDialect):
             host, port = listener.getsockname()[:2]
             router.bind(f"tcp://[{host}]:{port}" if ":" in host else f"tcp://{host}:{port}")
             listener.detach()  # ZMQ owns it now and closes it with the ROUTER socket
+            self._strangers = strangers = _Strangers(router, zmq, port, self.context.limits.body_bytes)
             poller = zmq.Poller()
+            poller.register(strangers.monitor, zmq.POLLIN)
             poller.register(router, zmq.POLLIN)
             poller.register(authenticator, zmq.POLLIN)
             poller.register(self._bell, zmq.POLLIN)
             while not self._closing.is_set():
-                ready = dict(poller.poll(_TICK_MS))
+                ready = dict(poller.poll(_STRANGERS_MS if strangers else _TICK_MS))
+                if strangers.monitor in ready:
+                    strangers.note_events()
+                strangers.end_overdue()
                 if self._bell.fileno() in ready:
                     self._bell.recv(4096)
                     self._send(router, zmq)
@@ -126,6 +139,8 @@ class GR00TDialect(PortDialect):
             logger.exception("gr00t: the dialect has failed, and accepts no more clients")
         finally:
             listener.close()
+            if self._strangers is not None:
+                self._strangers.close()
             router.close()
             authenticator.close()
             context.destroy(linger=0)
@@ -142,7 +157,7 @@ class GR00TDialect(PortDialect):
     def _receive(self, router: Any, zmq: Any) -> None:
         for _ in range(64):  # then replies are sent again
             try:
-                parts = router.recv_multipart(zmq.NOBLOCK)
+                parts = router.recv_multipart(zmq.NOBLOCK, copy=False)
             except zmq.Again:
                 return
             except zmq.ZMQError as error:
@@ -150,10 +165,10 @@ class GR00TDialect(PortDialect):
                 return
             if not 2 <= len(parts) <= _ENVELOPE:
                 continue
-            *envelope, payload = parts
-            self._take(tuple(envelope), payload)
+            *envelope, payload = (part.bytes for part in parts)
+            self._take(tuple(envelope), payload, parts[-1].get(zmq.SRCFD))
 
-    def _take(self, envelope: Envelope, payload: bytes) -> None:
+    def _take(self, envelope: Envelope, payload: bytes, descriptor: int) -> None:
         client = self._clients.get(envelope)
         if client is None:
             answer = partial(self.answer, envelope)
@@ -162,8 +177,13 @@ class GR00TDialect(PortDialect):
             except PolicyUnavailable as full:
                 answer(codec.pack({"error": f"{full.code}: {full}"}))
                 return
-        if not client.put(payload):
-            self.answer(envelope, codec.pack({"error": "malformed: wait for the answer before the next request"}))
+        if self._strangers is not None:
+            self._strangers.note_client(descriptor, client)
+        try:
+            if not client.put(payload):
+                self.answer(envelope, codec.pack({"error": "malformed: wait for the answer before the next request"}))
+        except VLAgentsError as error:
+            self.answer(envelope, codec.pack({"error": f"{error.code}: {error}"}))
 
     def _forget_quiet(self) -> None:
         """End the sessions of idle clients and of clients whose key is no longer valid, twice a second."""
@@ -171,3 +191,93 @@ class GR00TDialect(PortDialect):
         if now - self._looked >= _TICK_MS / 1e3:
             self._looked = now
             self._clients.forget_quiet()
+
+
+class _Strangers:
+    """The connections that have not shown a valid key yet; bounds their number, their time and their bytes.
+
+    ZeroMQ collects a message of any peer until it is complete, with one limit for all peers, and the key is in the
+    message. It states the descriptor of each connection: a duplicate of that ends the connection from outside.
+    """
+
+    def __init__(self, router: Any, zmq: Any, port: int, most_bytes: int) -> None:
+        """`most_bytes` is the limit of the bytes of all these connections together, and of one message."""
+        self.monitor = router.get_monitor_socket(zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED)
+        self._router, self._zmq = router, zmq
+        self._port = port
+        self._most_bytes = most_bytes
+        self._since: dict[int, tuple[socket.socket, float]] = {}  # by the descriptor in ZeroMQ, oldest first
+        self._clients: dict[int, GR00TConnection] = {}
+
+    def __len__(self) -> int:
+        return len(self._since)
+
+    def note_events(self) -> None:
+        """Take the connections that ZeroMQ has accepted, and drop those that have ended."""
+        parse = require("zmq.utils.monitor").parse_monitor_message
+        while True:
+            try:
+                event = parse(self.monitor.recv_multipart(self._zmq.NOBLOCK))
+            except self._zmq.Again:
+                return
+            self._drop(event["value"])
+            if event["event"] == self._zmq.EVENT_ACCEPTED:
+                self._add(event["value"])
+
+    def note_client(self, descriptor: int, client: GR00TConnection) -> None:
+        """Take the client whose message came over a connection; its key is checked on another thread."""
+        if descriptor in self._since:
+            self._clients[descriptor] = client
+
+    def end_overdue(self) -> None:
+        """End the connections that take too long or, together, too much; forget those with a valid key."""
+        for descriptor in [one for one, client in self._clients.items() if client.known]:
+            self._drop(descriptor)
+        late = time.monotonic() - _STRANGER_S
+        sizes = {one: _received(connection) for one, (connection, _) in self._since.items()}
+        for descriptor, (_, since) in list(self._since.items()):
+            if since < late:
+                self._end(descriptor, "no message with a valid key in time")
+                del sizes[descriptor]
+        while sum(sizes.values()) > self._most_bytes:
+            largest = max(sizes, key=sizes.__getitem__)
+            self._end(largest, f"{sizes.pop(largest)} bytes without a valid key")
+
+    def close(self) -> None:
+        """Forget all connections, which end with the ROUTER socket."""
+        for descriptor in list(self._since):
+            self._drop(descriptor)
+        self._router.disable_monitor()
+
+    def _add(self, descriptor: int) -> None:
+        try:
+            connection = socket.socket(fileno=os.dup(descriptor))
+        except OSError:  # it has ended already
+            return
+        if connection.family not in (socket.AF_INET, socket.AF_INET6) or connection.getsockname()[1] != self._port:
+            connection.close()  # it has ended already, and another file of this process has its number
+            return
+        if len(self._since) >= _STRANGERS:
+            self._end(next(iter(self._since)), f"{_STRANGERS} connections are without a valid key")
+        self._since[descriptor] = connection, time.monotonic()
+
+    def _end(self, descriptor: int, reason: str) -> None:
+        logger.info("gr00t: a connection is closed: %s", reason)
+        with contextlib.suppress(OSError):  # the client closed it already
+            self._since[descriptor][0].shutdown(socket.SHUT_RDWR)
+        self._drop(descriptor)
+
+    def _drop(self, descriptor: int) -> None:
+        self._clients.pop(descriptor, None)
+        if (known := self._since.pop(descriptor, None)) is not None:
+            known[0].close()
+
+
+def _received(connection: socket.socket) -> int:
+    """Return the number of bytes that a connection has received."""
+    try:
+        info = connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _RECEIVED_AT + _RECEIVED.size)
+    except OSError:  # it has ended
+        return 0
+    (size,) = _RECEIVED.unpack_from(info, _RECEIVED_AT)
+    return int(size)

@@ -26,11 +26,12 @@ import numpy as np
 from pydantic import Field
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from vlagents_ray.errors import MalformedMessage, TooManyRequests, VLAgentsError
+from vlagents_ray.errors import MalformedMessage, TooManyRequests, VLAgentsError, shown
 from vlagents_ray.protocol.messages import Reply
 from vlagents_ray.serve.config.dialects import DialectConfig, MappingSetting
 from vlagents_ray.serve.dialects.base import (
     INTERNAL_ERROR,
+    POLICY_VIOLATION,
     RouteDialect,
     Stream,
     accept_or_refuse,
@@ -39,7 +40,7 @@ from vlagents_ray.serve.dialects.base import (
 )
 from vlagents_ray.serve.dialects.implicit_session import ImplicitSession, SessionObs, act_together
 from vlagents_ray.serve.dialects.openpi.rows import Rows, number_of_rows, unstacked
-from vlagents_ray.serve.engine.dispatch import Dispatcher
+from vlagents_ray.serve.engine.dispatch import REFUSED, Dispatcher
 from vlagents_ray.serve.engine.metrics_buffer import RequestTrace
 from vlagents_ray.wire.openpi import codec
 from vlagents_ray.wire.openpi.presets import PRESETS
@@ -161,7 +162,7 @@ class OpenPiDialect(MapDialect):
         if message.keys() != {"reset"}:
             return None
         if message["reset"] is not True:
-            raise MalformedMessage(f"reset: got {str(message['reset'])[:40]!r}, want true")
+            raise MalformedMessage(f"reset: got {shown(message['reset'])}, want true")
         connection.end_episodes()
         return codec.encode(message) if self.config.answer_reset else b""
 
@@ -170,7 +171,7 @@ class OpenPiDialect(MapDialect):
             return unstacked(message, self.context.engine.sessions.limit) if self.config.answer == "row" else None
         batch = message["batch"]
         if not isinstance(batch, list) or not batch:
-            raise MalformedMessage(f"batch: got {str(batch)[:40]!r}, want a list of one observation or more")
+            raise MalformedMessage(f"batch: got {shown(batch)}, want a list of one observation or more")
         return batch
 
     def rows(self, reply: Reply) -> np.ndarray:
@@ -259,6 +260,7 @@ class MapEndpoint:
         try:
             await socket.send_bytes(codec.encode(self._dialects[-1].first()))
             while True:
+                await gate.wait_unthrottled()
                 event = await asyncio.wait_for(socket.receive(), self._dialects[0].idle_s)
                 if event["type"] == "websocket.disconnect":
                     return
@@ -279,6 +281,7 @@ class MapEndpoint:
         trace, request_id = self._dialects[0].trace(), uuid.uuid4().hex
         admission = gate.admission(self._context.limits, 0 if data is None else len(data), self._dialects[0].rank)
         try:
+            admission.begin_message()
             if data is None:
                 raise MalformedMessage("message: got text, want a binary map")
             message = await decoded(lambda data, budget: codec.decode(data, budget.limits), data, admission)
@@ -294,8 +297,9 @@ class MapEndpoint:
             failure = self._dialects[0].failure(text)
             await (socket.send_text(text) if failure is None else socket.send_bytes(failure))
             if isinstance(problem, TooManyRequests):  # the connection stays open, as nothing was acted on
-                await asyncio.sleep(gate.throttled_s())
-                return True
+                if gate.refused_too_often:
+                    await socket.close(POLICY_VIOLATION, REFUSED)
+                return not gate.refused_too_often
             if failure is None:
                 await socket.close(INTERNAL_ERROR, "Internal server error.")
             return failure is not None

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.errors import MalformedMessage
+from vlagents_ray.errors import MalformedMessage, shown
 
 _NUMBER = "__action_chunk_size__"
 
@@ -48,7 +48,7 @@ def number_of_rows(message: dict[str, Any]) -> int:
     """Return how many rows the client executes before its next message."""
     number = message.get(_NUMBER, 1)
     if type(number) is not int or number < 1:
-        raise MalformedMessage(f"{_NUMBER}: got {str(number)[:40]!r}, want an integer, 1 or more")
+        raise MalformedMessage(f"{_NUMBER}: got {shown(number)}, want an integer, 1 or more")
     return number
 
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Literal
 
+import numpy as np
 from pydantic import Field
 
-from vlagents_ray.errors import MalformedMessage
+from vlagents_ray.errors import MalformedMessage, shown
 from vlagents_ray.protocol.messages import NAME_CHARACTERS, Reply
 from vlagents_ray.serve.config.dialects import DialectConfig, MappingSetting
 from vlagents_ray.serve.dialects.openpi.handler import MapConnection, MapDialect
@@ -55,12 +56,14 @@ class RoboArenaDialect(MapDialect):
     def begins(self, message: dict[str, Any], connection: MapConnection) -> bytes | str | None:
         endpoint = message.get("endpoint", "infer")
         if not isinstance(endpoint, str) or endpoint not in ("infer", "reset"):
-            raise MalformedMessage(f"endpoint: got {str(endpoint)[:40]!r}, want 'infer' or 'reset'")
+            raise MalformedMessage(f"endpoint: got {shown(endpoint)}, want 'infer' or 'reset'")
         if endpoint == "reset":
             connection.end_episodes()
             return "reset successful"
         if (named := message.get("session_id")) is not None:
-            episode = str(named)[:NAME_CHARACTERS]  # the client sends a text, or an array with one text
+            if isinstance(named, np.ndarray) and named.size == 1:  # the client sends a text, or an array with one text
+                named = named.item()
+            episode = shown(named, NAME_CHARACTERS)
             if connection.episode not in (None, episode):
                 connection.end_episodes()
             connection.episode = episode

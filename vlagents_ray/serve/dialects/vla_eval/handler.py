@@ -22,7 +22,7 @@ from starlette.routing import BaseRoute, Route
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from vlagents_ray.chunking.buffer import ChunkBuffer
-from vlagents_ray.errors import MalformedMessage, MessageTooLarge, PolicyUnavailable, VLAgentsError
+from vlagents_ray.errors import MalformedMessage, MessageTooLarge, PolicyUnavailable, VLAgentsError, shown
 from vlagents_ray.protocol.budget import Budget
 from vlagents_ray.protocol.messages import RankName
 from vlagents_ray.serve.config.dialects import DialectConfig, MappingSetting
@@ -35,9 +35,9 @@ from vlagents_ray.serve.dialects.base import (
     public_problem,
 )
 from vlagents_ray.serve.dialects.implicit_session import ImplicitSession
-from vlagents_ray.serve.endpoints.http_messages import LONG_BYTES, problem_response
+from vlagents_ray.serve.endpoints.http_messages import problem_response
 from vlagents_ray.serve.engine.admission import MessageAdmission
-from vlagents_ray.serve.engine.dispatch import Dispatcher
+from vlagents_ray.serve.engine.dispatch import REFUSED, Dispatcher
 from vlagents_ray.wire.vla_eval import codec
 from vlagents_ray.wire.vla_eval.presets import PRESETS
 
@@ -93,8 +93,8 @@ class VlaEvalDialect(RouteDialect):
                 answer = await self._answer(received, connection)
                 if answer is not None:
                     await socket.send_bytes(codec.encode(answer))
-            if inbox.overrun:
-                await socket.close(POLICY_VIOLATION)
+            if inbox.end is not None:
+                await socket.close(POLICY_VIOLATION, inbox.end)
         except WebSocketDisconnect:
             return
         finally:
@@ -106,7 +106,7 @@ class VlaEvalDialect(RouteDialect):
     async def _answer(self, received: _Received, connection: _Connection) -> codec.Message | None:
         message = received.message
         if isinstance(message, VLAgentsError):
-            return _error(message, received.seq, uuid.uuid4().hex)
+            return _error(message, 0, uuid.uuid4().hex)
         if message.kind == "hello":
             return self._hello(message)
         if message.kind in ("episode_start", "episode_end"):
@@ -119,7 +119,7 @@ class VlaEvalDialect(RouteDialect):
     def _hello(self, message: codec.Message) -> codec.Message:
         version = message.payload.get("protocol_version")
         if type(version) is not int or version != codec.PROTOCOL_VERSION:
-            error = MalformedMessage(f"protocol_version: got {str(version)[:20]}, want {codec.PROTOCOL_VERSION}")
+            error = MalformedMessage(f"protocol_version: got {shown(version, 20)}, want {codec.PROTOCOL_VERSION}")
             return _error(error, message.seq, uuid.uuid4().hex)
         known = self.context.metadata()
         payload: dict[str, Any] = {
@@ -173,7 +173,6 @@ class _Received:
 
     message: codec.Message | VLAgentsError
     admission: MessageAdmission
-    seq: int = 0  # sequence number of a refused message, if it is known
 
     @property
     def is_observation(self) -> bool:
@@ -186,7 +185,7 @@ class _Inbox:
     def __init__(self) -> None:
         self._messages: deque[_Received | None] = deque()
         self._there = asyncio.Event()
-        self.overrun = False  # whether reading stopped because too many messages waited
+        self.end: str | None = None  # the reason why the server ends the connection
 
     async def next(self) -> _Received | None:
         """Wait for the oldest message and return it; None if the client is gone."""
@@ -198,39 +197,32 @@ class _Inbox:
     async def fill(self, socket: WebSocket, gate: Dispatcher, dialect: VlaEvalDialect) -> None:
         """Receive messages until the client is gone, or too many of its messages wait for replies."""
         try:
-            while (event := await socket.receive())["type"] != "websocket.disconnect":
+            while not gate.refused_too_often:
+                await gate.wait_unthrottled()
+                if (event := await socket.receive())["type"] == "websocket.disconnect":
+                    return
                 data = event.get("bytes")
                 admission = gate.admission(dialect.context.limits, 0 if data is None else len(data), dialect.rank)
                 if len(self._messages) >= _WAITING:
-                    self.overrun = True
-                    most = MessageTooLarge(f"{_WAITING} messages wait for answers; send no more than that at once")
+                    self.end = f"{_WAITING} messages wait for answers; send no more than that at once"
+                    most = MessageTooLarge(self.end)
                     self._put(_Received(most, admission))
                     return
                 self._put(await self._read(data, admission))
-                await asyncio.sleep(gate.throttled_s())
+            self.end = REFUSED
         finally:
             self._put(None)
 
     @staticmethod
     async def _read(data: bytes | None, admission: MessageAdmission) -> _Received:
-        """Decode a message and count an observation as a request of the key.
-
-        A long message, which can only be an observation, is counted before it is decoded.
-        """
-        seq = 0
+        """Decode a message, which counts as a request of the key."""
         try:
+            admission.begin_message()
             if data is None:
                 raise MalformedMessage("message: got text, want a binary map")
-            if len(data) > LONG_BYTES:
-                return _Received(await decoded(_read_message, data, admission), admission)
-            message = _read_message(data, admission)
-            seq = message.seq
-            if message.kind == "observation":
-                admission.begin("act")
+            return _Received(await decoded(_read_message, data, admission), admission)
         except Exception as error:  # noqa: BLE001 - the client is answered with it
-            admission.count_unreadable()
-            return _Received(public_problem(error, "vla_eval", "of an unreadable message"), admission, seq)
-        return _Received(message, admission)
+            return _Received(public_problem(error, "vla_eval", "of an unreadable message"), admission)
 
     def _put(self, received: _Received | None) -> None:
         last = self._messages[-1] if self._messages else None

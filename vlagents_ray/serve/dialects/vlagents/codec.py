@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from vlagents_ray.errors import InvalidAction, InvalidObservation, MalformedMessage, MessageTooLarge
+from vlagents_ray.errors import InvalidAction, InvalidObservation, MalformedMessage, MessageTooLarge, shown
 from vlagents_ray.images.codecs import decode_files
 from vlagents_ray.interface import GOAL_IMAGE, Act, Obs
 from vlagents_ray.protocol.arrays import read_array
@@ -169,7 +169,7 @@ def _robot(robot: Mapping[str, Any], prefix: str, budget: Budget, segments: Segm
         if isinstance(gripper, np.ndarray) and gripper.size == 1:
             gripper = gripper.item()
         if not is_number(gripper):
-            raise InvalidObservation(f"gripper: got {str(gripper)[:40]!r}, want a number in [0, 1] where 1 = open")
+            raise InvalidObservation(f"gripper: got {shown(gripper)}, want a number in [0, 1] where 1 = open")
         if prefix:
             obs.state[f"{prefix}gripper"] = np.array([gripper], np.float32)
         else:
@@ -199,7 +199,7 @@ def _image(image: Any, kind: Any, name: str, budget: Budget, segments: Segments)
             raise InvalidObservation(f"camera {name[:40]!r}: got {type(image).__name__}, want an array")
         found = image
     else:
-        raise MalformedMessage(f"camera_data_type: got {str(kind)[:40]!r}, want {RAW!r}, {JPEG!r} or {SHARED!r}")
+        raise MalformedMessage(f"camera_data_type: got {shown(kind)}, want {RAW!r}, {JPEG!r} or {SHARED!r}")
     if found.ndim == 4 and len(found):
         found = found[-1]
     if found.ndim != 3 or found.shape[2] != 3 or found.dtype != np.uint8:
@@ -215,7 +215,7 @@ def _shared(payload: Mapping[str, Any], budget: Budget, segments: Segments) -> n
     if not isinstance(name, str) or payload.get("dtype", "uint8") != "uint8":
         raise MalformedMessage("shared memory: want a name, and pixels of uint8")
     if not (isinstance(shape, list) and 0 < len(shape) <= 4 and all(type(n) is int and n > 0 for n in shape)):
-        raise MalformedMessage(f"shared memory: got the shape {str(shape)[:60]}, want (H, W, 3)")
+        raise MalformedMessage(f"shared memory: got the shape {shown(shape)}, want (H, W, 3)")
     size = 1
     for n in shape:
         size *= n
@@ -241,4 +241,4 @@ def _mapping(value: Any, what: str) -> dict[str, Any]:
 
 def _require_known(value: Mapping[str, Any], known: set[str], what: str) -> None:
     if unknown := value.keys() - known:
-        raise MalformedMessage(f"{what}: unknown keys {sorted(unknown)[:8]}, want some of {sorted(known)}")
+        raise MalformedMessage(f"{what}: unknown keys {shown(sorted(unknown))}, want some of {sorted(known)}")

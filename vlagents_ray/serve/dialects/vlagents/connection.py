@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from vlagents_ray.errors import InvalidInput, MalformedMessage, MessageTooLarge, VLAgentsError
+from vlagents_ray.errors import InvalidInput, MalformedMessage, MessageTooLarge, VLAgentsError, shown
 from vlagents_ray.interface import Obs
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.dialects.base import GatewayContext
@@ -206,7 +206,7 @@ def _echo(call: RpycCall) -> str | bytes | None:
             return None
         case (str() | bytes() | None as said, *_):
             return said
-    raise MalformedMessage(f"ping: got {str(call.args[0])[:40]}, want text")
+    raise MalformedMessage(f"ping: got {shown(call.args[0])}, want text")
 
 
 def _number(args: tuple[Any, ...]) -> int:

@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import Field
 
-from vlagents_ray.errors import MalformedMessage
+from vlagents_ray.errors import MalformedMessage, shown
 from vlagents_ray.interface import Obs
 from vlagents_ray.serve.dialects.openpi.handler import MapConnection
 from vlagents_ray.serve.dialects.roboarena.handler import RoboArenaDialect, RoboArenaDialectConfig
@@ -71,7 +71,7 @@ class VllmOmniDialect(RoboArenaDialect):
         if (seed := message.get("seed")) is None:
             return {}
         if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
-            raise MalformedMessage(f"seed: got {str(seed)[:40]!r}, want an integer, 0 or more")
+            raise MalformedMessage(f"seed: got {shown(seed)}, want an integer, 0 or more")
         return {"seed": int(seed)}
 
     def failure(self, text: str) -> bytes | None:

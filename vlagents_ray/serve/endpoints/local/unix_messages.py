@@ -33,7 +33,7 @@ from vlagents_ray.serve.access.api_keys import Caller, Identity, NoKey
 from vlagents_ray.serve.endpoints.acceptor import Acceptor
 from vlagents_ray.serve.engine import arrival
 from vlagents_ray.serve.engine.admission import MessageAdmission, NeedsDecodingThread, decode_in_background
-from vlagents_ray.serve.engine.dispatch import Dispatcher
+from vlagents_ray.serve.engine.dispatch import REFUSED, Dispatcher
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.metrics_buffer import RequestTrace
 from vlagents_ray.serve.periodic import each_half_second
@@ -172,6 +172,8 @@ class UnixConnection:
             self._disconnect()
 
     def _read(self) -> None:
+        if self._sender is not None and self._sender.rated and self._is_throttled():
+            return
         trace = RequestTrace(self._engine.stats, self._server.name)
         buffer = _buffers.bytes
         try:
@@ -181,33 +183,51 @@ class UnixConnection:
         except OSError as error:
             logger.info("local client: %s", error)
             size, control = 0, []
-        descriptors: list[int] = []
-        for _, kind, data in control:
-            if kind == socket.SCM_RIGHTS:
-                descriptors += array("i", data[: len(data) // 4 * 4])
+        descriptors = [
+            number
+            for _, kind, data in control
+            if kind == socket.SCM_RIGHTS
+            for number in array("i", data[: len(data) // 4 * 4])
+        ]
         try:
             if not size:
                 self._disconnect()
                 return
             sender = self._sender or self._authenticate(bytes(buffer[: min(size, _KEY_BYTES)]))
-            if sender is None:
-                return
-            waited_s = arrival.waited_s(control)
-            memory, compact_form, text = self._payload.read(memoryview(buffer)[:size], descriptors)
-            if compact_form:
-                self._dispatch(sender, None, trace, waited_s, self._reader.read(text, memory))
-            else:
-                self._decode(sender, trace, waited_s, memory)
+            if sender is not None:
+                self._receive(sender, trace, arrival.waited_s(control), memoryview(buffer)[:size], descriptors)
         except VLAgentsError as error:
-            if self._sender is not None:
-                self._sender.admission(self._server.limits).count_unreadable()
             self._answer(trace, [Reply(error=error)])
+            if self._sender is not None and self._sender.refused_too_often:
+                self.end(REFUSED)
         finally:
             for descriptor in descriptors:
                 os.close(descriptor)
-        if self._sender is not None and (throttled_s := self._sender.throttled_s()) > 0:
-            self._pause()
-            self._engine.queue.call_later(throttled_s, self._resume)
+        if self._sender is not None and self._sender.rated:
+            self._is_throttled()
+
+    def _receive(
+        self, sender: Dispatcher, trace: RequestTrace, waited_s: float, message: memoryview, descriptors: list[int]
+    ) -> None:
+        try:  # only locates the memory; a new memory file of the client is taken even if the message is refused
+            memory, compact_form, text = self._payload.read(message, descriptors)
+        except VLAgentsError:
+            sender.count_message()
+            raise
+        if not compact_form:
+            self._decode(sender, trace, waited_s, memory)
+            return
+        if sender.rated:
+            sender.count_message()
+        self._dispatch(sender, None, trace, waited_s, self._reader.read(text, memory))
+
+    def _is_throttled(self) -> bool:
+        """Whether the key of the client is over its rate; if so, the connection is read again later."""
+        if self._ended or self._sender is None or (wait_s := self._sender.throttled_s()) <= 0:
+            return False
+        self._pause()
+        self._engine.queue.call_later(wait_s, self._resume)
+        return True
 
     def _decode(self, sender: Dispatcher, trace: RequestTrace, waited_s: float, frame: np.ndarray) -> None:
         """Decode the requests of a frame, in another thread if that is slow, and send them to the engine."""
