@@ -223,6 +223,7 @@ class PolicyUnavailable(VLAgentsError):
 
     code = "unavailable"
     status = 503
+    retry_after_s: float = 1.0  # seconds to wait before the next attempt
 
 
 class NoReplica(PolicyUnavailable):

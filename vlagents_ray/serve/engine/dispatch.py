@@ -160,10 +160,10 @@ class Dispatcher:
         loop = asyncio.get_running_loop()
         future: asyncio.Future[list[Reply]] = loop.create_future()
         collector = self.send(items, lambda replies: _deliver(loop, future, replies), admission=admission, part=part)
-        deadlines = [item.deadline_ms for item in items if isinstance(item, Request)]
+        left_ms = [item.left_ms for item in items if isinstance(item, Request)]
         timer = None
-        if None not in deadlines and deadlines:
-            timer = loop.call_later(max(deadlines) / 1e3, collector.expire)  # type: ignore[type-var, operator]
+        if None not in left_ms and left_ms:
+            timer = loop.call_later(max(left_ms) / 1e3, collector.expire)  # type: ignore[type-var, operator]
         try:
             return await future
         finally:
