@@ -193,7 +193,9 @@ def test_a_machine_that_is_always_starved_refuses_only_what_may_have_waited() ->
     assert 0.35 < longest_s < 3.0
 
 
-@pytest.mark.parametrize(("sent", "deadline_ms"), [("in the pause", 300.0), ("in the pause", 60e3), ("after it", 300.0)])
+@pytest.mark.parametrize(
+    ("sent", "deadline_ms"), [("in the pause", 300.0), ("in the pause", 60e3), ("after it", 300.0)]
+)
 def test_after_a_pause_an_http_request_is_refused_only_if_it_was_late(sent: str, deadline_ms: float) -> None:
     """As its connection's record says, and not for as long as others may be late."""
     now = 100.0

@@ -45,8 +45,8 @@ from vlagents_ray.protocol.messages import (
 
 logger = logging.getLogger(__name__)
 
-# statuses of a proxy that are worth a retry; HAProxy says 500 for its own 502 to 504
-_TRANSIENT = (408, 500, 502, 503, 504)
+# Statuses of a proxy that are worth a retry; HAProxy says 500 for its own 502 to 504, and 404 while it restarts.
+_TRANSIENT = (404, 408, 500, 502, 503, 504)
 _PAUSE_S = 0.2
 _DIRECT_S = 1.0  # s for a replica's own port to answer: a firewall may drop the packets
 
