@@ -61,12 +61,7 @@ class Request:
     request_id: str = ""
     deadline_ms: float | None = None  # how long the reply is of use, counted from the arrival of the request
     parts: bool = False  # of act: whether the chunk may come in several replies, all but the last with `Act.more`
-    waited_ms: float = 0.0  # time from its arrival until the server read it; not sent
-
-    @property
-    def left_ms(self) -> float | None:
-        """The part of the deadline that was left when the server read the request; None without a deadline."""
-        return None if self.deadline_ms is None else max(0.0, self.deadline_ms - self.waited_ms)
+    waited_ms: float = 0.0  # how much of the deadline had passed when the server read it; not sent
 
 
 @dataclass(slots=True)

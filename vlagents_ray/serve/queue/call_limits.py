@@ -49,7 +49,8 @@ class PolicyCall:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.end_forked_child()
+        if os.getpid() != self._process:
+            self.end_forked_child()
         self._calls.under_way.discard(self)
         self.ended = self._calls.clock()
         took_s = self.ended - self.began

@@ -86,8 +86,8 @@ class PendingRequest:
 
     def expired(self, now: float) -> bool:
         """Return whether the deadline has passed at `now`, s."""
-        left_ms = self.request.left_ms
-        return left_ms is not None and (now - self.arrived) * 1e3 > left_ms
+        deadline_ms = self.request.deadline_ms
+        return deadline_ms is not None and (now - self.arrived) * 1e3 > deadline_ms - self.request.waited_ms
 
 
 def _ignore_reply(reply: Reply) -> None:
