@@ -227,7 +227,10 @@ class PolicyUnavailable(VLAgentsError):
 
 
 class NoReplica(PolicyUnavailable):
-    """No replica of the application runs: its policy is loading or waits for resources, or the last replica died."""
+    """No replica of the application runs: its policy is loading or waits for resources, or the last replica died.
+
+    Clients raise it also if nothing accepts connections at the server's address.
+    """
 
     code = "no_replica"
 

@@ -30,6 +30,7 @@ from vlagents_ray.errors import (
     DeadlineExceeded,
     MalformedMessage,
     MessageTooLarge,
+    NoReplica,
     PolicyUnavailable,
     VLAgentsError,
 )
@@ -102,7 +103,8 @@ def open_websocket(url: str, credentials: Credentials, timeout_s: float) -> Prox
     """Connect to a path of a server's own port.
 
     Raises:
-        PolicyUnavailable: The server cannot be reached, or refuses the connection.
+        NoReplica: The server cannot be reached.
+        PolicyUnavailable: It refuses the connection.
         VLAgentsError: It refuses the API key.
     """
     try:
@@ -115,7 +117,7 @@ def open_websocket(url: str, credentials: Credentials, timeout_s: float) -> Prox
             raise refusal(error.response.status_code, kind, bytes(error.response.body or b"")) from error
         raise PolicyUnavailable(f"{url}: refused with HTTP {error.response.status_code}") from error
     except (OSError, InvalidHandshake, TimeoutError) as error:
-        raise PolicyUnavailable(f"{url}: cannot connect ({error}); is it running?") from error
+        raise NoReplica(f"{url}: cannot connect ({error}); is it running?") from error
 
 
 class WebSocketTransport:
