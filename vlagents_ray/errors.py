@@ -256,10 +256,14 @@ class PolicyUnavailable(VLAgentsError):
 
     code = "unavailable"
     status = 503
+    retry_after_s: float = 1.0  # seconds to wait before the next attempt
 
 
 class NoReplica(PolicyUnavailable):
-    """No replica of the application runs: its policy is loading or waits for resources, or the last replica died."""
+    """No replica of the application runs: its policy is loading or waits for resources, or the last replica died.
+
+    Clients raise it also if nothing accepts connections at the server's address.
+    """
 
     code = "no_replica"
 

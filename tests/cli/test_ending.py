@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -57,6 +58,14 @@ def test_it_ends_with_one_sentence(body: str, leave_s: float) -> None:
     ended = run(COMMAND.format(body=body, leave_s=leave_s))
     assert ended.returncode == 1
     assert ended.stderr.strip() == "error ClusterLost: the raylet has ended; start it again"
+
+
+def test_its_sentence_is_the_last_line_whatever_rays_native_threads_say_of_it() -> None:
+    native = "[os.write(2, b'E native\\n') or time.sleep(0.001) for _ in iter(int, 1)]"
+    body = f"import os, threading; threading.Thread(target=lambda: {native}, daemon=True).start(); loss.wait()"
+    ended = run(COMMAND.format(body=body, leave_s=30))
+    assert ended.returncode == 1
+    assert re.fullmatch(r"(E native\n)+error ClusterLost: the raylet has ended; start it again\n", ended.stderr)
 
 
 def test_a_command_that_leaves_ray_by_itself_is_left_alone() -> None:

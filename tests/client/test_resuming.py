@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -22,11 +23,12 @@ from vlagents_ray import (
     Obs,
     PolicyFailed,
     PolicyUnavailable,
+    RemoteAgent,
     UnknownSession,
 )
 from vlagents_ray.client import connection, session
 from vlagents_ray.contract import Contract
-from vlagents_ray.errors import NoReplica
+from vlagents_ray.errors import NoReplica, UnknownApp, VLAgentsError
 from vlagents_ray.serve.scaling import session_migration
 
 
@@ -94,20 +96,90 @@ def replicas() -> Iterator[Callable[[int], Replicas]]:
 
 def test_a_session_of_a_replica_that_stops_moves_with_all_it_has(replicas: Callable[[int], Replicas]) -> None:
     served = replicas(2)
-    expected = [np.random.default_rng(3).random(6)]
     agent = served.agent()
     agent.reset(obs(1), "stack", seed=3)
     drawn = [agent.act(obs(value)).info["random"] for value in (2, 3)]
     served.engines[0].drain()
-    for value in (4, 5, 6, 7):
-        act = agent.act(obs(value))
-        assert "resumed" not in act.info
-        drawn.append(act.info["random"])
-    assert drawn == expected[0].tolist()
-    assert act.info["acts"] == 6
+    drawn += act_until_moved(agent, served)
+    assert drawn == np.random.default_rng(3).random(len(drawn)).tolist()
     assert len(served.engines[1].sessions) == 1
     assert len(served.engines[0].sessions) == 0
     agent.close()
+
+
+def act_until_moved(agent: RemoteAgent, served: Replicas) -> list[float]:
+    """Act until the second replica has the session, which goes on; return what it drew."""
+    drawn = []
+    while not len(served.engines[1].sessions):
+        act = agent.act(obs(len(drawn) % 200))
+        assert "resumed" not in act.info
+        drawn.append(act.info["random"])
+    return drawn
+
+
+@pytest.mark.parametrize("look_up", ["is refused", "finds no application", "hangs"])
+def test_a_session_stays_where_it_is_until_another_replica_has_answered(
+    look_up: str, replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A replica that sends it away goes on answering, while the load balancer may be gone."""
+    served = replicas(2)
+    agent = served.agent(timeout_s=5.0)
+    agent.reset(obs(1), "stack", seed=3)
+    connect, tried, back = InProcess.connect, threading.Semaphore(0), threading.Event()
+
+    def fail(self: InProcess, timeout_s: float) -> Any:
+        tried.release()
+        if look_up == "hangs":
+            assert back.wait(20)
+        if back.is_set():
+            return connect(self, timeout_s)
+        raise PolicyUnavailable("refused") if look_up == "is refused" else UnknownApp("no application")
+
+    monkeypatch.setattr(InProcess, "connect", fail)
+    monkeypatch.setattr(connection, "_LOOK_UP_PAUSE_S", 0.0)
+    served.engines[0].drain()
+    drawn = [agent.act(obs(2)).info["random"]]
+    for _ in range(1 if look_up == "hangs" else 3):
+        while not tried.acquire(blocking=False):
+            drawn.append(agent.act(obs(2)).info["random"])
+        drawn += [agent.act(obs(3)).info["random"] for _ in range(3)]
+    assert agent.reconnects == 0
+    back.set()
+    drawn += act_until_moved(agent, served)
+    assert drawn == np.random.default_rng(3).random(len(drawn)).tolist()  # not one act was lost or repeated
+    agent.close()
+
+
+@pytest.mark.parametrize("status", ["ended", "broken"])
+def test_a_look_up_for_a_session_that_no_longer_needs_it_leaves_no_connection(
+    status: str, replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    served = replicas(2)
+    agent = served.agent()
+    agent.reset(obs(1), "stack")
+    connect, looked, back = InProcess.connect, threading.Event(), threading.Event()
+    found: list[InProcess] = []
+
+    def later(self: InProcess, timeout_s: float) -> Any:
+        if threading.current_thread() is not threading.main_thread():
+            found.append(self)
+            looked.set()
+            assert back.wait(20)
+        return connect(self, timeout_s)
+
+    monkeypatch.setattr(InProcess, "connect", later)
+    served.engines[0].drain()
+    agent.act(obs(2))
+    assert looked.wait(20)
+    if status == "broken":
+        served.dead.add(0)
+        assert agent.act(obs(3)).info["resumed"]
+    else:
+        agent.close()
+    closed = threading.Event()
+    monkeypatch.setattr(InProcess, "close", lambda self: closed.set() if self in found else None)
+    back.set()
+    assert closed.wait(20)
 
 
 def test_a_session_of_a_dead_replica_begins_again_and_sees_its_history(replicas: Callable[[int], Replicas]) -> None:
@@ -236,7 +308,8 @@ def test_an_act_for_which_little_time_is_left_is_not_sent_again(
 def test_a_reset_waits_for_a_replica_while_none_runs_but_not_for_room_at_a_full_one(
     replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    refusals: list[PolicyUnavailable] = [PolicyUnavailable("full"), NoReplica("none runs"), NoReplica("none runs")]
+    not_found = UnknownApp("Path '/v1/reset' not found")  # of HAProxy, while it restarts
+    refusals: list[VLAgentsError] = [PolicyUnavailable("full"), NoReplica("none runs"), not_found]
     call = InProcess.call
 
     def refuse(self: InProcess, requests: Any, timeout_s: float) -> Any:

@@ -428,7 +428,7 @@ def test_a_full_replica_closes_a_proxied_websocket_with_its_reason(keyed: Replic
             late.recv(5)
     assert closed.value.rcvd is not None
     assert closed.value.rcvd.code == 1013
-    assert "its limit" in closed.value.rcvd.reason
+    assert "its limit; close one, or raise sessions.limit" in closed.value.rcvd.reason
 
 
 def test_a_look_that_fails_is_followed_by_the_next(caplog: pytest.LogCaptureFixture) -> None:

@@ -210,7 +210,7 @@ class KeyedReplica:
             engines=[self.engine], dead=set(), frozen=set(), prefer=0, lose_reply=False, stopping=False, frames=[]
         )
         way = _Near(asdict(self.local.address), Credentials(key or "")) if near else InProcess(engines)  # type: ignore[arg-type]
-        agent._connection = Connection(agent.url, way, CodecChoice("raw"), 5.0, 5.0)  # type: ignore[arg-type]
+        agent._connection = Connection(agent.url, lambda: way, CodecChoice("raw"), 5.0, 5.0)  # type: ignore[arg-type]
         return agent
 
     def _on_own_port(self, stack: contextlib.ExitStack, name: str, near: bool, check: Any, **settings: Any) -> int:

@@ -58,9 +58,11 @@ class Replicas:
     def agent(self, **options: Any) -> RemoteAgent:
         """A client of them."""
         agent = RemoteAgent("http://127.0.0.1:9", **options)
-        another = partial(InProcess, self) if options.get("resume", True) else None
-        timeout_s = options.get("timeout_s", 30.0)
-        agent._connection = Connection(agent.url, InProcess(self), CodecChoice("raw"), timeout_s, 30.0, another)
+        timeout_s, resume = options.get("timeout_s", 30.0), options.get("resume", True)
+        new_transport = partial(InProcess, self)
+        agent._connection = Connection(
+            agent.url, new_transport, CodecChoice("raw"), timeout_s, 30.0, leaves_silent=resume
+        )
         return agent
 
     def close(self) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,7 +16,7 @@ from rich.console import Console, ConsoleDimensions
 from rich.table import Table
 from rich.text import Text
 
-from vlagents_ray.errors import ConfigError, VLAgentsError
+from vlagents_ray.errors import ClusterLost, ConfigError, VLAgentsError
 from vlagents_ray.ray_tools.signals import interrupts
 from vlagents_ray.settings import wrong_settings
 
@@ -63,6 +64,11 @@ def errors() -> Iterator[None]:
         fail(f"wrong settings: {wrong_settings(error, _model_of(error))}", 2)
     except ConfigError as error:
         fail(str(error), 2)
+    except ClusterLost as error:
+        with open(os.dup(2), "w") as last, open(os.devnull, "w") as nowhere:
+            os.dup2(nowhere.fileno(), 2)  # Ray's native threads log there until the process ends
+            say_error(f"{type(error).__name__}: {error}", PlainConsole(file=last))
+        raise typer.Exit(1) from error
     except VLAgentsError as error:
         fail(f"{type(error).__name__}: {error}", 1)
     except KeyboardInterrupt as error:
@@ -83,10 +89,10 @@ def fail(message: str, code: int) -> NoReturn:
     raise typer.Exit(code)
 
 
-def say_error(message: str) -> None:
+def say_error(message: str, console: Console = err) -> None:
     """Print what went wrong, after all other output."""
     sys.stdout.flush()
-    err.print(Text.assemble(("error", "bold red"), f" {message}"))
+    console.print(Text.assemble(("error", "bold red"), f" {message}"))
 
 
 def fresh(folder: Path) -> Path:

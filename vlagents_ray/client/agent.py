@@ -95,8 +95,7 @@ class RemoteAgent(Agent):
         choice = CodecChoice(codec)
         self.credentials = Credentials(api_key, ca, certificate)
         new_transport = partial(select_transport, url, transport, choice, self.credentials)
-        renew = new_transport if resume else None
-        connection = Connection(url, new_transport(), choice, timeout_s, connect_timeout_s, renew)
+        connection = Connection(url, new_transport, choice, timeout_s, connect_timeout_s, leaves_silent=resume)
         self._attach(connection, rank, resume, commands)
 
     def _attach(self, connection: Connection, rank: RankName, resume: bool, commands: CommandInbox | None) -> None:

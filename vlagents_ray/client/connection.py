@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import threading
 import time
 import uuid
@@ -14,8 +15,8 @@ from vlagents_ray.client.credentials import is_loopback
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import (
     ConfigError,
-    ConnectionLost,
     DeadlineExceeded,
+    NoReplica,
     PolicyUnavailable,
     UnknownApp,
     VLAgentsError,
@@ -28,46 +29,53 @@ if TYPE_CHECKING:
     from vlagents_ray.client.transports.codec_selection import CodecChoice
     from vlagents_ray.interface import Parts
 
+logger = logging.getLogger(__name__)
+
 _CLOSE_S = 2.0
 # The server gets the deadline of a call less the time of transport: this share of it, and at most so many s.
 _TRANSPORT_SHARE, _TRANSPORT_S = 0.1, 0.2
+_LOOK_UP_S, _LOOK_UP_PAUSE_S = 10.0, 1.0  # time to find another replica, and between two attempts
 SILENT_S = 5.0  # s without any answer, in one or several calls, after which the next call goes to another replica
 
 
 class Connection:
     """Connects when first needed, and again when the connection broke or the replica asks its clients to reconnect.
 
-    Only one thread may use it at a time.
+    A replica that asks for it still answers: its connection is used until another replica has answered. Only one thread
+    may use a connection at a time.
     """
 
     def __init__(
         self,
         url: str,
-        transport: Transport,
+        new_transport: Callable[[], Transport],
         codec: CodecChoice,
         timeout_s: float,
         connect_timeout_s: float,
-        new_transport: Callable[[], Transport] | None = None,
+        *,
+        leaves_silent: bool = True,
     ) -> None:
         """Set up the connection, without opening it.
 
         Args:
             url: The server's URL.
-            transport: The transport to use.
+            new_transport: Returns a new transport.
             codec: The codec of the cameras.
             timeout_s: How long a call may take.
             connect_timeout_s: How long to wait for a server that is not ready.
-            new_transport: Returns a new transport like the first one, for use when a replica no longer answers; None
-                keeps the first.
+            leaves_silent: Whether to go to another replica when one no longer answers.
         """
         self.url = url
         self._new_transport = new_transport
+        self._leaves_silent = leaves_silent
         self._silent_since: float | None = None  # time.monotonic(); no call that began later was answered
         self._silent = False  # whether that has lasted for `SILENT_S`
         # The transport to the replica that does not answer, kept until another one answers: its sessions may still be
         # moved.
         self._old_transport: Transport | None = None
-        self.transport = transport
+        self._next: _NextTransport | None = None  # to the replica that is to be next, while the present one answers
+        self._look_up_at = float("-inf")  # no earlier, time.monotonic()
+        self.transport = new_transport()
         self.codec = codec
         self.timeout_s = timeout_s
         self.metadata: dict[str, Any] | None = None
@@ -77,7 +85,7 @@ class Connection:
         self._connect_timeout_s = connect_timeout_s
         self.reconnects = 0  # how often it has connected again
         self._must_reconnect = False  # connect again before the next request
-        self._asked_to_move = False  # whether that is only because the replica asked for it
+        self._asked_to_move = False  # whether the replica keeps the sessions when its connection is closed
         self._prefix = uuid.uuid4().hex[:16]
         self._requests = 0
 
@@ -89,8 +97,9 @@ class Connection:
     def open(self, timeout_s: float | None = None) -> None:
         """Connect, waiting for the server to become ready; raises `PolicyUnavailable` if it does not."""
         if self._must_reconnect:
+            self._drop_next()
             self.reconnects += 1
-            if self._silent and self._new_transport is not None:
+            if self._silent and self._leaves_silent:
                 self._close_old_transport()
                 self._old_transport, self.transport = self.transport, self._new_transport()
                 self._silent, self._silent_since = False, None
@@ -99,7 +108,10 @@ class Connection:
             self.metadata, self._must_reconnect, self._asked_to_move = None, False, False
         if self.metadata is not None:
             return
-        metadata = self.transport.connect(self._connect_timeout_s if timeout_s is None else timeout_s)
+        self._connected(self.transport.connect(self._connect_timeout_s if timeout_s is None else timeout_s))
+
+    def _connected(self, metadata: dict[str, Any]) -> None:
+        """Take the metadata of the replica that the transport has connected to."""
         if metadata.get("protocol") != PROTOCOL_VERSION:
             self.transport.close()
             raise ConfigError(
@@ -113,10 +125,31 @@ class Connection:
         self._silent, self._silent_since = False, None  # also where the transport is still the same
         self.metadata = metadata
 
+    def _move(self) -> None:
+        """Go on with the next transport, once it is connected; if it cannot be, stay, and try again in a while."""
+        if self._next is None or not self._next.ended:
+            return
+        found, self._next = self._next, None
+        if found.metadata is None:
+            self._look_up_at = time.monotonic() + _LOOK_UP_PAUSE_S
+            return
+        self._close_old_transport()
+        self._old_transport, self.transport = self.transport, found.transport
+        self._close_old_transport()
+        self.reconnects += 1
+        self._must_reconnect = self._asked_to_move = False
+        self._connected(found.metadata)
+
+    def _drop_next(self) -> None:
+        if self._next is not None:
+            self._next.drop()
+            self._next = None
+
     def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
         """Send requests in one message and return their replies; an error on the way stands in place of a reply."""
         begun = time.monotonic()
         try:
+            self._move()
             if self._must_reconnect:
                 self.open(timeout_s)
                 timeout_s -= time.monotonic() - begun
@@ -158,19 +191,22 @@ class Connection:
         """Note that a call which began at that time, s of `time.monotonic`, had no answer within its time."""
         self._silent_since = begun if self._silent_since is None else self._silent_since
         self._silent = time.monotonic() - self._silent_since >= SILENT_S
-        self._must_reconnect = self._must_reconnect or (self._silent and self._new_transport is not None)
+        self._must_reconnect = self._must_reconnect or (self._silent and self._leaves_silent)
 
     def _noted(self, requests: Sequence[Request], replies: list[Reply]) -> list[Reply]:
         """Note errors and whether to connect again; return a reply for each request."""
         for reply in replies:
             if isinstance(reply.error, UnknownApp):  # it existed: the server is stopping or restarting
-                reply.error = PolicyUnavailable(f"{self.url}: the application is gone ({reply.error})")
+                reply.error = NoReplica(f"{self.url}: the application is gone ({reply.error})")
         if len(replies) != len(requests):  # one reply to the frame as a whole
             whole = replies[0].error or PolicyUnavailable(f"got {len(replies)} replies to {len(requests)} requests")
             replies = [Reply(request.request_id, error=whole) for request in requests]
-        broken = any(isinstance(reply.error, (ConnectionLost, PolicyUnavailable)) for reply in replies)
-        if broken or any(reply.draining for reply in replies):
-            self._must_reconnect, self._asked_to_move = True, not broken
+        if any(isinstance(reply.error, PolicyUnavailable) for reply in replies):
+            self._must_reconnect, self._asked_to_move = True, False
+        elif any(reply.draining for reply in replies):
+            self._asked_to_move = True
+            if self._next is None and time.monotonic() >= self._look_up_at:
+                self._next = _NextTransport(self._new_transport())
         return replies
 
     def end_session(self, user: object, session: str) -> None:
@@ -183,13 +219,14 @@ class Connection:
             with contextlib.suppress(VLAgentsError):  # harmless: the server forgets idle sessions
                 self.transport.call([close], _CLOSE_S)  # on the old connection, which holds the session
         if not self.users:
+            self._drop_next()
             self._close_old_transport()
             self.transport.close()
             self.codec.forget()  # the next connection may be over another link
             self.metadata, self._must_reconnect, self._asked_to_move = None, False, False
 
     def _close_old_transport(self) -> None:
-        """Close the transport to the silent replica that was left; in a thread, since closing it may take long."""
+        """Close the transport to the replica that was left; in a thread, since closing it may take long."""
         if self._old_transport is not None:
             threading.Thread(target=self._old_transport.close, daemon=True).start()
             self._old_transport = None
@@ -200,6 +237,40 @@ def _without_names_of_the_loop(reply: Reply) -> None:
     if reply.act is not None:
         for name in OF_THE_LOOP:
             reply.act.info.pop(name, None)
+
+
+class _NextTransport:
+    """A transport that connects in a thread of its own, once."""
+
+    def __init__(self, transport: Transport) -> None:
+        self.transport = transport
+        self.metadata: dict[str, Any] | None = None  # of the replica; None if none answered
+        self.ended = False
+        self._dropped = False
+        self._lock = threading.Lock()
+        threading.Thread(target=self._connect, name="next-replica", daemon=True).start()
+
+    def _connect(self) -> None:
+        metadata = None
+        try:
+            metadata = self.transport.connect(_LOOK_UP_S)
+            if metadata.get("protocol") != PROTOCOL_VERSION:
+                metadata = None
+        except VLAgentsError as error:
+            logger.info("the replica stays, no other one is found: %s", error)
+        finally:
+            with self._lock:
+                self.metadata, self.ended = metadata, True
+                unused = metadata is None or self._dropped
+            if unused:
+                self.transport.close()
+
+    def drop(self) -> None:
+        """Close the transport, as soon as it is connected."""
+        with self._lock:
+            self._dropped = True
+        if self.ended:
+            self.transport.close()
 
 
 def _changes_connection(reply: Reply) -> bool:

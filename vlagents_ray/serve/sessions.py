@@ -162,10 +162,7 @@ class SessionTable(Generic[M]):
                 if len(self._sessions) >= self.limit:
                     self._drop_idle()
                 if len(self._sessions) >= self.limit:
-                    raise PolicyUnavailable(
-                        f"this replica holds {self.limit} sessions, its limit; "
-                        f"close one, or raise sessions.limit or the number of replicas"
-                    )
+                    raise self.full()
                 session = self._sessions[session_id] = Session(session_id)
                 self.opened += 1
         session.used = time.monotonic()
@@ -203,7 +200,12 @@ class SessionTable(Generic[M]):
         """Raise `PolicyUnavailable` if the session is not here and the replica holds as many sessions as it may."""
         with self._lock:
             if session_id not in self._sessions and len(self._sessions) >= self.limit:
-                raise PolicyUnavailable(f"this replica holds {self.limit} sessions, its limit")
+                raise self.full()
+
+    def full(self) -> PolicyUnavailable:
+        """Return the error for a client whose session has no room here."""
+        cure = "close one, or raise sessions.limit or the number of replicas"
+        return PolicyUnavailable(f"this replica holds {self.limit} sessions, its limit; {cure}")
 
     def enter(self, arriving: Session[M]) -> None:
         """Add a session from another replica, in place of an older state of it.

@@ -14,7 +14,10 @@ from vlagents_ray.client.transports.codec_selection import CodecChoice
 from vlagents_ray.client.transports.http import HttpTransport
 from vlagents_ray.client.transports.serve_handle import HandleTransport
 from vlagents_ray.client.transports.websocket import WebSocketTransport
-from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, PolicyUnavailable
+from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, NoReplica, PolicyUnavailable
+from vlagents_ray.interface import Obs
+from vlagents_ray.protocol.messages import Request
+from vlagents_ray.serve.ports import free_port
 
 TIMEOUT_S = 2.0  # of an act, in which a session whose replica froze connects to another
 
@@ -113,3 +116,13 @@ def test_a_server_that_is_waited_for_is_reported_once_within_seconds(
         assert message.startswith(f"{url}: not ready; trying again for up to 5")
         assert message.endswith(" s (connection refused)")
         assert reported_at[0] < 5
+
+
+@pytest.mark.parametrize("kind", [HttpTransport, WebSocketTransport])
+def test_a_server_that_refuses_connections_is_one_without_replicas(
+    kind: type[HttpTransport | WebSocketTransport],
+) -> None:
+    """So that a reset waits for HAProxy as it waits for a replica; both start again within seconds."""
+    transport = kind(f"http://127.0.0.1:{free_port()}", CodecChoice("raw"))
+    with pytest.raises(NoReplica, match="is it running"):
+        transport.call([Request("reset", Obs(), request_id="1")], 1.0)

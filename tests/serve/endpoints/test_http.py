@@ -403,3 +403,14 @@ def test_a_request_id_that_could_forge_a_line_in_the_log_is_replaced(client: Tes
     answer = client.get("/nope", headers=[(b"x-request-id", name.encode("latin-1"))])
     assert answer.json()["request_id"].isalnum()
     assert client.get("/nope", headers={"x-request-id": "mine-1"}).json()["request_id"] == "mine-1"
+
+
+def test_a_full_replica_says_when_to_try_again() -> None:
+    engine = Engine(Mean(), session_limit=1)
+    engine.start()
+    inside = build_http_app(engine, dict, LIMITS)
+    with TestClient(AccessMiddleware(inside, None, "app")) as full:
+        assert post(full, "reset", session="first").status_code == 200
+        answer = post(full, "reset", session="second")
+    engine.close()
+    assert (answer.status_code, answer.headers["retry-after"], answer.json()["code"]) == (503, "1", "unavailable")

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import http.client
+import json
+import queue
 import socket
 import threading
 import time
@@ -13,15 +17,19 @@ from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
+from asgi_server import served
 from eval_fakes import wait_for
+from starlette.types import Receive, Scope, Send
 
 from vlagents_ray.client.transports.direct_websocket import Stream
 from vlagents_ray.client.transports.local.shm import ShmTransport
 from vlagents_ray.errors import DeadlineExceeded
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.frames import decode_reply, encode_request
-from vlagents_ray.protocol.messages import Limits, Reply, Request
+from vlagents_ray.protocol.messages import DEADLINE_HEADER, SESSION_HEADER, Limits, Reply, Request
 from vlagents_ray.serve.access.api_keys import NoKey
+from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
+from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.endpoints.local.shm import ShmServer
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.arrival import SPACE, PauseDetector, enable_timestamps, waited_s
@@ -183,6 +191,55 @@ def test_a_machine_that_is_always_starved_refuses_only_what_may_have_waited() ->
             longest_s = max(longest_s, pauses.waited_s())
             pauses.check()
     assert 0.35 < longest_s < 3.0
+
+
+@pytest.mark.parametrize(
+    ("sent", "deadline_ms"), [("in the pause", 300.0), ("in the pause", 60e3), ("after it", 300.0)]
+)
+def test_after_a_pause_an_http_request_is_refused_only_if_it_was_late(sent: str, deadline_ms: float) -> None:
+    """As its connection's record says, and not for as long as others may be late."""
+    now = 100.0
+    engine = Engine(Gated())
+    engine.start()
+    engine.pauses.stop()
+    engine.pauses = PauseDetector(lambda: now)
+    loops: queue.SimpleQueue[asyncio.AbstractEventLoop] = queue.SimpleQueue()
+    inside = build_http_app(engine, dict, Limits())
+
+    async def app(scope: Scope, receive: Receive, send: Send) -> None:
+        loops.put(asyncio.get_running_loop())
+        await AccessMiddleware(inside, None, "app", slow_s=30, idle_s=30)(scope, receive, send)
+
+    with served(app) as port, contextlib.closing(http.client.HTTPConnection("127.0.0.1", port, timeout=30)) as client:
+
+        def send(op: str, limit_ms: float = 60e3) -> None:
+            headers = {"content-type": "application/json", DEADLINE_HEADER: str(limit_ms), SESSION_HEADER: "robot"}
+            client.request("POST", f"/v1/{op}", "{}", headers)
+
+        def answer() -> dict[str, Any]:
+            found: dict[str, Any] = json.loads(client.getresponse().read())
+            return found
+
+        send("reset")
+        assert "code" not in answer()
+        engine.pauses.check()
+        reads = threading.Event()
+        loops.get().call_soon_threadsafe(reads.wait, 20)
+        if sent == "in the pause":
+            send("act", deadline_ms)
+            time.sleep(0.6)
+        now += 7.0
+        engine.pauses.check()
+        reads.set()
+        if sent == "after it":
+            send("act", deadline_ms)
+        if sent == "in the pause" and deadline_ms < 600:
+            late = answer()
+            assert late["code"] == "deadline_exceeded"
+            assert "within 300 ms" in late["detail"]  # what its sender asked for
+            send("act")
+        assert answer()["action"] == [1.0], "the late one was acted on"
+    engine.close()
 
 
 def test_a_request_that_serve_read_late_after_a_pause_is_not_acted_on() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 import socket
 import subprocess
@@ -189,6 +190,66 @@ def test_a_replica_that_does_not_answer_gets_no_more_requests(tmp_path: Path) ->
                 wait_for(lambda: answered(url), 60)
         finally:
             server.shutdown()
+
+
+@contextmanager
+def toggled(name: str) -> Iterator[tuple[int, threading.Event]]:
+    """A server that answers with its name while the event is set; yields its port and the event."""
+    up, over = threading.Event(), threading.Event()
+
+    class Named(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            while not up.is_set() and not over.is_set():
+                up.wait(0.1)
+            with suppress(OSError):  # it has gone meanwhile
+                self.send_response(200)
+                self.end_headers()
+                self.wfile.write(name.encode())
+
+        def log_message(self, *_: Any) -> None:
+            """Nothing."""
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Named) as server:
+        threading.Thread(target=server.serve_forever).start()
+        try:
+            yield server.server_port, up
+        finally:
+            over.set()
+            server.shutdown()
+
+
+def server_of(url: str, session: str) -> str:
+    """The server that answers the session; "" if none does."""
+    with suppress(OSError):
+        request = urllib.request.Request(f"{url}/v1/act", headers={"x-session-id": session})
+        with urllib.request.urlopen(request, timeout=1) as answer:
+            return str(answer.read().decode())
+    return ""
+
+
+@needs_haproxy
+@pytest.mark.parametrize("other", ["replica", "fallback"])
+def test_a_session_returns_from_serves_own_proxy_but_not_from_a_replica_where_it_acts(
+    other: str, tmp_path: Path
+) -> None:
+    """A replica that thaws would get them from one that holds them."""
+    sessions = [f"session-{number}" for number in range(10)]
+    checked = "check inter 100ms fall 2 rise 2"
+    with toggled("thawing") as (first, up), toggled(other) as (second, also_up):
+        also_up.set()
+        servers = [f"SERVE_REPLICA_app-Policy-1 127.0.0.1:{first} {checked}"]
+        if other == "replica":
+            servers.append(f"SERVE_REPLICA_app-Policy-2 127.0.0.1:{second} {checked}")
+        else:
+            servers.append(f"SERVE_PROXY_ACTOR-fallback 127.0.0.1:{second} {checked} backup")
+        balance = ROBOTS["RAY_SERVE_HAPROXY_BALANCE_ALGORITHM"]
+        settings = f"    balance {balance}    option httpchk GET /-/healthz\n    option abortonclose\n"
+        with proxied(tmp_path, *servers, settings=settings) as url:
+            wait_for(lambda: {server_of(url, one) for one in sessions} == {other}, 30)
+            up.set()
+            names = (f"new-{number}" for number in itertools.count())
+            wait_for(lambda: server_of(url, next(names)) == "thawing", 30)
+            assert {server_of(url, one) for one in sessions} == {"thawing" if other == "fallback" else other}
 
 
 def listens(port: int) -> bool:

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import os
 import queue
+import sys
 import threading
+import warnings
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 from eval_fakes import wait_for
 from shm_client import call, client, request
@@ -276,3 +280,56 @@ def test_a_deployment_sets_the_limits() -> None:
     assert args.call_limits() == CallLimits(1, 2, 3)
     assert args.limits() == Limits()
     assert LimitArgs().call_limits() == CallLimits()
+
+
+class Forking(Agent):
+    """Forks in each call; the child `ends` in the same way as a call that succeeds, or raises SystemExit."""
+
+    shared = ("children",)
+
+    def __init__(self, ends: str) -> None:
+        self.children: queue.SimpleQueue[int] = queue.SimpleQueue()
+        self.ends = ends
+
+    def _fork(self) -> None:
+        with warnings.catch_warnings():  # of Python: the process has threads
+            warnings.simplefilter("ignore", DeprecationWarning)
+            child = os.fork()
+        if child:
+            self.children.put(child)
+        elif self.ends == "exits":
+            sys.exit(0)
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        self._fork()
+        return {}
+
+    def observe(self, obs: Obs) -> None:
+        self._fork()
+
+    def act(self, obs: Obs) -> Act:
+        self._fork()
+        return Act(np.zeros(1, np.float32))
+
+    def __getstate__(self) -> dict[str, Any]:
+        self._fork()
+        return self.__dict__
+
+
+@pytest.mark.parametrize("ends", ["returns", "exits"])
+@pytest.mark.parametrize("op", OPS)
+def test_a_child_that_the_policy_forks_ends_with_the_call_and_answers_nobody(op: str, ends: str) -> None:
+    """It would go on with the clients' sockets and an older state of their sessions."""
+    agent = Forking(ends)
+    engine = Engine(agent)
+    engine.start()
+    ask(engine, "one", "reset")
+    if op != "reset":
+        ask(engine, "one", op)
+    children = [psutil.Process(agent.children.get()) for _ in range(agent.children.qsize())]
+    ended, alive = psutil.wait_procs(children, 10)
+    for child in alive:
+        child.kill()
+    engine.close()
+    assert not alive
+    assert {child.returncode for child in ended} == {1}

@@ -69,9 +69,9 @@ class ConnectReport:
     def failed(self, error: Exception) -> None:
         """Note that an attempt failed, and that there will be another one."""
         waited_s = time.monotonic() - self._begun
-        if not self._logged and waited_s >= _SILENT_S:
+        left_s = self._timeout_s - waited_s
+        if not self._logged and waited_s >= _SILENT_S and left_s > 0:
             self._logged = True
-            left_s = self._timeout_s - waited_s
             logger.warning("%s: not ready; trying again for up to %.0f s (%s)", self._url, left_s, error)
 
 

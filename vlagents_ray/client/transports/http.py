@@ -182,7 +182,7 @@ class HttpTransport:
             except ssl.SSLError as error:
                 raise tls_failure(self._url.geturl(), error) from error
             except OSError as error:
-                raise PolicyUnavailable(f"{self._url.geturl()}: cannot connect ({error}); is it running?") from error
+                raise NoReplica(f"{self._url.geturl()}: cannot connect ({error}); is it running?") from error
             connection.sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             self._connection = connection
         self._connection.sock.settimeout(timeout_s)

@@ -30,6 +30,7 @@ from vlagents_ray.errors import (
     DeadlineExceeded,
     MalformedMessage,
     MessageTooLarge,
+    NoReplica,
     PolicyUnavailable,
     VLAgentsError,
 )
@@ -46,8 +47,8 @@ from vlagents_ray.protocol.messages import (
 
 logger = logging.getLogger(__name__)
 
-# statuses of a proxy that are worth a retry; HAProxy says 500 for its own 502 to 504
-_TRANSIENT = (408, 500, 502, 503, 504)
+# Statuses of a proxy that are worth a retry; HAProxy says 500 for its own 502 to 504, and 404 while it restarts.
+_TRANSIENT = (404, 408, 500, 502, 503, 504)
 _PAUSE_S = 0.2
 _DIRECT_S = 1.0  # s for a replica's own port to answer: a firewall may drop the packets
 
@@ -103,7 +104,8 @@ def open_websocket(url: str, credentials: Credentials, timeout_s: float) -> Prox
     """Connect to a path of a server's own port.
 
     Raises:
-        PolicyUnavailable: The server cannot be reached, or refuses the connection.
+        NoReplica: The server cannot be reached.
+        PolicyUnavailable: It refuses the connection.
         VLAgentsError: It refuses the API key.
     """
     try:
@@ -116,7 +118,7 @@ def open_websocket(url: str, credentials: Credentials, timeout_s: float) -> Prox
             raise refusal(error.response.status_code, kind, bytes(error.response.body or b"")) from error
         raise PolicyUnavailable(f"{url}: refused with HTTP {error.response.status_code}") from error
     except (OSError, InvalidHandshake, TimeoutError) as error:
-        raise PolicyUnavailable(f"{url}: cannot connect ({error}); is it running?") from error
+        raise NoReplica(f"{url}: cannot connect ({error}); is it running?") from error
 
 
 class WebSocketTransport:

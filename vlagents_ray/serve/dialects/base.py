@@ -265,7 +265,7 @@ async def accept_or_refuse(websocket: WebSocket, context: ReplicaContext) -> boo
         context.engine.require_ready()
         sessions = context.engine.sessions
         if len(sessions) >= sessions.limit:
-            raise PolicyUnavailable(f"this replica holds {len(sessions)} sessions, its limit")
+            raise sessions.full()
     except VLAgentsError as error:
         if "websocket.http.response" in (websocket.scope.get("extensions") or {}):
             await websocket.send_denial_response(problem_response(error, "", PolicyUnavailable.status))

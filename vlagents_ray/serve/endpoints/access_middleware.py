@@ -27,6 +27,7 @@ from vlagents_ray.serve.access.api_keys import (
 )
 from vlagents_ray.serve.access.origin_check import require_own_page
 from vlagents_ray.serve.endpoints.http_messages import headers_of, named, problem_response
+from vlagents_ray.serve.engine.arrival import note_connection
 
 logger = logging.getLogger(__name__)
 
@@ -74,6 +75,8 @@ class AccessMiddleware:
             await self._app(scope, receive, send)
             return
         headers = headers_of(scope)
+        if scope["type"] == "http":
+            note_connection(scope)
         caller: Identity = NoKey.OPEN
         try:
             if _is_public(scope):

@@ -197,7 +197,7 @@ class _HttpEndpoint:
         """Serve one WebSocket, whose sessions end with it; a malformed request gets an error and changes no session."""
         await socket.accept()
         if len(self._engine.sessions) >= self._engine.sessions.limit:
-            full = PolicyUnavailable(f"this replica holds {len(self._engine.sessions)} sessions, its limit")
+            full = self._engine.sessions.full()
             await socket.send_bytes(encode_replies([Reply(error=full)]))
             await socket.close(_TRY_AGAIN_LATER, str(full)[:120])
             return

@@ -17,7 +17,14 @@ from starlette.responses import HTMLResponse, JSONResponse, Response
 from starlette.types import Message, Receive, Scope
 from starlette.websockets import WebSocket
 
-from vlagents_ray.errors import MalformedMessage, MessageTooLarge, Overloaded, TooManyRequests, VLAgentsError
+from vlagents_ray.errors import (
+    MalformedMessage,
+    MessageTooLarge,
+    Overloaded,
+    PolicyUnavailable,
+    TooManyRequests,
+    VLAgentsError,
+)
 from vlagents_ray.protocol.frames import CONTENT_TYPE, check_request, decode_requests
 from vlagents_ray.protocol.json_messages import CAMERA_PREFIX, PROBLEM_TYPE, problem, request_from_parts
 from vlagents_ray.protocol.messages import (
@@ -289,6 +296,6 @@ def problem_response(error: VLAgentsError, request_id: str, status: int | None =
     if status is not None:
         document["status"] = status
     response = JSONResponse(document, status_code=document["status"], media_type=PROBLEM_TYPE)
-    if isinstance(error, TooManyRequests | Overloaded):
+    if isinstance(error, TooManyRequests | Overloaded | PolicyUnavailable):
         response.headers["retry-after"] = str(max(1, math.ceil(error.retry_after_s)))
     return response

@@ -72,6 +72,7 @@ class ActStreams:
                 for ticket, _ in acting:
                     ticket.request.obs = None
                 for parts in stream:
+                    call.end_forked_child()
                     if len(parts) != rows:
                         raise PolicyFailed(f"act_batch_stream: got {rows} observations, yielded {len(parts)} parts")
                     if not any(self._goes_on(*waiting[i], parts[i]) for i in waiting):

@@ -1,25 +1,30 @@
 """Time that a message has waited in a socket before it was read: the policy's thread may read it seconds late.
 
-Deadlines begin when a message arrives, and the kernel records that time for each message. Messages that Serve's HTTP
-server and Ray's own calls read have no such timestamp; for these, only pauses of the whole process are counted.
+Deadlines begin when a message arrives, and the kernel records that time for each message. Serve's HTTP server and Ray's
+own calls do not pass the record on. After a pause of the whole process, it is therefore looked up for HTTP requests;
+messages of the server's WebSockets and Ray's calls are assumed to have waited since the pause began.
 """
 
 from __future__ import annotations
 
 import contextlib
 import fcntl
+import os
 import socket
 import struct
 import termios
 import time
 from array import array
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextvars import ContextVar
+from typing import Any
 
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.periodic import Periodic
 
 _TIMESTAMP = 35  # SO_TIMESTAMPNS of Linux, which Python's socket does not name
 _STAMP = struct.Struct("@qq")  # wall clock, s and ns
+_LAST_DATA = struct.Struct("@52xI")  # in TCP_INFO: time since data was received last, ms
 SPACE = socket.CMSG_SPACE(_STAMP.size)  # bytes of the timestamp in a message's control data
 
 LEAST_S = 1e-3  # a shorter wait cannot be distinguished from the time to read a message
@@ -54,10 +59,42 @@ def has_unread(connection: socket.socket) -> bool:
 
 
 def count_wait(requests: Sequence[Request | Reply], seconds: float) -> None:
-    """Shorten the requests' deadlines by the time that the requests have waited, s."""
+    """Count the time that the requests have waited, s, towards their deadlines."""
     for request in requests:
-        if isinstance(request, Request) and request.deadline_ms is not None:
-            request.deadline_ms = max(0.0, request.deadline_ms - seconds * 1e3)
+        if isinstance(request, Request):
+            request.waited_ms = seconds * 1e3
+
+
+# Ports of both ends of the TCP connection on which the current HTTP request came, the server's first.
+_PORTS: ContextVar[tuple[int, int] | None] = ContextVar("vlagents_ray_ports", default=None)
+
+
+def note_connection(scope: Mapping[str, Any]) -> None:
+    """Note the connection of an HTTP request, for `PauseDetector.waited_s` in the same context."""
+    server, client = scope.get("server"), scope.get("client")
+    _PORTS.set((server[1], client[1]) if server and client else None)
+
+
+def _since_last_data_s() -> float | None:
+    """Return the time since the connection of the current HTTP request received data, s; None if it is not known.
+
+    The server's sockets are not accessible, so all of this process are searched, which takes milliseconds.
+    """
+    if (ports := _PORTS.get()) is None:
+        return None
+    with contextlib.suppress(OSError):  # the system does not list descriptors
+        for descriptor in map(int, os.listdir("/proc/self/fd")):
+            with contextlib.suppress(OSError):  # it is no connected socket, or was closed meanwhile
+                connection = socket.socket(socket.AF_INET, socket.SOCK_STREAM, fileno=descriptor)
+                try:
+                    names = connection.getsockname(), connection.getpeername()
+                    if tuple(name[1] for name in names if isinstance(name, tuple)) == ports:
+                        info = connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _LAST_DATA.size)
+                        milliseconds: int = _LAST_DATA.unpack(info)[0]
+                        return milliseconds / 1e3
+                finally:
+                    connection.detach()
+    return None
 
 
 class PauseDetector:
@@ -92,6 +129,12 @@ class PauseDetector:
 
     def waited_s(self) -> float:
         """Return how long a request that was just read may have waited, s: 0 unless there was a pause."""
+        if (most_s := self._longest_wait_s()) == 0:
+            return 0.0
+        waited_s = _since_last_data_s()
+        return most_s if waited_s is None else waited_s
+
+    def _longest_wait_s(self) -> float:
         if self._checked is None:
             return 0.0
         now = self._clock()

@@ -183,10 +183,11 @@ class Dispatcher:
         loop = asyncio.get_running_loop()
         future: asyncio.Future[list[Reply]] = loop.create_future()
         collector = self.send(items, lambda replies: _deliver(loop, future, replies), admission=admission, part=part)
-        deadlines = [item.deadline_ms for item in items if isinstance(item, Request)]
+        requests = [item for item in items if isinstance(item, Request)]
+        left_ms = [one.deadline_ms - one.waited_ms for one in requests if one.deadline_ms is not None]
         timer = None
-        if None not in deadlines and deadlines:
-            timer = loop.call_later(max(deadlines) / 1e3, collector.expire)  # type: ignore[type-var, operator]
+        if left_ms and len(left_ms) == len(requests):
+            timer = loop.call_later(max(left_ms) / 1e3, collector.expire)
         try:
             return await future
         finally:

@@ -146,6 +146,9 @@ def _launcher(folder: Path, binary: str, *, alone: bool = True) -> Path:
 
     While an application has no replica, Serve would hold its requests until there is one. Here they are held briefly,
     so that an application scaled to zero starts a replica, and then get 503; WebSockets wait.
+
+    A session that has left a replica which did not answer does not return to it by its hash: it stays where it acts,
+    until HAProxy is started again with other replicas.
     """
     refusal = folder / _REFUSAL
     cause = NoReplica("no replica answers: the policy loads, or waits for resources; try again")
@@ -168,7 +171,8 @@ def _launcher(folder: Path, binary: str, *, alone: bool = True) -> Path:
         r"s/^backend .*$/&\n    acl replica_up always_false/",
         rf"s/^backend .*$/&\n    {wait} if {{ path_end \/healthz }}/",
         r"s/^    server (SERVE_REPLICA[^ ]*) .*$/    acl replica_up srv_is_up(\1)\n&/",
-        rf"s/^    server .* backup$/    {wait} if !replica_up !{{ hdr(upgrade) -m found }}\n&/",
+        rf"s/^    server .* backup$/    {wait} if !replica_up !{{ hdr(upgrade) -m found }}\n& non-stick/",
+        r"s/^backend .*$/&\n    stick-table type string len 128 size 100k expire 1h\n    stick on hdr(x-session-id)/",
     )
     file = folder / "haproxy"
     file.write_text(

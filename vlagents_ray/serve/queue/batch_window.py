@@ -146,5 +146,7 @@ class BatchWindow:
 
     def _risks_deadline(self, ticket: PendingRequest) -> bool:
         """Return whether the deadline may pass if the policy waits, and then takes as long as for the last batch."""
-        deadline_ms = ticket.request.deadline_ms
-        return deadline_ms is not None and ticket.arrived + deadline_ms / 1e3 < self._until + self._duration
+        if (deadline_ms := ticket.request.deadline_ms) is None:
+            return False
+        left_ms = deadline_ms - ticket.request.waited_ms
+        return ticket.arrived + left_ms / 1e3 < self._until + self._duration

@@ -7,6 +7,7 @@ calls, so these calls and loading have longer limits.
 
 from __future__ import annotations
 
+import os
 import sys
 import threading
 import time
@@ -35,23 +36,25 @@ class CallLimits:
 class PolicyCall:
     """Context manager around the calls of one kind, on one thread at a time; measures their durations."""
 
-    __slots__ = ("_calls", "_count", "_longest_s", "_thread", "began", "ended", "op")
+    __slots__ = ("_calls", "_count", "_longest_s", "_process", "_thread", "began", "ended", "op")
 
     def __init__(self, calls: PolicyCalls, op: str) -> None:
         self.op = op
         self._calls = calls
         self.began = self.ended = 0.0  # times of the last call, s of `PolicyCalls.clock`; for the calling thread only
-        self._thread = 0
+        self._thread = self._process = 0
         self._count = 0
         self._longest_s = 0.0  # longest call; of the warm-up calls only the shortest counts
 
     def __enter__(self) -> PolicyCall:
-        self._thread = threading.get_ident()
+        self._thread, self._process = threading.get_ident(), os.getpid()
         self.began = self._calls.clock()
         self._calls.under_way.add(self)
         return self
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        if os.getpid() != self._process:
+            self.end_forked_child()
         if error is not None:
             self._calls.record_error(error)
         self._calls.under_way.discard(self)
@@ -62,6 +65,12 @@ class PolicyCall:
             self._longest_s = min(self._longest_s, took_s)
         elif took_s > self._longest_s:
             self._longest_s = took_s
+
+    def end_forked_child(self) -> None:
+        """End this process if the policy forked it during the running call: it shares the clients' sockets."""
+        if os.getpid() != self._process:
+            os.write(2, f"a child that the policy forked in {self.op!r} has returned; it is ended\n".encode())
+            os._exit(1)
 
     @property
     def limit_s(self) -> float:

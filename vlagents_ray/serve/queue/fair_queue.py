@@ -87,7 +87,7 @@ class PendingRequest:
     def expired(self, now: float) -> bool:
         """Return whether the deadline has passed at `now`, s."""
         deadline_ms = self.request.deadline_ms
-        return deadline_ms is not None and (now - self.arrived) * 1e3 > deadline_ms
+        return deadline_ms is not None and (now - self.arrived) * 1e3 > deadline_ms - self.request.waited_ms
 
 
 def _ignore_reply(reply: Reply) -> None:

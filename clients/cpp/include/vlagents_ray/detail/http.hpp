@@ -133,7 +133,7 @@ struct Response {
   Error error() const {
     const std::string code = status == 401   ? "unauthorized"
                              : status == 403 ? "forbidden"
-                             : status == 404 ? "unknown_app"
+                             : status == 404 ? "unavailable"  // the proxy does not know the application yet
                              : status == 429 ? "too_many_requests"
                              : status == 503 ? "unavailable"
                                              : "internal";
