@@ -138,7 +138,7 @@ class Agent:
         try:
             return cls(cls.Config(**config))  # type: ignore[call-arg]
         except (TypeError, ValueError) as error:
-            message = wrong_settings(error, cls.Config) if isinstance(error, ValueError) else error
+            message = wrong_settings(error, cls.Config, "--set") if isinstance(error, ValueError) else error
             raise ConfigError(f"policy {cls.__name__}: {message}") from error
 
     def shared_objects(self) -> list[Any]:
