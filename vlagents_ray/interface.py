@@ -71,7 +71,7 @@ class Obs:
 
     `state` has a name for each part of the proprioception: `joints` (D,) rad; `xyzrpy` (6,) m and rad in the robot's
     base frame; `tquat` (7,) m and quaternion xyzw. A robot of several arms prefixes them: `left/joints`,
-    `right/joints`.
+    `right/joints`. With one camera: `Obs(cameras={"front": image}, gripper=1.0, state={"joints": joints})`.
     """
 
     cameras: dict[str, np.ndarray] = field(default_factory=dict)  # (H, W, 3) uint8 RGB, upright
