@@ -12,6 +12,7 @@ from ray._private import worker
 
 from vlagents_ray.cli.ray_session import quiet_ray
 from vlagents_ray.cli.serve import connection_lines
+from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.launch.deployment_file import deployment, with_gateways_at
 from vlagents_ray.serve.ports import EVERYWHERE
 
@@ -69,6 +70,13 @@ def test_the_same_holds_for_what_ray_logs_in_this_process(
     assert {record.getMessage() for record in caplog.records} == {"the controller does not answer"}
     assert file is not None
     assert file.read_text() == "Started Serve in namespace 'serve'\n"
+
+
+def test_an_empty_file_does_not_stay(printed: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    with pytest.raises(ConfigError), quiet_ray("serve"):
+        raise ConfigError("the port is taken")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_without_a_name_there_is_no_file(printed: list[str]) -> None:

@@ -76,9 +76,9 @@ def command(*words: str, start_new_session: bool = False) -> Iterator[subprocess
 @pytest.mark.parametrize("whole", [signal.SIGTERM, signal.SIGINT], ids=["service", "terminal"])
 def test_a_signal_to_every_process_of_a_server_ends_it_in_seconds(whole: signal.Signals) -> None:
     """systemd sends SIGTERM to all of a service's processes; Ray's head then ends before Serve can."""
-    port = free_port()
-    with command("serve", "noop", "--port", str(port), start_new_session=True) as process:
-        wait_for(lambda: health(f"http://127.0.0.1:{port}") == 200, 120)
+    with command("serve", "noop", "--port", str(free_port()), start_new_session=True) as process:
+        assert process.stdout is not None
+        assert "Ctrl-C stops\n" in iter(process.stdout.readline, "")
         family = psutil.Process(process.pid).children(recursive=True)
         for one in [psutil.Process(process.pid), *family]:
             if whole == signal.SIGTERM or os.getpgid(one.pid) == process.pid:
@@ -87,7 +87,6 @@ def test_a_signal_to_every_process_of_a_server_ends_it_in_seconds(whole: signal.
         assert process.wait(60) == 0
         assert time.monotonic() - begun < 15  # 3 s where nothing else runs; it was 36 s
         assert not psutil.wait_procs(family, timeout=10)[1]
-        assert process.stdout is not None
         assert "has not ended" not in process.stdout.read()
 
 

@@ -50,7 +50,7 @@ def quiet_ray(name: str | None) -> Iterator[Path | None]:
         name: What the name of the log file begins with; None keeps no log.
 
     Yields:
-        The log file, which stays and which this user alone can read; None without one.
+        The log file, which stays unless it is empty and which this user alone can read; None without one.
     """
     file, kept = _file(name) if name is not None else (None, None)
 
@@ -91,8 +91,10 @@ def quiet_ray(name: str | None) -> Iterator[Path | None]:
         for logger in loggers:
             logger.removeFilter(is_shown)
         set_output_printer(printed)
-        if kept is not None:
+        if file is not None and kept is not None:
             kept.close()
+            if file.stat().st_size == 0:  # as when the port is taken
+                file.unlink()
 
 
 def _file(name: str) -> tuple[Path, logging.Handler]:
