@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 import numpy as np
 
 from vlagents_ray.errors import ConfigError, NotTrainable
+from vlagents_ray.naming import says_its_fields
 from vlagents_ray.settings import require_arguments, wrong_settings
 from vlagents_ray.weights.trainable import named_values, set_values
 
@@ -65,6 +66,7 @@ AGE_MS = "age_ms"  # float: the same in ms, from its capture until the player re
 SILENT = "silent_s"  # float: seconds since the oldest unanswered request, retries included; 0.0 if there is none
 
 
+@says_its_fields()
 @dataclass(slots=True)
 class Obs:
     """An observation: the sensor readings of a robot or an environment at one moment.
@@ -81,6 +83,7 @@ class Obs:
     prepared: Any = field(default=None, repr=False, compare=False)  # what the server got from `Agent.prepare`, or None
 
 
+@says_its_fields()
 @dataclass(slots=True)
 class Act:
     """A policy's answer: one action, or a chunk of actions to be executed in order."""
