@@ -4,6 +4,10 @@
 #   vlagents-ray serve noop
 #   bash curl.sh http://localhost:8000 picture.jpg
 #
+# With https:// and a certificate authority of your own, its file is in CURL_CA_BUNDLE; a key is in VLAGENTS_RAY_API_KEY:
+#
+#   CURL_CA_BUNDLE=ca.pem VLAGENTS_RAY_API_KEY=vlr_... bash curl.sh https://gpu-box:8000 picture.jpg
+#
 # docs/protocol.md is the specification. Loops in languages that robots use are clients/cpp/examples/loop.cpp and
 # clients/typescript/examples/loop.mjs, over WebSockets, with chunks that are executed while the next one is computed.
 set -euo pipefail

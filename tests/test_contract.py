@@ -18,7 +18,7 @@ from vlagents_ray.errors import (
     MissingState,
     NotOffered,
 )
-from vlagents_ray.interface import Obs
+from vlagents_ray.interface import Act, Obs
 from vlagents_ray.validation import check_action, check_observation
 
 POLICY = Contract(
@@ -233,3 +233,27 @@ class TestAPolicyOfSeveralPartsServedAsOne:
         assert told == [
             "state 'joints': the policy needs 21 numbers, the env gives 7; is this another task's or robot's policy?"
         ]
+
+
+@pytest.mark.parametrize(
+    ("cls", "wrong", "said"),
+    [
+        (
+            Obs,
+            "camera",
+            "Obs: got ['camera'], want some of ['cameras', 'gripper', 'state', 'info', 'prepared'];",
+        ),
+        (Obs, "camera", "did you mean 'cameras'?"),
+        (ActionSpec, "horizon", "the rows of a chunk are Contract(chunk=…)"),
+        (Contract, "control_hertz", "did you mean 'control_hz'?"),
+    ],
+)
+def test_an_unknown_field_is_refused_with_those_that_there_are(cls: type, wrong: str, said: str) -> None:
+    with pytest.raises(TypeError) as caught:
+        cls(**{wrong: 1})
+    assert said in str(caught.value)
+
+
+def test_another_error_of_a_constructor_is_the_same_as_without_the_list_of_fields() -> None:
+    with pytest.raises(TypeError, match="missing 1 required positional argument: 'action'"):
+        Act()  # type: ignore[call-arg]

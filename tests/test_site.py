@@ -56,6 +56,10 @@ def test_every_link_within_the_site_leads_to_a_file_and_an_anchor_in_it() -> Non
     assert broken == set()
 
 
+def test_nothing_of_pythons_own_is_in_the_site() -> None:
+    assert [str(path) for path in SITE.rglob("__pycache__")] == []
+
+
 def test_llms_txt_names_each_page_of_the_navigation() -> None:
     listing = (SITE / "llms.txt").read_text()
     named = re.findall(r"^- \[.+?\]\((.+?)\)", listing, re.MULTILINE)

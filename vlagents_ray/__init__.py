@@ -3,27 +3,31 @@
 This is the light install: it needs numpy, simplejpeg and websockets, and loads neither ray nor torch.
 """
 
-from vlagents_ray.client import ChunkPlayer, RemoteAgent
-from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
-from vlagents_ray.errors import (
-    ConfigError,
-    ConnectionLost,
-    ContractMismatch,
-    DeadlineExceeded,
-    Forbidden,
-    InvalidInput,
-    InvalidObservation,
-    NotReset,
-    PolicyFailed,
-    PolicyUnavailable,
-    TooManyRequests,
-    Unauthorized,
-    UnknownSession,
-    VLAgentsError,
-)
-from vlagents_ray.images.codecs import ImageCodec
-from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.ray_tools.local_servers import LocalServer, join
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from vlagents_ray.client import ChunkPlayer, RemoteAgent
+    from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
+    from vlagents_ray.errors import (
+        ConfigError,
+        ConnectionLost,
+        ContractMismatch,
+        DeadlineExceeded,
+        Forbidden,
+        InvalidInput,
+        InvalidObservation,
+        NotReset,
+        PolicyFailed,
+        PolicyUnavailable,
+        TooManyRequests,
+        Unauthorized,
+        UnknownSession,
+        VLAgentsError,
+    )
+    from vlagents_ray.images.codecs import ImageCodec
+    from vlagents_ray.interface import Act, Agent, Obs
+    from vlagents_ray.ray_tools.local_servers import LocalServer, join
 
 __all__ = [
     "Act",
@@ -53,3 +57,16 @@ __all__ = [
     "VLAgentsError",
     "join",
 ]
+
+_HOMES = ("errors", "contract", "interface", "images.codecs", "client", "ray_tools.local_servers")
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name when it is first used: so the command can handle Ctrl-C before numpy is loaded."""
+    if name in __all__:
+        for home in _HOMES:
+            module = import_module(f"{__name__}.{home}")
+            if hasattr(module, name):
+                globals()[name] = getattr(module, name)
+                return globals()[name]
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

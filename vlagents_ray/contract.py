@@ -19,6 +19,7 @@ from vlagents_ray.errors import (
     ContractMismatch,
     MalformedMessage,
 )
+from vlagents_ray.naming import says_its_fields
 
 _MOST_PARTS = 12  # of the env's state, of which combinations are tried
 _SHOWN = 3  # combinations in a message
@@ -26,6 +27,7 @@ _SHOWN = 3  # combinations in a message
 Rotation = Literal["none", "axis_angle", "euler_xyz", "quat_xyzw", "quat_wxyz", "rot6d"]
 
 
+@says_its_fields()
 @dataclass(frozen=True, slots=True)
 class CameraSpec:
     """The size of a camera's upright RGB images in pixels; None accepts any."""
@@ -34,6 +36,7 @@ class CameraSpec:
     width: int | None = None
 
 
+@says_its_fields()
 @dataclass(frozen=True, slots=True)
 class StateSpec:
     """The size and unit of one part of the proprioception, (dim,) float32."""
@@ -42,6 +45,7 @@ class StateSpec:
     unit: str | None = None  # e.g. "rad", "m", "m+quat_wxyz"
 
 
+@says_its_fields("; the rows of a chunk are Contract(chunk=…)")
 @dataclass(frozen=True, slots=True)
 class ActionSpec:
     """The meaning of the numbers in an action, (dim,) float32, or in each row of a chunk of actions."""
@@ -65,6 +69,7 @@ class ActionSpec:
         return True if self.delta or "velocity" in (self.space or "") else self.delta
 
 
+@says_its_fields()
 @dataclass(frozen=True, slots=True)
 class Contract:
     """The inputs and actions of a policy, or of a robot or env, to be compared with the other side's.

@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 import numpy as np
 
 from vlagents_ray.errors import ConfigError, NotTrainable
+from vlagents_ray.naming import says_its_fields
 from vlagents_ray.settings import require_arguments, wrong_settings
 from vlagents_ray.weights.trainable import named_values, set_values
 
@@ -69,13 +70,14 @@ OF_THE_LOOP = (SAFE, CAUSE, INTERVENTION, WANTED, AGE, PLANNED, CHUNK, ROW, AGE_
 """The names of `Act.info` by which a control loop goes. An answer that comes from a server has none of them."""
 
 
+@says_its_fields()
 @dataclass(slots=True)
 class Obs:
     """An observation: the sensor readings of a robot or an environment at one moment.
 
     `state` has a name for each part of the proprioception: `joints` (D,) rad; `xyzrpy` (6,) m and rad in the robot's
     base frame; `tquat` (7,) m and quaternion xyzw. A robot of several arms prefixes them: `left/joints`,
-    `right/joints`.
+    `right/joints`. With one camera: `Obs(cameras={"front": image}, gripper=1.0, state={"joints": joints})`.
     """
 
     cameras: dict[str, np.ndarray] = field(default_factory=dict)  # (H, W, 3) uint8 RGB, upright
@@ -85,6 +87,7 @@ class Obs:
     prepared: Any = field(default=None, repr=False, compare=False)  # what the server got from `Agent.prepare`, or None
 
 
+@says_its_fields()
 @dataclass(slots=True)
 class Act:
     """A policy's answer: one action, or a chunk of actions to be executed in order."""
@@ -142,7 +145,7 @@ class Agent:
         try:
             return cls(cls.Config(**config))  # type: ignore[call-arg]
         except (TypeError, ValueError) as error:
-            message = wrong_settings(error, cls.Config) if isinstance(error, ValueError) else error
+            message = wrong_settings(error, cls.Config, "--set") if isinstance(error, ValueError) else error
             raise ConfigError(f"policy {cls.__name__}: {message}") from error
 
     def shared_objects(self) -> list[Any]:

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import difflib
+import functools
 import re
 from collections.abc import Callable, Iterable
+from typing import Any, TypeVar
+
+T = TypeVar("T")
 
 
 def plain(name: str) -> str:
@@ -41,3 +45,27 @@ def did_you_mean(got: str, known: Iterable[str]) -> str:
     by_lower = {name.lower(): name for name in known}
     close = difflib.get_close_matches(got.lower(), by_lower, n=1)
     return f"; did you mean {by_lower[close[0]]!r}?" if close else ""
+
+
+def says_its_fields(hint: str = "") -> Callable[[type[T]], type[T]]:
+    """Let a dataclass list its fields in the error for an unknown one, with a hint where others are."""
+
+    def decorate(cls: type[T]) -> type[T]:
+        made = cls.__init__
+
+        @functools.wraps(made)
+        def init(self: T, *args: Any, **kwargs: Any) -> None:
+            try:
+                made(self, *args, **kwargs)
+            except TypeError as error:
+                fields: list[str] = list(cls.__dataclass_fields__)  # type: ignore[attr-defined]
+                unknown = [name for name in kwargs if name not in fields]
+                if not unknown:
+                    raise
+                meant = "".join(did_you_mean(name, fields) for name in unknown)
+                raise TypeError(f"{cls.__name__}: got {unknown}, want some of {fields}{meant or hint}") from error
+
+        cls.__init__ = init  # type: ignore[method-assign, assignment]
+        return cls
+
+    return decorate

@@ -13,6 +13,7 @@ import numpy as np
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.naming import did_you_mean
 
+_WANT = "Input should be "  # as pydantic says it
 # The types of the values that a plain type allows: also numpy's, and whole numbers for a float, as YAML reads 1 as int.
 _PLAIN: dict[type, tuple[type, ...]] = {
     bool: (bool, np.bool_),
@@ -80,13 +81,14 @@ def _is(value: Any, kind: type) -> bool:
     return isinstance(value, _PLAIN[kind]) and (kind is bool or not isinstance(value, bool))
 
 
-def wrong_settings(error: ValueError, model: type | None = None) -> str:
+def wrong_settings(error: ValueError, model: type | None = None, option: str | None = None) -> str:
     """Return the message of an error about settings.
 
     Args:
         error: An error; if it is pydantic's, the message has a line for each wrong setting, without the values, which
             may be secrets.
         model: The pydantic model of the settings, whose fields are listed if one is unknown.
+        option: The option of the command line that sets them, such as "--set".
 
     Returns:
         The message.
@@ -94,24 +96,38 @@ def wrong_settings(error: ValueError, model: type | None = None) -> str:
     listed: Callable[[], Sequence[Mapping[str, Any]]] | None = getattr(error, "errors", None)
     if listed is None:
         return str(error)
-    lines = [_sentence(item, model) for item in listed()]
+    lines = [_sentence(item, model, option) for item in listed()]
     return lines[0] if len(lines) == 1 else "\n" + "\n".join(f"- {line}" for line in lines)
 
 
-def _sentence(item: Mapping[str, Any], model: type | None) -> str:
+def _sentence(item: Mapping[str, Any], model: type | None, option: str | None) -> str:
     where = ".".join(map(str, item["loc"]))
     message = str(item["msg"]).removeprefix("Value error, ")
-    if item["type"] == "extra_forbidden":
-        takes = sorted(_fields(model, item["loc"][:-1]))
+    name = str(item["loc"][-1]) if item["loc"] else ""
+    beside = _fields(model, item["loc"][:-1])
+    got = item["input"] if isinstance(item["input"], (bool, int, float)) else type(item["input"]).__name__
+    if message.startswith(_WANT):
+        message = f"got {got}, want {message.removeprefix(_WANT)}"
+    if item["type"] in ("model_type", "model_attributes_type", "dict_type"):
+        takes = sorted(_fields(model, item["loc"]))
+        message = f"got {got}, want a mapping" + (f" with some of {takes}" if takes else "")
+        message += did_you_mean(name, beside.keys() - {name})
+    elif item["type"] == "missing":
+        example = next(iter(getattr(beside.get(name), "examples", None) or ()), "…")
+        message = f"is missing; give {f'`{name}: {example}`' if option is None else f'{option} {where}={example}'}"
+    elif item["type"] == "extra_forbidden":
+        takes = sorted(beside)
         message = "there is no such setting"
         if takes:
-            message += f"; want one of {takes}{did_you_mean(str(item['loc'][-1]), takes)}"
+            message += f"; want one of {takes}{did_you_mean(name, takes)}"
     return f"{where}: {message}" if where else message
 
 
 def _fields(model: type | None, place: Iterable[Any]) -> Mapping[str, Any]:
     """Return the fields at a place below `model`; empty if they cannot be determined."""
     for name in place:
+        if isinstance(name, int):  # of a list
+            continue
         field = _of(model).get(name)
         model = None if field is None else next(filter(_of, _parts(field.annotation)), None)
     return _of(model)

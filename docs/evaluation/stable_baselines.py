@@ -35,7 +35,7 @@ class StableBaselinesEnv(VecEnv):
     def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
         observations, rewards, terminated, truncated, infos = self.envs.step(self.actions)
         over = terminated | truncated
-        each: list[dict[str, Any]] = [{"TimeLimit.truncated": bool(one)} for one in truncated]
+        each: list[dict[str, Any]] = [{"TimeLimit.truncated": bool(one)} for one in truncated & ~terminated]
         for i in np.flatnonzero(over):
             each[i]["terminal_observation"] = infos["final_obs"][i]
         return observations, rewards.astype(np.float32), over, each

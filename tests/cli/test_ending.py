@@ -113,6 +113,19 @@ def test_an_evaluation_does_not_begin_after_an_interrupt_that_was_dropped() -> N
         assert not stop.is_set()
 
 
+def test_ctrl_c_while_modules_are_imported_ends_the_command_without_a_traceback() -> None:
+    command = [sys.executable, "-X", "importtime", "-c", "from vlagents_ray.cli import main; main()", "policies"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        for line in process.stderr:
+            if line.endswith("numpy.version\n"):
+                break
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert [line for line in said.splitlines() if not line.startswith("import time:")] == ["error interrupted"]
+
+
 def run(code: str) -> subprocess.CompletedProcess[str]:
     """In a process of its own."""
     environment = os.environ | {"COLUMNS": "200"}

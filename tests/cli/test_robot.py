@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pty
+import signal
 import subprocess
 import sys
 import time
@@ -142,6 +143,22 @@ def test_a_policy_alone_is_recorded_without_columns_that_nobody_fills(tmp_path: 
     assert run.output.count("success: ") == 2
     assert "recorded: 2 episodes" in run.output
     assert "intervention" not in frames(tmp_path, 1)
+
+
+def test_ctrl_c_says_what_was_recorded(tmp_path: Path) -> None:
+    code = "from vlagents_ray.cli import main; main()"
+    words = ["robot", "scripted", *QUICK, "--episodes", "9", "--hz", "200", "--record", str(tmp_path)]
+    with subprocess.Popen(
+        [sys.executable, "-c", code, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
+        assert process.stdout is not None
+        while b"seed 2" not in process.stdout.readline():
+            assert process.poll() is None
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=60)
+    kept = len(list(tmp_path.glob("data/*/*.parquet")))
+    assert kept in (2, 3), "with the running one, if it had begun"
+    assert (process.returncode, said.decode()) == (130, f"error interrupted; {kept} episodes are in {tmp_path}\n")
 
 
 def test_a_policy_of_this_process_is_loaded_once(monkeypatch: pytest.MonkeyPatch) -> None:

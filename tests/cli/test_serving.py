@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import stat
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from ray._private import worker
 
 from vlagents_ray.cli.ray_session import quiet_ray
 from vlagents_ray.cli.serve import connection_lines
+from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.launch.deployment_file import deployment, with_gateways_at
 from vlagents_ray.serve.ports import EVERYWHERE
 
@@ -69,6 +71,41 @@ def test_the_same_holds_for_what_ray_logs_in_this_process(
     assert {record.getMessage() for record in caplog.records} == {"the controller does not answer"}
     assert file is not None
     assert file.read_text() == "Started Serve in namespace 'serve'\n"
+
+
+LOAD_FAILURE = [
+    "ERROR 2026-11-25 07:36:46,517 controller 2516 -- Exception in Replica(id='kfzcaljf', ...), it will be stopped.",
+    "Traceback (most recent call last):",
+    "FileNotFoundError: [Errno 2] No such file or directory: 'nope.npz'",
+    "ERROR 2026-11-25 07:36:46,530 controller 2516 -- Failed to update the deployments ['Policy'].",
+]
+
+
+def test_the_traceback_of_a_policy_that_does_not_load_is_in_the_file_until_the_server_serves(
+    printed: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    started = threading.Event()
+    with pytest.raises(ConfigError), quiet_ray("serve", started) as file:  # noqa: PT012
+        for line in LOAD_FAILURE:  # Ray hands on a few lines at a time
+            say(line)
+            say(PRINTED, pid=2)
+        say(PROBLEM)
+        assert printed == [PRINTED] * len(LOAD_FAILURE) + [PROBLEM]
+        started.set()
+        say(*LOAD_FAILURE)
+        assert printed[-len(LOAD_FAILURE) :] == LOAD_FAILURE
+        raise ConfigError("the policy did not load")
+    assert file is not None
+    assert [line.partition(") ")[2] for line in file.read_text().splitlines()] == LOAD_FAILURE
+    assert str(file) in capsys.readouterr().err
+
+
+def test_an_empty_file_does_not_stay(printed: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    with pytest.raises(ConfigError), quiet_ray("serve"):
+        raise ConfigError("the port is taken")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_without_a_name_there_is_no_file(printed: list[str]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -18,11 +19,17 @@ from vlagents_ray.serve.ports import free_port
 
 ROOT = Path(__file__).parents[2]
 POLICY = """
+from pydantic import BaseModel
+
 from vlagents_ray import Act, Agent
 
 class Reach(Agent):
     def __init__(self, gain=0.5):
         self.gain = gain
+
+class Loaded(Agent):
+    class Config(BaseModel):
+        checkpoint: str
 """
 ENV = """
 from vlagents_ray.envs.tabletop import Tabletop
@@ -30,6 +37,11 @@ from vlagents_ray.envs.tabletop import Tabletop
 class MyEnv(Tabletop):
     pass
 """
+RUNS: dict[str, dict[str, object]] = {
+    "typo": {"worker": 2},
+    "low": {"workers": 0},
+    "listed": {"suites": [{"envs": ["tabletop"], "episods": 3}]},
+}
 # What the console script does, whose first entry of `sys.path` is its own folder and not the working directory.
 SCRIPT = """
 import sys
@@ -43,6 +55,9 @@ main()
 def folder(tmp_path: Path) -> Path:
     (tmp_path / "my_policies.py").write_text(POLICY)
     (tmp_path / "my_envs.py").write_text(ENV)
+    for name, wrong in RUNS.items():
+        run = {"policies": [{"source": "scripted"}], "suites": [{"envs": ["tabletop"]}]} | wrong
+        (tmp_path / f"{name}.yaml").write_text(json.dumps(run))
     return tmp_path
 
 
@@ -97,7 +112,16 @@ EVAL = ("--out", "runs/x", "--policy")
             ("eval", "tabletop", *EVAL, "scripted", "--worker-gpus", "0.5"),
             "a worker wants 0.5 GPUs, this",
         ),
-        (("eval", "tabletop", *EVAL, "scripted", "--video", "alll"), "video: Input should be 'none', "),
+        (("eval", "tabletop", *EVAL, "scripted", "--video", "alll"), "video: got str, want 'none', "),
+        (("eval", "tabletop", "--policy", "scripted"), "error got no --out, want --out; or a file of runs (.yaml)"),
+        (("eval", "tabletop", "--out", "runs/x"), "error got no --policy, want --policy; or a file of runs (.yaml)"),
+        (("eval", "typo.yaml"), "worker: got 2, want a mapping with some of ['cpus', "),
+        (("eval", "typo.yaml"), "did you mean 'workers'?"),
+        (("eval", "low.yaml"), "workers: got 0, want greater than 0"),
+        (("eval", "listed.yaml"), "suites.0.episods: there is no such setting; want one of ["),
+        (("eval", "listed.yaml"), "did you mean 'episodes'?"),
+        (("serve", "my_policies:Loaded"), "policy Loaded: checkpoint: is missing; give --set checkpoint=…"),
+        (("serve", "my_policies:Reach", "--set", "gain"), "got 'gain', want KEY=VALUE"),
     ],
 )
 def test_what_is_wrong_is_said_at_once_in_one_line_and_with_what_was_meant(

@@ -65,7 +65,7 @@ def episodes(config: EvalConfig) -> list[tuple[int, int, int]]:
         return db.execute("SELECT run, episode, attempts FROM episodes ORDER BY episode").fetchall()
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGKILL, -9), (signal.SIGINT, 130)])
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGKILL, -9), (signal.SIGINT, 130), (signal.SIGTERM, 130)])
 def test_a_stopped_and_resumed_evaluation_has_each_episode_exactly_once(
     config: Callable[..., EvalConfig], tmp_path: Path, ray_folder: Path, number: signal.Signals, code: int
 ) -> None:
@@ -80,12 +80,12 @@ def test_a_stopped_and_resumed_evaluation_has_each_episode_exactly_once(
         if number == signal.SIGKILL:
             evaluation.kill()
         else:
-            os.killpg(evaluation.pid, number)  # as a terminal does
+            os.killpg(evaluation.pid, number)  # as a terminal does, or a service manager
         assert evaluation.wait(300) == code
     wait_for_end(ray_folder, "Rollout")
     wait_for(lambda: not processes(ray_folder) and not [*ray_folder.iterdir()])
     assert [episode for _, episode, _ in episodes(settings)] == [0, 1, 2, 3, 4]
-    if number == signal.SIGINT:
+    if number != signal.SIGKILL:
         assert json.loads((settings.out / "summary.json").read_text())["state"] == "interrupted"
 
     with start(config(episodes=9, env_options=options, resume=True), ray_folder) as evaluation:

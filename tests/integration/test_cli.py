@@ -160,7 +160,7 @@ def test_a_file_of_runs_is_one_evaluation_of_all(ray_home: Path, tmp_path: Path)
     [
         (["tabletop", "--policy", "nope", "--out", "x"], "nope"),
         (["nowhere", "--policy", "noop", "--out", "x"], "nowhere"),
-        (["tabletop", "--out", "x"], "want --policy and --out, or a file of runs"),
+        (["tabletop", "--out", "x"], "got no --policy, want --policy"),
         (["absent.yaml"], "'absent.yaml' does not exist"),
         (["tabletop", "--policy", "noop", "--out", "x", "--set", "action_dims=4"], "action_dims"),
         (["tabletop", "--policy", "noop", "--out", "x", "--set", "action_dim"], "KEY=VALUE"),

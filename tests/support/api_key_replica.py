@@ -76,7 +76,7 @@ ANSWER_S = 10.0
 LIMITS = Limits(body_bytes=2**20)
 _NUMBERS = itertools.count()
 _WORDS = {  # of refusals, where a protocol has no code
-    "401": r"revoked|expired|not known|wants an API key",
+    "401": r"revoked|expired|not known|needs an API key",
     "403": r"is for \[",
     "429": r"requests a second|may hold \d+ sessions|sessions here",
 }

@@ -5,11 +5,14 @@ from __future__ import annotations
 import atexit
 import gc
 import os
+import signal
 import sys
+from types import FrameType
 
 
 def main() -> None:
     """Run the console script; say what to install where only the light install is there."""
+    signal.signal(signal.SIGINT, _end_at_once)  # until a command has its own handler: `cli.console.errors`
     try:
         from vlagents_ray.cli.main import app
     except ModuleNotFoundError as error:
@@ -23,6 +26,11 @@ def main() -> None:
     find_modules_here()
     atexit.register(gc.freeze)  # else Python looks for garbage in all of Ray once more when it ends, for half a second
     app()
+
+
+def _end_at_once(_number: int, _frame: FrameType | None) -> None:
+    os.write(2, b"error interrupted\n")
+    os._exit(130)
 
 
 def find_modules_here() -> None:

@@ -61,7 +61,7 @@ def errors() -> Iterator[None]:
         with interrupts():
             yield
     except ValidationError as error:
-        fail(f"wrong settings: {wrong_settings(error, _model_of(error))}", 2)
+        fail(f"wrong settings: {wrong_settings(error, *_model_of(error))}", 2)
     except ConfigError as error:
         fail(str(error), 2)
     except ClusterLost as error:
@@ -75,12 +75,15 @@ def errors() -> Iterator[None]:
         fail(str(error) or "interrupted", 130)
 
 
-def _model_of(error: ValidationError) -> type | None:
-    """Return the model that these settings are of, if users write it."""
+def _model_of(error: ValidationError) -> tuple[type | None, str | None]:
+    """Return the model that these settings are of, if users write it, and the option that sets its fields."""
     from vlagents_ray.evaluate import EvalConfig
+    from vlagents_ray.evaluate.exports.hub import HubSettings
+    from vlagents_ray.evaluate.exports.vla_eval import VlaEvalSettings
     from vlagents_ray.learn.tabletop.plan import LearnPlan
 
-    return next((model for model in (EvalConfig, LearnPlan) if model.__name__ == error.title), None)
+    options = {EvalConfig: None, LearnPlan: None, HubSettings: "--set", VlaEvalSettings: "--set"}
+    return next(((model, option) for model, option in options.items() if model.__name__ == error.title), (None, None))
 
 
 def fail(message: str, code: int) -> NoReturn:

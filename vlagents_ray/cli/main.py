@@ -175,8 +175,11 @@ def learn_tabletop_command(
         def watched(urls: Collection[str]) -> AbstractContextManager[Progress]:
             return live_progress(plan.out, urls, page, SilentProgress(), goes_on=True)
 
-        with quiet_ray(None), exit_if_ray_is_lost(RESUME), LearnBar(out) as bar:
-            summary = learn_tabletop(plan, bar, watched)
+        try:
+            with quiet_ray(None), exit_if_ray_is_lost(RESUME), LearnBar(out) as bar:
+                summary = learn_tabletop(plan, bar, watched)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(f"interrupted; go on with --resume --out {plan.out}") from None
         print_summary(out, summary)
 
 

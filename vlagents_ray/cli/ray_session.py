@@ -11,13 +11,13 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from logging.handlers import RotatingFileHandler
 from pathlib import Path
 from typing import Any
 
-from vlagents_ray.cli.console import say_error
-from vlagents_ray.errors import ClusterLost
+from vlagents_ray.cli.console import err, say_error
+from vlagents_ray.errors import ClusterLost, ConfigError
 from vlagents_ray.ray_tools.private import LOGGERS, node_of_this_process, output_printer, set_output_printer
 from vlagents_ray.ray_tools.signals import raise_dropped_interrupt
 
@@ -31,6 +31,8 @@ RESTART = "start it again"
 RESUME = "what was played is kept: go on with --resume when there is a cluster again"
 
 _FILE_BYTES = 10_000_000  # Serve logs each request; twice as much is kept
+_LOAD_FAILURES = ("Exception in Replica(", "Failed to update the deployments", "the policy did not load")
+_SERVES_LINE = re.compile(r"[A-Z]+ \d{4}-\d\d-\d\d \d\d:")
 _SERVES_INFO = re.compile(r"(INFO|DEBUG) \d{4}-\d\d-\d\d \d\d:")  # as each line of Serve's processes begins
 # Warnings of what is meant to be so: of `own_ray`, which is on loopback, has a token and leaves signals alone.
 _MEANT = (
@@ -41,58 +43,86 @@ _MEANT = (
 
 
 @contextlib.contextmanager
-def quiet_ray(name: str | None) -> Iterator[Path | None]:
+def quiet_ray(name: str | None, started: threading.Event | None = None) -> Iterator[Path | None]:
     """Keep what Ray, Serve and HAProxy log off the terminal, unless it is a problem.
 
     The context begins before Ray is started.
 
     Args:
         name: What the name of the log file begins with; None keeps no log.
+        started: Set once the server serves. Until then, the traceback of a policy that does not load is kept off the
+            terminal as well, since the command ends with its last line.
 
     Yields:
-        The log file, which stays and which this user alone can read; None without one.
+        The log file, which stays unless it is empty and which this user alone can read; None without one.
     """
     file, kept = _file(name) if name is not None else (None, None)
+    terminal = _Terminal(output_printer(), kept, started)
+    set_output_printer(terminal.print_lines)
+    loggers = [logging.getLogger(one) for one in LOGGERS]
+    for logger in loggers:
+        logger.addFilter(terminal.is_shown)
+    try:
+        yield file
+    except ConfigError:
+        if terminal.failing and file is not None:
+            err.print(f"traceback, and log of Ray, Serve and HAProxy: {file}")
+        raise
+    finally:
+        for logger in loggers:
+            logger.removeFilter(terminal.is_shown)
+        set_output_printer(terminal.printed)
+        if file is not None and kept is not None:
+            kept.close()
+            if file.stat().st_size == 0:  # as when the port is taken
+                file.unlink()
 
-    def no_problem(text: str, level: int) -> bool:
-        return level < logging.WARNING or any(one in text for one in _MEANT)
 
-    def note(text: str) -> None:
-        if kept is not None:
-            kept.emit(logging.LogRecord("ray", logging.INFO, "", 0, text, None, None))
+class _Terminal:
+    """What of the logs of Ray and Serve goes to the terminal; `kept` gets the rest."""
 
-    def is_shown(record: logging.LogRecord) -> bool:
+    def __init__(
+        self, printed: Callable[..., None], kept: logging.Handler | None, started: threading.Event | None
+    ) -> None:
+        self.printed = printed
+        self.failing: set[Any] = set()  # processes in the middle of a policy's traceback
+        self._kept = kept
+        self._started = started
+
+    def is_shown(self, record: logging.LogRecord) -> bool:
+        """Whether a record of this process is a problem; for `logging`."""
         text = record.getMessage()
-        if shown := not no_problem(text, record.levelno):
-            return shown
-        note(text)
-        return False
+        shown = _is_problem(text, record.levelno)
+        if not shown:
+            self._note(text)
+        return shown
 
-    printed = output_printer()
-
-    def print_to_stdstream(data: dict[str, Any], *args: Any, **kwargs: Any) -> None:
-        """Print lines of other processes, as Ray's own function does."""
+    def print_lines(self, data: dict[str, Any], *args: Any, **kwargs: Any) -> None:
+        """Print lines of another process, as Ray's own function does."""
         shown = []
         for line in data["lines"]:
-            if no_problem(line, logging.INFO if _SERVES_INFO.match(line) else logging.WARNING):
-                note(f"({data.get('actor_name') or data.get('task_name') or 'ray'} pid={data.get('pid')}) {line}")
+            level = logging.INFO if _SERVES_INFO.match(line) else logging.WARNING
+            if self._is_load_failure(data.get("pid"), line) or not _is_problem(line, level):
+                self._note(f"({data.get('actor_name') or data.get('task_name') or 'ray'} pid={data.get('pid')}) {line}")
             else:
                 shown.append(line)
         if shown:
-            printed({**data, "lines": shown}, *args, **kwargs)
+            self.printed({**data, "lines": shown}, *args, **kwargs)
 
-    set_output_printer(print_to_stdstream)
-    loggers = [logging.getLogger(one) for one in LOGGERS]
-    for logger in loggers:
-        logger.addFilter(is_shown)
-    try:
-        yield file
-    finally:
-        for logger in loggers:
-            logger.removeFilter(is_shown)
-        set_output_printer(printed)
-        if kept is not None:
-            kept.close()
+    def _is_load_failure(self, process: Any, line: str) -> bool:
+        if any(one in line for one in _LOAD_FAILURES):
+            self.failing.add(process)
+        elif _SERVES_LINE.match(line):
+            self.failing.discard(process)
+        return self._started is not None and not self._started.is_set() and process in self.failing
+
+    def _note(self, text: str) -> None:
+        if self._kept is not None:
+            self._kept.emit(logging.LogRecord("ray", logging.INFO, "", 0, text, None, None))
+
+
+def _is_problem(text: str, level: int) -> bool:
+    return level >= logging.WARNING and not any(one in text for one in _MEANT)
 
 
 def _file(name: str) -> tuple[Path, logging.Handler]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import socket
+import threading
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -83,10 +84,11 @@ def serve_command(
             "tls": _tls(tls_cert, tls_key, tls_client_ca),
         }
         with (
-            quiet_ray(f"vlagents-ray-serve-{port}") as log,
+            quiet_ray(f"vlagents-ray-serve-{port}", started := threading.Event()) as log,
             exit_if_ray_is_lost(RESTART) as loss,
             running_server(config, host=host, port=port, address=address, show_logs=True, **access) as server,
         ):
+            started.set()
             for line in connection_lines(with_gateways_at(config, host), server.apps, host, keys, insecure=insecure):
                 out.print(line)
             if address is None:

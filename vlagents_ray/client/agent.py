@@ -54,7 +54,7 @@ class RemoteAgent(Agent):
         *,
         transport: TransportName = "auto",
         timeout_s: float = 30.0,
-        connect_timeout_s: float = 60.0,
+        connect_timeout_s: float | None = None,
         codec: ImageCodec | CodecName = "auto",
         rank: RankName = "robot",
         resume: bool = True,
@@ -72,7 +72,8 @@ class RemoteAgent(Agent):
                 handle. The others force one. `agent.transport` says which, once connected.
             timeout_s: How long a `reset` or `act` may take; an observation's `info["deadline_ms"]` allows its `act`
                 less. 2 to 5 s suit a robot, since a call to a hung replica lasts until its end.
-            connect_timeout_s: How long to wait for a server that is still loading; after 2 s, a warning is logged.
+            connect_timeout_s: How long to wait for a server that cannot be reached or is still loading, by default
+                `timeout_s`; after 2 s, a warning is logged.
             codec: How images are encoded for a network. "auto" measures the link when the first ones are sent (0.3 s,
                 more for images of 720p and above, or if ten round trips take longer) and takes raw pixels, JPEG or PNG,
                 whichever is computed to be the fastest to encode, send and decode; where ten round trips take a quarter
@@ -95,7 +96,9 @@ class RemoteAgent(Agent):
         choice = CodecChoice(codec)
         self.credentials = Credentials(api_key, ca, certificate)
         new_transport = partial(select_transport, url, transport, choice, self.credentials)
-        connection = Connection(url, new_transport, choice, timeout_s, connect_timeout_s, leaves_silent=resume)
+        connection = Connection(
+            url, new_transport, choice, timeout_s, connect_timeout_s or timeout_s, leaves_silent=resume
+        )
         self._attach(connection, rank, resume, commands)
 
     def _attach(self, connection: Connection, rank: RankName, resume: bool, commands: CommandInbox | None) -> None:

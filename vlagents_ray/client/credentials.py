@@ -6,11 +6,12 @@ import contextlib
 import ipaddress
 import logging
 import os
+import socket
 import ssl
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cache
-from urllib.parse import urlsplit
+from urllib.parse import SplitResult, urlsplit
 
 from vlagents_ray.errors import ConfigError, ConnectionLost, VLAgentsError
 
@@ -107,7 +108,7 @@ def tls_failure(url: str, error: ssl.SSLError) -> VLAgentsError:
     Only a connection that just ended is worth a retry.
     """
     if isinstance(error, (ssl.SSLEOFError, ssl.SSLZeroReturnError)):
-        return ConnectionLost(f"{url}: the connection ended ({error})")
+        return ConnectionLost(f"{url}: the connection ended ({error}); does the server speak TLS at this port?")
     if isinstance(error, ssl.SSLCertVerificationError):
         cure = "if the server's certificate is signed by a CA of your own, give its file as ca=, or in SSL_CERT_FILE"
         return ConfigError(f"{url}: the server's certificate is not to be trusted: {error.verify_message}; {cure}")
@@ -116,4 +117,21 @@ def tls_failure(url: str, error: ssl.SSLError) -> VLAgentsError:
             f"{url}: the server refuses this client's certificate, or that it has none ({error.reason}); "
             f"give certificate=(certificate file, key file), signed by the CA that the server trusts"
         )
+    if error.reason in ("WRONG_VERSION_NUMBER", "RECORD_LAYER_FAILURE", "UNSUPPORTED_PROTOCOL"):
+        plain = url.replace("https://", "http://", 1).replace("wss://", "ws://", 1)
+        return ConfigError(f"{url}: got no TLS from this port ({error.reason}); if the server has none, write {plain}")
     return ConfigError(f"{url}: TLS failed ({error}); does the server speak TLS at this port?")
+
+
+def speaks_tls(url: SplitResult, timeout_s: float) -> bool:
+    """Whether the port of a server's URL answers to TLS, whatever its certificate and those it asks for."""
+    context = ssl.create_default_context()
+    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    try:
+        with socket.create_connection((url.hostname, url.port or 80), timeout_s) as connection:
+            context.wrap_socket(connection, server_hostname=url.hostname).close()
+    except ssl.SSLError as error:
+        return "ALERT" in (error.reason or "")  # which is TLS, too
+    except OSError:
+        return False
+    return True

@@ -35,9 +35,8 @@ class HeadMonitor:
 
     def __init__(self, cure: str) -> None:
         """Monitor the cluster to which this process is connected; `cure` ends the message when it is lost."""
-        host, _, port = ray.get_runtime_context().gcs_address.rpartition(":")
         self.node = node_of_this_process()
-        self._address = host.strip("[]"), int(port)
+        self._address = host, port = _address()
         self._name = f"the head of the Ray cluster, {host}:{port},"
         self._cure = cure
         self._timeout_s = _SHARE * float(os.environ.get(_RAY_TIMEOUT) or _RAY_TIMEOUT_S)
@@ -75,6 +74,22 @@ class HeadMonitor:
             self._looked = monotonic()
         else:
             self._looked = self._answered = monotonic()
+
+
+def head_is_gone() -> bool:
+    """Whether the head refuses connections, as it does after SIGTERM, though its process takes seconds to end."""
+    try:
+        socket.create_connection(_address(), ANSWER_S).close()
+    except ConnectionRefusedError:
+        return True
+    except OSError:  # it may be busy
+        return False
+    return False
+
+
+def _address() -> tuple[str, int]:
+    host, _, port = ray.get_runtime_context().gcs_address.rpartition(":")
+    return host.strip("[]"), int(port)
 
 
 def keep_from_printing_last_words() -> None:

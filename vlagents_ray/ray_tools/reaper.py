@@ -100,6 +100,8 @@ def about(folder: str) -> list[int]:
 
 def main() -> None:
     """Wait for the end of the driver, and kill the processes that remain."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):  # systemd and Slurm signal every process of a service
+        signal.signal(number, signal.SIG_IGN)
     folder = sys.argv[1]
     orderly = os.read(0, 1) == _ORDERLY
     if not orderly:

@@ -22,6 +22,8 @@ from vlagents_ray.ray_tools.signals import own_sigterm
 log = logging.getLogger(__name__)
 
 _ATTEMPTS = 3
+# A driver whose head has ended would wait for 5 s to send its last events, of which nothing here makes use.
+_CONFIG = {"task_events_shutdown_flush_timeout_ms": 300}
 _FAILED = "Check failed: "  # in the log of a daemon that ended
 FILES = "ray"  # the folder of Ray's files in a `ray_folder`
 _SHORT = "/tmp"  # noqa: S108 - used if the names of Ray's sockets would be too long elsewhere
@@ -139,7 +141,7 @@ def start_ray(**options: Any) -> None:
     for attempt in range(1, _ATTEMPTS + 1):
         try:
             with own_sigterm(), only_needed_processes(options):  # "local" starts one even if RAY_ADDRESS is set
-                ray.init("local", **options)
+                ray.init("local", _system_config=_CONFIG, **options)
         except Exception as error:  # Ray raises a plain Exception
             node = node_that_failed(error)
             if node is None or not node.all_processes:  # nothing was started, so time is not the cause

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import threading
 import time
 import urllib.error
 import urllib.request
@@ -92,6 +94,29 @@ def test_a_whole_evaluation_over_the_page_shows_no_policy(tmp_path: Path, operat
     assert run.summary.total.mean_return == pytest.approx((0.75 + 0.75 + 1 + 1) / 4)
     for text in (*NAMES, *URLS.values(), "4711", "digest-of", "fingerprint-of"):
         assert text.encode() not in person.read
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [(None, "is complete"), (KeyboardInterrupt(), "--resume"), (ValueError("pi0"), "see the terminal")],
+)
+def test_an_open_page_says_how_the_evaluation_ended(error: BaseException | None, said: str) -> None:
+    """Before the server is gone: afterwards, an end and a lost connection look the same."""
+    read: list[dict[str, Any]] = []
+
+    def watch(person: Person) -> None:
+        while not read or read[-1]["phase"] != "end":
+            read.append(person.state())
+
+    with contextlib.suppress(KeyboardInterrupt, ValueError), PageOperator(say=lambda _: None) as operator:
+        watching = threading.Thread(target=watch, args=[Person(operator.url)])
+        watching.start()
+        wait_for(lambda: read)
+        if error is not None:
+            raise error
+    watching.join()
+    assert said in read[-1]["ending"]
+    assert "pi0" not in read[-1]["ending"]
 
 
 def test_an_answer_counts_for_the_question_that_was_shown(tmp_path: Path, operator: PageOperator) -> None:

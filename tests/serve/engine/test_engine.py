@@ -220,7 +220,7 @@ def test_a_loading_policy_is_unavailable_and_a_broken_one_says_why() -> None:
     engine = Engine(Broken())
     with pytest.raises(PolicyUnavailable):
         engine.require_ready()
-    with pytest.raises(PolicyFailed, match="no such checkpoint"):
+    with pytest.raises(PolicyFailed, match=r"no such checkpoint \(test_engine.py:\d+\)$"):
         engine.start()
     with pytest.raises(PolicyFailed, match="did not load: FileNotFoundError; the server"):  # no path leaves it
         ask(engine, "a", "reset")

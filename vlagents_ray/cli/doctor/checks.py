@@ -28,6 +28,7 @@ __all__ = ["Check", "checks", "run"]
 
 DEFAULT_PORT = 8000
 OLDEST_PYTHON = (3, 10)
+_WIDTH = 120  # columns of the table in a file or a pipe
 _STYLE = {"ok": "green", "warn": "yellow", "fail": "bold red"}
 _TORCH_CUDA = "import torch; print(torch.__version__, torch.version.cuda, torch.cuda.is_available(), sep='|')"
 
@@ -46,7 +47,7 @@ def run(console: Console, port: int = DEFAULT_PORT) -> int:
             failed |= check.status == "fail"
             style = _STYLE[check.status]
             table.add_row(check.name, Text(check.status, style), Text(check.detail), Text(check.cure))
-    console.print(table)
+    console.print(table, width=None if console.is_terminal else _WIDTH)
     return int(failed)
 
 

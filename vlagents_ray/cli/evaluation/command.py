@@ -228,8 +228,11 @@ def config_from_options(options: Mapping[str, Any]) -> EvalConfig:
             raise ConfigError(f"{what[0]} says what is evaluated; got {beside} beside it: write that there")
         fields = read_run(Path(what[0])) | run
     else:
-        if "source" not in policy or "out" not in run:
-            raise ConfigError("want --policy and --out, or a file of runs (.yaml)")
+        missing = [option for option, there in (("--policy", "source" in policy), ("--out", "out" in run)) if not there]
+        if missing:
+            raise ConfigError(
+                f"got no {' and no '.join(missing)}, want {' and '.join(missing)}; or a file of runs (.yaml)"
+            )
         fields = {"policies": [policy], "suites": [{"envs": list(what)} | suite], **run}
     if options["arm"] is not None:
         fields["robot"] = {**(fields.get("robot") or {}), "arm": options["arm"]}

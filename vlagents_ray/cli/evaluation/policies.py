@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
     from vlagents_ray.evaluate import EvalConfig, PolicyConfig
 
-_STARTING_S = 60.0  # how long to wait for a server at a URL
+_STARTING_S = 30.0  # how long to wait for a server at a URL
 
 
 @contextlib.contextmanager

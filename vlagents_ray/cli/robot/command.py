@@ -63,4 +63,8 @@ def robot_command(
             ask_for_help=ask_for_help,
             samples=samples,
         )
-        run.play(range(seed, seed + episodes))
+        try:
+            run.play(range(seed, seed + episodes))
+        except KeyboardInterrupt:
+            kept = "" if run.recorder is None else f"; {run.recorder.episodes} episodes are in {run.record}"
+            raise KeyboardInterrupt(f"interrupted{kept}") from None

@@ -82,6 +82,7 @@ class RobotRun:
     samples: int | None
     verdict: Label | None = field(default=None, init=False)  # of the running episode, once a human has given it
     over: bool = field(default=False, init=False)  # the human wants no further episode
+    recorder: Recorder | None = field(default=None, init=False)
     _control: Control | None = field(default=None, init=False)
     _view: TerminalView | None = field(default=None, init=False)
     _said: str | None = field(default=None, init=False)  # who moves the robot, or why nobody does, as printed
@@ -102,6 +103,7 @@ class RobotRun:
             recorder = None
             if self.record is not None:
                 recorder = stack.enter_context(Recorder(self.record, hz, interventions=leader is not None))
+                self.recorder = recorder
             if self.teleop == "keyboard":
                 out.print(f"{HELP}\n{KEYS}")
             if self.teleop is not None and out.is_terminal:

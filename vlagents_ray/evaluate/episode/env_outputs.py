@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vlagents_ray.contract import Contract
-from vlagents_ray.errors import EnvFailed, InvalidObservation
+from vlagents_ray.errors import ContractMismatch, EnvFailed, InvalidObservation, VLAgentsError
 from vlagents_ray.interface import Obs
 from vlagents_ray.validation import check_observation
 
@@ -66,19 +66,32 @@ def checked_step(
 
 
 def checked_obs(obs: object, contract: Contract, where: str, *, images: bool = True) -> Obs:
-    """Return `obs`; raises `EnvFailed` if it is malformed, or lacks a part of the environment's own `contract`."""
+    """Return `obs`, checked against the environment's own `contract`.
+
+    Raises:
+        ContractMismatch: The first observation does not fit: every episode would fail in the same way.
+        EnvFailed: A number is not finite, or a later observation does not fit.
+    """
+    wrong: type[VLAgentsError] = ContractMismatch if where == "reset" else EnvFailed
     if not isinstance(obs, Obs):
-        raise EnvFailed(f"env {where}: got {type(obs).__name__} in place of the observation, want an Obs")
+        raise wrong(f"env {where}: got {type(obs).__name__} in place of the observation, want an Obs")
     for name, part in (("cameras", obs.cameras), ("state", obs.state), ("info", obs.info)):
         if not isinstance(part, (dict, Mapping)):  # testing for a dict first is faster
-            raise EnvFailed(f"env {where}: got {type(part).__name__} as the observation's {name}, want a dict")
+            raise wrong(f"env {where}: got {type(part).__name__} as the observation's {name}, want a dict")
     try:
         check_observation(obs, contract if images else replace(contract, cameras=None))
     except InvalidObservation as error:
-        raise EnvFailed(f"env {where}: the observation does not fit the env's own contract: {error}") from error
+        if _has_diverged(obs):
+            wrong = EnvFailed
+        raise wrong(f"env {where}: the observation does not fit the env's own contract: {error}") from error
     except TypeError as error:  # a gripper that cannot be compared with 0 and 1
-        raise EnvFailed(f"env {where}: got {obs.gripper!r} as the gripper, want a number in [0, 1]") from error
+        raise wrong(f"env {where}: got {obs.gripper!r} as the gripper, want a number in [0, 1]") from error
     return obs
+
+
+def _has_diverged(obs: Obs) -> bool:
+    numbers = [*map(np.asarray, obs.state.values()), np.asarray(0 if obs.gripper is None else obs.gripper)]
+    return not all(np.isfinite(part).all() for part in numbers if part.dtype.kind == "f")
 
 
 def _number(reward: Any) -> float:

@@ -78,9 +78,9 @@ def explain(error: VLAgentsError) -> Failure:
     return Failure(cause, error.code, message, "".join(traceback.format_exception(error)))
 
 
-# By these errors an environment does not say that it broke, but reports its settings, a missing package, or an action
-# that it refuses.
-_FROM_ENV = (ConfigError, EnvFailed, InvalidAction, MissingDependency)
+# By these errors an environment does not say that it broke, but reports its settings, a breach of its contract, a
+# missing package, or an action that it refuses.
+_FROM_ENV = (ConfigError, ContractMismatch, EnvFailed, InvalidAction, MissingDependency)
 
 
 class _Side:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from pydantic import BaseModel, ConfigDict, field_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.artifacts.storage import whole_folder
@@ -28,7 +28,9 @@ class HubSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
-    dataset: str  # the benchmark's dataset on the Hub, OWNER/NAME, where its leaderboard is
+    dataset: str = Field(
+        examples=["OWNER/NAME"]
+    )  # the benchmark's dataset on the Hub, OWNER/NAME, where its leaderboard is
     task_id: str | None = None  # of that benchmark's eval.yaml; None: the name of the score, without its simulator
     model: str | None = None  # name in the model-index; None: the policy's in the evaluation
     source_url: str | None = None  # of the bundle, or of a paper

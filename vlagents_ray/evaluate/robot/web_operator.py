@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import uvicorn
 from starlette.applications import Starlette
+from starlette.background import BackgroundTask
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response
@@ -28,12 +29,13 @@ from vlagents_ray.naming import distinct
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-_Phase = Literal["scene", "playing", "verdict", "next"]
+_Phase = Literal["scene", "playing", "verdict", "next", "end"]
 _CHOICES = {
     "scene": {"ready", "end"},
     "playing": {"stop"},
     "verdict": {"success", "failure", "partial", "repeat"},
     "next": set[str](),
+    "end": set[str](),
 }
 _AWAY_S = 3.0  # without a request of the page; then nobody watches
 _LOOK_S = 0.1  # between two live pictures while the scene is set
@@ -53,7 +55,8 @@ class PageOperator(Operator):
     """An operator at a page in the browser. Use as a context manager: the page is served within it.
 
     The page is on the loopback interface, and its address has a random part, without which there is no answer. A
-    running trial is stopped if the page has asked for nothing for 3 s, as when it was closed.
+    running trial is stopped if the page has asked for nothing for 3 s, as when it was closed. At the end of the context
+    an open page says whether the evaluation is complete.
 
     Args:
         say: Prints a line: the page's address.
@@ -70,6 +73,7 @@ class PageOperator(Operator):
         self._answer: dict[str, Any] | None = None
         self._obs: Obs | None = None
         self._asked_at = 0.0  # when the page asked last
+        self._end_shown = threading.Event()
         self.url = ""
         """The page's address within the context."""
 
@@ -87,7 +91,17 @@ class PageOperator(Operator):
         self._say(f"the operator's page: {self.url}")
         return self
 
-    def __exit__(self, *exc: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        with self._changed:
+            self._phase, self._answer = "end", None
+            if kind is None:
+                self._ending = "The evaluation is complete: close this page"
+            elif issubclass(kind, KeyboardInterrupt):
+                self._ending = "The evaluation was interrupted: --resume goes on with it, at a new address"
+            else:
+                self._ending = "The evaluation ended with an error: see the terminal"
+        if self._is_watched():
+            self._end_shown.wait(_AWAY_S)
         self._server.should_exit = self._server.force_exit = True
         self._thread.join()
 
@@ -147,7 +161,9 @@ class PageOperator(Operator):
         with self._changed:
             shown = None if self._trial is None else self._trial.to_json()
             state = {"phase": self._phase, "trial": shown, "ending": self._ending, "answered": self._answer is not None}
-        return JSONResponse(state | {"cameras": [] if obs is None else sorted(distinct(obs.cameras).values())})
+        cameras = [] if obs is None else sorted(distinct(obs.cameras).values())
+        sent = BackgroundTask(self._end_shown.set) if state["phase"] == "end" else None
+        return JSONResponse(state | {"cameras": cameras}, background=sent)
 
     async def _camera(self, http: Request) -> Response:
         obs = self._obs

@@ -23,7 +23,7 @@ from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
 
-from vlagents_ray.client.credentials import is_loopback
+from vlagents_ray.client.credentials import KEY_VARIABLE, is_loopback
 from vlagents_ray.errors import ConfigError, Forbidden, TooManyRequests, Unauthorized, VLAgentsError
 from vlagents_ray.protocol.messages import RankName
 from vlagents_ray.serve.access.audit import Audit
@@ -92,7 +92,10 @@ class Keys:
         """
         if not token:
             self.audit.refused("", "no key")
-            raise Unauthorized("this server wants an API key; send the header 'Authorization: Bearer KEY'")
+            raise Unauthorized(
+                f"this server needs an API key: set {KEY_VARIABLE}, or api_key= (Python, C++), the option `key` "
+                f"(TypeScript) or the header 'Authorization: Bearer KEY' (HTTP)"
+            )
         self._refresh()
         digest = hashlib.sha256(token.encode(errors="surrogateescape")).digest()
         found: bytes | None = None

@@ -7,8 +7,11 @@ a callback on a thread of the batch queue receives the reply.
 from __future__ import annotations
 
 import logging
+import sysconfig
 import time
+import traceback
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import (
@@ -40,6 +43,8 @@ from vlagents_ray.serve.weights.updates import WeightUpdates, follows
 from vlagents_ray.serve.weights.versions import WeightsVersion
 
 logger = logging.getLogger(__name__)
+
+_LIBRARIES = (str(Path(__file__).parents[2]), sysconfig.get_path("stdlib"))  # this package's own, and Python's
 
 
 class Engine:
@@ -117,7 +122,7 @@ class Engine:
         except Exception as error:
             failed = f"the policy did not load: {type(error).__name__}"
             self._unready = PolicyFailed(f"{failed}; the server's log says why")
-            self._failure = PolicyFailed(f"{failed}: {error}")
+            self._failure = PolicyFailed(f"{failed}: {error}{_place(error)}")
             raise self._failure from error
         if threaded:
             self._preparations = Preparations()
@@ -363,3 +368,11 @@ class Engine:
         if unsent:
             self.queue.answer_later(unsent)
         self.stats.batch(len(acting), rows)
+
+
+def _place(error: Exception) -> str:
+    """Return the line of the user's own code that raised an error, " (my_policy.py:12)"; "" if none did."""
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        if not frame.filename.startswith(_LIBRARIES) and "site-packages" not in frame.filename:
+            return f" ({Path(frame.filename).name}:{frame.lineno})"
+    return ""

@@ -47,17 +47,19 @@ def shut_down(client: Any) -> None:
     """End Serve, so that replicas drain and HAProxy stops, like `serve.shutdown`, but without its error message.
 
     The controller ends itself during this call, which Ray would report as a failed task that will be
-    retried.
+    retried. A signal to the whole process group or service, as systemd's SIGTERM, also ends Ray's head: then Serve can
+    neither answer nor go on, and the reaper ends its processes.
     """
     import ray
+
+    from vlagents_ray.ray_tools.head_monitor import head_is_gone
 
     _stop_long_polls(client)
     client.shutdown_cached_handles()
     last = end_controller(client)
-    try:
-        ray.get(last, timeout=_SHUTDOWN_S)
-    except ray.exceptions.RayActorError:
-        pass
-    except ray.exceptions.GetTimeoutError:
-        log.warning("Serve has not ended within %g s; nobody waits for it any longer", _SHUTDOWN_S)
+    deadline = time.monotonic() + _SHUTDOWN_S
+    while not ray.wait([last], timeout=_LOOK_S)[0] and not head_is_gone():
+        if time.monotonic() > deadline:
+            log.warning("Serve has not ended within %g s and is left behind", _SHUTDOWN_S)
+            break
     forget_serve(client)

@@ -6,7 +6,7 @@ let shown = "";
 
 async function look() {
   if (!document.hidden) await refresh();  // when nobody looks, the server stops a running trial
-  setTimeout(look, 300);
+  if (state === null || state.phase !== "end") setTimeout(look, 300);
 }
 
 async function refresh() {
@@ -17,13 +17,14 @@ async function refresh() {
   } catch {
     state = null;
     shown = "";
-    $("phase").textContent = "No connection: the evaluation has ended, or was interrupted";
+    $("phase").textContent = "No connection to the evaluation: see the terminal";
     for (const part of document.querySelectorAll("[data-phase]")) part.hidden = true;
   }
 }
 
 function show(found) {
   state = found;
+  if (state.phase === "end") return showEnd();
   $("phase").textContent = state.answered ? PHASES.next : PHASES[state.phase];
   const trial = state.trial;
   cameras();
@@ -55,6 +56,13 @@ function show(found) {
   $("parts").replaceChildren(...parts);
   const first = document.querySelector("[data-phase]:not([hidden]) button");
   if (state.phase === "playing" && first) first.focus();
+}
+
+function showEnd() {
+  $("count").textContent = document.title = "The end";
+  $("phase").textContent = state.ending;
+  $("task").hidden = $("overlay").hidden = $("answers").hidden = true;
+  $("cameras").replaceChildren();
 }
 
 function cameras() {
