@@ -18,6 +18,7 @@ from typing import Any
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import PolicyUnavailable, UnknownSession, VLAgentsError
 from vlagents_ray.interface import Agent, Parts
+from vlagents_ray.policies.base.program import Program
 from vlagents_ray.serve.models.checkpoints import Checkpoints
 from vlagents_ray.serve.models.loaded_model import (
     LoadedModel,
@@ -52,6 +53,7 @@ class ModelManager:
         self.continues_plans = False  # whether that model's chunks go on from the plan that is executed
         self.contract: Contract | None = None  # contract of the deployment's own model that was loaded last
         self.weights: dict[str, Any] | None = None  # weights of the deployment's own model that was loaded last
+        self.files: Program = {}  # digests of the files that the settings of that model name
         self.step = ""  # the step of a long first load, such as "compiling 4 rows (3 of 5)"
         self.on_step: Callable[[str], None] = lambda _: None  # called with it, on the thread that loads
         self._source = source
@@ -240,7 +242,7 @@ class ModelManager:
     def _set_own_model(self, model: LoadedModel) -> None:
         self.contract, self._fingerprint = model.contract, model.version[1]
         self.act_parts, self.continues_plans = model.agent.act_parts, model.agent.continues_plans
-        self.weights = model.weights
+        self.weights, self.files = model.weights, model.files
 
     def _loop(self) -> None:
         while (task := self._next_task()) is not None:
