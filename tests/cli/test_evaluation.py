@@ -160,7 +160,8 @@ def test_a_cell_that_stopped_early_misses_nothing(monkeypatch: pytest.MonkeyPatc
 
 def test_only_what_was_asked_for_now_is_missed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     config = lost(tmp_path)
-    other = config.model_copy(update={"resume": True, "suites": [SuiteConfig(envs=["tabletop"], name="b", seeds=[9])]})
+    suite = SuiteConfig(envs=["tabletop"], name="b", seeds=[9])
+    other = config.model_copy(update={"resume": True, "accept_changes": True, "suites": [suite]})
     with Store(other) as store:
         for job in plan(store.cells):
             store.record(EpisodeResult(job.key, "done", True, True, 3), 1)

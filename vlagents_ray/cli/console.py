@@ -22,14 +22,14 @@ from vlagents_ray.settings import wrong_settings
 
 
 class PlainConsole(Console):
-    """A console that shows text as it is: `[serve]` is no markup, and a line is as long as it is, for copying.
+    """A console that shows text as it is, for copying: `[serve]` is no markup, `:boat:` no picture, lines are not cut.
 
     What is to be styled is a `Text`, or has a `style`. A table is as wide as the terminal, and breaks words that are
     too long for its cells; elsewhere it is as wide as it needs to be.
     """
 
     def __init__(self, **options: Any) -> None:
-        super().__init__(markup=False, highlight=False, soft_wrap=True, **options)
+        super().__init__(markup=False, emoji=False, highlight=False, soft_wrap=True, **options)
 
     @property  # type: ignore[misc]
     def size(self) -> ConsoleDimensions:

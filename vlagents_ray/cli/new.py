@@ -53,7 +53,11 @@ class $title(Agent):
         )
 
     def initialize(self):
-        """Load the weights, once in a replica and before the first session."""
+        """Load the weights, once in a replica and before the first session.
+
+        An evaluation identifies them by the files that the settings name. For weights from elsewhere set
+        `self.weights_id = {"digest": "...", "revision": None}`, so that results of two weights are not mixed.
+        """
         self.weights = np.random.default_rng(0).normal(0, 0.3, (6, 4)).astype(np.float32)
 
     def reset(self, obs, instruction, **kwargs):
@@ -91,7 +95,10 @@ applications:
 }
 _ENV = {
     "$name.py": '''\
-"""The environment $title: put your simulator in place of the point that moves."""
+"""The environment $title: put your simulator in place of the point that moves.
+
+An evaluation identifies it by this file, the modules that it imports, and the files that its options name.
+"""
 
 import numpy as np
 

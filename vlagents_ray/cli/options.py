@@ -34,7 +34,10 @@ LiveAt = Annotated[
 
 
 def parse_settings(texts: Iterable[str], option: str) -> dict[str, Any]:
-    """Parse `a.b=1` and the like to nested settings; the value is YAML, so `[1, 2]` and `true` work."""
+    """Parse `a.b=1` and the like to nested settings; the value is YAML, so `[1, 2]` and `true` work.
+
+    A value that is not YAML, such as `@handle`, is text, unless it begins like a list, a mapping or a quotation.
+    """
     settings: dict[str, Any] = {}
     for text in texts:
         key, equals, value = text.partition("=")
@@ -49,6 +52,9 @@ def parse_settings(texts: Iterable[str], option: str) -> dict[str, Any]:
         try:
             place[path[-1]] = yaml.safe_load(value)
         except yaml.YAMLError as error:
+            if not value.lstrip().startswith(("[", "{", '"', "'")):
+                place[path[-1]] = value
+                continue
             raise ConfigError(f"{option}: the value of {key!r} is not YAML ({error})") from error
     return settings
 

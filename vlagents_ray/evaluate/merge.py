@@ -7,7 +7,7 @@ import json
 import sqlite3
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from glob import escape
 from pathlib import Path
 from typing import Any
@@ -25,9 +25,9 @@ from vlagents_ray.evaluate.artifacts.storage import (
 from vlagents_ray.evaluate.plan.config import canonical
 from vlagents_ray.evaluate.report.html import FILE as REPORT
 from vlagents_ray.evaluate.report.html import write_report
+from vlagents_ray.evaluate.results.changes import Change, changed, listed, policy_changes, program_changes
 from vlagents_ray.evaluate.results.database import FILE, SCHEMA, VERSION, WORKERS, insert
 from vlagents_ray.evaluate.results.reader import Results, episode_of, reading, table
-from vlagents_ray.evaluate.results.store import changed
 from vlagents_ray.evaluate.results.summary import Summary, summarize, write_summary
 
 _SHOWN = 10  # conflicts in a message
@@ -47,7 +47,7 @@ class _Merged:
     home: dict[str, Path] = field(default_factory=dict)
 
 
-def merge(out: Path, folders: Sequence[Path], *, keep_first: bool = False) -> Summary:
+def merge(out: Path, folders: Sequence[Path], *, keep_first: bool = False, accept_changes: bool = False) -> Summary:
     """Put the results of `folders` together in the new folder `out`, which can be resumed.
 
     An episode with the same outcome in several folders is taken from the first; one that was played replaces one that
@@ -57,14 +57,15 @@ def merge(out: Path, folders: Sequence[Path], *, keep_first: bool = False) -> Su
         out: A folder without results; it is made if it is missing.
         folders: Folders of results.
         keep_first: Of an episode with different outcomes take that of the first folder.
+        accept_changes: Merge although files of a policy or an env, or weights, differ; the report says so.
 
     Returns:
         The summary of the merged results.
 
     Raises:
-        ConfigError: Cells of one name have different settings, a policy is not the same everywhere, an episode has
-            different outcomes and `keep_first` is off, or an episode's file is missing or outside of its folder, by its
-            path or by a symbolic link.
+        ConfigError: Cells of one name have different settings, a policy or the files of an env are not the same
+            everywhere and `accept_changes` is off, an episode has different outcomes and `keep_first` is off, or an
+            episode's file is missing or outside of its folder, by its path or by a symbolic link.
         StorageFailed: The disk is full, or cannot be written to.
     """
     if (out / FILE).exists():
@@ -73,10 +74,18 @@ def merge(out: Path, folders: Sequence[Path], *, keep_first: bool = False) -> Su
     conflicts: list[str] = []
     for folder in folders:
         with reading(folder) as db:
-            _add_policies(merged, folder, db)
-            _add_cells(merged, folder, db)
+            found = _add_policies(merged, folder, db) + _add_cells(merged, folder, db)
+            if found and not accept_changes:
+                raise ConfigError(
+                    f"{folder} was not played with the program of the folders before it:\n{listed(found)}\n"
+                    f"merge them apart, or mix them and have the report say so (--accept-changes)"
+                )
             conflicts += _add_episodes(merged, folder, db)
-    _require_one_checkpoint(merged)
+            if found:
+                last = merged.runs[-1]
+                earlier = json.loads(last.get("changes") or "[]")
+                last["changes"] = canonical([*earlier, *(asdict(one) for one in found)])
+    _require_one_checkpoint(merged, weights_may_differ=accept_changes)
     if conflicts and not keep_first:
         shown = "\n".join(f"- {text}" for text in conflicts[:_SHOWN])
         raise ConfigError(
@@ -93,19 +102,24 @@ def merge(out: Path, folders: Sequence[Path], *, keep_first: bool = False) -> Su
     return summary
 
 
-def _add_policies(merged: _Merged, folder: Path, db: sqlite3.Connection) -> None:
+def _add_policies(merged: _Merged, folder: Path, db: sqlite3.Connection) -> list[Change]:
+    found = []
     swept = {name for (name,) in db.execute("SELECT DISTINCT policy FROM cells WHERE step IS NOT NULL")}
     for row in table(db, "policies"):
         known = merged.policies.setdefault(row["name"], row)
         before, now = json.loads(known["metadata"]), json.loads(row["metadata"])
-        if what := changed(before, now, swept=row["name"] in swept):
+        is_swept = row["name"] in swept
+        found += policy_changes(f"policy {row['name']}", before, now, swept=is_swept)
+        if (what := changed(before, now, swept=is_swept)) in ("policy", "checkpoint"):
             raise ConfigError(
                 f"{folder}: policy {row['name']!r} has {what} {now.get(what)!r}, that of the folders before it "
                 f"{before.get(what)!r}; give one of them another name in its evaluation"
             )
+    return found
 
 
-def _add_cells(merged: _Merged, folder: Path, db: sqlite3.Connection) -> None:
+def _add_cells(merged: _Merged, folder: Path, db: sqlite3.Connection) -> list[Change]:
+    changes: dict[Change, None] = {}
     names = {_name(row): row for row in merged.cells.values()}
     for row in table(db, "cells"):
         known = merged.cells.get(row["cell"]) or names.setdefault(_name(row), row)  # a suite may have a new name
@@ -119,9 +133,12 @@ def _add_cells(merged: _Merged, folder: Path, db: sqlite3.Connection) -> None:
         if known["stop"] != row["stop"]:
             where = " ".join(filter(None, _name(row)))
             raise ConfigError(f"{folder}: {where} stops early by {row['stop']}, that before it by {known['stop']}")
-        for name in ("described", "contract", "code"):
-            known[name] = known[name] or row[name]
+        programs = [None if one.get("program") is None else json.loads(one["program"]) for one in (known, row)]
+        changes |= dict.fromkeys(program_changes(f"env {row['env']}", *programs))
+        for name in ("described", "contract", "code", "program"):
+            known[name] = known.get(name) or row.get(name)
         _extend(known, row, folder)
+    return list(changes)
 
 
 def _name(cell: Row) -> tuple[str, str, str, str]:
@@ -166,7 +183,7 @@ def _differences(known: Row, row: Row) -> str:
     return ", ".join(f"{name} is {before[name]!r} and {now[name]!r}" for name in before if before[name] != now[name])
 
 
-def _require_one_checkpoint(merged: _Merged) -> None:
+def _require_one_checkpoint(merged: _Merged, *, weights_may_differ: bool) -> None:
     """Raise `ConfigError` for a cell of several checkpoints, or a policy's checkpoint of several weights."""
     checkpoints: dict[str, dict[str, str]] = {}  # the key of an episode of each, by cell
     weights: dict[tuple[str, int | None, str | None], dict[str, str]] = {}  # by policy, step and checkpoint
@@ -177,7 +194,8 @@ def _require_one_checkpoint(merged: _Merged) -> None:
         if (found := row.get("weights")) is not None:  # older results have none
             weights.setdefault((cell["policy"], cell["step"], checkpoint), {}).setdefault(found, row["key"])
     several = [(merged.cells[cell]["env"], "checkpoints", found) for cell, found in checkpoints.items()]
-    several += [(f"{policy} {name!r}", "weights under one name", found) for (policy, _, name), found in weights.items()]
+    named = {} if weights_may_differ else weights
+    several += [(f"{policy} {name!r}", "weights under one name", found) for (policy, _, name), found in named.items()]
     for where, what, found_keys in several:
         if len(found_keys) > 1:
             raise ConfigError(

@@ -6,6 +6,7 @@ import contextlib
 import logging
 from collections import Counter
 from collections.abc import Callable
+from typing import Any
 
 from vlagents_ray.errors import ConfigError, StorageFailed, from_code
 from vlagents_ray.evaluate.artifacts.provenance import (
@@ -31,7 +32,7 @@ from vlagents_ray.evaluate.results.stopping import Stopping
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.evaluate.results.summary import Summary, summarize, write_summary
 from vlagents_ray.evaluate.trackers import TrackerFeed
-from vlagents_ray.evaluate.workers.agents import AgentFactory, agents
+from vlagents_ray.evaluate.workers.agents import AgentFactory, agents, factory_program
 from vlagents_ray.evaluate.workers.cluster import ray_cluster, unused_gpus
 from vlagents_ray.evaluate.workers.dispatch import FailedAttempts, dispatch
 from vlagents_ray.evaluate.workers.in_process import InProcessWorkers
@@ -99,7 +100,8 @@ def evaluate(
         ContractMismatch: A policy and an env do not fit together.
         StorageFailed: The disk is full, or cannot be written to.
         EvaluationInterrupted: Ctrl-C or SIGTERM; `OutOfTime`, which is one, if `end_at` left episodes over.
-        VLAgentsError: The last infrastructure error, after `config.abort_after` lost episodes in a row.
+        VLAgentsError: The last infrastructure error, after `config.abort_after` lost episodes in a row; `PolicyFailed`
+            with the last error, after as many in a row that an error of a policy ended.
     """
     if config.real_robot is not None:
         raise ConfigError("robot.arm: got a real robot, want a plan in simulation; see vlagents_ray.evaluate.robot")
@@ -112,7 +114,8 @@ def evaluate(
             save_diffs(config.out, driver_code().values())
         try:
             with tracking:
-                run = _Run(config, store, progress or SilentProgress(), tracking, only, end_at, in_process)
+                local = {} if agent_factory is None else {"program": factory_program(agent_factory)}
+                run = _Run(config, store, progress or SilentProgress(), tracking, only, end_at, in_process, local)
                 state, summary = run.play(factory)
         except BaseException:
             with contextlib.suppress(StorageFailed):  # of the same disk, it may be: what went wrong first is told
@@ -157,11 +160,13 @@ class _Run:
         only: tuple[int, int] | None,
         end_at: float | None,
         in_process: bool,
+        local_program: dict[str, Any],
     ) -> None:
         self._config = config
         self._store = store
         self._progress = progress
         self._tracking = tracking
+        self._local_program = local_program
         self._attempts = FailedAttempts(config)
         self._in_process = in_process
         self._checked_gpus = in_process  # when an env first drew
@@ -217,7 +222,7 @@ class _Run:
 
     def _handle(self, job: Job, report: Report) -> None:
         if report.policy is not None:
-            self._store.note_policy(job.cell.policy.name, report.policy)
+            self._store.note_policy(job.cell.policy.name, self._local_program | report.policy)
             save_diffs(self._config.out, [policy_code(report.policy)])
         if report.env is not None:
             self._store.note_env(job.cell.place, report.env)
@@ -227,7 +232,8 @@ class _Run:
         if report.failure is not None:
             self._failed(job, report.failure)
         elif report.result is not None:
-            self._attempts.note_played()
+            if report.result.status != "policy_error":
+                self._attempts.note_played()
             if (reason := report.artifacts.not_repeatable) is not None:
                 log.warning(
                     "%s: nothing of it is recorded, as its actions do not repeat it in the simulator: %s; its worker "
@@ -236,6 +242,8 @@ class _Run:
                     reason,
                 )
             self._record(job, report.result, report.artifacts)
+            if report.result.status == "policy_error":
+                self._attempts.note_policy_error(report.result.error or "")
 
     def _note_worker(self, cell: EvalCase, worker: WorkerInfo) -> None:
         self._store.note_worker(worker)

@@ -88,7 +88,7 @@ def test_an_unfinished_cell_is_told_by_the_run_that_completes_it_and_no_other_tw
     one_env = {"suites": [settings.suites[0].model_copy(update={"envs": [LINE]})]}
     play(settings, left_out=[2])
     assert tell(settings) == []
-    play(settings.model_copy(update={"resume": True} | one_env))
+    play(settings.model_copy(update={"resume": True, "accept_changes": True} | one_env))
     assert [min(metrics) for _, _, metrics in tell(settings)] == [f"{LINE}/episodes"]
     assert tell(settings) == []
     play(settings.model_copy(update={"resume": True}))

@@ -73,6 +73,13 @@ def evaluate_command(
     ] = None,
     track: Annotated[str, typer.Option(help="wandb, trackio, tensorboard, with commas between them.")] = "",
     resume: Annotated[bool, typer.Option(help="Go on with the results in --out.")] = False,
+    accept_changes: Annotated[
+        bool,
+        typer.Option(
+            "--accept-changes",
+            help="With --resume: although files or weights of a policy or an environment changed; the report says so.",
+        ),
+    ] = False,
     execute: Annotated[int | None, typer.Option(min=1, help="Rows executed of each chunk; default: all.")] = None,
     retries: Annotated[
         int | None, typer.Option(min=0, help="Further attempts after an infrastructure failure; default: 3.")
@@ -140,8 +147,8 @@ def evaluate_command(
     --rerun, --foxglove, --track, --retries and --resume win over it.
 
     Exit status: 0 when every episode has its result, 75 when --end-at left some over (--resume goes on), 130 after
-    Ctrl-C or SIGTERM (likewise), 2 for wrong settings, 1 for what else failed, and when infrastructure lost an episode
-    for good (--resume tries it again).
+    Ctrl-C or SIGTERM (likewise), 2 for wrong settings, 3 when an error of the policy ended every episode of a cell, 1
+    for what else failed, and when infrastructure lost an episode for good (--resume tries it again).
     """
     given = locals()  # every option by its name
     with errors(), exit_if_ray_is_lost(RESUME):

@@ -117,13 +117,17 @@ def merge_command(
         bool,
         typer.Option("--keep-first", help="Of different outcomes of an episode keep that of the folder named first."),
     ] = False,
+    accept_changes: Annotated[
+        bool,
+        typer.Option("--accept-changes", help="Although files of a policy or an env, or weights, differ; it is shown."),
+    ] = False,
 ) -> None:
     """Put results together: each episode once, by its key; videos and trajectories go along."""
     from vlagents_ray.evaluate import print_summary
     from vlagents_ray.evaluate.merge import merge
 
     with errors():
-        print_summary(out, merge(into, folders, keep_first=keep_first))
+        print_summary(out, merge(into, folders, keep_first=keep_first, accept_changes=accept_changes))
 
 
 def bundle_command(

@@ -7,7 +7,10 @@ from typing import TYPE_CHECKING
 
 from vlagents_ray.cli.console import fail, out
 from vlagents_ray.cli.evaluation.policies import served
+from vlagents_ray.errors import PolicyFailed
 from vlagents_ray.slurm.script import UNFINISHED
+
+POLICY_ERRORS = 3  # exit status: an error of the policy ended every episode of a cell
 
 if TYPE_CHECKING:
     from vlagents_ray.evaluate import EvalConfig, Progress, Summary
@@ -50,10 +53,17 @@ def play_one(config: EvalConfig, address: str | None, only: tuple[int, int]) -> 
 
 def evaluate_and_print(config: EvalConfig, progress: Progress, end_at: float | None = None) -> Summary:
     """Evaluate policies that are at their URLs; an interrupted evaluation prints what it has."""
-    from vlagents_ray.evaluate import EvaluationInterrupted, OutOfTime, evaluate, print_summary
+    from vlagents_ray.evaluate import EvaluationInterrupted, OutOfTime, Results, evaluate, print_summary
+    from vlagents_ray.evaluate.results.summary import failing_cells, summarize
 
     try:
         summary = evaluate(config, progress=progress, end_at=end_at)
+    except PolicyFailed as error:
+        results = Results.load(config.out)
+        if not failing_cells(results):
+            raise
+        print_summary(out, summarize(results))
+        fail(str(error), POLICY_ERRORS)
     except EvaluationInterrupted as interrupted:
         print_summary(out, interrupted.summary)
         if isinstance(interrupted, OutOfTime):
@@ -64,11 +74,19 @@ def evaluate_and_print(config: EvalConfig, progress: Progress, end_at: float | N
 
 
 def require_results(config: EvalConfig, summary: Summary) -> None:
-    """End the command with status 1 if an episode that `config` plans has no result: infrastructure lost it."""
+    """End the command with status 3 if an error of the policy ended every episode of a cell that `config` plans.
+
+    With status 1, if an episode has no result: infrastructure lost it.
+    """
     from vlagents_ray.evaluate.plan.cases import cells
+    from vlagents_ray.evaluate.results.summary import errors_of_policies, failing_cells
 
     wanted = {cell.fingerprint for cell in cells(config)}
     mine = [cell for cell in summary.results.cells if cell.cell in wanted]
+    if failing := failing_cells(summary.results.among(mine)):
+        (_, _, error), _ = errors_of_policies(summary.results.among(failing))[0]
+        where = ", ".join(f"{cell.contender} in {cell.task}" for cell in failing)
+        fail(f"every episode ended by an error of the policy: {where}; the first one: {error.strip()}", POLICY_ERRORS)
     missing = sum(cell.missing for cell in mine)
     if not missing:
         return

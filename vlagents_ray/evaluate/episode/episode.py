@@ -151,6 +151,7 @@ class _Episode:
         self.ticks: deque[Tick] = deque()  # the ticks before the next request
         self.outcome: Outcome | None = None  # set once the episode is over
         self._new_executor, self._executor = executor, executor()
+        self._width: int | None = None  # numbers of an action
         self._done = False  # the policy ends the episode with these ticks
 
     def began(self, answer: dict[str, Any] | Exception) -> None:
@@ -183,6 +184,11 @@ class _Episode:
                 latency_s = self._executor.latency_s(seconds)
                 self.stats.acted(answer, seconds, latency_s)
             rows = Act(check_action(answer.action, contract)).rows()
+            if self._width not in (None, rows.shape[1]):  # the environment's contract states no size
+                raise InvalidAction(
+                    f"action: got {rows.shape}, want {self._width} numbers a row, as in the first answer"
+                )
+            self._width = rows.shape[1]
             ticks = list(self._executor.ticks(rows, latency_s or 0.0))
             acted(self.number, answer, sum(tick.waited for tick in ticks))
             self.ticks.extend(ticks)

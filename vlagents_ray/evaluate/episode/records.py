@@ -83,6 +83,8 @@ class EnvInfo:
     described: dict[str, Any]  # `EvalEnv.describe()`
     contract: dict[str, Any]
     code: GitState | None = None  # the state of the environment's code, if git tracks it
+    program: dict[str, str] | None = None  # digests of its files on the worker's machine
+    host: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -89,6 +89,8 @@ COLUMNS = (
     _of_episode("videos", "json", "paths in the folder of results"),
     _of_episode("trajectory", "string", "path in the folder of results"),
     _of_result("revision", "string", "the hub's commit of the checkpoint, if it was loaded from the hub's cache"),
+    _of_episode("env_program", "string", "stands for the files of the env, its code included; null if installed"),
+    _of_episode("policy_program", "string", "the same of the policy"),
 )  # fmt: skip
 
 

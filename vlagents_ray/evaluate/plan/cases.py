@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fnmatch
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -20,7 +21,8 @@ from vlagents_ray.evaluate.plan.config import (
     fingerprint,
 )
 from vlagents_ray.naming import plain
-from vlagents_ray.registry import env_class, env_suite
+from vlagents_ray.policies.base.program import Program, code_of_class, files_named, with_defaults
+from vlagents_ray.registry import env_class, env_suite, env_task
 
 _COUNTS = "executed actions"  # what rows are placed by (`client.plan.Plan`); scores from when it was ticks are others
 
@@ -93,10 +95,27 @@ class EvalCase:
         """Stands for the environment that a worker must have made to play it."""
         return fingerprint([self.env, self.suite.env_options, self.suite.num_envs, self.kind])
 
+    @cached_property
+    def program(self) -> Program:
+        """The files that its environment is made of, as they are now: its code, and what its settings name."""
+        return env_program(self)
+
     @property
     def planned(self) -> int:
         """Episodes of all seeds together."""
         return self.suite.episodes * len(self.suite.seeds)
+
+
+def env_program(cell: EvalCase, code: Callable[[str], Program] = code_of_class) -> Program:
+    """Return the files of a cell's environment, or of its robot; `code` finds those of a class."""
+    if cell.robot is not None:
+        return code(cell.on_robot[0].arm or "")
+    cls = env_class(cell.env)
+    settings = with_defaults(cls, cell.suite.env_options) | {"reset_options": cell.suite.reset_options}
+    namespace = (env_task(cell.env) or "").rpartition("/")[0]  # of an id of Gymnasium, which is registered there
+    modules = [f"{cls.__module__}:{cls.__name__}", cell.suite.env_options.get("module") or namespace]
+    found = {name: digest for module in modules if isinstance(module, str) for name, digest in code(module).items()}
+    return found | files_named(settings, folders=False)
 
 
 def _settings(robot: RobotConfig, task: RobotTask) -> dict[str, Any]:

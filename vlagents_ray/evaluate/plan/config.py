@@ -242,6 +242,7 @@ class EvalConfig(_PlanModel):
     rerun: str | None = None
     foxglove: str | None = None
     resume: bool = False
+    accept_changes: bool = False  # resume although files of policy or environment changed; the report says so
     worker: WorkerConfig = WorkerConfig()
     stop: StopConfig | None = None  # early stopping; None: every episode is played
     track: list[Tracker] = []  # where rates and videos are shown beside `out`, against the training step
@@ -250,7 +251,7 @@ class EvalConfig(_PlanModel):
 
     # What happens when something breaks.
     retries: NonNegativeInt = 3  # further attempts after an infrastructure failure
-    abort_after: NonNegativeInt = 10  # stop after so many infrastructure failures in a row; 0 = never
+    abort_after: NonNegativeInt = 10  # stop after so many lost episodes, or errors of policies, in a row; 0 = never
     make_timeout_s: PositiveFloat = 300.0  # making an env, imports and shaders included
     env_timeout_s: PositiveFloat = 60.0  # one reset or step
     policy_timeout_s: PositiveFloat = 60.0  # one reset or act of the policy

@@ -17,6 +17,7 @@ from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.evaluate.plan.jobs import Job
 from vlagents_ray.evaluate.results.statistics import Rate
 from vlagents_ray.evaluate.results.stopping import confidence_sequence
+from vlagents_ray.evaluate.results.summary import cause_of
 
 LINE_EVERY_S = 5.0
 MOST_ROWS = 12
@@ -93,6 +94,7 @@ class _Counts:
         self._steps = 0
         self._played = 0  # in this run
         self._left = left
+        self._causes: set[tuple[str, str]] = set()  # (policy id, cause) of errors that were shown
         self._alone = len({cell.contender for cell in cells}) == 1
         self.retries = 0
 
@@ -108,6 +110,17 @@ class _Counts:
         error_rate = before.error_rate  # of a cell that may stop early
         bounds = None if error_rate is None else confidence_sequence(successes, episodes, error_rate)
         self._rates[cell.fingerprint] = Rate(successes, episodes, bounds, error_rate)
+
+    def new_error(self, cell: EvalCase, result: EpisodeResult) -> str | None:
+        """A line with the error of the policy that ended an episode, at the first of each cause."""
+        if result.status != "policy_error":
+            return None
+        error = (result.error or "").strip().partition("\n")[0]
+        cause = cell.contender, cause_of(error)
+        if cause in self._causes:
+            return None
+        self._causes.add(cause)
+        return f"{cell.contender} failed in {cell.env} episode {result.key.episode}, counted as no success: {error}"
 
     def spare(self, episodes: int) -> None:
         self._left -= episodes
@@ -154,8 +167,10 @@ class LiveProgress:
         self._live.start()
 
     def episode(self, cell: EvalCase, result: EpisodeResult) -> None:
-        """Count the episode."""
+        """Count the episode; print an error of the policy above the table, once for each cause."""
         self._counts.add(cell, result)
+        if (line := self._counts.new_error(cell, result)) is not None:
+            self._live.console.print(line, markup=False, highlight=False)
 
     def retry(self, job: Job, failure: Failure) -> None:
         """Count the retry, and print its reason above the table."""
@@ -196,8 +211,10 @@ class LineProgress:
         self._line()
 
     def episode(self, cell: EvalCase, result: EpisodeResult) -> None:
-        """Print a line, unless the last one is recent."""
+        """Print a line, unless the last one is recent, and errors of the policy, once for each cause."""
         self._counts.add(cell, result)
+        if (line := self._counts.new_error(cell, result)) is not None:
+            self._print(line)
         if monotonic() - self._last >= self._every_s:
             self._last = monotonic()
             self._line()

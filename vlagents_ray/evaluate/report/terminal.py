@@ -5,11 +5,12 @@ from __future__ import annotations
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from vlagents_ray.evaluate.report.html import FILE as REPORT
 from vlagents_ray.evaluate.results.comparison import Comparison, clock_gaps
 from vlagents_ray.evaluate.results.database import RUNNING
-from vlagents_ray.evaluate.results.summary import Group, Summary, pushed_of
+from vlagents_ray.evaluate.results.summary import Group, Summary, errors_of_policies, pushed_of
 
 
 def results_table(summary: Summary) -> Table:
@@ -44,6 +45,8 @@ def print_summary(console: Console, summary: Summary) -> None:
         summary: As `evaluate` returns it.
     """
     console.print(results_table(summary))
+    if summary.total.policy_errors:
+        console.print(_errors_table(summary))
     total = summary.total
     speed = summary.rollout_steps_per_second
     lines = [f"{total.steps} steps in {summary.wall_seconds:.1f} s"]
@@ -60,6 +63,7 @@ def print_summary(console: Console, summary: Summary) -> None:
         lines.append(f"{total.retries} attempts lost to infrastructure and repeated")
     if total.infra_failures:
         lines.append(f"{total.infra_failures} episodes lost to infrastructure, in no rate; --resume tries them again")
+    lines += [f"accepted change: {change}" for change in summary.results.accepted_changes]
     pushed = {cell.contender: words for cell in summary.results.cells if (words := pushed_of(cell)) is not None}
     lines += [f"{name}: weights pushed by a learner, {words}" for name, words in pushed.items()]
     lines += [_stopped(group) for group in summary.cells if group.stopped]
@@ -79,6 +83,16 @@ def print_summary(console: Console, summary: Summary) -> None:
         lines.append(f"videos: {summary.out / 'videos'}")
     for line in lines:
         console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+
+def _errors_table(summary: Summary) -> Table:
+    table = Table(title="Errors of policies", box=SIMPLE_HEAD, padding=0, pad_edge=False)
+    for title in ("policy", "env", "error"):
+        table.add_column(title, overflow="fold")
+    table.add_column("episodes", justify="right", no_wrap=True)
+    for (policy, task, error), number in errors_of_policies(summary.results):
+        table.add_row(policy, task, Text(error.strip().partition("\n")[0]), str(number))
+    return table
 
 
 def _interval(total: Group) -> str:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from vlagents_ray.errors import ConfigError
+from vlagents_ray.evaluate.results.changes import listed, program_changes
 from vlagents_ray.evaluate.results.reader import CellResults, Results, synchronous_twin
 from vlagents_ray.evaluate.results.statistics import Pairs, difference_interval, holm
 
@@ -159,6 +160,17 @@ def _require_same_env(cell: CellResults, other: CellResults) -> None:
                 f"compare: {cell.env!r} had {name} {one.get(name)!r} for {cell.contender!r}, but {two.get(name)!r} for "
                 f"{other.contender!r}; evaluate both alike, or name the suites apart"
             )
+    if odd := program_changes(f"env {cell.env}", cell.program or None, other.program or None):
+        raise ConfigError(
+            f"compare: {cell.contender!r} and {other.contender!r} were not played in the same environment:\n"
+            f"{listed(odd)}\nevaluate both with the same files"
+        )
+    programs = {one.env_program for each in (cell, other) for one in each.episodes if one.counts} - {None}
+    if len(programs) > 1:
+        raise ConfigError(
+            f"compare: episodes of {cell.contender!r} and {other.contender!r} in {cell.env!r} were played with "
+            f"{len(programs)} versions of its files, as --accept-changes allowed; evaluate both again in a new folder"
+        )
 
 
 def _of_env(cell: CellResults) -> dict[str, Any]:

@@ -26,13 +26,13 @@ VERSION = 3
 SCHEMA = """
 CREATE TABLE runs (
     run INTEGER PRIMARY KEY, started REAL NOT NULL, ended REAL, state TEXT NOT NULL,
-    config TEXT NOT NULL, versions TEXT NOT NULL
+    config TEXT NOT NULL, versions TEXT NOT NULL, changes TEXT
 );
 CREATE TABLE policies (name TEXT PRIMARY KEY, metadata TEXT NOT NULL);
 CREATE TABLE cells (
     cell TEXT PRIMARY KEY, policy TEXT NOT NULL, step INTEGER, suite TEXT NOT NULL, env TEXT NOT NULL,
     planned INTEGER NOT NULL, seeds TEXT NOT NULL, stop TEXT, settings TEXT NOT NULL, described TEXT, contract TEXT,
-    code TEXT
+    code TEXT, program TEXT
 );
 CREATE TABLE episodes (
     key TEXT PRIMARY KEY, cell TEXT NOT NULL REFERENCES cells, env TEXT NOT NULL, episode INTEGER NOT NULL,
@@ -43,8 +43,8 @@ CREATE TABLE episodes (
     ticks_waited INTEGER NOT NULL, ticks_held INTEGER NOT NULL,
     timing_ms TEXT NOT NULL, transport TEXT NOT NULL, checkpoint TEXT, weights TEXT, revision TEXT,
     policy_version INTEGER, policy_fingerprint TEXT, first_policy_version INTEGER,
-    actions_sha256 TEXT, videos TEXT NOT NULL, trajectory TEXT, attempts INTEGER NOT NULL,
-    run INTEGER NOT NULL REFERENCES runs, finished REAL NOT NULL
+    actions_sha256 TEXT, videos TEXT NOT NULL, trajectory TEXT, env_program TEXT, policy_program TEXT,
+    attempts INTEGER NOT NULL, run INTEGER NOT NULL REFERENCES runs, finished REAL NOT NULL
 );
 CREATE INDEX episodes_of_cells ON episodes (cell, checkpoint);
 CREATE TABLE attempts (
@@ -76,7 +76,11 @@ _COLUMNS = {
         "env_seconds": "REAL",
         "policy_seconds": "REAL",
         "revision": "TEXT",
-    }
+        "env_program": "TEXT",
+        "policy_program": "TEXT",
+    },
+    "cells": {"program": "TEXT"},
+    "runs": {"changes": "TEXT"},
 }
 
 

@@ -18,6 +18,7 @@ from vlagents_ray.evaluate.plan.cases import contender
 from vlagents_ray.evaluate.plan.config import StopConfig
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
 from vlagents_ray.evaluate.results import lock
+from vlagents_ray.evaluate.results.changes import Change
 from vlagents_ray.evaluate.results.database import FILE, RUNNING, read_only, require_readable
 from vlagents_ray.evaluate.results.statistics import Rate
 from vlagents_ray.evaluate.results.stopping import Stopping, pooled
@@ -36,6 +37,8 @@ class Episode:
     attempts: int
     run: int
     finished: float  # seconds since 1970
+    env_program: str | None = None  # stands for the files of its environment, None if it has none of its own
+    policy_program: str | None = None  # the same of its policy
     beyond: bool = False  # it is after the point at which its cell stopped, or no longer planned
 
     @property
@@ -85,6 +88,7 @@ class Run:
     state: str  # "complete", "interrupted", "out of time", "stopped" by an error, "running", or "killed"
     config: dict[str, Any]
     versions: dict[str, Any]
+    changes: tuple[Change, ...] = ()  # in the program since earlier runs, which this one was told to accept
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,6 +105,7 @@ class CellResults:
     described: dict[str, Any]  # `EvalEnv.describe()`; {} if no worker has made the env
     contract: dict[str, Any]
     code: dict[str, Any]  # of the env: commit, dirty, diff_sha256; {} if it is in no git repository
+    program: dict[str, str]  # digests of the env's files by their names; {} for an installed env
     episodes: tuple[Episode, ...]  # by seed
     attempts: tuple[Attempt, ...]
     stop: StopConfig | None = None  # the rule by which it could stop early
@@ -137,6 +142,11 @@ class Results:
     policies: dict[str, dict[str, Any]]  # the metadata of each policy's server, by the policy's name
     workers: tuple[Worker, ...] = ()  # in the order of time; empty for old results
     parts: tuple[Path, ...] = ()  # the folders, below `out`, if several were read as one (`combined`)
+
+    @property
+    def accepted_changes(self) -> list[Change]:
+        """What changed in files or weights between episodes, and was to be accepted."""
+        return list(dict.fromkeys(change for run in self.runs for change in run.changes))
 
     @classmethod
     def load(cls, out: str | Path) -> Results:
@@ -256,12 +266,14 @@ def episode_of(row: dict[str, Any]) -> Episode:
     result = EpisodeResult(**known | {"key": key, "timing_ms": json.loads(row["timing_ms"])})
     videos = tuple(require_below(path) for path in json.loads(row["videos"]))
     trajectory = None if row["trajectory"] is None else require_below(row["trajectory"])
-    return Episode(result, videos, trajectory, row["attempts"], row["run"], row["finished"])
+    programs = row.get("env_program"), row.get("policy_program")
+    return Episode(result, videos, trajectory, row["attempts"], row["run"], row["finished"], *programs)
 
 
 def _cell(row: dict[str, Any], episodes: tuple[Episode, ...], attempts: tuple[Attempt, ...]) -> CellResults:
     seeds, rule = json.loads(row.pop("seeds")), row.pop("stop")
-    parsed = {name: json.loads(row[name] or "{}") for name in ("settings", "described", "contract", "code")}
+    names = ("settings", "described", "contract", "code", "program")
+    parsed = {name: json.loads(row.get(name) or "{}") for name in names}
     each = row["planned"] // len(seeds)
     episodes = tuple(replace(one, beyond=not _is_planned(one.result.key, seeds, each)) for one in episodes)
     stop, stopped_at = None, None
@@ -283,7 +295,8 @@ def _is_planned(key: EpisodeKey, seeds: Sequence[int], each: int) -> bool:
 
 
 def _run(row: dict[str, Any]) -> Run:
-    return Run(**row | {name: json.loads(row[name]) for name in ("config", "versions")})
+    changes = tuple(Change(**one) for one in json.loads(row.get("changes") or "[]"))
+    return Run(**row | {name: json.loads(row[name]) for name in ("config", "versions")} | {"changes": changes})
 
 
 def rate_of(cells: Sequence[CellResults], what: Literal["success_once", "success_at_end"]) -> Rate:

@@ -22,24 +22,17 @@ from vlagents_ray.evaluate.plan.cases import EvalCase, cells
 from vlagents_ray.evaluate.plan.config import EvalConfig, canonical
 from vlagents_ray.evaluate.plan.jobs import Job
 from vlagents_ray.evaluate.results import database, lock
+from vlagents_ray.evaluate.results.changes import (
+    IDENTITY,
+    MIX,
+    Change,
+    listed,
+    policy_changes,
+    policy_program,
+    program_changes,
+    program_id,
+)
 from vlagents_ray.evaluate.results.database import RUNNING, SCHEMA, VERSION, complete, insert, require_readable
-
-IDENTITY = ("policy", "checkpoint", "weights")  # of a policy's metadata; must not change between runs
-
-
-def changed(known: dict[str, Any], now: dict[str, Any], *, swept: bool) -> str | None:
-    """The field of a policy's identity that differs between two metadata of its server; None if none does.
-
-    Older servers report no weights. In a sweep (`swept`) sessions choose their checkpoint, whatever the server's is.
-    """
-    for field in IDENTITY[:1] if swept else IDENTITY:
-        before, after = known.get(field), now.get(field)
-        if field == "weights":
-            if before and after and before["digest"] != after["digest"]:
-                return field
-        elif before != after:
-            return field
-    return None
 
 
 class Store:
@@ -49,8 +42,8 @@ class Store:
         """Open or begin the results in `config.out`.
 
         Raises:
-            ConfigError: There are results and `config.resume` is off, they have other settings, or another evaluation
-                is writing there.
+            ConfigError: There are results and `config.resume` is off, they have other settings or another program and
+                `config.accept_changes` is off, or another evaluation is writing there.
             StorageFailed: Nothing can be written there.
         """
         self.cells = cells(config)
@@ -60,6 +53,10 @@ class Store:
             self._out.mkdir(parents=True, exist_ok=True)
             self._lock = lock.acquire(self._out)
         self._run = 0
+        self._accepts = config.accept_changes
+        self._changes: list[Change] = []  # accepted in this run
+        self._accepted: set[Hashable] = set()  # policies, cells and places whose change was accepted in this run
+        self._policy_programs: dict[str, str | None] = {}  # by policy; of this run
         self._cell = {cell.fingerprint: cell for cell in self.cells}
         self._weights: dict[Hashable, str] = {}  # by cell, and by (policy, step, checkpoint); read when first needed
         self._made: set[str] = set()  # places whose env is known to be that of earlier runs
@@ -92,6 +89,9 @@ class Store:
             )
             cursor = self._db.execute("INSERT INTO runs (started, state, config, versions) VALUES (?, ?, ?, ?)", row)
             self._run = int(cursor.lastrowid or 0)
+            self._write_changes()
+            programs = [(canonical(cell.program), cell.fingerprint) for cell in self.cells]
+            self._db.executemany("UPDATE cells SET program = ? WHERE cell = ?", programs)
 
     def end_run(self, state: str) -> None:
         """Record how the run ended."""
@@ -131,6 +131,8 @@ class Store:
             "timing_ms": canonical(result.timing_ms),
             "videos": canonical(list(videos)),
             "trajectory": trajectory,
+            "env_program": program_id(self._cell[result.key.settings].program),
+            "policy_program": self._policy_programs.get(self._cell[result.key.settings].policy.name),
             "attempts": attempts,
             "run": self._run,
             "finished": time.time() if finished is None else finished,
@@ -175,11 +177,29 @@ class Store:
         for of in (cell.fingerprint, (cell.policy.name, cell.step, result.checkpoint)):
             known = self._weights.setdefault(of, result.weights)
             if result.weights != known:
-                raise ConfigError(
-                    f"policy: {result.key} was played by other weights than the results in {self._out}: "
-                    f"{result.checkpoint!r} is {result.weights} now, and was {known}. Bring the old weights "
-                    f"back, or choose another out folder"
-                )
+                change = Change(f"policy {cell.contender}", result.checkpoint or "weights", known, result.weights)
+                self._accept_or_raise(of, [change], f"{result.key} was played by other weights than the results in")
+                self._weights[of] = result.weights
+
+    def _accept_or_raise(self, what: Hashable, changes: list[Change], where: str, cure: str = MIX) -> None:
+        """Note changes since earlier runs, once for each `what` in a run; raise `ConfigError` unless they are accepted.
+
+        A second change within a run comes from processes that have different files.
+        """
+        if not changes:
+            return
+        if not self._accepts or what in self._accepted:
+            cure = "all processes of a run need the same files" if self._accepts else cure
+            raise ConfigError(f"{where} {self._out}:\n{listed(changes)}\n{cure}")
+        self._accepted.add(what)
+        self._changes += [one for one in changes if one not in self._changes]
+        if self._run:
+            with self._db:
+                self._write_changes()
+
+    def _write_changes(self) -> None:
+        value = canonical([asdict(one) for one in self._changes])
+        self._db.execute("UPDATE runs SET changes = ? WHERE run = ?", (value, self._run))
 
     def record_attempt(self, job: Job, failure: Failure, *, retried: bool) -> None:
         """Record an attempt that infrastructure failed."""
@@ -196,9 +216,17 @@ class Store:
     def note_env(self, place: str, made: EnvInfo) -> None:
         """Record the description, contract and code of the env of the cells at `place`.
 
-        Raises `ConfigError` if description or contract differ from an earlier run, as after an update of the simulator.
+        Raises `ConfigError` if description or contract differ from an earlier run, as after an update of the simulator,
+        or if the worker has other files than the process that made the plan.
         """
-        self._require_same_env(place, made)
+        [cell, *_] = [cell for cell in self.cells if cell.place == place]
+        odd = program_changes(f"env {cell.env}", cell.program, made.program)
+        if any(one.was is not None for one in odd):  # the environment may write a file that its settings name
+            raise ConfigError(
+                f"the worker on {made.host} has other files than this process, or they were edited since the start:\n"
+                f"{listed(odd)}\ngive both the same files, and go on with --resume"
+            )
+        self._require_same_env(cell, made)
         code = {} if made.code is None else made.code.to_json()
         found = (json.dumps(made.described, default=str), canonical(made.contract), canonical(code))
         with self._db:
@@ -207,37 +235,38 @@ class Store:
                 [(*found, cell.fingerprint) for cell in self.cells if cell.place == place],
             )
 
-    def _require_same_env(self, place: str, made: EnvInfo) -> None:
-        if place in self._made:  # by another worker of this run; nodes may differ in what they describe
+    def _require_same_env(self, cell: EvalCase, made: EnvInfo) -> None:
+        if cell.place in self._made:  # by another worker of this run; nodes may differ in what they describe
             return
-        self._made.add(place)
-        [cell, *_] = [cell for cell in self.cells if cell.place == place]
+        self._made.add(cell.place)
         query = "SELECT described, contract FROM cells WHERE cell = ? AND described IS NOT NULL"
         known = self._db.execute(query, (cell.fingerprint,)).fetchone()
         if known is None:
             return
         now = (json.loads(json.dumps(made.described, default=str)), json.loads(canonical(made.contract)))
-        for what, old, new in zip(
-            ("says of itself", "states in its contract"), map(json.loads, known), now, strict=True
-        ):
-            if odd := [
-                f"{name}: {old.get(name)!r}, now {new.get(name)!r}" for name in new if old.get(name) != new[name]
-            ]:
-                raise ConfigError(
-                    f"env {cell.env}: what it {what} has changed since the results in {self._out}: {'; '.join(odd)}; "
-                    f"go on with what they were made with, or choose another out folder"
-                )
+        odd = [
+            Change(f"env {cell.env}", f"{what} {name!r}", repr(old.get(name)), repr(new[name]))
+            for what, old, new in zip(("its description", "its contract"), map(json.loads, known), now, strict=True)
+            for name in new
+            if old.get(name) != new[name]
+        ]
+        self._accept_or_raise(cell.place, odd, "the environment is not that of the results in")
 
     def note_policy(self, name: str, metadata: dict[str, Any]) -> None:
         """Record the metadata of a policy's server; raises `ConfigError` if it is another policy than before."""
         row = self._db.execute("SELECT metadata FROM policies WHERE name = ?", (name,)).fetchone()
         known = None if row is None else json.loads(row[0])
         swept = any(cell.step is not None for cell in self.cells if cell.policy.name == name)
-        if known is not None and (what := changed(known, metadata, swept=swept)):
-            raise ConfigError(
-                f"policy {name!r}: the server has {what} {metadata.get(what)!r}, the results in {self._out} are of "
-                f"{known.get(what)!r}; serve that one again, or choose another out folder"
-            )
+        if known is not None:
+            what = next((one for one in IDENTITY[: 1 if swept else 2] if known.get(one) != metadata.get(one)), None)
+            if what is not None:
+                raise ConfigError(
+                    f"policy {name!r}: the server has {what} {metadata.get(what)!r}, the results in {self._out} are of "
+                    f"{known.get(what)!r}; serve that one again, or choose another out folder"
+                )
+            odd = policy_changes(f"policy {name}", known, metadata, swept=swept)
+            self._accept_or_raise(("policy", name), odd, "the policy is not that of the results in")
+        self._policy_programs[name] = program_id(policy_program(metadata, swept=swept))
         with self._db:
             value = json.dumps(metadata, default=str)
             self._db.execute("INSERT OR REPLACE INTO policies VALUES (?, ?)", (name, value))
@@ -277,6 +306,32 @@ class Store:
                 + "\n".join(found)
                 + "\ntake the old settings, or choose another out folder"
             )
+        lacking, programs = self._other_plan(db), self._other_programs(db)
+        self._accept_or_raise(
+            "plan",
+            lacking,
+            "this plan is not that of the results in",
+            "plan these, too; give a new folder (--out); or add to the results and have the report say so "
+            "(--accept-changes)",
+        )
+        self._accept_or_raise("program", programs, "the environment is not that of the results in")
+
+    def _other_plan(self, db: sqlite3.Connection) -> list[Change]:
+        """What the results have and this plan lacks: a plan may grow, and steps of a policy may follow one another."""
+        mine = {(cell.policy.name, cell.suite.name, cell.env) for cell in self.cells}
+        rows = db.execute("SELECT DISTINCT policy, suite, env FROM cells WHERE cell IN (SELECT cell FROM episodes)")
+        gone = [" ".join(filter(None, row)) for row in rows if row not in mine]
+        return [Change("plan", name, "in it", None) for name in gone]
+
+    def _other_programs(self, db: sqlite3.Connection) -> list[Change]:
+        """The files of environments that are not what the results were played with."""
+        found: dict[Change, None] = {}  # in the order of the plan
+        for cell in self.cells:
+            query = "SELECT program FROM cells WHERE env = ? AND program IS NOT NULL AND cell = ?"
+            row = db.execute(query, (cell.env, cell.fingerprint)).fetchone()
+            if row is not None:
+                found |= dict.fromkeys(program_changes(f"env {cell.env}", json.loads(row[0]), cell.program))
+        return list(found)
 
     def _note_cells(self, db: sqlite3.Connection, config: EvalConfig) -> None:
         stop = config.stop.model_dump_json() if config.stop else None
@@ -285,9 +340,10 @@ class Store:
                 identity = (cell.policy.name, cell.step, cell.suite.name, cell.env)
                 extent = (cell.planned, canonical(cell.suite.seeds), stop)
                 db.execute(
-                    "INSERT INTO cells (cell, policy, step, suite, env, settings, planned, seeds, stop)"
-                    " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?) ON CONFLICT DO UPDATE SET planned = ?, seeds = ?, stop = ?",
-                    (cell.fingerprint, *identity, canonical(cell.settings), *extent, *extent),
+                    "INSERT INTO cells (cell, policy, step, suite, env, settings, planned, seeds, stop, program)"
+                    " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)"
+                    " ON CONFLICT DO UPDATE SET planned = ?, seeds = ?, stop = ?",
+                    (cell.fingerprint, *identity, canonical(cell.settings), *extent, canonical(cell.program), *extent),
                 )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -152,6 +153,7 @@ class Summary:
             | {"pushed_weights": pushed_of(cell)}
             | {"settings": cell.settings, "env": cell.env}
             | {"described": cell.described, "contract": cell.contract, "code": cell.code}
+            | {"program": cell.program}
             | {"stopped_at": cell.stopped_at, "gap_to_synchronous": gap_to_synchronous(self.results, cell)}
             for group, cell in zip(self.cells, self.results.cells, strict=True)
         ]  # fmt: skip
@@ -167,6 +169,7 @@ class Summary:
             "env_busy": self.env_busy,
             "policy_busy": self.policy_busy,
             "transports": self.transports,
+            "accepted_changes": [asdict(one) for one in self.results.accepted_changes],
             "policies": self.results.policies,
             "versions": last.versions,
             "config": last.config,
@@ -210,6 +213,28 @@ def pushed_of(cell: CellResults) -> str | None:
         return None
     first, last = min(numbers), max(numbers)
     return f"version {last} ({named[last]})" if first == last else f"versions {first} to {last}, one after the other"
+
+
+def cause_of(error: str) -> str:
+    """The first line of an error, without the numbers and ids in which errors of one cause differ."""
+    return re.sub(r"[0-9a-f]{8,}|\d+(\.\d+)?", "…", error.strip().partition("\n")[0])
+
+
+def errors_of_policies(results: Results) -> list[tuple[tuple[str, str, str], int]]:
+    """Errors that ended episodes: (policy id, task, an error of the cause), and how many episodes it ended."""
+    found: dict[tuple[str, str, str], list[str]] = {}
+    for cell in results.cells:
+        for one in cell.counted:
+            if one.status == "policy_error":
+                error = one.error or ""
+                found.setdefault((cell.contender, cell.task, cause_of(error)), []).append(error)
+    return [((policy, task, errors[0]), len(errors)) for (policy, task, _), errors in found.items()]
+
+
+def failing_cells(results: Results) -> list[CellResults]:
+    """The cells of which every episode ended by an error of the policy."""
+    outcomes = [(cell, {one.status for one in cell.counted}) for cell in results.cells]
+    return [cell for cell, statuses in outcomes if statuses == {"policy_error"}]
 
 
 def write_summary(summary: Summary) -> Path:

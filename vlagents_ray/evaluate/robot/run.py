@@ -16,9 +16,10 @@ from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult
 from vlagents_ray.evaluate.plan.cases import EvalCase, cells
 from vlagents_ray.evaluate.plan.config import EvalConfig
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
+from vlagents_ray.evaluate.results.changes import changed
 from vlagents_ray.evaluate.results.database import FILE as RESULTS
 from vlagents_ray.evaluate.results.stopping import Stopping
-from vlagents_ray.evaluate.results.store import Store, changed
+from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.evaluate.results.summary import Summary
 from vlagents_ray.evaluate.robot.operator import Operator, Verdict, VisibleTrial
 from vlagents_ray.evaluate.robot.pictures import save_start, start_pictures

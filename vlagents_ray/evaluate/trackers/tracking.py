@@ -11,9 +11,9 @@ from typing import Any
 
 from vlagents_ray.evaluate.artifacts.storage import PROVENANCE
 from vlagents_ray.evaluate.plan.config import EvalConfig, Tracker, fingerprint
+from vlagents_ray.evaluate.results.changes import IDENTITY
 from vlagents_ray.evaluate.results.database import FILE, WAIT_S
 from vlagents_ray.evaluate.results.reader import CellResults, Results
-from vlagents_ray.evaluate.results.store import IDENTITY
 from vlagents_ray.evaluate.results.summary import Group, summarize
 from vlagents_ray.evaluate.trackers.base import About, TrackerRun
 from vlagents_ray.registry import named_class, require

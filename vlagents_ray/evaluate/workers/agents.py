@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from typing import Any
 
 from vlagents_ray.client import RemoteAgent
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.plan.config import EvalConfig, PolicyConfig
 from vlagents_ray.interface import Agent
+from vlagents_ray.policies.base.program import Program, code_of_class, files_named
 from vlagents_ray.protocol.messages import RankName
 
 AgentFactory = Callable[[PolicyConfig], Agent]
@@ -45,3 +47,13 @@ def _remote_agent(config: EvalConfig, rank: RankName, policy: PolicyConfig) -> R
         rank=rank,
         resume=False,  # an interrupted episode is played again, so that its result depends only on its key
     )
+
+
+def factory_program(make: Callable[[], Agent]) -> Program:
+    """Return the files of the module that defines `make`, and those that the arguments of a `partial` name."""
+    settings: dict[str, Any] = {}
+    if isinstance(make, functools.partial):
+        settings = {**{str(i): value for i, value in enumerate(make.args)}, **make.keywords}
+        make = make.func
+    module = getattr(make, "__module__", None) or type(make).__module__
+    return code_of_class(module) | files_named(settings)

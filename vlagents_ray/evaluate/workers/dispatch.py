@@ -1,10 +1,10 @@
-"""Jobs for the workers of a pool, and what follows from an attempt that failed."""
+"""Jobs for the workers of a pool, and what follows from attempts and episodes that failed."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
-from vlagents_ray.errors import from_code
+from vlagents_ray.errors import PolicyFailed, from_code
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.plan.config import EvalConfig
 from vlagents_ray.evaluate.plan.jobs import Job, JobQueue
@@ -27,6 +27,7 @@ class FailedAttempts:
     def __init__(self, config: EvalConfig) -> None:
         self._config = config
         self._lost = 0  # episodes in a row
+        self._policy_errors = 0  # episodes in a row
 
     def repeats(self, job: Job, failure: Failure) -> bool:
         """Whether the episode of a failed attempt is to be played again."""
@@ -34,7 +35,20 @@ class FailedAttempts:
 
     def note_played(self) -> None:
         """Note that an episode was played to its end."""
-        self._lost = 0
+        self._lost = self._policy_errors = 0
+
+    def note_policy_error(self, error: str) -> None:
+        """Note that an error of the policy ended an episode.
+
+        Raises:
+            PolicyFailed: The error, if it ended too many episodes in a row.
+        """
+        self._policy_errors += 1
+        if self._policy_errors == self._config.abort_after:
+            raise PolicyFailed(
+                f"{self._policy_errors} episodes in a row ended by an error of the policy: {error.strip()}; mend the "
+                f"policy and evaluate it with a new --out, or raise abort_after"
+            )
 
     def note_lost(self, failure: Failure, cure: str) -> None:
         """Note that an episode was lost, its last attempt to `failure`.

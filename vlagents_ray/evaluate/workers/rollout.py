@@ -28,12 +28,15 @@ from vlagents_ray.evaluate.artifacts.recorder import Artifacts, EpisodeRecorder,
 from vlagents_ray.evaluate.episode.episode import Outcome, Phase, options_of_reset, run_episodes, transport_of
 from vlagents_ray.evaluate.episode.failures import Failure, env_side, explain, policy_side
 from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult, WorkerInfo
-from vlagents_ray.evaluate.plan.cases import EvalCase
+from vlagents_ray.evaluate.plan.cases import EvalCase, env_program
 from vlagents_ray.evaluate.plan.config import EvalConfig, PolicyConfig
 from vlagents_ray.evaluate.plan.jobs import Job
 from vlagents_ray.evaluate.workers.agents import AgentFactory
 from vlagents_ray.evaluate.workers.logs import own_logs
 from vlagents_ray.interface import Agent
+from vlagents_ray.policies.base.checkpoint import used_checkpoints
+from vlagents_ray.policies.base.checkpoint_files import weights_of
+from vlagents_ray.policies.base.program import loaded_code
 from vlagents_ray.protocol.json_messages import plain_values
 from vlagents_ray.ray_tools.git_state import GitState, code_of
 from vlagents_ray.registry import env_class
@@ -87,6 +90,7 @@ class Rollout:
         self._recorder_factory = recorder_factory
         self._agent: Agent | None = None
         self._policy: str | None = None  # the policy of the agent
+        self._described: dict[str, Any] = {}  # of an agent without a server: its weights
         self._broken_agents = 0  # in a row
         self._sessions: list[Agent] = []  # further sessions of the agent, for episodes side by side
         self._env: BatchEnv | None = None
@@ -138,11 +142,12 @@ class Rollout:
         cell = jobs[0].cell
         if self._agent is None or self._policy != cell.policy.name:
             self._agent = self._connect(cell.policy)
-            setup.policy = _metadata(self._agent)
+            setup.policy = self._described or _metadata(self._agent)
         if self._env is None or self._place != cell.place:
             self._env = self._make_env(cell)
             # The driver may have another numpy, which cannot read this one's pickles.
             setup.env = EnvInfo(plain_values(self._env.describe()), self._env.contract.to_json(), _code(cell))
+            setup.env = replace(setup.env, program=env_program(cell, loaded_code), host=socket.gethostname())
         agent, env = self._agent, self._env
         if setup.env is not None or setup.policy is not None:
             require_match(agent.contract, env.contract)
@@ -223,12 +228,14 @@ class Rollout:
         with policy_side("start"):
             agent = self._agent_factory(policy)
         try:
-            with policy_side("initialize"):
+            with policy_side("initialize"), used_checkpoints() as found:
                 agent.initialize()
                 _metadata(agent)  # fetches the metadata, which checks that the server runs and knows the policy
         except VLAgentsError:
             agent.close()
             raise
+        weights = agent.weights_id or weights_of(found)
+        self._described = {"weights": weights} if weights and not hasattr(agent, "metadata") else {}
         self._policy = policy.name
         return agent
 

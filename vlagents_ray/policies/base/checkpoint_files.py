@@ -148,7 +148,7 @@ def digest(paths: Iterable[Path]) -> str:
     """
     found = hashlib.sha256()
     for path in paths:
-        for file in _files(path):
+        for file in files_in(path):
             name = file.name if file == path else file.relative_to(path).as_posix()
             with contextlib.suppress(OSError):  # unreadable or gone, so it was not loaded
                 size = file.stat().st_size
@@ -166,7 +166,8 @@ def revision(path: Path) -> str | None:
     return next((commit for commit in commits if _COMMIT.fullmatch(commit)), None)
 
 
-def _files(path: Path) -> list[Path]:
+def files_in(path: Path) -> list[Path]:
+    """Return the files of a checkpoint that count for its digest, in the order of their names."""
     if path.is_file():
         return [path]
     return sorted(_below(path, frozenset()))

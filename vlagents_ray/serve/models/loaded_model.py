@@ -16,11 +16,13 @@ from vlagents_ray.errors import UnknownSession
 from vlagents_ray.interface import Agent, Obs
 from vlagents_ray.policies.base.checkpoint import used_checkpoints
 from vlagents_ray.policies.base.checkpoint_files import weights_of
+from vlagents_ray.policies.base.program import Program, digest_of, files_named, with_defaults
 from vlagents_ray.policies.compilation.cuda_graph import CAPTURES
 from vlagents_ray.policies.loading import LoadingReport, loading_report
+from vlagents_ray.policies.wrapper import Wrapper
 from vlagents_ray.protocol.messages import Request
 from vlagents_ray.serve.models.agent_copies import AgentCopies
-from vlagents_ray.serve.models.checkpoints import Checkpoints, resolved
+from vlagents_ray.serve.models.checkpoints import CHOICE, Checkpoints, resolved
 from vlagents_ray.serve.models.padding import Padding, powers_up_to
 from vlagents_ray.serve.queue.call_limits import LOAD, PolicyCall, PolicyCalls
 from vlagents_ray.serve.queue.checkpoint_choice import CheckpointChoice
@@ -42,6 +44,7 @@ class LoadedModel:
     copies: AgentCopies
     padding: Padding
     weights: dict[str, Any] | None  # digest and revision, see `Agent.weights_id`
+    files: Program  # digests of the files that its settings name
     version: tuple[str, str]  # equal in replicas that can take over each other's sessions of this model
     calls: PolicyCalls  # running calls of the replica, including those of this agent
     parameters: ModelWeights  # versions of the weights
@@ -163,6 +166,13 @@ class Loader:
             ):
                 agent.initialize()
             weights = agent.weights_id or weights_of(found)
+            policy = agent
+            while isinstance(policy, Wrapper):
+                policy = policy.agent
+            named = with_defaults(type(policy), settings)
+            files = files_named({**named, CHOICE: resolved(named)}, folders=not weights)
+            if weights is None and files:
+                weights = {"digest": digest_of(files), "revision": None}
             contract = agent.contract
             self._check(contract)
             copies = AgentCopies(agent)
@@ -187,6 +197,7 @@ class Loader:
             copies,
             padding,
             weights,
+            files,
             version,
             calls,
             parameters,

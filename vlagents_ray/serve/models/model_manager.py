@@ -19,6 +19,7 @@ from vlagents_ray.contract import Contract
 from vlagents_ray.errors import PolicyUnavailable, UnknownSession, VLAgentsError
 from vlagents_ray.interface import Agent, Parts
 from vlagents_ray.policies.base.accelerator import free_memory
+from vlagents_ray.policies.base.program import Program
 from vlagents_ray.serve.models.checkpoints import Checkpoints
 from vlagents_ray.serve.models.loaded_model import (
     LoadedModel,
@@ -53,6 +54,7 @@ class ModelManager:
         self.contract: Contract | None = None  # contract of the deployment's own model that was loaded last
         self.weights: dict[str, Any] | None = None  # weights of the deployment's own model that was loaded last
         self.devices: list[dict[str, Any]] = []  # on which that model computes
+        self.files: Program = {}  # digests of the files that the settings of that model name
         self.step = ""  # the step of a long first load, such as "compiling 4 rows (3 of 5)"
         self.on_step: Callable[[str], None] = lambda _: None  # called with it, on the thread that loads
         self._source = source
@@ -241,7 +243,7 @@ class ModelManager:
     def _set_own_model(self, model: LoadedModel) -> None:
         self.contract, self._fingerprint = model.contract, model.version[1]
         self.act_parts, self.continues_plans = model.agent.act_parts, model.agent.continues_plans
-        self.weights, self.devices = model.weights, model.report.devices
+        self.weights, self.files, self.devices = model.weights, model.files, model.report.devices
 
     def _loop(self) -> None:
         while (task := self._next_task()) is not None:

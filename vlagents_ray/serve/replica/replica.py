@@ -19,6 +19,7 @@ from starlette.types import ASGIApp
 
 from vlagents_ray.client.transports.serve_handle import ClientApi
 from vlagents_ray.errors import PolicyUnavailable
+from vlagents_ray.policies.base.program import loaded_code
 from vlagents_ray.protocol.messages import PROTOCOL_VERSION, SERVERS_MACHINE, boot_id
 from vlagents_ray.ray_tools.git_state import code_of
 from vlagents_ray.ray_tools.private import http_options, replica_is_ending
@@ -75,7 +76,11 @@ class PolicyReplica(EngineReplica, ReplicaWeights, ReplicaLive, ReplicaShadow, C
         self._gateways: dict[str, Any] = {}
         self._args = ServerArgs(**args)
         self._app = serve.get_replica_context().app_name
-        self._code = code_of(names("policies").get(self._args.policy, self._args.policy))
+        policy = names("policies").get(self._args.policy, self._args.policy)
+        self._code = code_of(policy)
+        wrappers = [name for one in self._args.wrappers for name in ([one] if isinstance(one, str) else one)]
+        wrappers = [names("wrappers").get(name, name) for name in wrappers]
+        self._program = {name: of for one in (policy, *wrappers) for name, of in loaded_code(one).items()}
         self._keys = self._args.access.keys()
         require_access(http_options().host or EVERYWHERE, self._keys, self._args.access.insecure)
         if self._keys is not None:
@@ -152,6 +157,7 @@ class PolicyReplica(EngineReplica, ReplicaWeights, ReplicaLive, ReplicaShadow, C
             "protocol": PROTOCOL_VERSION,
             "version": importlib.metadata.version("vlagents-ray"),
             "code": None if self._code is None else self._code.to_json(),
+            "program": self._program | models.files,
             "dialects": describe(self._args.dialects) | self._gateways,
             "local": None if self._local is None else asdict(self._local.address),
             "stream": None if self._stream is None else asdict(self._stream.address),

@@ -17,6 +17,7 @@ import numpy as np
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.artifacts.storage import outcome
 from vlagents_ray.evaluate.results.reader import Attempt, CellResults, Episode, Results
+from vlagents_ray.evaluate.results.summary import errors_of_policies
 from vlagents_ray.images.jpeg_png import encode_jpeg
 from vlagents_ray.registry import require
 
@@ -179,14 +180,12 @@ def failures(results: Results, gallery: Gallery) -> Failures | None:
 def errors(results: Results) -> Errors | None:
     """What broke, with the logs; None if nothing did."""
     recorded = [(cell, one.result) for cell in results.cells for one in cell.episodes]
-    broken = [
-        (cell.contender, cell.task, result.error or "") for cell, result in recorded if result.status == "policy_error"
-    ]
+    broken = errors_of_policies(results)
     attempts = [(cell, attempt) for cell in results.cells for attempt in cell.attempts]
     if not broken and not attempts:
         return None
     return Errors(
-        collections.Counter(broken).most_common(MOST_ERRORS),
+        sorted(broken, key=lambda one: -one[1])[:MOST_ERRORS],
         attempts[:MOST_LOGS],
         len(attempts),
         sum(attempt.retried for _, attempt in attempts),

@@ -10,6 +10,7 @@ from typing import Any
 import yaml
 
 from vlagents_ray.evaluate.plan.config import EvalConfig
+from vlagents_ray.evaluate.results.changes import Change
 from vlagents_ray.evaluate.results.reader import CellResults, Results, Run
 from vlagents_ray.evaluate.results.statistics import Rate
 from vlagents_ray.evaluate.results.summary import (
@@ -42,6 +43,8 @@ class Configuration:
     """Runs, workers, versions, the metadata of each policy's server, and all settings."""
 
     runs: tuple[Run, ...]
+    changes: list[Change]  # of files or weights, between episodes
+    programs: list[tuple[str, Mapping[str, str]]]  # (env, digests of its files)
     checkpoints: list[tuple[str, str]]  # (policy id, checkpoint, commit, digest or version of its weights)
     workers: list[tuple[str, str, str, str, int]]  # (host, policy, transport, renderer, workers)
     versions: list[Mapping[str, Any]]  # of each folder
@@ -98,6 +101,8 @@ def configuration(results: Results) -> Configuration:
     last = _last_runs(results)
     return Configuration(
         results.runs,
+        results.accepted_changes,
+        list({cell.env: (cell.env, cell.program) for cell in results.cells if cell.program}.values()),
         list(dict.fromkeys(named)),
         [(*where, len(alike)) for where, alike in sorted(workers.items())],
         [{name: value for name, value in run.versions.items() if value is not None} for run in last],
@@ -146,7 +151,7 @@ def _quote(name: str, cells: list[CellResults], version: str | None) -> Quote:
 def _again(run: Run) -> Again:
     """The settings as a file. A policy that was served for the run is served again: its address is left out."""
     config = EvalConfig.model_validate(run.config)
-    document = config.model_dump(mode="json", exclude_defaults=True, exclude={"out", "resume"})
+    document = config.model_dump(mode="json", exclude_defaults=True, exclude={"out", "resume", "accept_changes"})
     for policy in document["policies"]:
         if policy.get("source") is not None:
             policy.pop("url", None)

@@ -1,0 +1,81 @@
+"""What changed in the program of an evaluation: the files and weights of its policies and environments."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from vlagents_ray.evaluate.plan.config import fingerprint
+
+IDENTITY = ("policy", "checkpoint", "weights")  # of a policy's metadata
+_SWEPT = "checkpoint: "  # begins the name of a file that each step of a sweep has for itself
+_DIGITS = 12  # of a digest that a person reads
+MIX = "bring the old files back, give a new folder (--out), or mix both and have the report say so (--accept-changes)"
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """A file, a digest or a setting that is not what the earlier episodes were played with."""
+
+    subject: str  # "env my_envs:Reach", "policy pi0", or "plan"
+    name: str  # of the file, or of what it is
+    was: str | None  # its digest; None if there was none
+    now: str | None
+
+    def __str__(self) -> str:
+        return f"{self.subject}: {self.name} was {_short(self.was)}, is {_short(self.now)}"
+
+
+def listed(changes: Sequence[Change]) -> str:
+    """A line for each change, for an error."""
+    return "\n".join(f"- {one}" for one in changes)
+
+
+def program_changes(subject: str, was: Mapping[str, str] | None, now: Mapping[str, str] | None) -> list[Change]:
+    """Compare two programs by file; nothing is known to have changed where one of them is None."""
+    if was is None or now is None:
+        return []
+    names = sorted(name for name in was.keys() | now.keys() if was.get(name) != now.get(name))
+    return [Change(subject, name, was.get(name), now.get(name)) for name in names]
+
+
+def changed(known: Mapping[str, Any], now: Mapping[str, Any], *, swept: bool) -> str | None:
+    """The field of a policy's identity that differs between two metadata of its server; None if none does.
+
+    In a sweep (`swept`) sessions choose their checkpoint, whatever the server's is.
+    """
+    for field in IDENTITY[: 1 if swept else 2]:
+        if known.get(field) != now.get(field):
+            return field
+    found = policy_changes("", known, now, swept=swept)
+    return None if not found else "weights" if found[-1].name == "weights" else "program"
+
+
+def policy_changes(subject: str, known: Mapping[str, Any], now: Mapping[str, Any], *, swept: bool) -> list[Change]:
+    """Compare the files and the weights that two metadata of a policy's server state; the weights come last."""
+    found = program_changes(subject, policy_program(known, swept=swept), policy_program(now, swept=swept))
+    before, after = known.get("weights"), now.get("weights")
+    if not swept and before and after and before["digest"] != after["digest"]:
+        found.append(Change(subject, "weights", before["digest"], after["digest"]))
+    return found
+
+
+def policy_program(metadata: Mapping[str, Any], *, swept: bool) -> dict[str, str] | None:
+    """The program that a policy's server states; None if it states none."""
+    program = metadata.get("program")
+    if program is None:
+        return None
+    return {name: value for name, value in program.items() if not (swept and name.startswith(_SWEPT))}
+
+
+def program_id(program: Mapping[str, str] | None) -> str | None:
+    """16 digits that stand for a program; None for one without files of its own."""
+    return fingerprint(dict(program)) if program else None
+
+
+def _short(value: str | None) -> str:
+    if value is None:
+        return "not there"
+    method, colon, digits = value.rpartition(":")
+    return f"{method}:{digits[:_DIGITS]}" if colon and len(digits) == 64 else value

@@ -1,0 +1,180 @@
+"""Digests of the files that make a policy or an environment: the code of its class, and what its settings name."""
+
+from __future__ import annotations
+
+import ast
+import functools
+import hashlib
+import inspect
+import json
+import sys
+import sysconfig
+from collections.abc import Iterator, Mapping
+from importlib.machinery import ModuleSpec, PathFinder
+from importlib.metadata import packages_distributions, version
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from vlagents_ray.policies.base.checkpoint import STEP, at_step
+from vlagents_ray.policies.base.checkpoint_files import METHOD, digest, files_in
+
+_PACKAGE = "vlagents_ray"  # its classes are identified by the version of this package, which the results have
+_LIBRARIES = tuple(Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "platstdlib", "purelib", "platlib"))
+_SITES = {"site-packages", "dist-packages"}
+_LISTED = 32  # files of a folder that are named one by one; of a larger folder there is one digest
+_LONGEST = 4096  # characters of a path
+
+Program = dict[str, str]  # digest, or the version of an installed package, by name
+
+
+def code_of_class(target: str) -> Program:
+    """Return the digests of the module of "module:Class", and of all that it imports, directly or not.
+
+    Modules are found as Python's `import` would find them, but nothing is imported: import statements are read from the
+    source, those within functions included. Installed packages and the standard library do not count; a class in an
+    installed package is identified by the version of its distribution, one of this package by nothing.
+
+    Args:
+        target: "module:Class" or "module".
+
+    Returns:
+        `sha256:` and 64 digits for each file, by its path below the folder that Python imports it from.
+    """
+    module = target.partition(":")[0]
+    top = module.partition(".")[0]
+    if not top.isidentifier() or top == _PACKAGE:
+        return {}
+    found: Program = {}
+    waiting, seen = [module], set()
+    while waiting:
+        name = waiting.pop()
+        if name in seen:
+            continue
+        seen.add(name)
+        if "." in name:
+            waiting.append(name.rpartition(".")[0])  # a package is executed before its modules
+        file = _file(name)
+        if file is None or not _is_own(file):
+            continue
+        content = file.read_bytes()
+        inside = name if file.stem == "__init__" else name.rpartition(".")[0]
+        folder = Path(*inside.split(".")) if inside else Path()
+        found[(folder / file.name).as_posix()] = f"sha256:{hashlib.sha256(content).hexdigest()}"
+        if file.suffix == ".py":
+            waiting += _imports(content, inside)
+    if not found and top != "__main__":
+        found = {name: f"version {version(name)}" for name in sorted(set(packages_distributions().get(top, ())))}
+    return found
+
+
+loaded_code = functools.cache(code_of_class)
+"""`code_of_class` as it was at the first call in this process: later edits do not change the running code."""
+
+
+def files_named(settings: Mapping[str, Any], *, folders: bool = True) -> Program:
+    """Return the digests of the files that settings name, by setting and path: "checkpoint: runs/a/w.npz".
+
+    Args:
+        settings: Any text in them that is the path of an existing file or folder counts; `{step}` in it is replaced by
+            the setting `checkpoint_step`.
+        folders: Whether the files of folders count. A folder that holds the working directory never does.
+    """
+    step = settings.get("checkpoint_step")
+    found: Program = {}
+    for name, text in _texts(settings):
+        path = _existing(at_step(text, step) if isinstance(step, int) else text)
+        if path is None:
+            continue
+        if path.is_file():
+            found[f"{name}: {path}"] = digest([path])
+        elif folders and not Path.cwd().resolve().is_relative_to(path.resolve()):
+            files = files_in(path)
+            listed = files if len(files) <= _LISTED else [path]
+            found |= {f"{name}: {file}": digest([file]) for file in listed}
+    return found
+
+
+def digest_of(files: Program) -> str:
+    """Return one digest for all these files, whatever their paths are called on this machine."""
+    parts = json.dumps(list(files.values())).encode()
+    return f"{METHOD}:{hashlib.sha256(parts).hexdigest()}"
+
+
+def with_defaults(cls: type[Any], settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return `settings` and, where they say nothing, the defaults of the class's `Config` or of its constructor."""
+    fields = getattr(getattr(cls, "Config", None), "model_fields", {})
+    defaults = {name: field.default for name, field in fields.items()}
+    parameters = inspect.signature(cls.__init__).parameters.values()
+    defaults |= {one.name: one.default for one in parameters if one.default is not inspect.Parameter.empty}
+    return {**defaults, **settings}
+
+
+def _file(name: str) -> Path | None:
+    """Return the file that `import name` would execute; None if there is none, or if it is below an installed one."""
+    if name == "__main__":
+        path = getattr(sys.modules[name], "__file__", None)
+        return None if path is None else Path(path)
+    spec = _spec(name)
+    return None if spec is None or not spec.has_location or spec.origin is None else Path(spec.origin)
+
+
+def _spec(name: str) -> ModuleSpec | None:
+    parent, _, _ = name.rpartition(".")
+    if not parent:
+        try:
+            return find_spec(name)  # imports nothing, as the name has no parent
+        except (ImportError, ValueError):  # a module without a spec
+            return None
+    above = _spec(parent)
+    if above is None or above.submodule_search_locations is None:
+        return None
+    if above.has_location and above.origin is not None and not _is_own(Path(above.origin)):
+        return None
+    return PathFinder.find_spec(name, list(above.submodule_search_locations))
+
+
+def _is_own(file: Path) -> bool:
+    """Whether a file is in no installed package, nor in this one or the standard library."""
+    path = file.resolve()
+    here = Path(__file__).resolve().parents[2]
+    return not _SITES & set(path.parts) and not any(path.is_relative_to(one) for one in (*_LIBRARIES, here))
+
+
+def _imports(source: bytes, package: str) -> Iterator[str]:
+    """Yield the full names of the modules that a source may import; `package` is the one that it is in."""
+    try:
+        tree = ast.parse(source)
+    except (SyntaxError, ValueError):  # its import raises the same
+        return
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            parts = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
+            base = ".".join([*parts, *([node.module] if node.module else [])])
+            if base:
+                yield base
+                yield from (f"{base}.{alias.name}" for alias in node.names if alias.name != "*")
+
+
+def _texts(value: Any, name: str = "") -> Iterator[tuple[str, str]]:
+    """Yield each text in nested settings, with the name of its setting."""
+    if isinstance(value, str | Path):
+        yield name, str(value)
+    elif isinstance(value, Mapping):
+        for key, below in value.items():
+            yield from _texts(below, f"{name}.{key}" if name else str(key))
+    elif isinstance(value, list | tuple):
+        for below in value:
+            yield from _texts(below, name)
+
+
+def _existing(text: str) -> Path | None:
+    if not text.strip() or len(text) > _LONGEST or STEP in text or not text.isprintable():
+        return None
+    try:
+        path = Path(text).expanduser()
+        return path if path.exists() else None
+    except (OSError, RuntimeError):  # a name too long for the file system, or `~` of an unknown user
+        return None
