@@ -232,8 +232,7 @@ def _shared_memory(message: bytes, where: Where, key: str, end: float) -> None:
         threading.Thread(target=_drain, args=(connection,), daemon=True).start()
         head = LocalAddress.REQUEST.pack(0, 0, len(message))
         socket.send_fds(connection, [head], [descriptor])
-        while (left_s := end - time.monotonic()) > 0:
-            connection.settimeout(left_s)
+        while time.monotonic() < end:  # blocking, as poll() calls such a socket writable while its peer reads nothing
             connection.send(head)
 
 
