@@ -238,12 +238,7 @@ class TestAPolicyOfSeveralPartsServedAsOne:
 @pytest.mark.parametrize(
     ("cls", "wrong", "said"),
     [
-        (
-            Obs,
-            "camera",
-            "Obs: got ['camera'], want some of ['cameras', 'gripper', 'state', 'info', 'prepared'];",
-        ),
-        (Obs, "camera", "did you mean 'cameras'?"),
+        (CameraSpec, "hight", "CameraSpec: got ['hight'], want some of ['height', 'width'];"),
         (ActionSpec, "horizon", "the rows of a chunk are Contract(chunk=…)"),
         (Contract, "control_hertz", "did you mean 'control_hz'?"),
     ],

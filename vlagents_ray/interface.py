@@ -25,7 +25,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 import numpy as np
 
 from vlagents_ray.errors import ConfigError, NotTrainable
-from vlagents_ray.naming import says_its_fields
 from vlagents_ray.settings import require_arguments, wrong_settings
 from vlagents_ray.weights.trainable import named_values, set_values
 
@@ -70,7 +69,6 @@ OF_THE_LOOP = (SAFE, CAUSE, INTERVENTION, WANTED, AGE, PLANNED, CHUNK, ROW, AGE_
 """The names of `Act.info` by which a control loop goes. An answer that comes from a server has none of them."""
 
 
-@says_its_fields()
 @dataclass(slots=True)
 class Obs:
     """An observation: the sensor readings of a robot or an environment at one moment.
@@ -87,7 +85,6 @@ class Obs:
     prepared: Any = field(default=None, repr=False, compare=False)  # what the server got from `Agent.prepare`, or None
 
 
-@says_its_fields()
 @dataclass(slots=True)
 class Act:
     """A policy's answer: one action, or a chunk of actions to be executed in order."""

@@ -213,7 +213,7 @@ def test_each_option_that_is_a_setting_is_one_of_a_single_model() -> None:
     [
         (["--live-at", "8050"], "want HOST:PORT"),
         (["--live-at", "127.0.0.1:many"], "want HOST:PORT"),
-        (["--live-at", "0.0.0.0:8050"], "whoever reaches it would see all cameras"),
+        (["--live-at", "0.0.0.0:8050"], "without keys all cameras would be public"),
         (["--live", "--dry-run"], "nothing is played"),
     ],
 )

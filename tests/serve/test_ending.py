@@ -6,25 +6,24 @@ from types import SimpleNamespace
 
 import pytest
 import ray
-from ray.exceptions import ActorDiedError, GetTimeoutError
 from ray.serve._private.router import SharedRouterLongPollClient
 
+from vlagents_ray.ray_tools import head_monitor
 from vlagents_ray.serve.launch import serve_client
 
 
-@pytest.mark.parametrize(("error", "said"), [(ActorDiedError(), False), (GetTimeoutError(), True)])
+@pytest.mark.parametrize(("ends", "head", "said"), [(True, True, False), (False, True, True), (False, False, False)])
 def test_a_controller_that_ends_or_that_does_not_answer_is_no_error(
-    error: Exception, said: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    ends: bool, head: bool, said: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    def fail(*_: object, **__: object) -> None:
-        raise error
-
     ending = SimpleNamespace(remote=lambda: None)
     controller = SimpleNamespace(graceful_shutdown=SimpleNamespace(options=lambda **_: ending))
     client = SimpleNamespace(
         _controller=controller, handle_cache={}, shutdown_cached_handles=lambda: None, _shutdown=False
     )
-    monkeypatch.setattr(ray, "get", fail)
+    monkeypatch.setattr(ray, "wait", lambda refs, **_: (refs, []) if ends else ([], refs))
+    monkeypatch.setattr(head_monitor, "head_is_gone", lambda: not head)
+    monkeypatch.setattr(serve_client, "_SHUTDOWN_S", 0.0)
     serve_client.shut_down(client)
     assert client._shutdown
     assert ("has not ended within" in caplog.text) is said

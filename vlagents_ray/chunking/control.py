@@ -82,7 +82,7 @@ class Control:
 
     @property
     def state(self) -> ControlState:
-        """Who moves the robot at this tick."""
+        """The state at this tick: whether the policy, a human or nothing moves the robot."""
         return self._state
 
     @property

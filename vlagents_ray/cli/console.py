@@ -92,10 +92,10 @@ def fail(message: str, code: int) -> NoReturn:
     raise typer.Exit(code)
 
 
-def say_error(message: str, console: Console = err) -> None:
+def say_error(message: str, console: Console | None = None) -> None:
     """Print what went wrong, after all other output."""
     sys.stdout.flush()
-    console.print(Text.assemble(("error", "bold red"), f" {message}"))
+    (console or err).print(Text.assemble(("error", "bold red"), f" {message}"))
 
 
 def fresh(folder: Path) -> Path:

@@ -162,7 +162,7 @@ def _step(node: dict[str, Any]) -> Any:
     if step is None:
         return None
     if not (isinstance(step, str) and step.isascii() and step.isdecimal() and len(step) < 20):
-        raise MalformedMessage(f"step: got {str(step)[:40]}, want the text of the last answer, such as '7'")
+        raise MalformedMessage(f"step: got {shown(step)}, want the text of the last answer, such as '7'")
     return int(step)
 
 

@@ -199,7 +199,7 @@ def test_a_capture_that_waits_for_a_push_delays_no_act_and_is_not_starved_by_act
     def acts() -> int:
         count = 0
         while not stop.is_set():
-            with CAPTURES.act():
+            with CAPTURES:
                 count += 1
                 acting.set()
         return count
@@ -218,7 +218,7 @@ def test_a_capture_that_waits_for_a_push_delays_no_act_and_is_not_starved_by_act
 
 
 def test_a_capture_may_not_begin_within_an_act_of_its_thread(cuda: FakeCuda) -> None:
-    with CAPTURES.act(), pytest.raises(RuntimeError, match="within an act"):
+    with CAPTURES, pytest.raises(RuntimeError, match="within an act"):
         CudaGraph(lambda x: x.tanh(), [numbers(cuda)])
 
 

@@ -43,7 +43,7 @@ class VlaEvalSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
-    curated_by: str = Field(pattern=r"^@[\w-]+$", examples=["'\"@HANDLE\"'"])  # your handle on GitHub
+    curated_by: str = Field(pattern=r"^@[\w-]+$", examples=["@HANDLE"])  # your handle on GitHub
     weight_type: Literal["shared", "finetuned"]  # one checkpoint for all benchmarks, or one trained on this benchmark
     model: str | None = None  # key, as kim24openvla; None: the policy's name
     display_name: str | None = None  # None: the policy's name

@@ -145,7 +145,7 @@ class Results:
 
     @property
     def accepted_changes(self) -> list[Change]:
-        """What changed in files or weights between episodes, and was to be accepted."""
+        """Changes of files and weights between episodes, which `--accept-changes` accepted."""
         return list(dict.fromkeys(change for run in self.runs for change in run.changes))
 
     @classmethod

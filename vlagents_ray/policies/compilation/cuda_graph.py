@@ -15,7 +15,7 @@ _EMPTY = "CUDA Graph is empty"  # in torch's warning
 
 
 class CaptureLock:
-    """Keeps acts and pushes of weights out of the captures of this process.
+    """Keeps acts, of which it is the context, and pushes of weights out of the captures of this process.
 
     A call that waits for a whole device ends any capture on it, with an error on both threads, whatever the mode of the
     capture. A waiting capture goes before the next act, but waits for a push without delaying acts.
@@ -27,19 +27,17 @@ class CaptureLock:
         self._capturing = False  # or about to
         self.pushes = threading.RLock()  # the context of a push, within which its thread may also act
 
-    @contextmanager
-    def act(self) -> Iterator[None]:
-        """Wait for the end of a capture; none begins within this context, which a thread does not enter twice."""
-        thread = threading.get_ident()
+    def __enter__(self) -> None:
+        """Begin an act: wait for the end of a capture. None begins until its end; a thread enters once at a time."""
         with self._changed:
             self._changed.wait_for(lambda: not self._capturing)
-            self._acting.add(thread)
-        try:
-            yield
-        finally:
-            with self._changed:
-                self._acting.discard(thread)
-                self._changed.notify_all()
+            self._acting.add(threading.get_ident())
+
+    def __exit__(self, *_: object) -> None:
+        """End an act."""
+        with self._changed:
+            self._acting.discard(threading.get_ident())
+            self._changed.notify_all()
 
     @contextmanager
     def capture(self) -> Iterator[None]:

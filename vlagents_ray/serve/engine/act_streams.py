@@ -65,7 +65,8 @@ class ActStreams:
                 ticket.answer(reply)
 
         try:
-            with model.running(call):
+            with model.busy, model.uncaptured, call:
+                model.require_open()
                 model.parameters.use(weights)
                 stream = model.agent.act_batch_stream(observations, agents)  # type: ignore[arg-type]
                 del observations  # they may lie in memory that their sender needs back

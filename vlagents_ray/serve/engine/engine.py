@@ -144,7 +144,8 @@ class Engine:
             raise self.models.loading() if self._unready is self._loading else self._unready
         if not self.queue.alive():
             raise PolicyFailed("the policy's thread has ended")
-        self.calls.require_device()
+        if self.calls.broken is not None:
+            self.calls.require_device()
 
     def check_health(self) -> None:
         """Raise the full reason why the policy cannot act, including errors of the agents' own health checks.
@@ -310,7 +311,8 @@ class Engine:
     def _observe(self, ticket: PendingRequest) -> None:
         session, model, weights = self._ready(ticket)
         if session.agent is not None and ticket.request.obs is not None:  # `_ready` and the decoder ensure both
-            with model.running(model.call("observe")):
+            with model.busy, model.uncaptured, model.call("observe"):
+                model.require_open()
                 model.parameters.use(weights)
                 session.agent.observe(ticket.request.obs)
         ticket.request.obs = None
@@ -325,7 +327,7 @@ class Engine:
         preparations = [(ticket.preparation, session.agent) for ticket, session in acting]
         if all(preparation is None for preparation, _ in preparations):
             return acting, 0.0
-        with model.busy, model.call("act", "prepare") as call:
+        with model.busy, model.uncaptured, model.call("act", "prepare") as call:
             errors = {} if model.closed else Preparations.finish(preparations)
         for place, error in errors.items():
             ticket = acting[place][0]
@@ -341,14 +343,16 @@ class Engine:
         rows = len(observations)
         call = model.call("act", rows if self._batch_sizes else None)
         try:
-            with model.running(call):
+            with model.busy, model.uncaptured, call:
+                model.require_open()
                 model.parameters.use(weights)
                 results: Sequence[Act | Exception] = model.agent.act_batch(observations, agents)  # type: ignore[arg-type]
             if len(results) != rows:
                 raise PolicyFailed(f"act_batch: got {rows} observations, returned {len(results)} actions")
         except Exception as error:  # noqa: BLE001 - becomes the replies
             results = [error] * rows
-        model.calls.record_batch(results[: len(acting)])
+        if len(acting) > 1 or isinstance(results[0], Exception) or model.calls.failed_batches:
+            model.calls.record_batch(results[: len(acting)])
         del observations  # they may lie in memory that their sender needs back
         for ticket, _ in acting:
             ticket.request.obs = None

@@ -87,7 +87,8 @@ class Resets:
         if model is None or request.obs is None:  # the decoder ensures the second
             raise UnknownSession(f"session {ticket.session_id!r}: closed before its reset was over")
         model.check(request)
-        with model.running(model.call("reset")) as call:
+        with model.busy, model.uncaptured, model.call("reset") as call:
+            model.require_open()
             model.parameters.use(model.parameters.begin(session, follows=ticket.follows))
             agent = model.copies.make()
             info = agent.reset(request.obs, request.instruction, **request.kwargs)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import logging
+import sys
 import threading
 import time
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -53,7 +54,16 @@ class LoadedModel:
     since: float = field(default_factory=time.monotonic)  # time at which it was loaded, s
     sessions: int = 0  # number of sessions that hold it
     closed: bool = False
+    # Held beside `busy` while the agent runs, so that no other model is captured as a CUDA graph meanwhile. Where none
+    # can be, it is a lock of no other use, which costs less.
+    uncaptured: AbstractContextManager[Any] = field(init=False)
     _calls_by_kind: dict[tuple[str, Hashable], PolicyCall] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Find out whether its process computes on an accelerator."""
+        torch = sys.modules.get("torch")
+        on_gpu = any(device["kind"] != "cpu" for device in self.report.devices)
+        self.uncaptured = CAPTURES if on_gpu or (torch and torch.cuda.is_initialized()) else threading.RLock()
 
     @property
     def checkpoint(self) -> str | None:
@@ -85,17 +95,10 @@ class LoadedModel:
             call = self._calls_by_kind[op, kind] = PolicyCall(self.calls, op)
         return call
 
-    @contextmanager
-    def running(self, call: PolicyCall) -> Iterator[PolicyCall]:
-        """Hold the agent for a call: no other thread runs it, and no other model is captured as a CUDA graph.
-
-        Raises:
-            UnknownSession: The model and its sessions were closed meanwhile.
-        """
-        with self.busy, CAPTURES.act(), call:
-            if self.closed:
-                raise UnknownSession(f"{self.choice} has just been unloaded for another; reset the session")
-            yield call
+    def require_open(self) -> None:
+        """Raise `UnknownSession` if the model and its sessions were closed meanwhile; `busy` is held."""
+        if self.closed:
+            raise UnknownSession(f"{self.choice} has just been unloaded for another; reset the session")
 
     def pad(self, observations: list[Obs | None], agents: list[Agent | None]) -> int:
         """Append rows that fill a batch up to the next size; return their number. On the policy's thread alone."""
