@@ -115,7 +115,8 @@ def test_a_server_in_a_job_says_how_to_get_in_and_lets_nobody_else_in(slurm: Slu
     server = json.loads(file.read_text())
     assert (server["job"], server["host"]) == (int(job), slurm.nodes[0].name)
     log = tmp_path / f"{job}.log"
-    slurm.wait_for(job, lambda: server["key"] in log.read_text())
-    assert log.stat().st_mode & 0o777 == 0o600
+    slurm.wait_for(job, lambda: str(file) in log.read_text())
+    assert server["key"] not in log.read_text()
+    assert file.parent.stat().st_mode & 0o777 == 0o700
     slurm.do("scancel", job)
     assert slurm.wait_for_end(job) == "CANCELLED"

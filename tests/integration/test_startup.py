@@ -15,6 +15,7 @@ import urllib.request
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
@@ -93,7 +94,7 @@ def test_a_signal_to_every_process_of_a_server_ends_it_in_seconds(whole: signal.
 def test_health_is_503_while_the_policy_loads_and_clients_wait_for_it(tmp_path: Path) -> None:
     gate, port = tmp_path / "gate", free_port()
     url = f"http://127.0.0.1:{port}"
-    answers: list[object] = []
+    answers: list[Any] = []
 
     def robot() -> None:
         with RemoteAgent(url) as agent:
@@ -110,7 +111,9 @@ def test_health_is_503_while_the_policy_loads_and_clients_wait_for_it(tmp_path: 
     with running_server(deployment("served_agents:Gated", config={"gate": str(gate)}), port=port):
         watcher.join(120)
         thread.join(120)
-        assert answers == [503, {}]
+        first, info = answers
+        assert first == 503
+        assert info["weights"].startswith("sampled-sha256:")  # of the file that a setting names
         assert health(url) == 200
 
 

@@ -317,7 +317,12 @@ class Store:
         self._accept_or_raise("program", programs, "the environment is not that of the results in")
 
     def _other_plan(self, db: sqlite3.Connection) -> list[Change]:
-        """What the results have and this plan lacks: a plan may grow, and steps of a policy may follow one another."""
+        """Return what the results have and this plan lacks: a plan may grow, and steps of a policy may follow.
+
+        A trainer evaluates one version of one policy after the other into one folder, each with a plan of its own.
+        """
+        if all(self._pushed.values()):
+            return []
         mine = {(cell.policy.name, cell.suite.name, cell.env) for cell in self.cells}
         rows = db.execute("SELECT DISTINCT policy, suite, env FROM cells WHERE cell IN (SELECT cell FROM episodes)")
         gone = [" ".join(filter(None, row)) for row in rows if row not in mine]

@@ -81,11 +81,11 @@ class SessionRecordings:
             if answer.op in _SHOWN_OPS:
                 answers[answer.session].append(answer)
         sessions = {session.id: session.instruction for session in self._engine.sessions.all()}
-        self._tap.forget_others(sessions)
         for name, [*earlier, last] in answers.items():
             for answer in earlier:
                 self._write(name, sessions.get(name), answer, None)
             self._write(name, sessions.get(name), last, self._tap.seen(name))
+        self._tap.forget_others(sessions)  # not before: a session may have ended since its last answer
         for name in self._episodes.keys() - sessions.keys():
             self._end(name)
 
