@@ -94,8 +94,8 @@ def serve_command(
             if address is None:
                 out.print(f"Ray programs of yours on this machine: vlagents_ray.join({server.url!r})")
             out.print(f"log of Ray, Serve and HAProxy: {log}")
-            out.print("Ctrl-C stops")
             with contextlib.suppress(KeyboardInterrupt):
+                out.print("Ctrl-C stops")
                 loss.wait()
 
 
