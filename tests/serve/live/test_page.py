@@ -191,7 +191,7 @@ def test_buttons_act_on_a_session(page: Page, server: LiveServer, width: int, sc
         until(page, "document.querySelectorAll('.compared polyline').length > 2", want=True)
         page.value(f"({PRESS})('Pause')")
         until(page, outcome, "pause: done")
-        until(page, "document.querySelector('article').innerText.includes('stopped')", want=True)
+        until(page, "document.querySelector('article').innerText.includes('paused from the live page')", want=True)
         assert page.value("document.documentElement.scrollWidth") <= width
         page.value(f"({PRESS})('Follow versions')")  # a robot is pinned unless it is told otherwise
         until(page, outcome, "follow: done")
