@@ -23,7 +23,6 @@ log = logging.getLogger(__name__)
 # The loggers of what Ray and Serve say in the process that started them.
 LOGGERS = ("ray.serve", "ray._private.worker", "ray._private.authentication.authentication_token_setup")
 
-_FOR_EVER_S, _SETUP_S = 10**8, 60  # of a process that was started ahead: its life, and its runtime environment
 _ANSWER_S = 10.0  # of Ray's daemon
 
 # The connection of this process.
@@ -125,33 +124,6 @@ def node_that_failed(error: BaseException) -> Any:
 
     found = (frame.f_locals.get("self") for frame, _ in traceback.walk_tb(error.__traceback__))
     return next((one for one in found if isinstance(one, Node)), None)
-
-
-def start_workers_ahead(number: int, env_vars: Mapping[str, str]) -> None:
-    """Let the daemon of this node start worker processes that any job may use later.
-
-    Args:
-        number: Of processes; the daemon starts no more at once than there are cores.
-        env_vars: Environment variables of the runtime environment of the actors that may use them.
-    """
-    import grpc
-    import ray
-    from ray._private.grpc_utils import init_grpc_channel
-    from ray.core.generated.common_pb2 import Language
-    from ray.core.generated.node_manager_pb2 import PrestartWorkersRequest
-    from ray.core.generated.node_manager_pb2_grpc import NodeManagerServiceStub
-    from ray.runtime_env import RuntimeEnv
-
-    node = next(one for one in ray.nodes() if one["NodeID"] == ray.get_runtime_context().get_node_id())
-    request = PrestartWorkersRequest(language=Language.PYTHON, num_workers=number, keep_alive_duration_secs=_FOR_EVER_S)
-    if env_vars:
-        request.runtime_env_info.serialized_runtime_env = RuntimeEnv(env_vars=dict(env_vars)).serialize()
-        request.runtime_env_info.runtime_env_config.setup_timeout_seconds = _SETUP_S
-    with init_grpc_channel(f"{node['NodeManagerAddress']}:{node['NodeManagerPort']}") as channel:
-        try:
-            NodeManagerServiceStub(channel).PrestartWorkers(request, timeout=_ANSWER_S)
-        except grpc.RpcError as error:  # the next actors start without
-            log.warning("no process was started ahead: %s", error)
 
 
 def gpus_here() -> float:
