@@ -33,7 +33,7 @@ class Execution:
         self._noted = False  # an action was noted in place of the policy's at this tick
 
     def tick(self) -> None:
-        """Begin a tick."""
+        """Begin a tick, at which no action is executed in place of the policy's yet."""
         self._noted = False
 
     def note_in_place(self, action: np.ndarray) -> None:
@@ -42,7 +42,7 @@ class Execution:
         self._noted = True
 
     def heard(self, answer: Act) -> None:
-        """Note whether somebody watches, as an answer of the policy says."""
+        """Note whether a viewer watches, as an answer of the policy says."""
         if answer.info.pop(WATCHED, False):
             self._watched_until = time.monotonic() + _WATCHED_S
 

@@ -79,7 +79,7 @@ def quiet_ray(name: str | None, started: threading.Event | None = None) -> Itera
 
 
 class _Terminal:
-    """What of the logs of Ray and Serve goes to the terminal; `kept` gets the rest."""
+    """The lines of the logs of Ray and Serve that go to the terminal; `kept` gets the rest."""
 
     def __init__(
         self, printed: Callable[..., None], kept: logging.Handler | None, started: threading.Event | None

@@ -146,8 +146,8 @@ def evaluate_command(
     A file holds policies, their checkpoints, suites of environments, seeds; --out, --workers, --video, --record,
     --rerun, --foxglove, --track, --retries and --resume win over it.
 
-    Exit status: 0 when every episode has its result, 75 when --end-at left some over (--resume goes on), 130 after
-    Ctrl-C or SIGTERM (likewise), 2 for wrong settings, 3 when an error of the policy ended every episode of a cell, 1
+    Exit status: 0 when every episode has its result; 75 when --end-at left some over, and 130 after Ctrl-C or SIGTERM
+    (--resume goes on after both); 2 for wrong settings; 3 when an error of the policy ended every episode of a cell; 1
     for what else failed, and when infrastructure lost an episode for good (--resume tries it again).
     """
     given = locals()  # every option by its name

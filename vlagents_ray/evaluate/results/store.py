@@ -319,13 +319,14 @@ class Store:
     def _other_plan(self, db: sqlite3.Connection) -> list[Change]:
         """Return what the results have and this plan lacks: a plan may grow, and steps of a policy may follow.
 
-        A trainer evaluates one version of one policy after the other into one folder, each with a plan of its own.
+        A trainer evaluates one version of one policy after the other into one folder, each with a plan of its own: of
+        the other policies its plan lacks nothing.
         """
-        if all(self._pushed.values()):
-            return []
+        trained = all(self._pushed.values())
+        policies = {cell.policy.name for cell in self.cells}
         mine = {(cell.policy.name, cell.suite.name, cell.env) for cell in self.cells}
         rows = db.execute("SELECT DISTINCT policy, suite, env FROM cells WHERE cell IN (SELECT cell FROM episodes)")
-        gone = [" ".join(filter(None, row)) for row in rows if row not in mine]
+        gone = [" ".join(filter(None, row)) for row in rows if row not in mine and (row[0] in policies or not trained)]
         return [Change("plan", name, "in it", None) for name in gone]
 
     def _other_programs(self, db: sqlite3.Connection) -> list[Change]:

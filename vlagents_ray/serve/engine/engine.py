@@ -351,6 +351,7 @@ class Engine:
                 raise PolicyFailed(f"act_batch: got {rows} observations, returned {len(results)} actions")
         except Exception as error:  # noqa: BLE001 - becomes the replies
             results = [error] * rows
+        # Not after a lone act that succeeded as the one before did: the calls would be a hundredth of its time.
         if len(acting) > 1 or isinstance(results[0], Exception) or model.calls.failed_batches:
             model.calls.record_batch(results[: len(acting)])
         del observations  # they may lie in memory that their sender needs back
