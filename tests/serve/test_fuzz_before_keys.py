@@ -38,7 +38,7 @@ from rpyc_client import LOCAL, ROOT, TUPLE, VALUE, call, document, request
 from vlagents_ray.interface import Obs
 from vlagents_ray.protocol.frames import CONTENT_TYPE, encode_request
 from vlagents_ray.protocol.messages import LocalAddress, Request
-from vlagents_ray.wire.vla_eval import codec as vla_eval_codec
+from vlagents_ray.wire import vla_eval as vla_eval_codec
 from vlagents_ray.wire.vlagents import rpyc
 from vlagents_ray.wire.vlagents.rpyc import Handler
 

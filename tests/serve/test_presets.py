@@ -14,7 +14,7 @@ from vlagents_ray.errors import InvalidObservation
 from vlagents_ray.interface import Obs
 from vlagents_ray.serve.dialects.gr00t.connection import nested_mapping
 from vlagents_ray.serve.presets import presets
-from vlagents_ray.wire.gr00t import codec as gr00t_codec
+from vlagents_ray.wire import gr00t as gr00t_codec
 from vlagents_ray.wire.mapping.key_paths import lookup, matches
 from vlagents_ray.wire.mapping.mapping import KeyMapping
 

@@ -33,8 +33,8 @@ from vlagents_ray.serve.dialects.base import GatewayContext
 from vlagents_ray.serve.dialects.gr00t import handler as gr00t
 from vlagents_ray.serve.engine.admission import Admission
 from vlagents_ray.serve.engine.dispatch import REFUSALS
-from vlagents_ray.wire.lerobot.upstream import read_chunk
-from vlagents_ray.wire.pickles.tensors import _CONSTANT
+from vlagents_ray.wire.lerobot import read_chunk
+from vlagents_ray.wire.pickles import _CONSTANT
 
 SLACK = 48 * 2**20  # bytes of buffers in the kernel's and the interpreter's own care
 SEEN = Obs({"front": np.zeros((8, 8, 3), np.uint8)})

@@ -20,7 +20,7 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.dialects.gateway_sessions import GatewaySessions
 from vlagents_ray.serve.dialects.lerobot import handler
-from vlagents_ray.wire.lerobot import codec
+from vlagents_ray.wire import lerobot
 
 
 def sessions(replicas: Replicas) -> int:
@@ -278,7 +278,7 @@ def test_an_endpoint_for_ipv4_has_no_clients_over_ipv6(open_lerobot, monkeypatch
 
 
 def test_what_is_no_error_of_ours_is_logged_and_not_shown(open_lerobot, caplog, monkeypatch) -> None:
-    monkeypatch.setattr(codec, "frame", lambda *_: 1 / 0)
+    monkeypatch.setattr(lerobot, "frame", lambda *_: 1 / 0)
     with AsyncClient(open_lerobot()).begin() as robot, pytest.raises(grpc.RpcError) as error:
         robot.send(robot_saw(0))
     status, details = status_of(error)

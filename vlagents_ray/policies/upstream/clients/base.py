@@ -12,7 +12,7 @@ import numpy as np
 
 from vlagents_ray.errors import MalformedMessage, PolicyFailed
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
-from vlagents_ray.wire.lerobot.codec import PolicyInstructions
+from vlagents_ray.wire.lerobot import PolicyInstructions
 from vlagents_ray.wire.mapping.outgoing import Outgoing
 
 logger = logging.getLogger(__name__)

@@ -9,8 +9,8 @@ from typing import Any, ClassVar
 from vlagents_ray.errors import ConnectionLost, InvalidObservation, PolicyUnavailable, VLAgentsError
 from vlagents_ray.policies.upstream.clients.base import Answer, ClientOptions, UpstreamClient
 from vlagents_ray.registry import require
-from vlagents_ray.wire.gr00t import upstream as wire
-from vlagents_ray.wire.gr00t.codec import TEXT_KEY, is_flat, nested
+from vlagents_ray.wire import gr00t as wire
+from vlagents_ray.wire.gr00t import TEXT_KEY, is_flat, nested
 from vlagents_ray.wire.mapping.key_paths import matches
 from vlagents_ray.wire.mapping.outgoing import Outgoing
 

@@ -12,8 +12,8 @@ from urllib.parse import urlsplit
 from vlagents_ray.errors import ConnectionLost, PolicyUnavailable, VLAgentsError
 from vlagents_ray.policies.upstream.clients.base import Answer, ClientOptions, UpstreamClient
 from vlagents_ray.registry import require
-from vlagents_ray.wire.lerobot import protobuf
-from vlagents_ray.wire.lerobot import upstream as wire
+from vlagents_ray.wire import lerobot
+from vlagents_ray.wire import lerobot as wire
 
 _LOST = ("UNAVAILABLE", "DEADLINE_EXCEEDED", "CANCELLED")  # the other status codes are answers
 _OPTIONS = [
@@ -63,9 +63,9 @@ class LeRobotClient(UpstreamClient):
             raise ValueError("lerobot: want instructions among the options")
         most = ("grpc.max_receive_message_length", self.options.limits.body_bytes)
         channel = self._channel = self._grpc.insecure_channel(urlsplit(self.options.url).netloc, [*_OPTIONS, most])
-        unary = {name: channel.unary_unary(protobuf.method(name)) for name in ("Ready", "SendPolicyInstructions")}
-        self._observe = channel.stream_unary(protobuf.method("SendObservations"))
-        self._act = channel.unary_unary(protobuf.method("GetActions"))
+        unary = {name: channel.unary_unary(lerobot.method(name)) for name in ("Ready", "SendPolicyInstructions")}
+        self._observe = channel.stream_unary(lerobot.method("SendObservations"))
+        self._act = channel.unary_unary(lerobot.method("GetActions"))
         self._ended = ended = threading.Event()
 
         def watch(state: Any) -> None:
@@ -75,9 +75,9 @@ class LeRobotClient(UpstreamClient):
 
         self._watch = watch
         try:
-            self._call(unary["Ready"], protobuf.EMPTY, timeout_s)
+            self._call(unary["Ready"], lerobot.EMPTY, timeout_s)
             channel.subscribe(watch)
-            setup = protobuf.write_data(wire.write_instructions(instructions))
+            setup = lerobot.write_data(wire.write_instructions(instructions))
             self._call(unary["SendPolicyInstructions"], setup, self.options.load_s)
         except ConnectionLost as error:
             raise PolicyUnavailable(f"{error}; is it running?") from error
@@ -93,8 +93,8 @@ class LeRobotClient(UpstreamClient):
             raise ConnectionLost(f"upstream {self.options.url}: the connection is closed")
         deadline, now, self._step = time.monotonic() + self.options.timeout_s, time.time(), self._step + 1
         data = wire.write_observation(observation, self.options.instructions, now, self._step)
-        self._call(self._observe, protobuf.write_observation_parts(data), self.options.timeout_s)
-        reply = protobuf.read_data(self._call(self._act, protobuf.EMPTY, max(0.0, deadline - time.monotonic())))
+        self._call(self._observe, lerobot.write_observation_parts(data), self.options.timeout_s)
+        reply = lerobot.read_data(self._call(self._act, lerobot.EMPTY, max(0.0, deadline - time.monotonic())))
         if not reply and not self.is_open:
             self.close()
             raise ConnectionLost(f"upstream {self.options.url}: it was restarted, and has no policy yet")

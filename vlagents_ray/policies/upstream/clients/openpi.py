@@ -11,8 +11,8 @@ import numpy as np
 from vlagents_ray.errors import PolicyUnavailable, VLAgentsError
 from vlagents_ray.policies.upstream.clients.base import Answer, ClientOptions, UpstreamClient
 from vlagents_ray.policies.upstream.clients.websocket import UpstreamSocket
+from vlagents_ray.wire import openpi
 from vlagents_ray.wire.mapping.outgoing import Outgoing
-from vlagents_ray.wire.openpi import codec
 
 _RESET = "reset successful"  # what RoboArena's servers answer to `reset`
 
@@ -53,7 +53,7 @@ class OpenPiClient(UpstreamClient):
         self._socket.close()
 
     def _call(self, message: Mapping[str, Any]) -> Any:
-        self._socket.send(codec.encode(message))
+        self._socket.send(openpi.encode(message))
         return self._read(self._socket.recv())
 
     def _read(self, data: bytes | str) -> Any:
@@ -64,7 +64,7 @@ class OpenPiClient(UpstreamClient):
         if isinstance(data, str):
             self.close()
             raise self.failed(data)
-        return codec.decode(data, self.options.limits)
+        return openpi.decode(data, self.options.limits)
 
     def _actions(self, reply: Any) -> np.ndarray:
         actions = reply.get("actions") if isinstance(reply, dict) else None
@@ -103,7 +103,7 @@ class RoboArenaClient(OpenPiClient):
 
     def begin(self) -> None:
         self._session = uuid.uuid4().hex
-        self._socket.send(codec.encode({"endpoint": "reset"}))
+        self._socket.send(openpi.encode({"endpoint": "reset"}))
         answer = self._socket.recv()
         if answer != _RESET:
             self._read(answer)  # vLLM-Omni answers a map; any other text is an error
@@ -126,7 +126,7 @@ class RoboArenaClient(OpenPiClient):
 
     def _read(self, data: bytes | str) -> Any:
         """Return a map, or the array that older servers answer; vLLM-Omni says an error in a map."""
-        reply = self._map(data) if isinstance(data, str) else codec.decode_any(data, self.options.limits)
+        reply = self._map(data) if isinstance(data, str) else openpi.decode_any(data, self.options.limits)
         if isinstance(reply, dict) and reply.get("type") == "error":
             raise self.failed(reply.get("message"))
         return reply

@@ -12,7 +12,7 @@ from urllib.parse import urlsplit
 
 from vlagents_ray.errors import ConnectionLost, MessageTooLarge, PolicyUnavailable
 from vlagents_ray.policies.upstream.clients.base import Answer, ClientOptions, UpstreamClient
-from vlagents_ray.wire.openvla import codec
+from vlagents_ray.wire import openvla
 
 _BUSY = (408, 429, 502, 503, 504)
 
@@ -69,7 +69,7 @@ class OpenVLAClient(UpstreamClient):
             raise ConnectionLost(f"upstream {self.options.url}: the connection is closed")
         most = self.options.limits.body_bytes
         try:
-            self._connection.request("POST", self._path, codec.encode_observation(observation), self._headers)
+            self._connection.request("POST", self._path, openvla.encode_observation(observation), self._headers)
             response = self._connection.getresponse()
             body = response.read(most + 1)
         except (http.client.HTTPException, OSError) as error:
@@ -85,7 +85,7 @@ class OpenVLAClient(UpstreamClient):
             raise ConnectionLost(f"upstream {self.options.url}: it answered with HTTP {response.status}")
         if response.status != http.HTTPStatus.OK:
             raise self.failed(f"HTTP {response.status}: {body[:2000]!r}")
-        action = codec.decode_action(body, self.options.limits)
+        action = openvla.decode_action(body, self.options.limits)
         if action is None:
             raise self.failed("error")
         return [action]

@@ -12,9 +12,9 @@ import numpy as np
 from vlagents_ray.errors import PolicyUnavailable, VLAgentsError
 from vlagents_ray.policies.upstream.clients.base import Answer, ClientOptions, UpstreamClient
 from vlagents_ray.policies.upstream.clients.websocket import UpstreamSocket
+from vlagents_ray.wire import vla_eval
 from vlagents_ray.wire.mapping.outgoing import Outgoing
-from vlagents_ray.wire.vla_eval import codec
-from vlagents_ray.wire.vla_eval.codec import Message
+from vlagents_ray.wire.vla_eval import Message
 
 _STATED = ("model_server", "harness_version", "protocol_version", "observation_params", "action_spec")
 
@@ -42,16 +42,17 @@ class VlaEvalClient(UpstreamClient):
         version = importlib.metadata.version("vlagents-ray")
         try:
             self._send(
-                "hello", {"harness_version": f"vlagents-ray {version}", "protocol_version": codec.PROTOCOL_VERSION}
+                "hello", {"harness_version": f"vlagents-ray {version}", "protocol_version": vla_eval.PROTOCOL_VERSION}
             )
             hello = self._answer("hello", timeout_s)
         except VLAgentsError as error:
             self.close()
             raise PolicyUnavailable(f"{error}; it did not answer `hello`") from error
-        if (theirs := hello.get("protocol_version")) != codec.PROTOCOL_VERSION:
+        if (theirs := hello.get("protocol_version")) != vla_eval.PROTOCOL_VERSION:
             self.close()
             raise PolicyUnavailable(
-                f"upstream {self.options.url}: got protocol version {str(theirs)[:20]}, want {codec.PROTOCOL_VERSION}"
+                f"upstream {self.options.url}: got protocol version {str(theirs)[:20]}, "
+                f"want {vla_eval.PROTOCOL_VERSION}"
             )
         return {name: hello[name] for name in _STATED if name in hello}
 
@@ -80,11 +81,11 @@ class VlaEvalClient(UpstreamClient):
             return ["state: the upstream wants it (send_state), the mapping has none; add it to mapping.state"]
         return []
 
-    def _send(self, kind: codec.Kind, payload: dict[str, Any]) -> None:
+    def _send(self, kind: vla_eval.Kind, payload: dict[str, Any]) -> None:
         self._seq += 1
-        self._socket.send(codec.encode(Message(kind, payload, self._seq)))
+        self._socket.send(vla_eval.encode(Message(kind, payload, self._seq)))
 
-    def _answer(self, kind: codec.Kind, timeout_s: float) -> dict[str, Any]:
+    def _answer(self, kind: vla_eval.Kind, timeout_s: float) -> dict[str, Any]:
         """Return the payload of the answer to the last message; older answers are skipped."""
         deadline = time.monotonic() + timeout_s
         while True:
@@ -92,7 +93,7 @@ class VlaEvalClient(UpstreamClient):
             if isinstance(data, str):
                 self.close()
                 raise self.unreadable("a text", "a binary map")
-            message = codec.decode(data, self.options.limits)
+            message = vla_eval.decode(data, self.options.limits)
             if message.kind == "error" and message.seq in (self._seq, self._begun):
                 raise self.failed(message.payload)
             if message.seq == self._seq and message.kind == kind:

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 from vlagents_ray.errors import PolicyUnavailable, VLAgentsError
 from vlagents_ray.policies.upstream.clients.base import Answer, ClientOptions, UpstreamClient
 from vlagents_ray.policies.upstream.clients.websocket import UpstreamSocket
-from vlagents_ray.wire.xpolicylab import codec
+from vlagents_ray.wire import xpolicylab
 
 _EVALUATION = "vlagents-ray"
 
@@ -48,9 +48,9 @@ class XPolicyLabClient(UpstreamClient):
 
     def ask(self, observations: Sequence[Mapping[str, Any]]) -> list[Answer]:
         [observation] = observations
-        payload = self._call("infer", codec.observed(observation), self.options.timeout_s)
+        payload = self._call("infer", xpolicylab.observed(observation), self.options.timeout_s)
         self._step += 1
-        return [codec.read_actions(payload)]
+        return [xpolicylab.read_actions(payload)]
 
     def close(self) -> None:
         self._socket.close()
@@ -58,17 +58,17 @@ class XPolicyLabClient(UpstreamClient):
     def _call(self, kind: str, payload: Mapping[str, Any], timeout_s: float) -> dict[str, Any]:
         """Send a request and return the payload of its reply; replies to older requests are skipped."""
         name, deadline = uuid.uuid4().hex, time.monotonic() + timeout_s
-        self._socket.send(codec.write_request(kind, name, payload, _EVALUATION, self._trial, self._step))
+        self._socket.send(xpolicylab.write_request(kind, name, payload, _EVALUATION, self._trial, self._step))
         while True:
             data = self._socket.recv(max(0.0, deadline - time.monotonic()))
             if isinstance(data, str):
                 self.close()
                 raise self.unreadable("a text", "a binary map")
-            reply = codec.read_reply(data, self.options.limits)
+            reply = xpolicylab.read_reply(data, self.options.limits)
             if reply.message_id != name:
                 continue
-            if reply.kind == codec.ERROR:
+            if reply.kind == xpolicylab.ERROR:
                 raise self.failed(reply.payload)
-            if reply.kind != codec.REPLIES[kind]:
-                raise self.unreadable(f"a message {reply.kind[:40]!r}", codec.REPLIES[kind])
+            if reply.kind != xpolicylab.REPLIES[kind]:
+                raise self.unreadable(f"a message {reply.kind[:40]!r}", xpolicylab.REPLIES[kind])
             return reply.payload

@@ -17,8 +17,8 @@ from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.dialects.base import GatewayContext
 from vlagents_ray.serve.dialects.gateway_sessions import GatewaySessions
-from vlagents_ray.wire.gr00t import codec
-from vlagents_ray.wire.gr00t.codec import GR00TRequest, Observations
+from vlagents_ray.wire import gr00t
+from vlagents_ray.wire.gr00t import GR00TRequest, Observations
 from vlagents_ray.wire.mapping.key_paths import matches
 from vlagents_ray.wire.mapping.mapping import KeyMapping
 
@@ -97,14 +97,14 @@ class GR00TConnection:
         try:
             self._let_in(payload)
             self._session.begin()
-            request = codec.read_request(payload, self._context.limits)
-            return codec.pack(self._value(request), packed=request.packed)
+            request = gr00t.read_request(payload, self._context.limits)
+            return gr00t.pack(self._value(request), packed=request.packed)
         except VLAgentsError as error:
-            return codec.pack({"error": f"{error.code}: {error}"})
+            return gr00t.pack({"error": f"{error.code}: {error}"})
         except Exception:
             name = uuid.uuid4().hex
             logger.exception("gr00t: request %s failed", name)
-            return codec.pack({"error": f"internal error; the server's log has the details under {name}"})
+            return gr00t.pack({"error": f"internal error; the server's log has the details under {name}"})
 
     def _let_in(self, payload: bytes) -> None:
         """Identify the client by the key in the message, before anything else of that is decoded."""
@@ -112,29 +112,29 @@ class GR00TConnection:
         if isinstance(check, NoKey):
             self._session.show(check, None)
         else:
-            key = codec.read_token(payload, self._context.limits)
+            key = gr00t.read_token(payload, self._context.limits)
             self._session.show(check(key), key)
 
     def _value(self, request: GR00TRequest) -> Any:
         if request.endpoint == "ping":
             return {"status": "ok", "message": "Server is running"}
         if request.endpoint == "get_modality_config":
-            return codec.modality_config(self._modalities(), flat=self._flat)
+            return gr00t.modality_config(self._modalities(), flat=self._flat)
         if request.endpoint == "reset":
             self._session.restart()
             return {}
-        return self._act(codec.read_observations(request.data))
+        return self._act(gr00t.read_observations(request.data))
 
     def _act(self, asked: Observations) -> Any:
         mapping, contract = self._mapping, self._context.contract
         self._flat = asked.flat
-        seen = [mapping.obs(codec.newest(one), self._context.limits, contract) for one in asked.each]
+        seen = [mapping.obs(gr00t.newest(one), self._context.limits, contract) for one in asked.each]
         if not self._session.begun:
-            mapping.warn_of_unread_cameras(codec.newest(asked.each[0]), "gr00t")
+            mapping.warn_of_unread_cameras(gr00t.newest(asked.each[0]), "gr00t")
         acts = self._session.act_batch([obs for obs, _ in seen], [text for _, text in seen])
         spec = None if contract is None else contract.action
         info = {"done": [act.done for act in acts]} | {"timing": acts[0].info.get("timing", {})}
-        return codec.write_actions([mapping.actions(act.action, spec) for act in acts], asked, info)
+        return gr00t.write_actions([mapping.actions(act.action, spec) for act in acts], asked, info)
 
     def _modalities(self) -> dict[str, tuple[list[str], list[int]]]:
         mapping, contract = self._mapping, self._context.contract
@@ -146,7 +146,7 @@ class GR00TConnection:
             "video": (_theirs(cameras, contract.cameras or {}), [0]),
             "state": (_theirs(state, contract.state or {}), [0]),
             "action": (list(mapping.action) or ["action"], list(range(chunk))),
-            "language": ([codec.TEXT_KEY], [0]),
+            "language": ([gr00t.TEXT_KEY], [0]),
         }
 
 
@@ -160,7 +160,7 @@ def _theirs(entries: Iterable[tuple[str, str]], needed: Iterable[str]) -> list[s
 
 
 def nested_mapping(mapping: KeyMapping) -> tuple[KeyMapping, bool]:
-    """Return a mapping with the keys of `codec.newest`, and whether it had N1.5's flat keys, such as `video.front`."""
+    """Return a mapping with the keys of `gr00t.newest`, and whether it had N1.5's flat keys, such as `video.front`."""
 
     def folders(key: str) -> str:
         return "|".join(_FOLDER.sub(r"\1/", one) for one in key.split("|"))
@@ -170,7 +170,7 @@ def nested_mapping(mapping: KeyMapping) -> tuple[KeyMapping, bool]:
         cameras={name: replace(one, key=folders(one.key)) for name, one in mapping.cameras.items()},
         state={name: tuple(replace(one, key=folders(one.key)) for one in of) for name, of in mapping.state.items()},
         gripper=mapping.gripper and replace(mapping.gripper, key=folders(mapping.gripper.key)),
-        instruction=mapping.instruction and f"language/{codec.TEXT_KEY}",
+        instruction=mapping.instruction and f"language/{gr00t.TEXT_KEY}",
         action={name.removeprefix("action."): one for name, one in mapping.action.items()},
     )
     return nested, nested.cameras != mapping.cameras or nested.state != mapping.state

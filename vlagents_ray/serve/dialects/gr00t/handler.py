@@ -21,8 +21,8 @@ from vlagents_ray.serve.config.dialects import MappingSetting, PortConfig
 from vlagents_ray.serve.dialects.base import GatewayContext, PortDialect
 from vlagents_ray.serve.dialects.gateway_clients import GatewayClients
 from vlagents_ray.serve.dialects.gr00t.connection import WAITING, GR00TConnection
-from vlagents_ray.wire.gr00t import codec
-from vlagents_ray.wire.gr00t.presets import PRESETS
+from vlagents_ray.wire import gr00t
+from vlagents_ray.wire.gr00t import PRESETS
 
 logger = logging.getLogger(__name__)
 
@@ -175,15 +175,15 @@ class GR00TDialect(PortDialect):
             try:
                 client = self._clients.add(envelope, lambda: GR00TConnection(self.context, self.mapping, answer))
             except PolicyUnavailable as full:
-                answer(codec.pack({"error": f"{full.code}: {full}"}))
+                answer(gr00t.pack({"error": f"{full.code}: {full}"}))
                 return
         if self._strangers is not None:
             self._strangers.note_client(descriptor, client)
         try:
             if not client.put(payload):
-                self.answer(envelope, codec.pack({"error": "malformed: wait for the answer before the next request"}))
+                self.answer(envelope, gr00t.pack({"error": "malformed: wait for the answer before the next request"}))
         except VLAgentsError as error:
-            self.answer(envelope, codec.pack({"error": f"{error.code}: {error}"}))
+            self.answer(envelope, gr00t.pack({"error": f"{error.code}: {error}"}))
 
     def _forget_quiet(self) -> None:
         """End the sessions of idle clients and of clients whose key is no longer valid, twice a second."""

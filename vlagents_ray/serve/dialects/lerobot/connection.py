@@ -17,8 +17,8 @@ from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.dialects.base import GatewayContext
 from vlagents_ray.serve.dialects.gateway_sessions import GatewaySessions
 from vlagents_ray.serve.engine.admission import MessageAdmission
-from vlagents_ray.wire.lerobot import codec
-from vlagents_ray.wire.lerobot.codec import PolicyInstructions, RobotObservation
+from vlagents_ray.wire import lerobot
+from vlagents_ray.wire.lerobot import PolicyInstructions, RobotObservation
 from vlagents_ray.wire.mapping.mapping import KeyMapping
 
 logger = logging.getLogger(__name__)
@@ -102,10 +102,10 @@ class LeRobotConnection:
         if self._robot is None:
             raise NotReset("SendPolicyInstructions: got none since Ready; start the client again")
         admission.begin("act")
-        seen = codec.read_observation(data, admission)
+        seen = lerobot.read_observation(data, admission)
         if seen.timestep <= self._acted and not seen.must_go:
             return
-        theirs = codec.frame(seen, self._robot)
+        theirs = lerobot.frame(seen, self._robot)
         obs, instruction = self._mapping.obs(theirs, self._context.limits, self._context.contract)
         if not self._session.begun:
             self._mapping.warn_of_unread_cameras(theirs, "lerobot")
@@ -162,4 +162,4 @@ class LeRobotConnection:
             waiting.admission.release()
         rows: np.ndarray = self._mapping.rows(act.action, None if contract is None else contract.action)
         hz = (contract and contract.control_hz) or _HZ
-        return codec.write_chunk(rows[: robot.actions_per_chunk], seen.timestamp, seen.timestep, 1 / hz)
+        return lerobot.write_chunk(rows[: robot.actions_per_chunk], seen.timestamp, seen.timestep, 1 / hz)

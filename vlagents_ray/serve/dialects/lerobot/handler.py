@@ -22,9 +22,8 @@ from vlagents_ray.serve.dialects.base import GatewayContext, PortDialect
 from vlagents_ray.serve.dialects.gateway_clients import GatewayClients
 from vlagents_ray.serve.dialects.lerobot.connection import LeRobotConnection
 from vlagents_ray.serve.engine.admission import MessageAdmission
-from vlagents_ray.wire.lerobot import codec, protobuf
-from vlagents_ray.wire.lerobot.presets import PRESETS
-from vlagents_ray.wire.lerobot.protobuf import TransferState
+from vlagents_ray.wire import lerobot
+from vlagents_ray.wire.lerobot import PRESETS, TransferState
 
 logger = logging.getLogger(__name__)
 
@@ -90,7 +89,7 @@ class LeRobotDialect(PortDialect):
         most = _REQUESTS * self.context.sessions
         self._server = grpc.server(
             ThreadPoolExecutor(most, "lerobot-client"),
-            handlers=[grpc.method_handlers_generic_handler(protobuf.SERVICE, self._methods(grpc))],
+            handlers=[grpc.method_handlers_generic_handler(lerobot.SERVICE, self._methods(grpc))],
             options=[
                 ("grpc.so_reuseport", 0),  # another process could share the port otherwise
                 ("grpc.max_concurrent_streams", _REQUESTS),
@@ -139,7 +138,7 @@ class LeRobotDialect(PortDialect):
             status, text = _STATUS.get(error.status, "INTERNAL"), f"{error.code}: {error}"
         except Exception as error:
             if isinstance(error, grpc.RpcError):  # the client is gone
-                return protobuf.EMPTY
+                return lerobot.EMPTY
             name = uuid.uuid4().hex
             logger.exception("lerobot: request %s failed", name)
             status, text = "INTERNAL", f"internal error; the server's log has the details under {name}"
@@ -153,14 +152,14 @@ class LeRobotDialect(PortDialect):
             raise Forbidden("this server is for IPv4; connect to such an address, or set dialects.lerobot.host to '::'")
         make = partial(LeRobotConnection, self.context, self.mapping, self.config.checkpoint)
         self._clients.add(context.peer(), make)
-        return protobuf.EMPTY
+        return lerobot.EMPTY
 
     def _set_up(self, message: bytes, context: Any) -> bytes:
         with self._client(context) as client:
-            if (data := protobuf.read_data(message)) is None:
+            if (data := lerobot.read_data(message)) is None:
                 raise MalformedMessage("policy instructions: got none")
-            client.set_up(codec.read_instructions(data, self.context.limits))
-        return protobuf.EMPTY
+            client.set_up(lerobot.read_instructions(data, self.context.limits))
+        return lerobot.EMPTY
 
     def _observe(self, parts: Iterator[bytes], context: Any) -> bytes:
         with self._client(context) as client:
@@ -172,12 +171,12 @@ class LeRobotDialect(PortDialect):
             finally:
                 del self._uploads[context]
             client.observe(data, admission)
-        return protobuf.EMPTY
+        return lerobot.EMPTY
 
     def _act(self, _: bytes, context: Any) -> bytes:
         with self._client(context) as client:
             actions = client.actions()
-        return protobuf.EMPTY if actions is None else protobuf.write_data(actions)
+        return lerobot.EMPTY if actions is None else lerobot.write_data(actions)
 
     @contextlib.contextmanager
     def _client(self, context: Any) -> Iterator[LeRobotConnection]:
@@ -203,7 +202,7 @@ def _joined(messages: Iterator[bytes], admission: MessageAdmission) -> bytes:
     parts: list[memoryview] = []
     size, limit = 0, admission.limits.body_bytes
     for message in messages:
-        part = protobuf.read_observation_part(message)
+        part = lerobot.read_observation_part(message)
         if part.state is TransferState.BEGIN and parts:
             raise MalformedMessage("observation: begins twice")
         size += len(part.data)

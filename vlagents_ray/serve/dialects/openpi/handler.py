@@ -42,8 +42,8 @@ from vlagents_ray.serve.dialects.implicit_session import ImplicitSession, Sessio
 from vlagents_ray.serve.dialects.openpi.rows import Rows, number_of_rows, unstacked
 from vlagents_ray.serve.engine.dispatch import REFUSED, Dispatcher
 from vlagents_ray.serve.engine.metrics_buffer import RequestTrace
-from vlagents_ray.wire.openpi import codec
-from vlagents_ray.wire.openpi.presets import PRESETS
+from vlagents_ray.wire import openpi
+from vlagents_ray.wire.openpi import PRESETS
 
 
 class MapDialect(RouteDialect):
@@ -164,7 +164,7 @@ class OpenPiDialect(MapDialect):
         if message["reset"] is not True:
             raise MalformedMessage(f"reset: got {shown(message['reset'])}, want true")
         connection.end_episodes()
-        return codec.encode(message) if self.config.answer_reset else b""
+        return openpi.encode(message) if self.config.answer_reset else b""
 
     def batch(self, message: dict[str, Any]) -> list[Any] | None:
         if message.keys() != {"batch"}:
@@ -216,10 +216,10 @@ class MapConnection:
         number, batched = dialect.rows_taken(message), batch is not None
         begins = any(session.episode.begins(instruction) for session, _, instruction in seen)
         if number is not None and not begins and self._rows.has(number, stacked=batched):
-            return codec.encode(self._rows.take(number))
+            return openpi.encode(self._rows.take(number))
         trace.decoded_alike(len(observations))
         replies = await act_together(seen, request_id, **dialect.reset_arguments(message))
-        data = trace.written(replies, lambda: codec.encode(self._said(replies, number, batched=batched)))
+        data = trace.written(replies, lambda: openpi.encode(self._said(replies, number, batched=batched)))
         self._before_ms = (time.perf_counter() - trace.arrived) * 1e3
         return data
 
@@ -258,7 +258,7 @@ class MapEndpoint:
         connections: dict[str, MapConnection] = {}
         gate = self._dialects[0].gate()
         try:
-            await socket.send_bytes(codec.encode(self._dialects[-1].first()))
+            await socket.send_bytes(openpi.encode(self._dialects[-1].first()))
             while True:
                 await gate.wait_unthrottled()
                 event = await asyncio.wait_for(socket.receive(), self._dialects[0].idle_s)
@@ -284,7 +284,7 @@ class MapEndpoint:
             admission.begin_message()
             if data is None:
                 raise MalformedMessage("message: got text, want a binary map")
-            message = await decoded(lambda data, budget: codec.decode(data, budget.limits), data, admission)
+            message = await decoded(lambda data, budget: openpi.decode(data, budget.limits), data, admission)
             dialect = next((dialect for dialect in self._dialects if dialect.speaks(message)), self._dialects[0])
             arrived, trace = trace.arrived, dialect.trace()
             trace.arrived = arrived

@@ -16,8 +16,8 @@ from starlette.responses import Response
 from vlagents_ray.protocol.budget import Budget
 from vlagents_ray.serve.config.dialects import DialectConfig, MappingSetting
 from vlagents_ray.serve.dialects.http import HttpDialect
-from vlagents_ray.wire.openvla import codec
-from vlagents_ray.wire.openvla.presets import PRESETS
+from vlagents_ray.wire import openvla
+from vlagents_ray.wire.openvla import PRESETS
 
 
 class OpenVLADialectConfig(DialectConfig):
@@ -43,10 +43,10 @@ class OpenVLADialect(HttpDialect):
 
         def read(data: bytes, budget: Budget) -> dict[str, Any]:
             nonlocal twice
-            theirs, twice = codec.decode(data, budget.limits)
+            theirs, twice = openvla.decode(data, budget.limits)
             return theirs
 
         def write(rows: np.ndarray) -> bytes:
-            return codec.encode(list(rows) if self.config.chunk else rows[0], twice)
+            return openvla.encode(list(rows) if self.config.chunk else rows[0], twice)
 
         return await self.answer(http, read, write)

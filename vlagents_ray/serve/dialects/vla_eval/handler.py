@@ -38,8 +38,8 @@ from vlagents_ray.serve.dialects.implicit_session import ImplicitSession
 from vlagents_ray.serve.endpoints.http_messages import problem_response
 from vlagents_ray.serve.engine.admission import MessageAdmission
 from vlagents_ray.serve.engine.dispatch import REFUSED, Dispatcher
-from vlagents_ray.wire.vla_eval import codec
-from vlagents_ray.wire.vla_eval.presets import PRESETS
+from vlagents_ray.wire import vla_eval
+from vlagents_ray.wire.vla_eval import PRESETS
 
 _WAITING = 16  # maximum of waiting messages of a client that does not wait for replies
 
@@ -92,7 +92,7 @@ class VlaEvalDialect(RouteDialect):
             while (received := await inbox.next()) is not None:
                 answer = await self._answer(received, connection)
                 if answer is not None:
-                    await socket.send_bytes(codec.encode(answer))
+                    await socket.send_bytes(vla_eval.encode(answer))
             if inbox.end is not None:
                 await socket.close(POLICY_VIOLATION, inbox.end)
         except WebSocketDisconnect:
@@ -103,7 +103,7 @@ class VlaEvalDialect(RouteDialect):
             with contextlib.suppress(asyncio.CancelledError):
                 await reading
 
-    async def _answer(self, received: _Received, connection: _Connection) -> codec.Message | None:
+    async def _answer(self, received: _Received, connection: _Connection) -> vla_eval.Message | None:
         message = received.message
         if isinstance(message, VLAgentsError):
             return _error(message, 0, uuid.uuid4().hex)
@@ -116,27 +116,29 @@ class VlaEvalDialect(RouteDialect):
             return None  # the message reports an error of the client
         return await self._act(message, received.admission, connection)
 
-    def _hello(self, message: codec.Message) -> codec.Message:
+    def _hello(self, message: vla_eval.Message) -> vla_eval.Message:
         version = message.payload.get("protocol_version")
-        if type(version) is not int or version != codec.PROTOCOL_VERSION:
-            error = MalformedMessage(f"protocol_version: got {shown(version, 20)}, want {codec.PROTOCOL_VERSION}")
+        if type(version) is not int or version != vla_eval.PROTOCOL_VERSION:
+            error = MalformedMessage(f"protocol_version: got {shown(version, 20)}, want {vla_eval.PROTOCOL_VERSION}")
             return _error(error, message.seq, uuid.uuid4().hex)
         known = self.context.metadata()
         payload: dict[str, Any] = {
             "harness_version": f"vlagents-ray {known.get('version')}",
-            "protocol_version": codec.PROTOCOL_VERSION,
+            "protocol_version": vla_eval.PROTOCOL_VERSION,
             "model_server": known.get("policy"),
             "capabilities": {},
         }
         if self.config.observation_params:
             payload["observation_params"] = self.config.observation_params
-        return codec.Message("hello", payload, message.seq)
+        return vla_eval.Message("hello", payload, message.seq)
 
-    async def _act(self, message: codec.Message, admission: MessageAdmission, connection: _Connection) -> codec.Message:
+    async def _act(
+        self, message: vla_eval.Message, admission: MessageAdmission, connection: _Connection
+    ) -> vla_eval.Message:
         trace = self.trace()
         request_id = uuid.uuid4().hex
         try:
-            payload = await admission.decoded(partial(codec.decode_images, message.payload))
+            payload = await admission.decoded(partial(vla_eval.decode_images, message.payload))
             obs, instruction = self.read(payload)
             if not connection.session.episode.begun:
                 self.mapping.warn_of_unread_cameras(payload, self.name)
@@ -145,7 +147,7 @@ class VlaEvalDialect(RouteDialect):
                 reply = await connection.session.act(obs, instruction, request_id)
                 rows = trace.written(reply, lambda: self.rows(reply))
                 connection.chunk.replace(rows[: self.config.execute])
-            return codec.Message("action", {"actions": connection.chunk.take().action}, message.seq)
+            return vla_eval.Message("action", {"actions": connection.chunk.take().action}, message.seq)
         except Exception as error:  # noqa: BLE001 - the client is answered with it
             problem = public_problem(error, self.name, request_id)
             trace.refused(problem.code)
@@ -171,12 +173,12 @@ class _Connection:
 class _Received:
     """A received message, whose images are not decoded yet, or the error of a refused one."""
 
-    message: codec.Message | VLAgentsError
+    message: vla_eval.Message | VLAgentsError
     admission: MessageAdmission
 
     @property
     def is_observation(self) -> bool:
-        return isinstance(self.message, codec.Message) and self.message.kind == "observation"
+        return isinstance(self.message, vla_eval.Message) and self.message.kind == "observation"
 
 
 class _Inbox:
@@ -232,9 +234,9 @@ class _Inbox:
         self._there.set()
 
 
-def _read_message(data: bytes, budget: Budget) -> codec.Message:
-    return codec.decode(data, budget.limits)
+def _read_message(data: bytes, budget: Budget) -> vla_eval.Message:
+    return vla_eval.decode(data, budget.limits)
 
 
-def _error(error: VLAgentsError, seq: int, request_id: str) -> codec.Message:
-    return codec.Message("error", {"error": f"{error} (request {request_id})", "code": error.code}, seq)
+def _error(error: VLAgentsError, seq: int, request_id: str) -> vla_eval.Message:
+    return vla_eval.Message("error", {"error": f"{error} (request {request_id})", "code": error.code}, seq)

@@ -18,7 +18,7 @@ from vlagents_ray.errors import MalformedMessage, shown
 from vlagents_ray.interface import Obs
 from vlagents_ray.serve.dialects.openpi.handler import MapConnection
 from vlagents_ray.serve.dialects.roboarena.handler import RoboArenaDialect, RoboArenaDialectConfig
-from vlagents_ray.wire.openpi import codec
+from vlagents_ray.wire import openpi
 
 
 class VllmOmniDialectConfig(RoboArenaDialectConfig):
@@ -65,7 +65,7 @@ class VllmOmniDialect(RoboArenaDialect):
 
     def begins(self, message: dict[str, Any], connection: MapConnection) -> bytes | str | None:
         said = super().begins(message, connection)
-        return None if said is None else codec.encode({"status": said})
+        return None if said is None else openpi.encode({"status": said})
 
     def reset_arguments(self, message: dict[str, Any]) -> dict[str, Any]:
         if (seed := message.get("seed")) is None:
@@ -75,7 +75,7 @@ class VllmOmniDialect(RoboArenaDialect):
         return {"seed": int(seed)}
 
     def failure(self, text: str) -> bytes | None:
-        return codec.encode({"type": "error", "message": text})
+        return openpi.encode({"type": "error", "message": text})
 
 
 def _is_stack(value: Any) -> bool:

@@ -15,6 +15,7 @@ import numpy as np
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
 from vlagents_ray.wire import json_numpy
+from vlagents_ray.wire.mapping.robots import ALOHA_ACTION, ALOHA_STATE, libero_state
 
 
 def decode(body: bytes, limits: Limits = DEFAULT_LIMITS) -> tuple[dict[str, Any], bool]:
@@ -79,3 +80,38 @@ def _plain_numbers(values: list[Any]) -> np.ndarray:
     if array.dtype.kind not in "fiu":
         raise MalformedMessage(f"action: got {array.dtype}, want numbers")
     return array
+
+
+# Mappings of the clients of OpenVLA and OpenVLA-OFT.
+
+
+PRESETS: dict[str, dict[str, Any]] = {
+    # openvla, vla-scripts/deploy.py
+    "openvla": {
+        "cameras": {"front": "image"},
+        "instruction": "instruction",
+        "info": {"unnorm_key": "unnorm_key"},
+        "action_gripper": {"index": 6, "open": 1.0, "closed": 0.0},
+    },
+    # openvla-oft: observations as in experiments/robot/libero; vla-scripts/deploy.py replies with the model's output, 1
+    # = open, which its clients convert to LIBERO's -1 themselves (normalize_gripper_action, invert_gripper_action)
+    "openvla-oft": {
+        "cameras": {"front": "full_image", "wrist": {"key": "wrist_image", "optional": True}},
+        **libero_state("state"),
+        "instruction": "instruction",
+        "info": {"unnorm_key": "unnorm_key"},
+        "action_gripper": {"index": 6, "open": 1.0, "closed": 0.0},
+    },
+    # openvla-oft, experiments/robot/aloha/run_aloha_eval.py: `state` is qpos, (14,)
+    "openvla-oft-aloha": {
+        "cameras": {
+            "front": "full_image",
+            "left_wrist": {"key": "left_wrist_image", "optional": True},
+            "right_wrist": {"key": "right_wrist_image", "optional": True},
+        },
+        "state": ALOHA_STATE,
+        "instruction": "instruction",
+        "info": {"unnorm_key": "unnorm_key"},
+        "action_gripper": ALOHA_ACTION,
+    },
+}

@@ -11,13 +11,16 @@ Bytes are not copied. Arrays that a call allocates count towards `decoded_bytes`
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge, shown
-from vlagents_ray.protocol.arrays import Buffer
-from vlagents_ray.protocol.messages import Limits
+from vlagents_ray.protocol.arrays import Buffer, read_array
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
 
 _PROTOCOLS = (4, 5)
 _INTEGER = 9  # maximum number of bytes of an integer
@@ -362,3 +365,215 @@ _OPCODES: dict[int, Callable[[_StackMachine], Any]] = {
     ord("b"): _StackMachine.build,
     0x95: lambda reader: reader.take(_U8.size),  # a frame, whose length is of no use here
 }
+
+
+# numpy's arrays, types and numbers in a pickle: the calls by which numpy's own pickles state them.
+#
+# The facts come from the pickles of numpy 1.26 and 2.4 in protocol 4 and 5. Arrays of objects, text, times or
+# structures, and big-endian ones, are refused.
+
+
+class _Dtype(str):
+    """The name of a plain numpy type, such as `<f4`."""
+
+    __slots__ = ()
+
+
+def _dtype(arguments: tuple[Any, ...]) -> Reduced:
+    """`numpy.dtype`: ("f4", False, True), then (3, "<", None, None, None, -1, -1, 0)."""
+    match arguments:
+        case (str(kind), bool() | int(), bool() | int()):
+            return Reduced(lambda state: _ordered_dtype(kind, state))
+    raise MalformedMessage("pickle: numpy.dtype: want the type of plain numbers")
+
+
+def _ordered_dtype(kind: str, state: Any) -> _Dtype:
+    match state:
+        case (int(3), str("<") | str("|") as order, None, None, None, int(-1), int(-1), int(0)):
+            return _Dtype(order + kind)
+    raise MalformedMessage("pickle: numpy.dtype: want the type of plain numbers in little-endian order")
+
+
+def _array(arguments: tuple[Any, ...]) -> Reduced:
+    """`_reconstruct`: (numpy.ndarray, (0,), b"b"), then (1, shape, dtype, whether by columns, data)."""
+    match arguments:
+        case (Name("numpy", "ndarray"), (int(0),), memoryview() as kind) if bytes(kind[:2]) == b"b":
+            return Reduced(_content)
+    raise MalformedMessage("pickle: numpy: want a plain array")
+
+
+def _content(state: Any) -> np.ndarray:
+    match state:
+        case (int(1), tuple(shape), _Dtype() as dtype, bool(by_columns), memoryview() as data):
+            return _ordered(data, dtype, shape, by_columns)
+    raise MalformedMessage("pickle: numpy: want the shape, the type of numbers and the data of an array")
+
+
+def _frombuffer(arguments: tuple[Any, ...]) -> Reduced:
+    """`_frombuffer`, of protocol 5: (data, dtype, shape, "C" or "F")."""
+    match arguments:
+        case (memoryview() as data, _Dtype() as dtype, tuple(shape), str("C") | str("F") as order):
+            return Reduced(value=_ordered(data, dtype, shape, order == "F"))
+    raise MalformedMessage("pickle: numpy: want an array by rows; send numpy.ascontiguousarray of it")
+
+
+def _scalar(arguments: tuple[Any, ...]) -> int | float:
+    """`scalar`: (dtype, data)."""
+    match arguments:
+        case (_Dtype() as dtype, memoryview() as data):
+            number: int | float = read_array(data, str(dtype), ()).item()
+            return number
+    raise MalformedMessage("pickle: numpy: want a plain number")
+
+
+def _ordered(data: memoryview, dtype: str, shape: tuple[Any, ...], by_columns: bool) -> np.ndarray:
+    return read_array(data, str(dtype), shape[::-1]).T if by_columns else read_array(data, str(dtype), shape)
+
+
+# numpy renamed its modules in 2.0.
+NUMPY_CALLS: dict[Name, Call | None] = {Name("numpy", "dtype"): _dtype, Name("numpy", "ndarray"): None} | {
+    Name(f"numpy.{core}.{module}", name): read
+    for core in ("core", "_core")
+    for module, name, read in (
+        ("multiarray", "_reconstruct", _array),
+        ("multiarray", "scalar", _scalar),
+        ("numeric", "_frombuffer", _frombuffer),
+    )
+}
+
+
+def read_pickled_array(data: bytes) -> np.ndarray:
+    """Return the numpy array that a pickle consists of, which views `data`.
+
+    Raises:
+        MalformedMessage: The pickle has anything but such an array, see `pickles`.
+        MessageTooLarge: It exceeds a limit.
+    """
+    found = read_pickle(data, DEFAULT_LIMITS, {}, NUMPY_CALLS)
+    if not isinstance(found, np.ndarray):
+        raise MalformedMessage(f"pickle: got {type(found).__name__}, want a numpy array")
+    return found
+
+
+# torch's tensors in a pickle: the calls by which torch states them, and the file of numbers within.
+#
+# The facts come from the pickles of torch 2.13. A tensor is a view of a storage, whose bytes are a file of
+# `torch.save` in its form before version 1.6: four pickles of protocol 2 that are always the same but for the type, the
+# key and the number of elements, a fifth with the key, and the numbers. That text is compared, and not read as pickles.
+
+
+_DTYPES = {b"Float": "<f4", b"Double": "<f8", b"Half": "<f2", b"BFloat16": "<u2"}
+_CONSTANT = (
+    b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P\x19."  # torch's magic number
+    b"\x80\x02M\xe9\x03."  # version 1001
+    b"\x80\x02}q\0(X\x10\0\0\0protocol_versionq\1M\xe9\3X\r\0\0\0little_endianq\2\x88X\n\0\0\0type_sizesq\3}q\4("
+    b"X\5\0\0\0shortq\5K\2X\3\0\0\0intq\6K\4X\4\0\0\0longq\7K\4uu."
+)
+_FILE = re.compile(
+    re.escape(_CONSTANT) + rb"\x80\x02\(X\x07\0\0\0storageq\0ctorch\n(?P<kind>Float|Double|Half|BFloat16)Storage\nq\x01"
+    rb"X.\0\0\0(?P<key>[0-9]{1,20})q\x02X\x03\0\0\0cpuq\x03(?:K.|M..|J....)Ntq\x04Q\."
+    rb"\x80\x02\]q\0X.\0\0\0(?P=key)q\x01a\."
+    rb"(?P<size>.{8})",
+    re.DOTALL,
+)
+
+
+def _storage(arguments: tuple[Any, ...]) -> Reduced:
+    """`_load_from_bytes`: (a file of torch.save,)."""
+    match arguments:
+        case (memoryview() as data,) if (file := _FILE.match(data)) is not None:
+            numbers, size = data[file.end() :], int.from_bytes(file["size"], "little")
+            found = read_array(numbers, _DTYPES[file["kind"]], (size,))
+            if file["kind"] != b"BFloat16":
+                return Reduced(value=found)
+            wide = found.astype("<u4")  # the upper half of a float32
+            wide <<= 16
+            return Reduced(value=wide.view("<f4"), allocated=wide.nbytes)
+    raise MalformedMessage("pickle: torch: want a storage of floating-point numbers on the CPU")
+
+
+def _tensor(arguments: tuple[Any, ...]) -> Reduced:
+    """`_rebuild_tensor_v2`: (storage, offset, size, stride, whether it has a gradient, no hooks)."""
+    match arguments:
+        case (np.ndarray() as storage, int(start), (int(size),), (int(stride),), bool(), dict() as hooks) if (
+            not hooks and start >= 0 and size >= 0 and start + size <= storage.size and (stride == 1 or size < 2)
+        ):
+            return Reduced(value=storage[start : start + size])
+    raise MalformedMessage("pickle: torch: want a tensor of one dimension, whose numbers lie side by side")
+
+
+def _no_hooks(arguments: tuple[Any, ...]) -> Reduced:
+    """`OrderedDict`: ()."""
+    if arguments:
+        raise MalformedMessage("pickle: torch: want a tensor without hooks")
+    return Reduced(value={})
+
+
+TORCH_CALLS: dict[Name, Call | None] = {
+    Name("torch._utils", "_rebuild_tensor_v2"): _tensor,
+    Name("torch.storage", "_load_from_bytes"): _storage,
+    Name("collections", "OrderedDict"): _no_hooks,
+}
+
+
+# Pickles that are written by hand, as Python's own pickler would need the classes.
+
+
+_ARRAY, _KIND, _DTYPE = (
+    Name("numpy._core.multiarray", "_reconstruct"),
+    Name("numpy", "ndarray"),
+    Name("numpy", "dtype"),
+)
+
+
+def write_record(name: Name, fields: Mapping[str, Any]) -> bytes:
+    """Return the pickle of an object of a data class, in protocol 4.
+
+    Args:
+        name: The class.
+        fields: Its fields: numbers below 2**31, texts, truth values, None, arrays of plain numbers, and tuples, lists
+            and dicts of these.
+    """
+    return b"".join((b"\x80\4", _named(name), b")\x81", written(fields), b"b."))
+
+
+def written(value: Any) -> bytes:
+    """Return the opcodes that push a value onto the stack."""
+    if isinstance(value, str):
+        return text(value)
+    if isinstance(value, float):
+        return b"G" + struct.pack(">d", value)
+    if isinstance(value, np.ndarray):
+        return _written_array(value)
+    if isinstance(value, Mapping):
+        return b"}(" + b"".join(text(key) + written(one) for key, one in value.items()) + b"u"
+    if isinstance(value, tuple):
+        return b"(" + b"".join(map(written, value)) + b"t"
+    if isinstance(value, list):
+        return b"](" + b"".join(map(written, value)) + b"e"
+    if value is None or isinstance(value, bool):
+        return {None: b"N", True: b"\x88", False: b"\x89"}[value]
+    return b"J" + struct.pack("<i", value)
+
+
+def text(value: str) -> bytes:
+    """Return the opcodes that push a text."""
+    data = value.encode()
+    return b"X" + struct.pack("<I", len(data)) + data
+
+
+def _named(name: Name) -> bytes:
+    return text(name.module) + text(name.name) + b"\x93"
+
+
+def _written_array(value: np.ndarray) -> bytes:
+    """Return the calls by which numpy's own pickles, from version 1.26 on, state an array of protocol 4."""
+    value = np.ascontiguousarray(value)
+    order, kind = value.dtype.str[0], value.dtype.str[1:]
+    dtype = (
+        _named(_DTYPE) + written((kind, False, True)) + b"R" + written((3, order, None, None, None, -1, -1, 0)) + b"b"
+    )
+    data = value.tobytes()
+    made = _named(_ARRAY) + _named(_KIND) + written((0,)) + b"C\1b\x87R"
+    head = written(1) + written(value.shape) + dtype + written(False) + b"B" + struct.pack("<I", len(data))
+    return b"".join((made, b"(", head, data, b"tb"))

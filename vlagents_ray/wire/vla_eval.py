@@ -124,3 +124,17 @@ def _node(value: Any) -> Any:
     if isinstance(value, np.generic) and value.dtype.kind in "biuf":
         return value.item()
     raise TypeError(f"cannot send {type(value).__name__}; want plain values and arrays of numbers")
+
+
+# The mapping of vla-eval's benchmarks.
+
+
+PRESETS: dict[str, dict[str, Any]] = {
+    # The benchmark chooses the cameras' names. Most benchmarks call the state `states`, some `state`, as vla-eval's
+    # types.py recommends; its own servers prefer the former.
+    "vla-eval": {
+        "cameras": {"*": "images/*"},
+        "state": {"state": {"key": "states|state", "optional": True}},
+        "instruction": "task_description",
+    },
+}
