@@ -15,8 +15,7 @@ from vlagents_ray.interface import Obs
 from vlagents_ray.serve.dialects.gr00t.connection import nested_mapping
 from vlagents_ray.serve.presets import presets
 from vlagents_ray.wire import gr00t as gr00t_codec
-from vlagents_ray.wire.mapping.key_paths import lookup, matches
-from vlagents_ray.wire.mapping.mapping import KeyMapping
+from vlagents_ray.wire.mapping import KeyMapping, lookup, matches
 
 each = pytest.mark.parametrize("sent", SENT, ids=lambda sent: f"{sent.preset}: {sent.source}")
 

@@ -21,7 +21,7 @@ from vlagents_ray.errors import InvalidObservation, MalformedMessage, MessageToo
 from vlagents_ray.protocol.arrays import read_array
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
 from vlagents_ray.registry import require
-from vlagents_ray.wire import msgpack, msgpack_numpy
+from vlagents_ray.wire import msgpack
 
 ENDPOINTS = ("get_action", "reset", "ping", "get_modality_config")
 TEXT_KEY = "task"  # our key in "language", in place of the client's
@@ -81,9 +81,9 @@ def read_request(payload: bytes | memoryview, limits: Limits) -> GR00TRequest:
         nonlocal packed
         if "__ndarray_class__" in node:
             return read_npy(node.get("as_npy"), limits)
-        if msgpack_numpy.is_packed(node):
+        if msgpack.is_packed(node):
             packed = True
-            return msgpack_numpy.read_packed(node)
+            return msgpack.read_packed(node)
         return node
 
     document = msgpack.unpack(payload, limits, array, text=limits.text)
@@ -197,7 +197,7 @@ def _flat(modality: str, key: str) -> str:
 
 def pack(value: Any, *, packed: bool = False) -> bytes:
     """Return a message with `value`; `packed` writes arrays in the format of `msgpack_numpy`."""
-    return msgpack.pack(value, msgpack_numpy.write_packed if packed else write_npy)
+    return msgpack.pack(value, msgpack.write_packed if packed else write_npy)
 
 
 def _arrays(group: Any, kind: str) -> dict[str, np.ndarray]:
@@ -360,7 +360,7 @@ def flat(batched: Mapping[str, Any]) -> dict[str, Any]:
 
 def write(endpoint: str, data: Any, api_token: str | None, *, packed: bool = False) -> bytes:
     """Return the message of a request; `data` is left out if it is None; `packed` is that of `reads_packed`."""
-    array = msgpack_numpy.write_packed if packed else write_npy
+    array = msgpack.write_packed if packed else write_npy
     message = {"endpoint": endpoint} | ({} if data is None else {"data": data})
     return msgpack.pack(message | ({"api_token": api_token} if api_token else {}), array)
 
@@ -371,7 +371,7 @@ def read(payload: bytes, limits: Limits = DEFAULT_LIMITS) -> Any:
     def array(node: dict[Any, Any]) -> Any:
         if "__ndarray_class__" in node:
             return read_npy(node.get("as_npy"), limits)
-        return msgpack_numpy.read_packed(node) if msgpack_numpy.is_packed(node) else node
+        return msgpack.read_packed(node) if msgpack.is_packed(node) else node
 
     return msgpack.unpack(payload, limits, array)
 

@@ -9,7 +9,7 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.naming import did_you_mean
 from vlagents_ray.wire.gr00t import PRESETS as GR00T
 from vlagents_ray.wire.lerobot import PRESETS as LEROBOT
-from vlagents_ray.wire.mapping.mapping import KeyMapping
+from vlagents_ray.wire.mapping import KeyMapping
 from vlagents_ray.wire.openpi import PRESETS as OPENPI
 from vlagents_ray.wire.openpi import ROBOARENA
 from vlagents_ray.wire.openvla import PRESETS as OPENVLA

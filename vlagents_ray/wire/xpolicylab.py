@@ -16,7 +16,7 @@ import numpy as np
 from vlagents_ray.errors import MalformedMessage, shown
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
 from vlagents_ray.protocol.observations import is_number
-from vlagents_ray.wire import msgpack, msgpack_numpy
+from vlagents_ray.wire import msgpack
 
 REPLIES = {"hello": "hello_ack", "reset": "reset_result", "infer": "infer_result"}
 ERROR = "error"
@@ -55,7 +55,7 @@ def write_request(
         "sent_at": datetime.now(timezone.utc).isoformat(),
         "payload": payload,
     }
-    return msgpack.pack(message, msgpack_numpy.write_packed)
+    return msgpack.pack(message, msgpack.write_packed)
 
 
 def observed(theirs: Mapping[str, Any]) -> dict[str, Any]:
@@ -67,7 +67,7 @@ def read_reply(data: bytes, limits: Limits = DEFAULT_LIMITS) -> PolicyReply:
     """Return a reply; raise `MalformedMessage` or `MessageTooLarge` if it is invalid."""
 
     def array(node: dict[Any, Any]) -> Any:
-        return msgpack_numpy.read_packed(node) if msgpack_numpy.is_packed(node) else node
+        return msgpack.read_packed(node) if msgpack.is_packed(node) else node
 
     found = msgpack.unpack(data, limits, array)
     if not isinstance(found, dict):

@@ -13,7 +13,7 @@ from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.policies.upstream.clients.base import UpstreamClient
 from vlagents_ray.policies.upstream.protocols import PROTOCOLS
 from vlagents_ray.wire.lerobot import PolicyInstructions, features_of
-from vlagents_ray.wire.mapping.mapping import KeyMapping
+from vlagents_ray.wire.mapping import KeyMapping
 from vlagents_ray.wire.presets import read_mapping
 
 

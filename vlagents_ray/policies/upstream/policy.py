@@ -17,7 +17,7 @@ from vlagents_ray.policies.upstream.clients.base import ClientOptions, UpstreamC
 from vlagents_ray.policies.upstream.config import UpstreamConfig
 from vlagents_ray.policies.upstream.lanes import Lanes
 from vlagents_ray.policies.upstream.session_connections import SessionConnections
-from vlagents_ray.wire.mapping.outgoing import Outgoing
+from vlagents_ray.wire.outgoing import Outgoing
 
 UPSTREAM_MS = "upstream_ms"  # in `Act.info`: the time that the upstreams needed for the batch, ms
 

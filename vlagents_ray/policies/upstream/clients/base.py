@@ -13,7 +13,7 @@ import numpy as np
 from vlagents_ray.errors import MalformedMessage, PolicyFailed
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
 from vlagents_ray.wire.lerobot import PolicyInstructions
-from vlagents_ray.wire.mapping.outgoing import Outgoing
+from vlagents_ray.wire.outgoing import Outgoing
 
 logger = logging.getLogger(__name__)
 

@@ -11,8 +11,8 @@ from vlagents_ray.policies.upstream.clients.base import Answer, ClientOptions, U
 from vlagents_ray.registry import require
 from vlagents_ray.wire import gr00t as wire
 from vlagents_ray.wire.gr00t import TEXT_KEY, is_flat, nested
-from vlagents_ray.wire.mapping.key_paths import matches
-from vlagents_ray.wire.mapping.outgoing import Outgoing
+from vlagents_ray.wire.mapping import matches
+from vlagents_ray.wire.outgoing import Outgoing
 
 
 class GR00TClient(UpstreamClient):

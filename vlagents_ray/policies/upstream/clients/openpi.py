@@ -12,7 +12,7 @@ from vlagents_ray.errors import PolicyUnavailable, VLAgentsError
 from vlagents_ray.policies.upstream.clients.base import Answer, ClientOptions, UpstreamClient
 from vlagents_ray.policies.upstream.clients.websocket import UpstreamSocket
 from vlagents_ray.wire import openpi
-from vlagents_ray.wire.mapping.outgoing import Outgoing
+from vlagents_ray.wire.outgoing import Outgoing
 
 _RESET = "reset successful"  # what RoboArena's servers answer to `reset`
 

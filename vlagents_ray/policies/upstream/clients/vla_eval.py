@@ -13,7 +13,7 @@ from vlagents_ray.errors import PolicyUnavailable, VLAgentsError
 from vlagents_ray.policies.upstream.clients.base import Answer, ClientOptions, UpstreamClient
 from vlagents_ray.policies.upstream.clients.websocket import UpstreamSocket
 from vlagents_ray.wire import vla_eval
-from vlagents_ray.wire.mapping.outgoing import Outgoing
+from vlagents_ray.wire.outgoing import Outgoing
 from vlagents_ray.wire.vla_eval import Message
 
 _STATED = ("model_server", "harness_version", "protocol_version", "observation_params", "action_spec")

@@ -19,8 +19,7 @@ from vlagents_ray.serve.dialects.base import GatewayContext
 from vlagents_ray.serve.dialects.gateway_sessions import GatewaySessions
 from vlagents_ray.wire import gr00t
 from vlagents_ray.wire.gr00t import GR00TRequest, Observations
-from vlagents_ray.wire.mapping.key_paths import matches
-from vlagents_ray.wire.mapping.mapping import KeyMapping
+from vlagents_ray.wire.mapping import KeyMapping, matches
 
 logger = logging.getLogger(__name__)
 

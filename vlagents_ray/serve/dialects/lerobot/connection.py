@@ -19,7 +19,7 @@ from vlagents_ray.serve.dialects.gateway_sessions import GatewaySessions
 from vlagents_ray.serve.engine.admission import MessageAdmission
 from vlagents_ray.wire import lerobot
 from vlagents_ray.wire.lerobot import PolicyInstructions, RobotObservation
-from vlagents_ray.wire.mapping.mapping import KeyMapping
+from vlagents_ray.wire.mapping import KeyMapping
 
 logger = logging.getLogger(__name__)
 

@@ -20,7 +20,7 @@ from vlagents_ray.serve.dialects.vlagents import codec as vlagents_codec
 from vlagents_ray.serve.dialects.vlagents.client_shm import SharedMemory
 from vlagents_ray.serve.engine.admission import MessageAdmission
 from vlagents_ray.wire import json_numpy
-from vlagents_ray.wire.mapping.mapping import KeyMapping
+from vlagents_ray.wire.mapping import KeyMapping
 from vlagents_ray.wire.vlagents import rpyc
 from vlagents_ray.wire.vlagents.rpyc import Handler, RpycCall
 

@@ -16,8 +16,7 @@ import numpy as np
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.errors import ConfigError, InvalidAction, InvalidObservation, MissingCamera, MissingState
 from vlagents_ray.interface import Obs
-from vlagents_ray.wire.mapping.fields import StateKey
-from vlagents_ray.wire.mapping.mapping import KeyMapping
+from vlagents_ray.wire.mapping import KeyMapping, StateKey
 
 _MOST = 4096  # numbers of a vector that is joined
 
