@@ -29,8 +29,8 @@ from vlagents_ray.protocol.frames import decode_replies, encode_request
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, STREAM_BYTES, Limits, Request
 from vlagents_ray.serve.access import api_keys
 from vlagents_ray.serve.access.api_keys import NoKey
+from vlagents_ray.serve.dialects import gr00t
 from vlagents_ray.serve.dialects.base import GatewayContext
-from vlagents_ray.serve.dialects.gr00t import handler as gr00t
 from vlagents_ray.serve.engine.admission import Admission
 from vlagents_ray.serve.engine.dispatch import REFUSALS
 from vlagents_ray.wire.lerobot import read_chunk

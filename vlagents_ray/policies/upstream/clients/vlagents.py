@@ -10,8 +10,8 @@ from urllib.parse import urlsplit
 
 from vlagents_ray.errors import ConnectionLost, PolicyUnavailable, VLAgentsError
 from vlagents_ray.policies.upstream.clients.base import Answer, ClientOptions, UpstreamClient
-from vlagents_ray.wire.vlagents import rpyc
-from vlagents_ray.wire.vlagents import upstream as wire
+from vlagents_ray.wire import rpyc
+from vlagents_ray.wire import vlagents as wire
 
 _PAUSE_S = 0.2  # between two questions whether the upstream's model is loaded
 
@@ -58,7 +58,7 @@ class VlagentsClient(UpstreamClient):
         text = self._method("act", deadline, wire.write_observation(observation))
         if not isinstance(text, str):
             raise self.unreadable(type(text).__name__, "a text")
-        return [wire.read_act(text, self.options.limits)]
+        return [wire.read_actions(text, self.options.limits)]
 
     def close(self) -> None:
         if self._socket is not None:
@@ -88,7 +88,7 @@ class VlagentsClient(UpstreamClient):
                     self._receive(connection, rpyc.HEADER.size, deadline), self.options.limits.body_bytes
                 )
                 body = self._receive(connection, length, deadline)
-                found = wire.read(body, compressed, self.options.limits.body_bytes)
+                found = wire.read_result(body, compressed, self.options.limits.body_bytes)
                 if found is not None and found[0] == self._sequence:
                     return found[1]
         except OSError as error:

@@ -11,7 +11,7 @@ from pydantic import Field
 from vlagents_ray.errors import MalformedMessage, shown
 from vlagents_ray.protocol.messages import NAME_CHARACTERS, Reply
 from vlagents_ray.serve.config.dialects import DialectConfig, MappingSetting
-from vlagents_ray.serve.dialects.openpi.handler import MapConnection, MapDialect
+from vlagents_ray.serve.dialects.openpi import MapConnection, MapDialect
 from vlagents_ray.wire.openpi import ROBOARENA
 
 

@@ -16,8 +16,8 @@ from pydantic import Field
 
 from vlagents_ray.errors import MalformedMessage, shown
 from vlagents_ray.interface import Obs
-from vlagents_ray.serve.dialects.openpi.handler import MapConnection
-from vlagents_ray.serve.dialects.roboarena.handler import RoboArenaDialect, RoboArenaDialectConfig
+from vlagents_ray.serve.dialects.openpi import MapConnection
+from vlagents_ray.serve.dialects.roboarena import RoboArenaDialect, RoboArenaDialectConfig
 from vlagents_ray.wire import openpi
 
 
