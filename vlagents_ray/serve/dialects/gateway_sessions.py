@@ -18,12 +18,8 @@ from vlagents_ray.errors import PolicyUnavailable
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.protocol.messages import RankName
 from vlagents_ray.serve.access.api_keys import Caller, Identity
-from vlagents_ray.serve.dialects.base import GatewayContext
+from vlagents_ray.serve.dialects.base import Connect, GatewayContext
 from vlagents_ray.serve.dialects.implicit_session import ImplicitEpisode
-
-Connect = Callable[[str | None, RankName | None], RemoteAgent]
-"""Connects to the application for one client, with its API key and the most urgent class that the key allows; None
-stands for no key, and for any class."""
 
 
 class GatewaySessions:

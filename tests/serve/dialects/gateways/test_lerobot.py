@@ -215,8 +215,8 @@ def test_a_compressed_message_is_not_decompressed(open_lerobot) -> None:
 
 
 def test_an_observation_that_takes_too_long_ends(open_lerobot, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lerobot, "_UPLOAD_S", 0.2)
-    monkeypatch.setattr(lerobot, "_TICK_S", 0.05)
+    monkeypatch.setattr("vlagents_ray.serve.dialects.lerobot._UPLOAD_S", 0.2)
+    monkeypatch.setattr("vlagents_ray.serve.dialects.lerobot._TICK_S", 0.05)
     goes_on = threading.Event()
 
     def slowly() -> Iterator[bytes]:
@@ -234,7 +234,7 @@ def test_an_observation_that_takes_too_long_ends(open_lerobot, monkeypatch: pyte
 
 
 def test_a_client_that_is_gone_loses_its_session(open_lerobot, replicas: Replicas, monkeypatch) -> None:
-    monkeypatch.setattr(lerobot, "_TICK_S", 0.05)
+    monkeypatch.setattr("vlagents_ray.serve.dialects.lerobot._TICK_S", 0.05)
     port = open_lerobot(idle_s=0.2)
     with AsyncClient(port).begin() as robot:
         robot.act(robot_saw(0))

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 from vlagents_ray.errors import ConnectionLost, InvalidObservation, PolicyUnavailable, VLAgentsError
-from vlagents_ray.policies.upstream.clients.base import Answer, ClientOptions, UpstreamClient
+from vlagents_ray.policies.upstream.client import Answer, ClientOptions, UpstreamClient
 from vlagents_ray.registry import require
 from vlagents_ray.wire import gr00t as wire
 from vlagents_ray.wire.gr00t import TEXT_KEY, is_flat, nested

@@ -8,8 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 from vlagents_ray.errors import PolicyUnavailable, VLAgentsError
-from vlagents_ray.policies.upstream.clients.base import Answer, ClientOptions, UpstreamClient
-from vlagents_ray.policies.upstream.clients.websocket import UpstreamSocket
+from vlagents_ray.policies.upstream.client import Answer, ClientOptions, UpstreamClient, UpstreamSocket
 from vlagents_ray.wire import xpolicylab
 
 _EVALUATION = "vlagents-ray"

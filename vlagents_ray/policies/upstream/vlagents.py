@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 from urllib.parse import urlsplit
 
 from vlagents_ray.errors import ConnectionLost, PolicyUnavailable, VLAgentsError
-from vlagents_ray.policies.upstream.clients.base import Answer, ClientOptions, UpstreamClient
+from vlagents_ray.policies.upstream.client import Answer, ClientOptions, UpstreamClient
 from vlagents_ray.wire import rpyc
 from vlagents_ray.wire import vlagents as wire
 

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 from urllib.parse import urlsplit
 
 from vlagents_ray.errors import ConnectionLost, MessageTooLarge, PolicyUnavailable
-from vlagents_ray.policies.upstream.clients.base import Answer, ClientOptions, UpstreamClient
+from vlagents_ray.policies.upstream.client import Answer, ClientOptions, UpstreamClient
 from vlagents_ray.wire import openvla
 
 _BUSY = (408, 429, 502, 503, 504)

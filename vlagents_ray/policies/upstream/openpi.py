@@ -9,8 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from vlagents_ray.errors import PolicyUnavailable, VLAgentsError
-from vlagents_ray.policies.upstream.clients.base import Answer, ClientOptions, UpstreamClient
-from vlagents_ray.policies.upstream.clients.websocket import UpstreamSocket
+from vlagents_ray.policies.upstream.client import Answer, ClientOptions, UpstreamClient, UpstreamSocket
 from vlagents_ray.wire import openpi
 from vlagents_ray.wire.outgoing import Outgoing
 

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 from urllib.parse import urlsplit
 
 from vlagents_ray.errors import ConnectionLost, PolicyUnavailable, VLAgentsError
-from vlagents_ray.policies.upstream.clients.base import Answer, ClientOptions, UpstreamClient
+from vlagents_ray.policies.upstream.client import Answer, ClientOptions, UpstreamClient
 from vlagents_ray.registry import require
 from vlagents_ray.wire import lerobot
 from vlagents_ray.wire import lerobot as wire
