@@ -604,12 +604,9 @@ def test_a_connection_over_its_rate_is_not_read_meanwhile(replica: KeyedReplica)
     replica.known.keys.check(visitor.token, "app").admit()
     [held] = [one for one in list(own._clients) if getattr(one.caller, "name", "") == visitor.name]
 
-    def is_left_alone() -> bool:  # for a second, in which this process may have stood still
-        client.send(frame(reset()), 10)
-        assert isinstance(decode_replies(client.recv(10))[0].error, TooManyRequests)
-        return not held._polled
-
-    wait_for(is_left_alone)
+    client.send(frame(reset()), 10)
+    assert isinstance(decode_replies(client.recv(10))[0].error, TooManyRequests)
+    wait_for(lambda: not held._polled, every_s=0.001)  # for a second, and again after each message
     client.send(frame(reset()), 10)
     assert isinstance(decode_replies(client.recv(10))[0].error, TooManyRequests)  # after a second, at most
     client.close()
