@@ -18,8 +18,8 @@ from vlagents_ray import ActionSpec, ConfigError, Contract, Obs
 from vlagents_ray.envs import make_env
 from vlagents_ray.errors import MissingDependency, MissingState
 from vlagents_ray.robot import run_loop
+from vlagents_ray.robot.environment import EnvRobot
 from vlagents_ray.robot.teleoperation import AxesLeader, Keyboard, SpaceMouse, TeleoperatedAgent
-from vlagents_ray.robot.teleoperation.environment import EnvRobot
 
 DELTAS = Contract(
     action=ActionSpec(dim=4, delta=True, gripper_open=1.0, gripper_closed=-1.0, low=-1.0, high=1.0), gripper=True
@@ -30,7 +30,7 @@ JOINTS = Contract(action=ActionSpec(dim=3, delta=False, low=-1.0, high=1.0))
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     clock = Clock()
-    monkeypatch.setattr("vlagents_ray.robot.teleoperation.keyboard.time.monotonic", clock)
+    monkeypatch.setattr("vlagents_ray.robot.teleoperation.time.monotonic", clock)
     return clock
 
 

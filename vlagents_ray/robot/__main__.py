@@ -28,8 +28,7 @@ from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.ros import RosRobot, read_settings
 from vlagents_ray.robot.safety import Guard, Watchdog, measured_state
 from vlagents_ray.robot.simulated import SimulatedRobot
-from vlagents_ray.robot.teleoperation import AxesLeader, Keyboard, SpaceMouse
-from vlagents_ray.robot.teleoperation.keyboard import HELP
+from vlagents_ray.robot.teleoperation import HELP, AxesLeader, Keyboard, SpaceMouse
 from vlagents_ray.robot.terminal import Terminal
 from vlagents_ray.viewers.targets import open_viewers
 

@@ -20,11 +20,10 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Agent, Obs
 from vlagents_ray.policies.wrapper import Wrapper, build_agent
 from vlagents_ray.robot import Guard, run_loop
+from vlagents_ray.robot.environment import EnvRobot
 from vlagents_ray.robot.episode import Label
 from vlagents_ray.robot.record import Recorder
-from vlagents_ray.robot.teleoperation import AxesDevice, AxesLeader, Keyboard, SpaceMouse, TeleoperatedAgent
-from vlagents_ray.robot.teleoperation.environment import EnvRobot
-from vlagents_ray.robot.teleoperation.keyboard import HELP
+from vlagents_ray.robot.teleoperation import HELP, AxesDevice, AxesLeader, Keyboard, SpaceMouse, TeleoperatedAgent
 
 DEVICES = ("keyboard", "spacemouse")
 KEYS = "p pauses and continues; y success, n failure, x discard end the episode; q quits"

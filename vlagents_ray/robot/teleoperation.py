@@ -1,0 +1,308 @@
+"""Devices with which an operator moves a robot: leaders for `ChunkPlayer(..., override=leader)`."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from vlagents_ray.chunking.control import Leader
+from vlagents_ray.contract import Contract
+from vlagents_ray.errors import ConfigError, MissingState
+from vlagents_ray.interface import INTERVENTION, Act, Agent, Obs
+from vlagents_ray.registry import require
+from vlagents_ray.robot.terminal import Terminal
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+__all__ = ["AxesDevice", "AxesLeader", "Keyboard", "Leader", "SpaceMouse", "TeleoperatedAgent"]
+
+_FULLY_OPEN = 0.9  # below this opening, a gripper may hold something
+_SPEED = 0.5
+
+
+class AxesDevice(Protocol):
+    """The interface of a device with axes; its methods return at once."""
+
+    def engaged(self) -> bool:
+        """Read the device, and return whether the human wants to move the robot."""
+        ...
+
+    def axes(self) -> np.ndarray:
+        """Return x, y, z, roll, pitch and yaw as read last, (6,), each in [-1, 1]."""
+        ...
+
+    def gripper_presses(self) -> int:
+        """Return how often the gripper's button has been pressed since the last call."""
+        ...
+
+
+class AxesLeader:
+    """A leader that turns the axes of a device into actions.
+
+    Axis i moves number i of the action: for relative actions of an end effector x, y, z and, if the action has them,
+    rotations; else the first six joints. The gripper is the last number, if the contract says how it is opened. When
+    the human takes over, it is left open if it is fully open; else it is closed, as it may hold something.
+
+    Args:
+        contract: The policy's contract, which states `action.dim`, and whether actions are relative.
+        device: The device.
+        step: The change of a number at a tick with the axis at its end, in the action's units; default: half of the
+            action's bound, if actions are relative and bounded.
+        measure: Returns the robot's pose in an observation, (D,) in the action's order and units, from which absolute
+            targets begin; default: the state's part `joints`, with the gripper's command after it.
+
+    Raises:
+        ConfigError: The contract does not say enough, or `step` is missing or not above 0.
+    """
+
+    def __init__(
+        self,
+        contract: Contract | None,
+        device: AxesDevice,
+        *,
+        step: float | None = None,
+        measure: Callable[[Obs], np.ndarray] | None = None,
+    ) -> None:
+        spec = None if contract is None else contract.action
+        if spec is None or spec.dim is None or spec.relative is None:
+            raise ConfigError(
+                "teleoperation: the contract states no action.dim, or not whether actions are relative; want both"
+            )
+        if step is None and spec.relative and spec.low is not None and spec.high is not None:
+            step = _SPEED * min(abs(spec.low), abs(spec.high))
+        if step is None or not step > 0:
+            raise ConfigError(
+                f"step: got {step}, want the change of a number at a tick, above 0; the contract has no bounds of "
+                f"relative actions to compute it from"
+            )
+        self._spec, self._device, self._step = spec, device, step
+        self._dim = spec.dim
+        self._measure = measure
+        self._engaged = False
+        self._closed: bool | None = None  # None: as the robot has it when the human takes over
+        self._target: np.ndarray | None = None  # of absolute actions
+
+    def engaged(self) -> bool:
+        """Read the device, and return whether the human wants to move the robot."""
+        engaged = self._device.engaged()
+        if engaged and not self._engaged:
+            self._closed = self._target = None
+        self._engaged = engaged
+        return engaged
+
+    def action(self, obs: Obs) -> np.ndarray:
+        """Return the action of the axes as read last, (D,) float32."""
+        spec, axes = self._spec, self._device.axes()
+        gripper = spec.gripper_open is not None and spec.gripper_closed is not None
+        moved = np.zeros(self._dim, np.float32)
+        n = min(self._dim - gripper, len(axes))
+        moved[:n] = self._step * axes[:n]
+        command = self._gripper(obs) if gripper else None
+        if not spec.relative:
+            if self._target is None:
+                self._target = self._pose(obs, command)
+            moved = self._target + moved
+            if spec.low is not None or spec.high is not None:
+                moved = np.clip(moved, spec.low, spec.high)
+            self._target = moved
+        if command is not None:
+            moved[-1] = command
+        return moved.astype(np.float32)
+
+    def _gripper(self, obs: Obs) -> float:
+        if self._closed is None:
+            self._closed = obs.gripper is not None and obs.gripper < _FULLY_OPEN
+        if self._device.gripper_presses() % 2:
+            self._closed = not self._closed
+        command = self._spec.gripper_closed if self._closed else self._spec.gripper_open
+        return float(command or 0.0)
+
+    def _pose(self, obs: Obs, command: float | None) -> np.ndarray:
+        if self._measure is not None:
+            return np.array(self._measure(obs), np.float32)
+        if "joints" not in obs.state:
+            raise MissingState("joints", obs.state)
+        joints = obs.state["joints"]
+        return np.array([*joints, *([] if command is None else [command])], np.float32)
+
+
+# A keyboard as a device with axes, read from the terminal, so that it also works over SSH.
+
+
+HOLD_S = 0.2
+"""How long a key counts as pressed: terminals report no release, and repeat a key that is held."""
+AXES = {"w": (0, 1), "s": (0, -1), "a": (1, 1), "d": (1, -1), "r": (2, 1), "f": (2, -1)}
+AXES |= {"o": (3, 1), "u": (3, -1), "i": (4, 1), "k": (4, -1), "j": (5, 1), "l": (5, -1)}
+GRIPPER, TAKE = " ", "\n"
+HELP = (
+    "w/s a/d r/f move along x, y, z and take over; u/o i/k j/l turn; space opens and closes the gripper; "
+    "Enter takes over and gives back"
+)
+
+
+class Keyboard:
+    """The keys of a terminal as six axes; any of them takes over, Enter takes over or gives back.
+
+        with Keyboard() as device:
+            player = ChunkPlayer(agent, override=AxesLeader(agent.contract, device))
+
+    Args:
+        keys: Further keys, and what they do. They are called by the thread of the control loop.
+        terminal: The file descriptor of the terminal; default: that of standard input.
+
+    Raises:
+        ConfigError: A key is used twice, or there is no terminal.
+    """
+
+    def __init__(self, keys: Mapping[str, Callable[[], object]] | None = None, *, terminal: int | None = None) -> None:
+        self._keys = dict(keys or {})
+        if taken := sorted(self._keys.keys() & {*AXES, GRIPPER, TAKE}):
+            raise ConfigError(f"keyboard: {taken} move the robot, so they cannot do something else")
+        self._terminal = Terminal(terminal)
+        self._until = np.zeros((6, 2))  # s of `time.monotonic`: until when a key counts, for each axis and direction
+        self._presses = 0
+        self._taken = False
+        self._open = contextlib.ExitStack()
+
+    def __enter__(self) -> Self:
+        self._open.enter_context(self._terminal.keys_at_once())
+        self._open.enter_context(self._terminal.consumed_by(self._press))
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._open.close()
+
+    def engaged(self) -> bool:
+        """Read the keys that were pressed, and return whether the human moves the robot."""
+        if not self._terminal.read(self._press):
+            raise ConnectionError("the terminal is closed")
+        return self._taken
+
+    def axes(self) -> np.ndarray:
+        """Return the axes whose keys are pressed, (6,), each -1, 0 or 1."""
+        pressed = self._until > time.monotonic()
+        return pressed[:, 0].astype(np.float32) - pressed[:, 1]
+
+    def gripper_presses(self) -> int:
+        """Return how often the gripper's key has been pressed since the last call."""
+        presses, self._presses = self._presses, 0
+        return presses
+
+    def _press(self, key: str) -> bool:
+        if key in AXES:
+            axis, sign = AXES[key]
+            side = 0 if sign > 0 else 1
+            self._until[axis, side], self._until[axis, 1 - side] = time.monotonic() + HOLD_S, 0.0
+            self._taken = True
+        elif key == GRIPPER:
+            self._presses += 1
+            self._taken = True
+        elif key == TAKE:
+            self._taken = not self._taken
+            self._until[:] = 0.0
+        elif key in self._keys:
+            self._keys[key]()
+        else:
+            return False
+        return True
+
+
+# A SpaceMouse as a device with axes; it needs the extra "spacemouse".
+
+
+_DEAD = 0.1  # of the range: the cap never rests exactly in the middle
+_REPORTS = 64  # the device sends more reports than a loop has ticks; so many are read at one
+
+
+class SpaceMouse:
+    """The cap of a SpaceMouse as six axes: pushed forward, left and up is +x, +y, +z, as ROS has them (REP 103).
+
+    Moving it takes over, its first button opens and closes the gripper, and its last one takes over or gives back.
+
+    Raises:
+        ConfigError: There is no such device, or it may not be read.
+        MissingDependency: The extra "spacemouse" is not installed.
+    """
+
+    def __init__(self) -> None:
+        try:
+            library: Any = require("pyspacemouse")
+            self._device: Any = library.open(axis_convention=library.AxisConvention.ROS)
+        except (OSError, RuntimeError) as error:  # also of hidapi, which the library loads
+            raise ConfigError(
+                f"SpaceMouse: {error}; plug one in, install hidapi (Debian: libhidapi-hidraw0), and let this user read "
+                "its /dev/hidraw"
+            ) from error
+        self._axes = np.zeros(6, np.float32)
+        self._buttons: list[int] = []
+        self._presses = 0
+        self._taken = False
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._device.close()
+
+    def engaged(self) -> bool:
+        """Read the device, and return whether the human wants to move the robot."""
+        read = None
+        for _ in range(_REPORTS):
+            state = self._device.read()
+            if state.t == read:
+                break
+            read = state.t
+            self._note(list(state.buttons))
+        axes = np.array([state.x, state.y, state.z, state.roll, state.pitch, state.yaw], np.float32)
+        self._axes = np.where(np.abs(axes) < _DEAD, 0, np.clip(axes, -1, 1)).astype(np.float32)
+        self._taken = self._taken or bool(self._axes.any())
+        return self._taken
+
+    def axes(self) -> np.ndarray:
+        """Return the axes as read last, (6,), each in [-1, 1]."""
+        return self._axes
+
+    def gripper_presses(self) -> int:
+        """Return how often the gripper's button has been pressed since the last call."""
+        presses, self._presses = self._presses, 0
+        return presses
+
+    def _note(self, buttons: list[int]) -> None:
+        before = self._buttons or [0] * len(buttons)
+        pressed = [now > then for now, then in zip(buttons, before, strict=True)]
+        self._buttons = buttons
+        if pressed and pressed[0]:
+            self._presses += 1
+            self._taken = True
+        if len(pressed) > 1 and pressed[-1]:
+            self._taken = not self._taken
+
+
+# An agent that is a human: demonstrations, in the same loop as a policy.
+
+
+class TeleoperatedAgent(Agent):
+    """An agent whose actions are all a leader's, engaged or not; there is no policy.
+
+    Args:
+        leader: What the human moves the robot with.
+        contract: What the robot gives and takes, for the loop's guard.
+    """
+
+    def __init__(self, leader: Leader, contract: Contract | None = None) -> None:
+        self._leader, self._contract = leader, contract
+
+    @property
+    def contract(self) -> Contract | None:
+        """The contract of the robot, as it was given."""
+        return self._contract
+
+    def act(self, obs: Obs) -> Act:
+        """Return the human's action, (D,) float32, with `info["intervention"]`."""
+        self._leader.engaged()  # reads what has been pressed
+        return Act(self._leader.action(obs), info={INTERVENTION: True})
