@@ -1,36 +1,25 @@
-"""The link is measured, and what is fastest over it is chosen: on a simulated link, loopback and shaped ones."""
+"""The link is measured, and the codec is chosen by it: on a simulated link, loopback and shaped ones."""
 
 from __future__ import annotations
 
-import itertools
 import time
 from collections.abc import Iterator
 
 import network_links
 import numpy as np
 import pytest
-from camera_images import photograph, rendered
+from camera_images import photograph
 
 from vlagents_ray import Obs, RemoteAgent
-from vlagents_ray.client.transports import codec_selection
-from vlagents_ray.client.transports.codec_selection import (
-    CodecChoice,
-    LinkSpeed,
-    coding_cost,
-    fastest,
-    measure,
-)
+from vlagents_ray.client.transports.codec_selection import CodecChoice, CodecName, LinkSpeed, measure
 from vlagents_ray.client.transports.select import TransportName
 from vlagents_ray.errors import MessageTooLarge, TooManyRequests
 from vlagents_ray.images.codecs import JPEG, LOSSLESS, RAW, ImageCodec
-from vlagents_ray.protocol.messages import DEFAULT_LIMITS
 
 pytestmark = pytest.mark.alone
 
 OBS = Obs({"front": photograph(seed=1), "wrist": photograph(seed=2)})
-CAMERAS = list(OBS.cameras.values())
-FLAT = Obs({"front": rendered(), "wrist": rendered()})  # PNG makes it many times smaller
-CANDIDATES = (JPEG, LOSSLESS, RAW)
+SIZE = sum(image.nbytes for image in OBS.cameras.values())
 
 
 class Simulated:
@@ -104,40 +93,29 @@ def test_a_server_that_takes_little_is_measured_with_little() -> None:
 
 
 @pytest.mark.parametrize(
-    ("bandwidth", "auto", "exact"),
-    [(1.25e6, JPEG, LOSSLESS), (12.5e6, JPEG, LOSSLESS), (1e11, RAW, RAW)],
+    ("bandwidth", "auto", "exact"), [(12.5e6, JPEG, LOSSLESS), (125e6, JPEG, RAW), (1.25e9, RAW, RAW)]
 )
-def test_what_is_fastest_over_the_link_is_chosen(
-    bandwidth: float, auto: object, exact: object, monkeypatch: pytest.MonkeyPatch
+def test_the_codec_goes_by_the_bandwidth(
+    bandwidth: float, auto: ImageCodec, exact: ImageCodec, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    coding_s = {"jpeg": 0.002, "lossless": 0.003, "raw": 0.0}  # of a machine that does nothing else
-    cost = codec_selection.coding_cost
-    monkeypatch.setattr(codec_selection, "coding_cost", lambda images, by: (cost(images, by)[0], coding_s[by.name]))
-    link = Simulated(2e-4, bandwidth)
-    found = LinkSpeed(2e-4, bandwidth)
-    assert fastest(CAMERAS, CANDIDATES, found, link.send) == auto
-    assert fastest(CAMERAS, CANDIDATES[1:], found, link.send) == exact
+    monkeypatch.setattr(
+        "vlagents_ray.client.transports.codec_selection.measure", lambda *_, **__: LinkSpeed(2e-4, bandwidth)
+    )
+    assert CodecChoice("auto").codec_for(OBS, lambda _: None) == auto
+    assert CodecChoice("exact").codec_for(OBS, lambda _: None) == exact
 
 
-def test_a_codec_costs_no_time_that_other_processes_take(monkeypatch: pytest.MonkeyPatch) -> None:
-    clock = itertools.count()  # a second passes between any two looks at it
-    monkeypatch.setattr("vlagents_ray.client.transports.codec_selection.time.perf_counter", lambda: float(next(clock)))
-    assert coding_cost(CAMERAS, JPEG)[1] < 0.5
-
-
-def test_a_message_over_the_limit_is_never_chosen() -> None:
-    link = Simulated(2e-4, 1e11)
-    assert fastest(CAMERAS, CANDIDATES, LinkSpeed(2e-4, 1e11), link.send, most_bytes=250_000) == JPEG
-    strict = Simulated(2e-4, 1e11, limit=250_000)
-    assert fastest(CAMERAS, CANDIDATES, LinkSpeed(2e-4, 1e11), strict.send) == JPEG
-
-
-def test_images_beyond_the_default_limits_are_left_to_the_server() -> None:
-    """Its `limits` may be higher; the client does not know them."""
-    huge = [np.zeros((2400, 8200, 3), np.uint8)]
-    link = Simulated(2e-4, 1.25e6)
-    assert huge[0].size > 3 * DEFAULT_LIMITS.pixels
-    assert fastest(huge, CANDIDATES, LinkSpeed(2e-4, 1.25e6), link.send) != RAW
+@pytest.mark.parametrize(("requested", "bandwidth"), [("auto", 1e9), ("exact", 1e9)])
+def test_a_message_over_the_limit_is_never_chosen(
+    requested: CodecName, bandwidth: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "vlagents_ray.client.transports.codec_selection.measure", lambda *_, **__: LinkSpeed(2e-4, bandwidth)
+    )
+    compressed = JPEG if requested == "auto" else LOSSLESS
+    assert CodecChoice(requested).codec_for(OBS, lambda _: None, most_bytes=SIZE - 1) == compressed
+    strict = Simulated(2e-4, bandwidth, limit=SIZE - 1)  # a proxy's
+    assert CodecChoice(requested).codec_for(OBS, strict.send) == compressed
 
 
 def test_a_request_over_a_long_way_is_not_late_because_the_way_was_measured() -> None:
@@ -173,19 +151,16 @@ def test_a_new_connection_is_measured_again_only_where_that_takes_no_time() -> N
         assert choice.codec is None
 
 
-def test_the_choice_stands_until_images_change_much_or_the_connection_is_new() -> None:
+def test_the_choice_stands_until_raw_images_grow_or_the_connection_is_new() -> None:
     sent: list[bytes] = []
     choice = CodecChoice("auto")
-    choice.codec_for(OBS, sent.append)
-    chosen, once = choice.link, len(sent)
-    assert once > 0
-    choice.codec_for(Obs({"front": OBS.cameras["front"][:, :160], "wrist": OBS.cameras["wrist"]}), sent.append)
-    choice.codec_for(Obs(state={"joints": np.zeros(7)}), sent.append)
-    choice.codec_for(None, sent.append)
-    assert len(sent) == once
+    choice.connected(near=True)
+    assert choice.codec_for(OBS, sent.append) == RAW
+    for obs in (OBS, Obs({"front": OBS.cameras["front"][:, :160]}), Obs(state={"joints": np.zeros(7)}), None):
+        choice.codec_for(obs, sent.append)
+    assert [len(message) for message in sent] == [SIZE]
     choice.codec_for(Obs({"front": photograph(480, 640)}), sent.append)
-    assert len(sent) > once
-    assert choice.link is chosen
+    assert [len(message) for message in sent] == [SIZE, 480 * 640 * 3]
     choice.forget()
     assert (choice.link, choice.codec) == (None, None)
 
@@ -194,7 +169,7 @@ def test_the_choice_stands_until_images_change_much_or_the_connection_is_new() -
 def test_within_a_machine_pixels_stay_raw_without_a_measurement_unless_they_are_too_many(
     part: float, chosen: ImageCodec
 ) -> None:
-    limit = part * sum(image.nbytes for image in OBS.cameras.values())
+    limit = part * SIZE
 
     def refuse(message: bytes) -> None:
         if len(message) > limit:
@@ -203,7 +178,7 @@ def test_within_a_machine_pixels_stay_raw_without_a_measurement_unless_they_are_
     choice = CodecChoice("auto")
     choice.connected(near=True)
     assert choice.codec_for(OBS, refuse) == chosen
-    assert (choice.link is None) == (chosen == RAW)
+    assert choice.link is None
 
 
 @pytest.fixture(scope="module")
@@ -234,8 +209,8 @@ def test_a_network_gets_jpeg_unless_pixels_must_arrive_as_they_are(rate: str, tr
 
             assert network_links.measure_until(agent, OBS, is_right), agent.link
         with RemoteAgent(url, transport=transport, codec="exact") as agent:
-            right = (LOSSLESS,) if rate == "100mbit" else (LOSSLESS, RAW)
-            assert network_links.measure_until(agent, FLAT, lambda: agent.codec in right), agent.link
+            right = LOSSLESS if rate == "100mbit" else RAW
+            assert network_links.measure_until(agent, OBS, lambda: agent.codec == right), agent.link
 
 
 def test_the_choice_is_the_fastest_of_all_over_a_true_link() -> None:
