@@ -93,7 +93,7 @@ class Comparer:
         found: ActionDifference | None = None
         if ours.act is not None and theirs.act is not None:
             try:
-                found = action_difference(ours.act.action, theirs.act.action, last_rows=request.parts)
+                found = action_difference(ours.act.action, theirs.act.action)
             except ValueError as error:
                 logger.warning("%s", error)
         with self._lock:

@@ -25,13 +25,12 @@ class ActionDifference:
         return float(self.by_joint.mean())
 
 
-def action_difference(live: np.ndarray, candidate: np.ndarray, *, last_rows: bool = False) -> ActionDifference:
+def action_difference(live: np.ndarray, candidate: np.ndarray) -> ActionDifference:
     """Compare the action of a candidate with that of the live policy.
 
     Args:
         live: (D,) or (H, D).
         candidate: (D,) or (H', D). Rows that only one of the two has are not compared.
-        last_rows: Whether `live` is the end of a chunk, to be compared with the last rows of `candidate`.
 
     Raises:
         ValueError: The actions have rows of different lengths, or no rows.
@@ -40,7 +39,7 @@ def action_difference(live: np.ndarray, candidate: np.ndarray, *, last_rows: boo
     rows = min(len(ours), len(theirs))
     if ours.shape[1:] != theirs.shape[1:] or rows == 0:
         raise ValueError(f"candidate's action: got {candidate.shape}, want rows as in {live.shape}")
-    ours, theirs = (ours[-rows:], theirs[-rows:]) if last_rows else (ours[:rows], theirs[:rows])
+    ours, theirs = ours[:rows], theirs[:rows]
     apart = np.abs(ours - theirs)
     lengths = np.linalg.norm(ours) * np.linalg.norm(theirs)
     cosine = float(np.vdot(ours, theirs) / lengths) if lengths else float(not (ours.any() or theirs.any()))
