@@ -163,19 +163,15 @@ class Connection:
                 self._close_old_transport()
         except VLAgentsError as error:
             if isinstance(error, DeadlineExceeded):
-                self._note_silence(begun)
+                self._silent_since = begun if self._silent_since is None else self._silent_since
+                self._silent = time.monotonic() - self._silent_since >= SILENT_S
+                self._must_reconnect = self._must_reconnect or (self._silent and self._leaves_silent)
             replies = [Reply(request.request_id, error=error) for request in requests]
         for reply in replies:
             _without_names_of_the_loop(reply)
         if len(replies) == len(requests) and not any(map(_changes_connection, replies)):
             return replies
         return self._noted(requests, replies)
-
-    def _note_silence(self, begun: float) -> None:
-        """Note that a call which began at that time, s of `time.monotonic`, had no answer within its time."""
-        self._silent_since = begun if self._silent_since is None else self._silent_since
-        self._silent = time.monotonic() - self._silent_since >= SILENT_S
-        self._must_reconnect = self._must_reconnect or (self._silent and self._leaves_silent)
 
     def _noted(self, requests: Sequence[Request], replies: list[Reply]) -> list[Reply]:
         """Note errors and whether to connect again; return a reply for each request."""
