@@ -21,8 +21,7 @@ from recorded_sessions import Brightness, recorded, reply_of, seen
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Obs
-from vlagents_ray.protocol.budget import Budget
-from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Request
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Budget, Request
 from vlagents_ray.protocol.values import from_text
 from vlagents_ray.robot.dataset import Dataset
 from vlagents_ray.serve.config.deployment import ServerArgs
