@@ -17,10 +17,10 @@ Each session has its own copy of the initialized agent, and all copies share the
 
 from __future__ import annotations
 
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
     from vlagents_ray.contract import Contract
-
-Parts = Literal["exact", "approximate"]
 
 # The keys of `Obs.info` and `Act.info` that have a meaning here; others are allowed as well, with values of the types
 # that `Obs.info` names.
@@ -92,7 +90,6 @@ class Act:
     action: np.ndarray  # (D,), or (H, D) for a chunk, float32, in the units of the contract's action
     done: bool = False  # the policy considers its task finished
     info: dict[str, Any] = field(default_factory=dict)  # as in `Obs.info`; `timing`: see `RemoteAgent.act`
-    more: bool = False  # of a part that `act_stream` yields: whether further rows of the chunk follow
 
     def rows(self) -> np.ndarray:
         """Return the action as a chunk, (H, D); a single action has H = 1."""
@@ -191,14 +188,6 @@ class Agent:
         return None
 
     @property
-    def act_parts(self) -> Parts | None:
-        """Whether `act_stream` gives a chunk in parts, so that its first rows can be executed early.
-
-        "exact": joined, they are what `act` returns. "approximate": they may differ, as the policy's page says.
-        """
-        return None
-
-    @property
     def continues_plans(self) -> bool:
         """Whether a chunk goes on from the plan in `Obs.info` (`LEFTOVER`), which it ignores otherwise."""
         return False
@@ -288,47 +277,6 @@ class Agent:
             except Exception as error:  # noqa: BLE001 - returned to the session whose request failed
                 acts.append(error)
         return acts
-
-    def act_stream(self, obs: Obs) -> Generator[Act, None, None]:
-        """Compute a chunk in parts, each as soon as its rows are known; by default, all in one part.
-
-        If the first rows are known long before the last ones, define this or `act_batch_stream`, and `act_parts`.
-
-        Args:
-            obs: The observation to act on, as in `act`.
-
-        Yields:
-            The next rows of the chunk, with `more` set in all parts but the last. `done` of the last one counts. The
-            caller reads all parts, or closes the generator, before it calls another method.
-        """
-        for [part] in self.act_batch_stream([obs], [self]):
-            if isinstance(part, Exception):
-                raise part
-            if part is not None:
-                yield part
-
-    def act_batch_stream(
-        self, obs: Sequence[Obs], sessions: Sequence[Agent]
-    ) -> Generator[list[Act | Exception | None], None, None]:
-        """Compute the chunks of several sessions in parts.
-
-        Args:
-            obs: One observation for each session, as in `act_batch`.
-            sessions: The sessions' copies of the agent, as in `act_batch`.
-
-        Yields:
-            The next part of each session, in their order; None if it has none this time. An exception ends its chunk.
-        """
-        if type(self).act_stream is Agent.act_stream:
-            yield list(self.act_batch(obs, sessions))
-            return
-        for i, (session, one) in enumerate(zip(sessions, obs, strict=True)):
-            others: tuple[list[None], list[None]] = [None] * i, [None] * (len(obs) - i - 1)
-            try:
-                for part in session.act_stream(one):
-                    yield [*others[0], part, *others[1]]
-            except Exception as error:  # noqa: BLE001 - returned to the session whose request failed
-                yield [*others[0], error, *others[1]]
 
     def check_health(self) -> None:
         """Raise an exception if this agent can never act again, e.g. after the loss of its GPU.

@@ -25,7 +25,6 @@ from ray._private import ray_constants
 from ray._private.internal_api import memory_summary
 from ray._private.worker import global_worker
 from readme_blocks import ENV, ROOT
-from streaming_agents import ROWS
 
 from vlagents_ray import ConnectionLost, Obs, PolicyUnavailable, RemoteAgent
 from vlagents_ray.client.transports import unix_messages
@@ -46,8 +45,6 @@ def served() -> Iterator[Server]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ray_constants, "DEFAULT_OBJECT_STORE_MAX_MEMORY_BYTES", STORE)
         document = deployment("served_agents:Echo", limits={"body_bytes": LIMIT, "pixels": LIMIT // 3})
-        [in_parts] = deployment("streaming_agents:InParts").applications
-        document.applications.append(in_parts.model_copy(update={"route_prefix": "/parts"}))
         with running_server(document, num_cpus=4) as server:
             yield server
 
@@ -98,7 +95,7 @@ def test_a_ray_program_of_the_user_joins_the_server_and_its_actors_act_over_plas
     script.write_text(LEARNER)
     ran = of_the_user(script, served.url)
     played = "('plasma', 'of an actor', [7.0])"
-    assert ran.stdout.splitlines() == [f"{(APP, 'InParts')} {played} {played}", "of the driver"], ran.stderr
+    assert ran.stdout.splitlines() == [f"{(APP,)} {played} {played}", "of the driver"], ran.stderr
 
 
 UNCHANGED = """
@@ -160,18 +157,6 @@ def held(agent: RemoteAgent) -> tuple[int, int]:
     """Threads and descriptors of the replica."""
     info = agent.act(frame()).info
     return info["threads"], info["descriptors"]
-
-
-def test_a_chunk_comes_in_parts_of_which_each_is_read_from_its_own_frame() -> None:
-    with RemoteAgent("serve://InParts", transport="plasma") as agent:
-        image = np.full((64, 64, 3), 9, np.uint8)
-        agent.reset(Obs({"front": image}, info={"value": 0.0}), "task")
-        for value in (1.0, 2.0):
-            parts = list(agent.act_stream(Obs({"front": image}, info={"value": value})))
-            assert [part.more for part in parts] == [True] * (ROWS - 1) + [False]
-            assert [part.rows().tolist() for part in parts] == [[[value, row]] for row in range(ROWS)]
-            whole = agent.act(Obs({"front": image}, info={"value": value}))
-            assert whole.rows().tolist() == [[value, row] for row in range(ROWS)]
 
 
 def test_every_type_of_value_comes_back(agent: RemoteAgent) -> None:

@@ -363,7 +363,7 @@ def test_no_answer_of_a_server_has_a_name_of_the_loop() -> None:
     replicas = Replicas([Loop({**dict.fromkeys(OF_THE_LOOP, 1.0), "other": 1})])
     with replicas.agent() as agent:
         agent.reset(Obs())
-        answers = [agent.act(Obs()), *agent.act_stream(Obs()), *agent.act_batch([Obs()], [agent])]
+        answers = [agent.act(Obs()), *agent.act_batch([Obs()], [agent])]
     replicas.close()
     for act in answers:
         assert isinstance(act, Act)

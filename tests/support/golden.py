@@ -102,7 +102,7 @@ def of_request(request: Request) -> dict[str, Any]:
     default = Request(request.op)
     said = {
         name: value
-        for name in ("instruction", "kwargs", "contract", "session", "rank", "request_id", "deadline_ms", "parts")
+        for name in ("instruction", "kwargs", "contract", "session", "rank", "request_id", "deadline_ms")
         if (value := getattr(request, name)) != getattr(default, name)
     }
     found = {"op": request.op, **meaning(said)}
@@ -122,8 +122,6 @@ def of_reply(reply: Reply) -> dict[str, Any]:
         found["error"] = describe_error(reply.error)
     if reply.act is not None:
         found["act"] = {"action": meaning(reply.act.action), "done": reply.act.done, "info": meaning(reply.act.info)}
-        if reply.act.more:
-            found["act"]["more"] = True
     if reply.info is not None:
         found["info"] = meaning(reply.info)
     if reply.step is not None:
@@ -169,7 +167,6 @@ def _requests() -> list[Golden]:
         "reset": ("a reset with raw pixels, a state and options", [reset]),
         "act": ("an act with a step over 2**53, a deadline and the class of simulations", [act]),
         "act_shortest": ("an act without cameras or state", [Request("act", Obs())]),
-        "act_parts": ("an act whose chunk may come in parts", [Request("act", plain, request_id="p", parts=True)]),
         "close": ("a close", [Request("close", session="robot-1", request_id="c-1")]),
         "values": ("every value that `info` may hold", [Request("act", Obs(info=info), request_id="v")]),
         "reset_contract": (
@@ -209,7 +206,6 @@ def _replies() -> list[Golden]:
     busy = Overloaded("the replica has no memory left; send it again later")
     busy.retry_after_s = 0.25
     unknown = UnknownSession("session 'robot-1': expired, closed, or never reset; reset it")
-    first, last = Act(CHUNK[:1], info=WEIGHTS, more=True), Act(CHUNK[1:], done=True, info=WEIGHTS)
     odd = {"loss": math.nan, "distribution": {"std": np.array([0.5, np.inf], np.float32)}, "raw": b"\x00\xff"}
     say: dict[str, tuple[str, list[Reply]]] = {
         "reset_reply": ("the answer to a reset", [Reply("r-1", info={"seed": 3}, step=STEP, timing=TIMING)]),
@@ -218,8 +214,6 @@ def _replies() -> list[Golden]:
         "act_reply_info": ("an action with an info of all sorts", [Reply("i", Act(CHUNK[0], info=odd))]),
         "close_reply": ("the answer to a close", [Reply("c-1", info={})]),
         "draining": ("an answer of a replica that stops", [Reply("a-2", Act(CHUNK[0]), step=STEP + 2, draining=True)]),
-        "part": ("the first part of a chunk", [Reply("p", first, step=STEP)]),
-        "part_last": ("its last part", [Reply("p", last, step=STEP)]),
         "error": ("an error", [Reply("a-1", error=unknown)]),
         "error_retry": ("an error with a time to wait", [Reply("a-1", error=busy)]),
         "several_replies": (

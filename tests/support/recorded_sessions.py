@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -63,9 +63,9 @@ class Recorded:
 class Robot:
     sender: Dispatcher
 
-    def ask(self, request: Request, part: Callable[[Reply], object] | None = None) -> Reply:
+    def ask(self, request: Request) -> Reply:
         replies: Future[list[Reply]] = Future()
-        self.sender.send([request], replies.set_result, part=part)
+        self.sender.send([request], replies.set_result)
         [reply] = replies.result(10)
         return reply
 

@@ -13,7 +13,6 @@ import pytest
 
 from vlagents_ray import Act, Agent, Obs
 from vlagents_ray.contract import ActionSpec, Contract, StateSpec
-from vlagents_ray.interface import Parts
 from vlagents_ray.testing import ContractViolation, check_agent
 
 
@@ -243,61 +242,6 @@ class WrongChunk(GoodAgent):
         return replace(super().contract or Contract(), chunk=4)
 
 
-class GivesParts(GoodAgent):
-    """Chunks of three rows, each a part; subclasses break what it does."""
-
-    act_parts: Parts | None = "exact"
-
-    @property
-    def contract(self) -> Contract | None:
-        return replace(super().contract or Contract(), chunk=3)
-
-    def rows(self, obs: Obs) -> np.ndarray:
-        return np.stack([super(GivesParts, self).act(obs).action for _ in range(3)])
-
-    def act(self, obs: Obs) -> Any:
-        return Act(self.rows(obs))
-
-    def act_stream(self, obs: Obs) -> Any:
-        for number, row in enumerate(self.rows(obs)):
-            yield Act(row, more=number < 2)
-
-
-class PartsOfAnotherChunk(GivesParts):
-    def act_stream(self, obs: Obs) -> Any:
-        for part in super().act_stream(obs):
-            yield replace(part, action=part.action + 1)
-
-
-class RoughParts(PartsOfAnotherChunk):
-    act_parts: Parts | None = "approximate"
-
-
-class PartsWithoutALast(GivesParts):
-    def act_stream(self, obs: Obs) -> Any:
-        for part in super().act_stream(obs):
-            yield replace(part, more=True)
-
-
-class PartsOfAShorterChunk(GivesParts):
-    def act_stream(self, obs: Obs) -> Any:
-        for number, part in enumerate(super().act_stream(obs)):
-            if number < 2:
-                yield replace(part, more=number == 0)
-
-
-class PartsOfNeighbours(RoughParts):
-    def act_batch_stream(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> Any:
-        for parts in super().act_batch_stream(obs, sessions):
-            yield [part and replace(part, action=part.action + len(obs)) for part in parts]
-
-
-class FailingParts(GivesParts):
-    def act_stream(self, obs: Obs) -> Any:
-        yield from super().act_stream(obs)
-        raise RuntimeError("out of memory")
-
-
 class DictContract(GoodAgent):
     @property
     def contract(self) -> Any:
@@ -351,11 +295,6 @@ BROKEN_AGENTS: list[tuple[type[GoodAgent], str]] = [
     (ParsesItsInstruction, r"reset: raised KeyError.* for the instruction 'pick up the cube', .*instructions=\["),
     (ParsesItInAct, r"act: raised KeyError.* for the instruction 'pick up the cube' .*instructions=\["),
     (WrongChunk, "has 1 rows, the contract states 4"),
-    (PartsOfAnotherChunk, 'the parts must be the chunk that `act` returns; else `act_parts` is "approximate"'),
-    (PartsWithoutALast, "`more` is .*, want True in all parts but the last"),
-    (PartsOfAShorterChunk, "act_stream: the action has 2 rows, the contract states 3"),
-    (PartsOfNeighbours, "in a batch of 2.*act_batch_stream must give each session"),
-    (FailingParts, "act_stream: failed with RuntimeError"),
     (DictContract, "contract: got dict"),
     (ResetsToNone, "reset: got NoneType"),
     (ResetsToObject, r"info\['agent'\]"),
@@ -363,7 +302,7 @@ BROKEN_AGENTS: list[tuple[type[GoodAgent], str]] = [
 ]
 
 
-@pytest.mark.parametrize("cls", [GoodAgent, SharesItsLock, GivesParts, RoughParts, Prepares, LocksItsTokenizer])
+@pytest.mark.parametrize("cls", [GoodAgent, SharesItsLock, Prepares, LocksItsTokenizer])
 def test_a_good_agent_passes(cls: type[GoodAgent]) -> None:
     check_agent(cls())
 

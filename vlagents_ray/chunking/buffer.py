@@ -48,7 +48,6 @@ class Chunk(NamedTuple):
     info: Mapping[str, Any] = MappingProxyType({})  # the info of the policy's Act
     tick: int = 0  # the tick of the observation
     seen_at: float = 0.0  # s, of `time.monotonic`: when the observation was captured
-    more: bool = False  # whether further rows will come, see `ChunkBuffer.extend`
 
     @property
     def end(self) -> int:
@@ -113,14 +112,14 @@ class ChunkBuffer:
         If there is nothing else, the last row may be executed one step late: an answer with a single action has no
         other row, and comes when the action before it has been executed.
         """
-        if chunk.end == self.executed and self.next is None and not chunk.more:
+        while self._chunks and self._chunks[0].end <= self.executed:
+            self._chunks.popleft()
+        if chunk.end == self.executed and self.next is None:
             chunk = chunk._replace(step=chunk.step + 1)
-        return self._append(chunk)
-
-    def extend(self, chunk: Chunk) -> bool:
-        """Replace the chunk of the same number by this one, which has further rows; return as `add`."""
-        self._chunks = deque(one for one in self._chunks if one.number != chunk.number)
-        return self._append(chunk)
+        if chunk.end <= self.executed:
+            return False
+        self._chunks.append(chunk)
+        return True
 
     @property
     def next(self) -> Step | None:
@@ -166,14 +165,6 @@ class ChunkBuffer:
         if dropped:
             self._chunks = deque(kept)
         return dropped
-
-    def _append(self, chunk: Chunk) -> bool:
-        while self._chunks and self._chunks[0].end <= self.executed:
-            self._chunks.popleft()
-        if chunk.end <= self.executed:
-            return False
-        self._chunks.append(chunk)
-        return True
 
     def _at(self, place: int) -> Step | None:
         for newest in reversed(self._chunks):

@@ -4,15 +4,24 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from vlagents_ray.chunking.answer import LastAnswer
-from vlagents_ray.chunking.background import AsyncCaller, parts_of
-from vlagents_ray.chunking.buffer import DELAYS, ENSEMBLE, ENSEMBLE_M, ChunkBuffer, Merge, Mode, Step, require_settings
+from vlagents_ray.chunking.background import AsyncCaller
+from vlagents_ray.chunking.buffer import (
+    DELAYS,
+    ENSEMBLE,
+    ENSEMBLE_M,
+    Chunk,
+    ChunkBuffer,
+    Merge,
+    Mode,
+    Step,
+    require_settings,
+)
 from vlagents_ray.chunking.capture_clock import CaptureClock, stamped
 from vlagents_ray.chunking.control import Control, Leader
 from vlagents_ray.chunking.execution import Execution
@@ -49,6 +58,14 @@ from vlagents_ray.interface import (
 from vlagents_ray.validation import check_action
 
 UNCERTAINTY = "uncertainty"  # in the info of an Act, if the policy states it: a number, or one for each row
+
+
+class _Request(NamedTuple):
+    """A request to the policy."""
+
+    tick: int = -1
+    step: int = 0  # `ChunkBuffer.executed` at its observation: the position of the answer's first row
+    seen_at: float = 0.0  # s, of `time.monotonic`: when the observation was captured
 
 
 class ChunkPlayer(Agent):
@@ -141,7 +158,9 @@ class ChunkPlayer(Agent):
     def _begin(self) -> None:
         self._plan.drop()
         self._tick: int | None = None  # tick of the next `act`; None outside an episode
-        self._answer, self._execution = LastAnswer(), Execution()
+        self._request, self._execution = _Request(), Execution()  # the last request
+        self._dropped = False  # whether the answer to it is not executed
+        self._chunks = 0  # number of answers
         self._waiting_since: float | None = None
         self._trouble = WAITING
         self._captured = CaptureClock()
@@ -204,8 +223,6 @@ class ChunkPlayer(Agent):
         """
         if self._asker is not None:
             self._asker.settle()
-        while self._answer.rest is not None:
-            self._read_part(self._answer.rest, self._tick or 0)
         self._agent.observe(obs)
         if action is not None and self._tick is not None:
             self._execution.note_in_place(self._motion.move(action, obs))
@@ -239,21 +256,19 @@ class ChunkPlayer(Agent):
 
     def close(self) -> None:
         """Close the policy, at once or as soon as the request in progress is over."""
-        asker, self._asker = self._asker, None
-        self._begin()  # before the policy is closed, so that nothing of its last answer is left to be read
-        if asker is not None:
-            asker.close()
+        if self._asker is not None:
+            self._asker.close()
+            self._asker = None
         else:
             self._agent.close()
+        self._begin()
 
     def _ask(self, obs: Obs, tick: int, begun: float) -> None:
         """Take what the policy has answered, and ask it if that is due."""
         if self._asker is None or self._deadline_s is None:
-            while (wanted := self._wants(tick, obs)) and self._answer.rest is not None:
-                self._read_part(self._answer.rest, tick)
-            if wanted:
+            if self._wants(tick, obs):
                 self._note_asked(tick, obs)
-                self._read_part(parts_of(self._agent, stamped(obs, self._extras())), tick)
+                self._take(self._agent.act(stamped(obs, self._extras())), tick)
         else:  # no tick waits for an action that is not executed
             wait_s = self._deadline_s if self.control.state == "autonomous" else 0.0
             self._ask_in_time(self._asker, obs, tick, begun + wait_s)
@@ -267,12 +282,7 @@ class ChunkPlayer(Agent):
         self._motion = Motion(self.check, self._contract, safe)
 
     def _note_asked(self, tick: int, obs: Obs) -> None:
-        self._answer.ask(tick, self._plan.executed, self._captured(obs))
-
-    def _read_part(self, parts: Generator[Act, None, None], tick: int) -> None:
-        self._answer.rest = None  # after an error nothing follows
-        self._take(act := next(parts), tick)
-        self._answer.rest = parts if act.more else None
+        self._request, self._dropped = _Request(tick, self._plan.executed, self._captured(obs)), False
 
     def _is_old(self, seen_at: float) -> bool:
         return self._max_age_s is not None and seen_at < time.monotonic() - self._max_age_s
@@ -293,19 +303,18 @@ class ChunkPlayer(Agent):
         if self._mode == "open_loop":
             return self._execute is not None and step.row >= self._execute
         last = step.chunk.end == self._plan.executed + 1  # also true for each answer of a single action
-        return last or tick - self._answer.tick >= (self._execute or 1)
+        return last or tick - self._request.tick >= (self._execute or 1)
 
     def _ask_in_time(self, asker: AsyncCaller, obs: Obs, tick: int, deadline: float) -> None:
         """Take an answer, send a request if one is due, and wait for its answer as long as allowed and needed."""
-        while (answer := asker.take()) is not None:
-            self._receive(answer, tick)
+        self._receive(asker.take(), tick)
         if asker.idle and self._wants(tick, obs):
             self._note_asked(tick, obs)
             if self._waiting_since is None:
                 self._waiting_since = time.monotonic()
             asker.ask(stamped(copied(obs), self._extras()))
         while not asker.idle and (left_s := deadline - time.monotonic()) > 0:
-            fresh = self._mode != "async" and self._answer.tick == tick and not self._answer.parts
+            fresh = self._mode != "async" and self._request.tick == tick
             if not fresh and self._next() is not None:
                 break
             self._receive(asker.take(left_s), tick)
@@ -315,9 +324,9 @@ class ChunkPlayer(Agent):
             return
         if isinstance(answer, Act):
             try:
-                if not self._answer.dropped:
+                if not self._dropped:
                     self._take(answer, tick)
-                self._waiting_since = time.monotonic() if answer.more else None
+                self._waiting_since = None
             except InvalidAction as error:
                 self._trouble = refused(error)
             return
@@ -326,23 +335,17 @@ class ChunkPlayer(Agent):
         self._trouble = self._execution.failed(answer)
 
     def _take(self, act: Act, now: int) -> None:
-        answer = self._answer
         act = replace(act, info={key: value for key, value in act.info.items() if key not in OF_THE_LOOP})
         self._execution.heard(act)
-        try:
-            rows = Act(check_action(act.action, self._contract)).rows()
-        except InvalidAction:
-            self._answer.drop()  # rows that follow would be executed in place of these
-            raise
-        chunk = answer.add(act, rows, self._horizon)
-        if self._mode == "open_loop" and chunk.done and self._execute is not None:
-            # One more row if it is known only now that the task is done: the last row says so.
-            most = max(self._execute, self._plan.executed + 1 - answer.step)
-            chunk = chunk._replace(rows=chunk.rows[:most])
-        if answer.parts == 1:
-            self._delays.append(now - answer.tick)
-        added = self._plan.add(chunk) if answer.parts == 1 else self._plan.extend(chunk)
-        self._trouble = WAITING if added or act.more else LATE
+        tick, step, seen_at = self._request
+        rows = Act(check_action(act.action, self._contract)).rows()[: self._horizon]
+        if self._mode == "open_loop" and act.done and self._execute is not None:
+            # A late answer keeps one row: the last row says that the task is done.
+            rows = rows[: max(self._execute, self._plan.executed + 1 - step)]
+        self._delays.append(now - tick)
+        added = self._plan.add(Chunk(self._chunks, step, rows, act.done, act.info, tick, seen_at))
+        self._chunks += 1
+        self._trouble = WAITING if added else LATE
 
     def _extras(self) -> dict[str, Any]:
         extras = self._execution.report(self._plan.executed, self._agent)
@@ -384,8 +387,6 @@ class ChunkPlayer(Agent):
                 return step.played(action, tick, self._silent_s())
             except InvalidAction as error:
                 self._plan.drop()  # the rest was planned from where this action would have led
-                if self._answer.parts:
-                    self._answer.drop()
                 why = refused(error)
                 if not self._motion.can_hold:
                     raise
@@ -422,7 +423,7 @@ class ChunkPlayer(Agent):
     def _begin_again(self, why: Held) -> None:
         """Let the next action be of the answer to a new observation."""
         self._plan.drop()
-        self._answer.drop()
+        self._dropped = True
         self._trouble = why
 
     def _silent_s(self) -> float:

@@ -6,7 +6,7 @@ import math
 import os
 import time
 from collections import deque
-from collections.abc import Generator, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +15,6 @@ from vlagents_ray.client.connection import Connection
 from vlagents_ray.client.credentials import Credentials
 from vlagents_ray.client.session import ClientSession, EpisodeState, call_with_recovery
 from vlagents_ray.client.tracing import traced
-from vlagents_ray.client.transports.base import no_parts
 from vlagents_ray.client.transports.codec_selection import CodecChoice, CodecName, LinkSpeed
 from vlagents_ray.client.transports.select import TransportName, select_transport
 from vlagents_ray.contract import Contract
@@ -24,12 +23,11 @@ from vlagents_ray.errors import (
     ConnectionLost,
     DeadlineExceeded,
     InvalidObservation,
-    NotReset,
     PolicyFailed,
     UnknownSession,
 )
 from vlagents_ray.images.codecs import RAW, ImageCodec
-from vlagents_ray.interface import DEADLINE, Act, Agent, Obs, Parts, copied
+from vlagents_ray.interface import DEADLINE, Act, Agent, Obs, copied
 from vlagents_ray.protocol.messages import RANKS, RankName, Reply, Request
 from vlagents_ray.tracing import tracer
 
@@ -265,44 +263,9 @@ class RemoteAgent(Agent):
         return [self._take(*each, round_trip_ms) for each in zip(siblings, obs, replies, strict=True)]
 
     @property
-    def act_parts(self) -> Parts | None:
-        """Whether the policy gives its chunks in parts over this connection; see `Agent.act_parts`."""
-        if self._session.episode is None:  # in an episode, only a call with a timeout may connect again
-            self._connection.open()
-        return self._connection.act_parts
-
-    @property
     def continues_plans(self) -> bool:
         """Whether the policy's chunks go on from the plan that is executed; see `Agent.continues_plans`."""
         return bool((self.metadata or {}).get("continues_plans"))
-
-    def act_stream(self, obs: Obs) -> Generator[Act, None, None]:
-        """Yield the rows of the next chunk as they come; the last part is without `more`, and has the `timing`.
-
-        The whole chunk is the only part where the policy gives no parts (`act_parts`), and over HTTP and Serve
-        handles. Read all parts, or close the generator, before the next call on this connection. The act counts when
-        its last part has come; an error after the first part ends it, and is not retried.
-        """
-        begun = time.perf_counter()
-        session = self._session
-        commands = self._commands
-        request = session.act(obs if commands is None else commands.asking(obs))
-        request.parts = self._connection.act_parts is not None
-        timeout_s = min(self._connection.timeout_s, _deadline_s([obs]))
-        [reply] = self._call([session], [request], timeout_s)
-        if reply.act is not None and reply.act.more and session.episode is not None:
-            session.episode.step = None  # if the caller stops here, the policy may have acted or not
-        while reply.act is not None and reply.act.more:
-            yield reply.act
-            reply = self._connection.call_on(request, timeout_s - (time.perf_counter() - begun))
-            if self._resume and isinstance(reply.error, (NotReset, UnknownSession)):  # which ask for a reset
-                reply.error = DeadlineExceeded("the session ended between two parts of a chunk; the next act begins it")
-        act = self._take(session, obs, reply, (time.perf_counter() - begun) * 1e3)
-        if commands is not None:
-            commands.came(act)
-        if isinstance(act, Exception):
-            raise act
-        yield act
 
     def close(self) -> None:
         """End the session. A later `reset` begins another one."""
@@ -330,8 +293,6 @@ class RemoteAgent(Agent):
             elif isinstance(reply.error, (ConnectionLost, UnknownSession)) and not self._resume:
                 session.episode = None
             return reply.error or PolicyFailed("act: the server's reply holds no action")
-        if reply.act.more:
-            return no_parts(self.transport)
         session.acted(obs, reply)
         timing = reply.act.info["timing"] = reply.timing
         timing["round_trip_ms"] = round_trip_ms

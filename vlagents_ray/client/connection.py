@@ -27,7 +27,6 @@ from vlagents_ray.protocol.messages import PROTOCOL_VERSION, Reply, Request, boo
 if TYPE_CHECKING:
     from vlagents_ray.client.transports.base import Transport
     from vlagents_ray.client.transports.codec_selection import CodecChoice
-    from vlagents_ray.interface import Parts
 
 logger = logging.getLogger(__name__)
 
@@ -80,7 +79,6 @@ class Connection:
         self.timeout_s = timeout_s
         self.metadata: dict[str, Any] | None = None
         self.contract: Contract | None = None
-        self.act_parts: Parts | None = None  # of the server that it was connected to last, as the contract
         self.users: set[object] = set()  # owners of the sessions
         self._connect_timeout_s = connect_timeout_s
         self.reconnects = 0  # how often it has connected again
@@ -120,7 +118,6 @@ class Connection:
             )
         contract = metadata.get("contract")
         self.contract = None if contract is None else Contract.from_json(contract)
-        self.act_parts = metadata.get("act_parts")
         self.codec.connected(near=_is_near(self.url, metadata))
         self._silent, self._silent_since = False, None  # also where the transport is still the same
         self.metadata = metadata
@@ -166,32 +163,15 @@ class Connection:
                 self._close_old_transport()
         except VLAgentsError as error:
             if isinstance(error, DeadlineExceeded):
-                self._note_silence(begun)
+                self._silent_since = begun if self._silent_since is None else self._silent_since
+                self._silent = time.monotonic() - self._silent_since >= SILENT_S
+                self._must_reconnect = self._must_reconnect or (self._silent and self._leaves_silent)
             replies = [Reply(request.request_id, error=error) for request in requests]
         for reply in replies:
             _without_names_of_the_loop(reply)
         if len(replies) == len(requests) and not any(map(_changes_connection, replies)):
             return replies
         return self._noted(requests, replies)
-
-    def call_on(self, request: Request, timeout_s: float) -> Reply:
-        """Return the next part of the reply to an act, after one whose `Act.more` is set; or the error on the way."""
-        begun = time.monotonic()
-        try:
-            reply = self.transport.call_on(request, max(1e-3, timeout_s))
-            self._silent_since = None
-        except VLAgentsError as error:
-            if isinstance(error, DeadlineExceeded):
-                self._note_silence(begun)
-            reply = Reply(request.request_id, error=error)
-        _without_names_of_the_loop(reply)
-        return self._noted([request], [reply])[0]
-
-    def _note_silence(self, begun: float) -> None:
-        """Note that a call which began at that time, s of `time.monotonic`, had no answer within its time."""
-        self._silent_since = begun if self._silent_since is None else self._silent_since
-        self._silent = time.monotonic() - self._silent_since >= SILENT_S
-        self._must_reconnect = self._must_reconnect or (self._silent and self._leaves_silent)
 
     def _noted(self, requests: Sequence[Request], replies: list[Reply]) -> list[Reply]:
         """Note errors and whether to connect again; return a reply for each request."""

@@ -1,14 +1,9 @@
-"""Flow matching in random steps, for log-probabilities, and with times by row, for early first rows.
-
-In random steps an action chunk has a log-probability (Flow-SDE).
+"""Flow matching in random steps, so that an action chunk has a log-probability (Flow-SDE).
 
 A flow's steps from noise to actions are deterministic, and the density of its actions is not known. The stochastic
 differential equation with the same marginal distributions at each time (Song et al. 2021, arXiv 2011.13456) makes each
 step a normal distribution, and the steps a Markov chain whose log-probability is a sum. Learners that fine-tune flows
 train with it: Flow-GRPO (arXiv 2505.05470), whose noise schedule this is, and πRL (arXiv 2510.25889).
-
-With times by row, the first rows of a chunk are finished after one step, and the last ones after all: the horizon-aware
-schedule of FASTER (Lu et al. 2026, arXiv 2603.19199, `compute_HAS` in their code).
 
 Flow time is openpi's: 1 is noise, 0 is the actions, and the velocity is noise minus actions. The functions take arrays
 of any library, and are differentiable there.
@@ -176,21 +171,3 @@ class RandomSteps:
             said = {"logprob": logprob[place], "entropy": entropy, "replay": replay}
             found[i] = {name: said[name] for name in want}
         return found
-
-
-def row_times(steps: int, rows: int, exponent: float) -> np.ndarray:
-    """Return the time of each row of a chunk before the first step and after each one, (K + 1, H) float32.
-
-    Row i is finished when the flow as a whole is at u = (1 - (i / (H - 1)) ** exponent) * (1 - 1 / K): the first row
-    after one step, the last one after all.
-
-    Args:
-        steps: The number of steps K.
-        rows: The number of rows H.
-        exponent: In (0, 1]; the smaller, the later are the rows after the first. FASTER's models have 0.6.
-    """
-    place = np.arange(rows) / max(rows - 1, 1)
-    ends = (1.0 - place**exponent) * (1.0 - 1.0 / steps)
-    times = (np.linspace(1.0, 0.0, steps + 1)[:, None] - ends) / (1.0 - ends)
-    times[times < 1e-6] = 0.0  # rounding
-    return times.astype(np.float32)

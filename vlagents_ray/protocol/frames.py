@@ -51,7 +51,6 @@ _OPTIONAL: dict[str, Any] = {
     "session": "",
     "rank": "robot",
     "deadline_ms": None,
-    "parts": False,
 }  # with defaults
 _WITH_OBS = ("reset", "act", "observe")
 _OF_RESET = ("instruction", "kwargs", "contract", "history")
@@ -184,8 +183,6 @@ def check_request(request: Request, limits: Limits) -> Request:
         value = getattr(request, name)
         if value is not None and not isinstance(value, dict):
             raise MalformedMessage(f"{name}: got {type(value).__name__}, want an object")
-    if type(request.parts) is not bool:
-        raise MalformedMessage(f"parts: got {shown(request.parts)}, want true or false")
     if request.rank not in RANKS:
         raise MalformedMessage(f"rank: got {shown(request.rank)}, want one of {list(RANKS)}")
     if request.step is not None and (type(request.step) is not int or request.step < 0):
@@ -240,8 +237,6 @@ def _write_reply(reply: Reply, writer: ValueWriter) -> dict[str, Any]:
             "done": bool(reply.act.done),
             "info": writer.value(reply.act.info),
         }
-        if reply.act.more:
-            node["act"]["more"] = True
     if reply.info is not None:
         node["info"] = writer.value(reply.info)
     if reply.step is not None:
@@ -277,7 +272,6 @@ def _read_reply(node: dict[str, Any], reader: ValueReader) -> Reply:
     elif (act := node.get("act")) is not None:
         try:
             reply.act = Act(reader.blob(act["action"]), bool(act["done"]), reader.value(act["info"]))
-            reply.act.more = act.get("more") is True
         except (KeyError, TypeError) as error:
             raise MalformedMessage(f"reply: got {shown(act)}, want action, done and info") from error
     else:

@@ -62,7 +62,6 @@ class Request:
     step: int | None = None
     request_id: str = ""
     deadline_ms: float | None = None  # how long the reply is of use, counted from the arrival of the request
-    parts: bool = False  # of act: whether the chunk may come in several replies, all but the last with `Act.more`
     waited_ms: float = 0.0  # how much of the deadline had passed when the server read it; not sent
 
 

@@ -226,7 +226,7 @@ class ShmReader:
 
 def _is_plain(request: Request, obs: Obs) -> bool:
     """Whether a request may have a layout, apart from its arrays."""
-    if request.op != "act" or request.parts or obs.info or len(request.request_id) > _ID_BYTES:
+    if request.op != "act" or obs.info or len(request.request_id) > _ID_BYTES:
         return False
     return obs.gripper is None or 0.0 <= obs.gripper <= 1.0  # else an error, for which the act must travel as a frame
 
@@ -256,7 +256,7 @@ def write_answers(replies: Sequence[Reply], *, arrived: float) -> bytes | None:
     actions, weights = [], []
     for reply in replies:
         act = reply.act
-        if reply.error is not None or act is None or act.more or act.action.dtype != _FLOAT32:
+        if reply.error is not None or act is None or act.action.dtype != _FLOAT32:
             return None
         if act.info:
             if (packed := _packed(act.info)) is None:

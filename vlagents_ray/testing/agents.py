@@ -43,9 +43,7 @@ def check_agent(
     Three sessions, copies of the initialized agent, run with an observation, an instruction and a seed each: one after
     the other, then in turn, with prepared observations, then in batches of 1, 2 and 3. Their actions must not depend on
     the other sessions, nor on whether `prepare` was called. If the agent defines `prepare`, several threads call it
-    while sessions are reset and acted on, as in a server, and every result must be that of one thread. If the agent
-    gives parts, those of its chunks must be the same in a batch, and be what `act` returns if its `act_parts` are
-    "exact".
+    while sessions are reset and acted on, as in a server, and every result must be that of one thread.
 
     Args:
         agent: The agent, not initialized yet.
@@ -107,8 +105,6 @@ def check_agent(
                     "act_batch must give each session what act gives it alone",
                     atol,
                 )
-    if agent.act_parts is not None:
-        _check_parts(suite, alone if agent.act_parts == "exact" else None, steps, atol)
     for attempt in ("first", "second"):
         try:
             agent.close()
@@ -151,25 +147,6 @@ def _check_threads(suite: _Suite, first: list[Act]) -> None:
             ended.set()
     for one in running:
         one.result()
-
-
-def _check_parts(suite: _Suite, whole: list[list[Act]] | None, steps: int, atol: float) -> None:
-    """Check the parts of chunks: of lone sessions, against the `whole` acts if they must equal them; and in batches."""
-    joined = []
-    for i in range(_SESSIONS):
-        session = suite.begin(i)
-        joined.append([suite.act_stream([session], [i])[0] for _ in range(steps)])
-    for i, acts in enumerate(whole or []):
-        for step, act in enumerate(acts):
-            cure = 'the parts must be the chunk that `act` returns; else `act_parts` is "approximate"'
-            require_same(act, joined[i][step], f"the joined parts of act {step} of session {i}", cure, atol)
-    for size in range(2, _SESSIONS + 1):
-        batch = [suite.begin(i) for i in range(size)]
-        for step in range(steps):
-            for i, act in enumerate(suite.act_stream(batch, range(size))):
-                where = f"the joined parts of act {step} of session {i} in a batch of {size}"
-                cure = "act_batch_stream must give each session what act_stream gives it alone"
-                require_same(joined[i][step], act, where, cure, atol)
 
 
 class _Suite:
@@ -246,27 +223,6 @@ class _Suite:
             got = f"{len(acts)} of them" if isinstance(acts, list) else type(acts).__name__
             raise ContractViolation(f"act_batch: got {got}, want a list of {len(sessions)} acts")
         return [self._checked(act, "act_batch") for act in acts]
-
-    def act_stream(self, sessions: list[Agent], numbers: Sequence[int]) -> list[Act]:
-        """Return the joined parts of an act of each session; `numbers` say whose observations they get."""
-        views = [self._view(i) for i in numbers]
-        before = copy.deepcopy(views)
-        parts: list[list[Act]] = [[] for _ in sessions]
-        for some in self._agent.act_batch_stream(views, sessions):
-            for own, part in zip(parts, some, strict=True):
-                if isinstance(part, Exception):
-                    raise ContractViolation(f"act_stream: failed with {part!r} for an observation that `act` takes")
-                if part is not None:
-                    own.append(part)
-        require_same(before, views, "the observations", "act_stream changed the caller's: work on copies")
-        joined = []
-        for own in parts:
-            if [part.more for part in own] != [True] * (len(own) - 1) + [False]:
-                marks = [part.more for part in own]
-                raise ContractViolation(f"act_stream: `more` is {marks}, want True in all parts but the last")
-            rows = np.concatenate([part.rows() for part in own]) if len(own) > 1 else own[0].action
-            joined.append(self._checked(replace(own[-1], action=rows), "act_stream"))
-        return joined
 
     @contextmanager
     def _calling(self, method: str, i: int) -> Iterator[None]:

@@ -36,7 +36,6 @@ export interface Request {
   step?: string | undefined;
   request_id?: string | undefined;
   deadline_ms?: number | undefined;
-  parts?: boolean | undefined;
 }
 
 /** An action, or a chunk of actions to be executed one after the other. */
@@ -51,8 +50,6 @@ export interface Act {
 export interface Reply {
   request_id: string;
   act?: Act;
-  /** Whether further rows of the same act follow. */
-  more?: boolean;
   info?: Record<string, Value>;
   error?: VLAgentsError;
   step?: string;
@@ -156,7 +153,6 @@ function readReply(node: Record<string, unknown>, reader: ValueReader): Reply {
     reply.error = errorFrom(error);
   } else if (act !== undefined && act !== null) {
     reply.act = readAct(act, reader);
-    if ((act as Record<string, unknown>)["more"] === true) reply.more = true;
   } else {
     reply.info = reader.value(node["info"] ?? {}) as Record<string, Value>;
   }

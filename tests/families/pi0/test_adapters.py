@@ -16,7 +16,7 @@ from peft_adapters import merge, pairs, save
 from tests.families.pi0 import tiny
 from tests.families.pi0.test_pi0 import WORDS, seen
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.interface import DISTRIBUTION, POLICY, SAMPLES, Act
+from vlagents_ray.interface import DISTRIBUTION, SAMPLES, Act
 from vlagents_ray.policies.pi0 import Pi0
 from vlagents_ray.serve.models.agent_copies import AgentCopies
 
@@ -81,23 +81,6 @@ def test_each_row_of_one_pass_acts_as_its_adapter_merged_alone(
                 samples = (one.info[DISTRIBUTION]["samples"] for one in (act, wanted))
                 np.testing.assert_allclose(*samples, atol=ATOL)
             assert chosen is None or np.abs(wanted.action - plain[seed]).max() > 100 * ATOL
-
-
-def test_parts_of_chunks_say_which_adapter_it_was(
-    folder: Path, saved: dict[str, tuple[Path, dict[str, np.ndarray]]]
-) -> None:
-    policy = load(folder, early_rows=0.6, adapters={name: str(path) for name, (path, _) in saved.items()})
-    sessions = [session(policy, seed, adapter=name) for seed, name in enumerate(("first", "second"))]
-    parts = list(policy.act_batch_stream([seen(0), seen(1)], sessions))
-    one_by_one = [(seen(i), session(policy, i, adapter=name)) for i, name in enumerate(saved)]
-    alone = [list(policy.act_batch_stream([obs], [one])) for obs, one in one_by_one]
-    said = set()
-    for i in range(2):
-        rows = np.concatenate([one[i].action for one in parts])  # type: ignore[union-attr]
-        np.testing.assert_allclose(rows, np.concatenate([one.action for [one] in alone[i]]), atol=ATOL)  # type: ignore[union-attr]
-        said |= {one[i].info[POLICY]["fingerprint"] for one in parts}  # type: ignore[union-attr]
-    assert len(said) == 2
-    assert len(parts) > 1
 
 
 def test_an_adapter_with_other_statistics_is_refused(

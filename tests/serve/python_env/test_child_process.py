@@ -330,26 +330,12 @@ def test_the_weights_of_a_policy_in_a_child_process_are_out_of_reach() -> None:
     assert weights.newest.describe() == {"version": 0, "fingerprint": "9f3c"}
 
 
-def test_parts_of_a_chunk_come_through_and_an_act_that_was_left_disturbs_no_other() -> None:
-    settings = Settings("streaming_agents:InParts", {}, 16, "1")
+def test_a_policy_in_a_child_process_says_whether_its_chunks_go_on_from_a_plan() -> None:
+    settings = Settings("mirror_policy:CountingPolicy", {}, 16, "1")
     policy = ChildAgent(Child(sys.executable, settings, {"PYTHONPATH": f"{SUPPORT}:{ROOT}"}))
-    assert (policy.act_parts, policy.continues_plans) == (None, False)
+    assert not policy.continues_plans
     policy.initialize()
     try:
-        assert (policy.act_parts, policy.continues_plans) == ("exact", True)
-        policy.reset(Obs(), "task")
-        parts = list(policy.act_stream(Obs(info={"value": 1.0})))
-        assert [part.rows().tolist() for part in parts] == [[[1.0, row]] for row in range(4)]
-        assert [part.more for part in parts] == [True, True, True, False]
-        left = policy.act_stream(Obs(info={"value": 2.0}))
-        next(left)
-        left.close()
-        [act] = policy.act_batch([Obs(info={"value": 3.0})], [policy])
-        assert isinstance(act, Act)
-        assert act.action.tolist() == [[3.0, row] for row in range(4)]
-        failing = policy.act_stream(Obs(info={"fail_at": 1}))
-        next(failing)
-        with pytest.raises(PolicyFailed):
-            next(failing)
+        assert policy.continues_plans
     finally:
         policy.close()

@@ -7,7 +7,6 @@ import json
 import shutil
 import stat
 import threading
-from collections.abc import Generator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,8 +20,8 @@ from eval_fakes import wait_for
 from recorded_sessions import Brightness, recorded, reply_of, seen
 
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.interface import Act, Obs, Parts
-from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Budget, Reply, Request
+from vlagents_ray.interface import Obs
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Budget, Request
 from vlagents_ray.protocol.values import from_text
 from vlagents_ray.robot.dataset import Dataset
 from vlagents_ray.serve.config.deployment import ServerArgs
@@ -171,29 +170,6 @@ def test_shorter_chunks_are_filled_up_and_longer_ones_get_another_dataset(tmp_pa
     assert (rows(first)["chunk_rows"], rows(second)["chunk_rows"]) == ([4, 2], [6, 4])
     assert rows(first)["chunk"][1] == [*chunks[1].ravel().tolist(), *chunks[1][-1].tolist() * 2]
     assert rows(second)["chunk"][0] == chunks[2].ravel().tolist()
-
-
-def test_a_chunk_that_was_sent_in_parts_is_whole(tmp_path: Path) -> None:
-    class InParts(Brightness):
-        @property
-        def act_parts(self) -> Parts | None:
-            return "exact"
-
-        def act_stream(self, obs: Obs) -> Generator[Act, None, None]:
-            whole = self.act(obs).rows()
-            yield Act(whole[:1], more=True)
-            yield Act(whole[1:3], more=True)
-            yield Act(whole[3:])
-
-    with recorded(tmp_path, InParts()) as server:
-        robot = server.robot()
-        robot.play(1)
-        parts: list[Reply] = []
-        last = robot.ask(Request("act", seen(1), parts=True), parts.append)
-    sent = [reply_of(reply).act for reply in [*parts, last]]
-    assert [0 if act is None else len(act.rows()) for act in sent] == [1, 2, 1]
-    whole = np.concatenate([act.rows() for act in sent if act is not None])
-    assert rows(only(tmp_path))["chunk"][1] == whole.ravel().tolist()
 
 
 def test_a_share_of_the_episodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

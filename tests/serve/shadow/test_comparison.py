@@ -39,12 +39,6 @@ def test_a_single_action_is_one_row() -> None:
     assert action_difference(np.ones(3), np.ones((4, 3))).rows == 1
 
 
-def test_the_end_of_a_chunk_is_compared_with_the_end() -> None:
-    rows = np.arange(12.0).reshape(4, 3)
-    assert action_difference(rows[2:], rows, last_rows=True).mean == 0
-    assert action_difference(rows[2:], rows).mean == 6
-
-
 @pytest.mark.parametrize(
     ("ours", "theirs", "cosine"),
     [([1, 2], [2, 4], 1), ([1, 0], [0, 1], 0), ([1, 2], [-1, -2], -1), ([0, 0], [0, 0], 1), ([0, 0], [1, 0], 0)],

@@ -15,7 +15,7 @@ from vlagents_ray.client.transports.plasma import PlasmaTransport
 from vlagents_ray.client.transports.serve_handle import HandleTransport
 from vlagents_ray.client.transports.shm import ShmTransport, reaches
 from vlagents_ray.client.transports.websocket import WebSocketTransport
-from vlagents_ray.errors import ConfigError, ConnectionLost, MessageTooLarge, NotReset, PolicyUnavailable
+from vlagents_ray.errors import ConfigError, MessageTooLarge, NotReset, PolicyUnavailable
 from vlagents_ray.protocol.messages import Reply, Request, boot_id
 
 
@@ -89,12 +89,6 @@ class AutoTransport:
         self._chosen.close()
         self._chosen, self._handle = self._handle, None
         return self._chosen.call(requests, timeout_s)
-
-    def call_on(self, request: Request, timeout_s: float) -> Reply:
-        """Wait for the next part by the chosen transport."""
-        if self._chosen is None:
-            raise ConnectionLost("closed between two parts of a chunk; reset before the next act")
-        return self._chosen.call_on(request, timeout_s)
 
     def close(self) -> None:
         """End the connection; the next one chooses again, since the server may have moved."""

@@ -7,7 +7,6 @@ import time
 from collections.abc import Sequence
 from typing import Any, Protocol
 
-from vlagents_ray.errors import MalformedMessage
 from vlagents_ray.protocol.messages import Reply, Request
 
 logger = logging.getLogger(__name__)
@@ -38,10 +37,6 @@ class RequestChannel(Protocol):
 
     def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
         """Send requests as one frame and wait for their replies, in order. Nothing is ever sent twice."""
-        ...
-
-    def call_on(self, request: Request, timeout_s: float) -> Reply:
-        """Wait for the next part of the reply to an act, after one whose `Act.more` is set; raises as `call` does."""
         ...
 
     def close(self) -> None:
@@ -87,11 +82,6 @@ def first_timeout_s(timeout_s: float) -> float:
 def left_s(deadline: float) -> float:
     """Return the time until a deadline, s of `time.monotonic`; at least 1 ms, as 0 means no limit to some calls."""
     return max(1e-3, deadline - time.monotonic())
-
-
-def no_parts(name: str) -> MalformedMessage:
-    """Return the error for a part of a reply from a server that sends whole chunks over this transport."""
-    return MalformedMessage(f"{name}: got a part of a chunk, want a whole one")
 
 
 def is_answer(replies: Sequence[Reply], requests: Sequence[Request]) -> bool:

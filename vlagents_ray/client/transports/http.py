@@ -14,7 +14,7 @@ from typing import Any
 from urllib.parse import SplitResult, urlsplit
 
 from vlagents_ray.client.credentials import ANONYMOUS, KEY_VARIABLE, Credentials, speaks_tls, tls_failure
-from vlagents_ray.client.transports.base import ConnectReport, first_timeout_s, no_parts
+from vlagents_ray.client.transports.base import ConnectReport, first_timeout_s
 from vlagents_ray.client.transports.codec_selection import CodecChoice
 from vlagents_ray.errors import (
     ConfigError,
@@ -131,10 +131,6 @@ class HttpTransport:
             return decode_replies(body)
         refused = refusal(status, kind, body)
         return [Reply(request.request_id, error=refused) for request in requests]
-
-    def call_on(self, request: Request, timeout_s: float) -> Reply:
-        """See `RequestChannel`; the server's reply over this transport is always a whole chunk."""
-        raise no_parts(self.name)
 
     def _probe(self, probe: bytes, timeout_s: float) -> None:
         headers = {SESSION_HEADER: self._session, "content-type": "application/octet-stream"}

@@ -12,7 +12,7 @@ import uuid
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
-from vlagents_ray.client.transports.base import ConnectReport, first_timeout_s, no_parts
+from vlagents_ray.client.transports.base import ConnectReport, first_timeout_s
 from vlagents_ray.errors import ConfigError, ConnectionLost, DeadlineExceeded, PolicyUnavailable, VLAgentsError
 from vlagents_ray.images.codecs import RAW
 from vlagents_ray.protocol.frames import decode_replies, encode_requests
@@ -132,10 +132,6 @@ class HandleTransport:
             raise ConnectionLost(f"serve://{self._app}: the replica failed: {error.cause}; reset again") from error
         except ray.exceptions.RayError as error:  # the replica is gone, or its node with the frame or the answer
             raise self._lost(error) from error
-
-    def call_on(self, request: Request, timeout_s: float) -> Reply:
-        """See `RequestChannel`; the server's reply over this transport is always a whole chunk."""
-        raise no_parts(self.name)
 
     def lease(self, length: int, timeout_s: float) -> tuple[bytes, int]:
         """Call `ClientApi.lease` of the chosen replica; errors of this package are raised here."""

@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from typing import ClassVar
 
 from vlagents_ray.client.transports.base import is_answer
-from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, PolicyUnavailable, VLAgentsError
+from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, PolicyUnavailable
 from vlagents_ray.images import thread_map
 from vlagents_ray.protocol import shm_layout
 from vlagents_ray.protocol.frames import decode_replies
@@ -75,24 +75,11 @@ class UnixTransport(ABC):
         try:
             self._send(connection, requests, deadline)
             return self._await(connection, requests, deadline)
+        except TimeoutError as error:
+            raise DeadlineExceeded(f"{self.name}: no answer within {timeout_s:g} s") from error
         except OSError as error:
-            raise self._failure(error, timeout_s) from error
-
-    def call_on(self, request: Request, timeout_s: float) -> Reply:
-        """See `RequestChannel`."""
-        if self._socket is None:
-            raise ConnectionLost(f"{self.name}: closed between two parts of a chunk; reset before the next act")
-        try:
-            return self._await(self._socket, [request], time.monotonic() + timeout_s)[0]
-        except OSError as error:
-            raise self._failure(error, timeout_s) from error
-
-    def _failure(self, error: OSError, timeout_s: float) -> VLAgentsError:
-        """Return the error of a call that failed, and close a connection that broke."""
-        if isinstance(error, TimeoutError):
-            return DeadlineExceeded(f"{self.name}: no answer within {timeout_s:g} s")
-        self.close()
-        return ConnectionLost(f"{self.name}: {error}; reset before the next act")
+            self.close()
+            raise ConnectionLost(f"{self.name}: {error}; reset before the next act") from error
 
     def close(self) -> None:
         """End the connection, and with it its sessions."""

@@ -32,7 +32,6 @@ from vlagents_ray.errors import (
     MessageTooLarge,
     NoReplica,
     PolicyUnavailable,
-    VLAgentsError,
 )
 from vlagents_ray.protocol.arrays import Buffer
 from vlagents_ray.protocol.frames import decode_replies, decode_reply, request_parts
@@ -170,25 +169,15 @@ class WebSocketTransport:
         connection = self._stream(left_s(deadline))
         try:
             connection.send_pieces(pieces, left_s(deadline))
-            return _await(connection, requests, deadline)
+            while True:
+                replies = decode_replies(connection.recv(max(0.0, deadline - time.monotonic())))
+                if is_answer(replies, requests):
+                    return replies
+        except TimeoutError as error:
+            raise DeadlineExceeded(f"{self._url}: no answer within {timeout_s:g} s") from error
         except (ConnectionClosed, OSError) as error:
-            raise self._failure(error, timeout_s) from error
-
-    def call_on(self, request: Request, timeout_s: float) -> Reply:
-        """Wait for the next part of a reply, as `RequestChannel` says."""
-        if self._socket is None:
-            raise ConnectionLost(f"{self._url}: closed between two parts of a chunk; reset before the next act")
-        try:
-            return _await(self._socket, [request], time.monotonic() + timeout_s)[0]
-        except (ConnectionClosed, OSError) as error:
-            raise self._failure(error, timeout_s) from error
-
-    def _failure(self, error: Exception, timeout_s: float) -> VLAgentsError:
-        """Return the error of a call that failed, and close a connection that broke."""
-        if isinstance(error, TimeoutError):
-            return DeadlineExceeded(f"{self._url}: no answer within {timeout_s:g} s")
-        self.close()
-        return ConnectionLost(f"{self._url}: {error}; reset before the next act")
+            self.close()
+            raise ConnectionLost(f"{self._url}: {error}; reset before the next act") from error
 
     def _probe(self, probe: bytes, timeout_s: float) -> None:
         connection = self._stream(timeout_s)
@@ -250,11 +239,3 @@ class WebSocketTransport:
                 if silent:
                     attempt_s *= 2
             time.sleep(_PAUSE_S)
-
-
-def _await(connection: _Socket, requests: Sequence[Request], deadline: float) -> list[Reply]:
-    """Return the next replies to these requests; those to earlier ones are dropped. Raises what `recv` raises."""
-    while True:
-        replies = decode_replies(connection.recv(max(0.0, deadline - time.monotonic())))
-        if is_answer(replies, requests):
-            return replies

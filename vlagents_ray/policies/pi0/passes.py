@@ -24,10 +24,8 @@ def flow_velocity(
     dtype: Any,
     owners: Sequence[int] | None = None,
     cores: FlowCores | None = None,
-) -> Callable[[Any, Any], Any]:
+) -> Callable[[Any, float], Any]:
     """Return the flow's velocity as a function of noisy actions (B, H, D) and time; inputs are encoded once.
-
-    The time is a number or, where the core for the velocity is `row_velocity_of`, a tensor (H,).
 
     Args:
         network: The `PI0ForConditionalGeneration`.
@@ -47,11 +45,8 @@ def flow_velocity(
         index = torch.tensor(owners, device=mask.device)
         encoded, mask, state = encoded[index], mask[index], state[index]
 
-    def velocity(actions: Any, time: Any) -> Any:
-        if isinstance(time, float):
-            times = torch.full((len(actions),), time, dtype=torch.float32, device=actions.device)
-        else:
-            times = time.expand(len(actions), -1)
+    def velocity(actions: Any, time: float) -> Any:
+        times = torch.full((len(actions),), time, dtype=torch.float32, device=actions.device)
         return cores.velocity(encoded, mask, state, actions.to(dtype), times)
 
     return velocity
@@ -88,19 +83,3 @@ def velocity_of(network: Any, encoded: Any, mask: Any, state: Any, actions: Any,
         cache.update(layer[:, 0], layer[:, 1], number)
     output = network(state=state, noise=actions, timestep=times, attention_mask=mask, past_key_values=cache)
     return output.logits.float()
-
-
-def row_velocity_of(network: Any, encoded: Any, mask: Any, state: Any, actions: Any, times: Any) -> Any:
-    """Return what `velocity_of` does, for times (B, H), one for each row of a chunk."""
-    from transformers import DynamicCache
-
-    torch, embed = require("torch"), network.embed_action_time
-    cache = DynamicCache()
-    for number, layer in enumerate(encoded.unbind(1)):
-        cache.update(layer[:, 0], layer[:, 1], number)
-    embedded = embed.action_in_proj(actions)
-    at = embed.sinusoid_embeds(times.reshape(-1)).reshape(embedded.shape).to(embedded.dtype)
-    hidden = torch.nn.functional.silu(embed.action_time_mlp_in(torch.cat([embedded, at], dim=2)))
-    inputs = torch.cat([embed.state_proj(state)[:, None], embed.action_time_mlp_out(hidden)], dim=1)
-    output = network.model(attention_mask=mask, past_key_values=cache, action_embeds=inputs)
-    return network.action_out_proj(output.last_hidden_state[:, -actions.shape[1] :]).float()

@@ -7,10 +7,9 @@ Physical Intelligence's own code and checkpoints are `vlagents_ray.policies.open
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -19,8 +18,8 @@ from pydantic import Field
 
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import ConfigError, InvalidObservation, PolicyFailed
-from vlagents_ray.interface import Obs, Parts
-from vlagents_ray.policies.base import ModelConfig, Prediction, Row, shared_frames
+from vlagents_ray.interface import Obs
+from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row, shared_frames
 from vlagents_ray.policies.base.accelerator import ensure_torchvision, torch_device, torch_dtype
 from vlagents_ray.policies.base.checkpoint import find_checkpoint, from_pretrained
 from vlagents_ray.policies.base.config import NoiseLevel
@@ -34,9 +33,8 @@ from vlagents_ray.policies.base.model_inputs import (
     state_vector,
 )
 from vlagents_ray.policies.base.realtime import Guide
-from vlagents_ray.policies.flow import OFFERED, Change, RandomSteps, follow, row_times
-from vlagents_ray.policies.pi0.passes import FlowCores, encode, flow_velocity, row_velocity_of, velocity_of
-from vlagents_ray.policies.streaming import StreamingPolicy
+from vlagents_ray.policies.flow import OFFERED, Change, RandomSteps, follow
+from vlagents_ray.policies.pi0.passes import FlowCores, encode, flow_velocity, velocity_of
 from vlagents_ray.registry import require
 
 CAMERAS = ("base_0_rgb", "left_wrist_0_rgb", "right_wrist_0_rgb")  # openpi's names, in the order of the image tokens
@@ -58,13 +56,6 @@ class Pi0Config(ModelConfig):
     max_tokens: int = Field(default=48, ge=1, description="tokens of an instruction, as in training; more are refused")
     guidance: float = Field(default=5.0, gt=0, description="real-time chunking: largest weight of the old plan")
     noise_level: NoiseLevel = 0.0
-    early_rows: float | None = Field(
-        default=None,
-        gt=0,
-        le=1,
-        description="for clients that take a chunk in parts: the exponent of a schedule that finishes the first row "
-        "after one step of the flow (FASTER, arXiv 2603.19199, whose models have 0.6); unset: whole chunks",
-    )
 
 
 @dataclass(frozen=True)
@@ -94,7 +85,7 @@ class LoadedPi0:
         return np.asarray(mean, np.float32), np.asarray(std, np.float32) + np.float32(_EPSILON)
 
 
-class Pi0(StreamingPolicy):
+class Pi0(ModelPolicy):
     """The policy π0: chunks by flow matching, with one forward pass for all sessions of a batch."""
 
     Config: ClassVar[type] = Pi0Config
@@ -126,10 +117,6 @@ class Pi0(StreamingPolicy):
     @property
     def state_dim(self) -> int | None:
         return None if self.model is None else len(self.model.processor.state_mean)
-
-    @property
-    def act_parts(self) -> Parts | None:
-        return "approximate" if self.config.early_rows and self.config.actions == "chunk" else None
 
     @property
     def continues_plans(self) -> bool:
@@ -229,28 +216,6 @@ class Pi0(StreamingPolicy):
             stated = {} if random is None else random.stated(self.config.execute, len(model.processor.actions_mean))
         return [Prediction(model.actions(one), behaviour=stated.get(i, {})) for i, one in enumerate(flow.cpu().numpy())]
 
-    def predict_parts(self, rows: Sequence[Row]) -> Generator[np.ndarray, None, None]:
-        """Yield the rows of all chunks that a step of the flow finishes; their velocities are not compiled."""
-        model, torch = self._loaded(), require("torch")
-        shape = (model.network.config.chunk_size, model.network.config.max_action_dim)
-        times = row_times(self._steps, shape[0], self.config.early_rows or 1.0)
-        cores = replace(model.cores, velocity=partial(row_velocity_of, model.network))
-        with torch.inference_mode():
-            actions = torch.from_numpy(np.stack([row.noise(*shape) for row in rows])).to(model.device)
-            velocity = self._velocity(rows, cores)
-        finished = 0
-        for now, later in pairwise(times):
-            # not while another thread or the caller has its turn
-            with torch.inference_mode(), self.adapters.rows([row.adapter for row in rows]):
-                at = torch.from_numpy(now).to(model.device)
-                change = torch.from_numpy(later - now).to(model.device)
-                actions = actions + change[:, None] * velocity(actions, at)
-                ready = int((later == 0).sum())
-                part = actions[:, finished:ready].cpu().numpy()
-            if ready > finished:
-                finished = ready
-                yield model.actions(part)
-
     @property
     def _steps(self) -> int:
         return int(self.config.steps or self._loaded().network.config.num_inference_steps)
@@ -269,14 +234,14 @@ class Pi0(StreamingPolicy):
             for key, value in batch.items()
         }
 
-    def _velocity(self, rows: Sequence[Row], cores: FlowCores | None = None) -> Callable[[Any, Any], Any]:
+    def _velocity(self, rows: Sequence[Row]) -> Callable[[Any, float], Any]:
         """Return the flow's velocity for the rows; what the samples of a session see is encoded once."""
         model = self._loaded()
         firsts, owners = shared_frames(rows)
         inputs = self._inputs([rows[i] for i in firsts])
         shared = owners if len(firsts) < len(rows) else None
         with self.adapters.rows([rows[i].adapter for i in firsts]):
-            return flow_velocity(model.network, inputs, model.dtype, shared, cores or model.cores)
+            return flow_velocity(model.network, inputs, model.dtype, shared, model.cores)
 
     def _follow(
         self, velocity: Callable[[Any, float], Any], noise: Any, guide: Guide | None, random: RandomSteps | None

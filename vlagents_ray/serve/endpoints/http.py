@@ -216,20 +216,12 @@ class _HttpEndpoint:
             sender.release()
 
     async def _reply(self, socket: WebSocket, sender: Dispatcher, message: bytes | None) -> None:
-        """Answer one message of a client, with several if it is an act whose chunk comes in parts."""
         if message is not None and is_probe(message):
             await socket.send_bytes(self._probed(sender, message))
             return
         trace = RequestTrace(self._engine.stats, "websocket")
-        sending: asyncio.Future[None] | None = None  # the last part
-
-        def send_part(part: Reply) -> None:
-            nonlocal sending
-            sending = asyncio.ensure_future(_send_after(sending, socket, trace.part(part)))
-
-        loop = asyncio.get_running_loop()
-        replies = await self._answer(sender, message, trace, lambda part: loop.call_soon_threadsafe(send_part, part))
-        await _send_after(sending, socket, trace.frame(replies))
+        replies = await self._answer(sender, message, trace)
+        await socket.send_bytes(trace.frame(replies))
 
     def _probed(self, sender: Dispatcher, message: bytes) -> bytes:
         try:
@@ -238,9 +230,7 @@ class _HttpEndpoint:
         except VLAgentsError as error:
             return encode_replies([Reply(error=error)])
 
-    async def _answer(
-        self, sender: Dispatcher, frame: bytes | None, trace: RequestTrace, part: Callable[[Reply], object]
-    ) -> list[Reply]:
+    async def _answer(self, sender: Dispatcher, frame: bytes | None, trace: RequestTrace) -> list[Reply]:
         admission = sender.admission(self._limits, 0 if frame is None else len(frame))
         try:
             admission.begin_message()
@@ -248,20 +238,13 @@ class _HttpEndpoint:
                 raise MalformedMessage("stream: got a text message, want a binary frame")
             requests = await self._requests.decode(frame, admission)
             trace.decoded(requests)
-            return await sender.ask(requests, admission, part)
+            return await sender.ask(requests, admission)
         except VLAgentsError as error:
             return [Reply(error=error)]
         except Exception:
             name = uuid.uuid4().hex
             logger.exception("stream failed (request %s)", name)
             return [Reply(name, error=VLAgentsError("internal error; the server's log has the details"))]
-
-
-async def _send_after(before: asyncio.Future[None] | None, socket: WebSocket, message: bytes) -> None:
-    """Send a message once the one `before` is sent."""
-    if before is not None:
-        await before
-    await socket.send_bytes(message)
 
 
 def _timed(http: HttpRequest, trace: RequestTrace) -> HttpRequest:

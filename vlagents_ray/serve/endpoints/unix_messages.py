@@ -264,12 +264,7 @@ class UnixConnection:
         trace.decoded(requests)
         if waited_s:
             arrival.count_wait(requests, waited_s)
-        sender.send(
-            requests,
-            lambda replies: self._answer(trace, replies),
-            admission=admission,
-            part=lambda reply: self._send(trace.part(reply), compact_form=False),
-        )
+        sender.send(requests, lambda replies: self._answer(trace, replies), admission=admission)
 
     def _pause(self) -> None:
         """Stop polling the client until `_resume` was called as many times."""

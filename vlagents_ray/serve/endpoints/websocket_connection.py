@@ -354,12 +354,7 @@ class WebSocketConnection:
         with self._sending:
             self._unanswered += 1
             self._unanswered_bytes += size
-        message.sender.send(
-            requests,
-            lambda replies: self._answer(trace, replies, size),
-            admission=message.admission,
-            part=lambda reply: self._send(trace.part(reply)),
-        )
+        message.sender.send(requests, lambda replies: self._answer(trace, replies, size), admission=message.admission)
 
     def _decoded(self, message: _Message, result: Callable[[], Sequence[Request | Reply]]) -> None:
         """Take a message that another thread has decoded; called on the thread that polls."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import uuid
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -19,7 +19,7 @@ from vlagents_ray.protocol.messages import Limits, Reply, Request
 from vlagents_ray.serve.access.api_keys import Caller, Identity, NoKey
 from vlagents_ray.serve.engine.admission import MessageAdmission
 from vlagents_ray.serve.engine.arrival import count_wait
-from vlagents_ray.serve.engine.responses import Done, ReplyCollector, whole_answers
+from vlagents_ray.serve.engine.responses import Done, ReplyCollector
 from vlagents_ray.serve.queue.batch_queue import PendingRequest
 
 if TYPE_CHECKING:
@@ -127,7 +127,6 @@ class Dispatcher:
         done: Done,
         arrived: float | None = None,
         admission: MessageAdmission | None = None,
-        part: Callable[[Reply], object] | None = None,
     ) -> ReplyCollector:
         """Queue the requests of a frame.
 
@@ -136,21 +135,13 @@ class Dispatcher:
             done: Receives all replies at once, in order, on the thread that completes the last one.
             arrived: Time at which the deadlines begin, s of the engine's clock; by default now.
             admission: Admission of the message, which has already counted the requests for the key.
-            part: Receives the replies before the last to a lone act that asks for its chunk in parts; None if the
-                endpoint sends only whole chunks.
         """
         if (watcher := self._engine.watchers.one) is not None:
             sessions = ["" if isinstance(item, Reply) else self._session(item) for item in items]
-            note = partial(watcher.note, sessions, items, (admission and admission.files) or {})
-            [first, *others] = items
-            if part is not None and not others and isinstance(first, Request) and first.parts:
-                done, part = whole_answers(note, done, part)
-            else:
-                done = note(done)
+            done = watcher.note(sessions, items, (admission and admission.files) or {}, done)
         if admission is not None and admission.holds:
             done = partial(_release, admission, done)
         collector = ReplyCollector(items, done, self._asks_to_reconnect, self._engine.withdraw)
-        collector.part = part if len(items) == 1 else None
         ready: list[PendingRequest] = []
         for index, item in enumerate(items):
             if isinstance(item, Reply):
@@ -166,13 +157,8 @@ class Dispatcher:
         self._put(ready)
         return collector
 
-    async def ask(
-        self,
-        items: Sequence[Request | Reply],
-        admission: MessageAdmission | None = None,
-        part: Callable[[Reply], object] | None = None,
-    ) -> list[Reply]:
-        """Send requests, and wait for the replies until the requests' deadlines; see `send` for `part`.
+    async def ask(self, items: Sequence[Request | Reply], admission: MessageAdmission | None = None) -> list[Reply]:
+        """Send requests, and wait for the replies until the requests' deadlines.
 
         The time that a request may have waited during a pause of the process counts towards its deadline.
         When the caller stops waiting (deadline, disconnect), its requests are cancelled, unless their batch is
@@ -182,7 +168,7 @@ class Dispatcher:
             count_wait(items, waited_s)
         loop = asyncio.get_running_loop()
         future: asyncio.Future[list[Reply]] = loop.create_future()
-        collector = self.send(items, lambda replies: _deliver(loop, future, replies), admission=admission, part=part)
+        collector = self.send(items, lambda replies: _deliver(loop, future, replies), admission=admission)
         requests = [item for item in items if isinstance(item, Request)]
         left_ms = [one.deadline_ms - one.waited_ms for one in requests if one.deadline_ms is not None]
         timer = None
@@ -262,7 +248,6 @@ class Dispatcher:
             quota=None if self._caller is None else (self._prefix, self._caller.sessions),
             arrived=arrived,
         )
-        ticket.part = collector.put_part if request.parts and collector.part is not None else None
         if self._owner:
             if request.op == "close":
                 self._sessions.discard(session_id)

@@ -24,7 +24,6 @@ from vlagents_ray.errors import (
 )
 from vlagents_ray.interface import Act, Agent
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Reply, Request
-from vlagents_ray.serve.engine.act_streams import Acting, ActStreams
 from vlagents_ray.serve.engine.admission import Admission
 from vlagents_ray.serve.engine.arrival import PauseDetector
 from vlagents_ray.serve.engine.metrics_buffer import MetricsBuffer
@@ -43,6 +42,8 @@ from vlagents_ray.serve.weights.updates import WeightUpdates, follows
 from vlagents_ray.serve.weights.versions import WeightsVersion
 
 logger = logging.getLogger(__name__)
+
+Acting = tuple[PendingRequest, Session[LoadedModel]]
 
 _LIBRARIES = (str(Path(__file__).parents[2]), sysconfig.get_path("stdlib"))  # this package's own, and Python's
 
@@ -110,7 +111,6 @@ class Engine:
         self.transfer = SessionTransfer(self.sessions, self.models, self.require_ready)
         self._resets = Resets(self.sessions, self.models, self.queue, finder, clock, reply_bytes)
         self.watchers = Watchers()
-        self._streams = ActStreams(self.sessions, self.queue, self.stats, clock, batch_sizes, reply_bytes)
 
     def start(self, *, threaded: bool = True) -> None:
         """Initialize the agent, and return when it can act; raises `PolicyFailed` if it does not load.
@@ -265,13 +265,12 @@ class Engine:
 
     def _run(self, batch: Sequence[PendingRequest]) -> None:
         """Answer every ticket of a batch. Called on the policy's thread."""
-        acting: dict[tuple[LoadedModel, WeightsVersion, bool], list[Acting]] = {}
+        acting: dict[tuple[LoadedModel, WeightsVersion], list[Acting]] = {}
         for ticket in batch:
             try:
                 if ticket.request.op == "act":
                     session, model, weights = self._ready(ticket)
-                    in_parts = ticket.part is not None and model.agent.act_parts is not None
-                    acting.setdefault((model, weights, in_parts), []).append((ticket, session))
+                    acting.setdefault((model, weights), []).append((ticket, session))
                 elif ticket.request.op == "reset":
                     self._resets.run(ticket)
                 elif ticket.request.op == "export":
@@ -289,12 +288,12 @@ class Engine:
             except Exception as error:  # noqa: BLE001 - becomes the reply
                 ticket.begun = ticket.begun and ticket.request.op != "act"  # the policy has not received this act
                 ticket.answer(Reply(ticket.request.request_id, error=public_error(error, ticket)))
-        for (model, weights, in_parts), group in acting.items():
+        for (model, weights), group in acting.items():
             prepared_s = 0.0
             if self.queue.window.slow:
                 group, prepared_s = self._prepared(model, group)  # noqa: PLW2901 - without those that failed
             if group:
-                (self._streams.run if in_parts else self._act)(model, weights, group, prepared_s)
+                self._act(model, weights, group, prepared_s)
 
     def _ready(self, ticket: PendingRequest) -> tuple[Session[LoadedModel], LoadedModel, WeightsVersion]:
         session = self.sessions.get(ticket.session_id)

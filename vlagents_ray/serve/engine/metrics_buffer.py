@@ -149,11 +149,6 @@ class RequestTrace:
         self.record(replies)
         return data
 
-    def part(self, reply: Reply) -> bytes:
-        """Encode a part of a reply as a frame; only the last one is recorded."""
-        self._set_decode_ms([reply])
-        return encode_replies([reply], arrived=self.arrived)
-
     def packed(self, replies: Sequence[Reply]) -> tuple[bytes, bool]:
         """Encode the replies with complete `timing`; call `record` after they are sent.
 

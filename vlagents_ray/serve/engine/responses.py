@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from types import MappingProxyType
 from typing import Any, Protocol
 
@@ -32,7 +31,6 @@ from vlagents_ray.validation import check_action
 logger = logging.getLogger(__name__)
 
 Done = Callable[[list[Reply]], None]
-Part = Callable[[Reply], object]
 
 
 class Watcher(Protocol):
@@ -79,37 +77,6 @@ class Watchers:
         self.one = watchers[0] if len(watchers) == 1 else self if watchers else None
 
 
-def whole_answers(note: Callable[[Done], Done], done: Done, part: Part) -> tuple[Done, Part]:
-    """Let watchers see the answer to a lone act as a whole, which its sender gets in parts.
-
-    Args:
-        note: `Watcher.note` of the act.
-        done: Sends the last part.
-        part: Sends a part before it.
-
-    Returns:
-        What to call in place of `done` and `part`.
-    """
-    earlier: list[np.ndarray] = []  # (h, D) each
-    last: list[Reply] = []
-    watched = note(lambda _: done(last))
-
-    def send_part(reply: Reply) -> object:
-        if reply.act is not None:
-            earlier.append(reply.act.rows())
-        return part(reply)
-
-    def answer(replies: list[Reply]) -> None:
-        last.extend(replies)
-        [reply] = replies
-        if earlier and reply.act is not None:
-            whole = np.concatenate([*earlier, reply.act.rows()])
-            reply = replace(reply, act=replace(reply.act, action=whole))
-        watched([reply])
-
-    return answer, send_part
-
-
 def build_reply(
     ticket: PendingRequest,
     session: Session[LoadedModel],
@@ -117,8 +84,6 @@ def build_reply(
     contract: Contract | None,
     limit: int = DEFAULT_LIMITS.reply_bytes,
     policy: Mapping[str, Any] = MappingProxyType({}),
-    *,
-    more: bool = False,
 ) -> Reply:
     """Build the reply to an act request, and count the step of its session if the result is valid.
 
@@ -129,7 +94,6 @@ def build_reply(
         contract: The policy's contract, if it has one; the action is checked against it.
         limit: Largest size of action and info together, bytes.
         policy: Version of the weights that acted, for the info, unless the policy itself names one (as a proxy does).
-        more: Whether further parts of the result follow, with the last of which the step counts.
 
     Returns:
         The reply; with an error if the policy raised one, or if its result is invalid or too large.
@@ -142,7 +106,7 @@ def build_reply(
             raise PolicyFailed(f"act: the policy returned {type(result).__name__}, want an Act")
         if (size := getattr(result.action, "nbytes", 0)) > limit:  # before it is copied and checked
             raise PolicyFailed(_too_large("action", size, limit))
-        act = Act(check_action(result.action, contract), bool(result.done), result.info, more)
+        act = Act(check_action(result.action, contract), bool(result.done), result.info)
         if act.action.nbytes > limit:  # the policy may return a list of numbers, which has no `nbytes`
             raise PolicyFailed(_too_large("action", act.action.nbytes, limit))
         if act.info:
@@ -150,8 +114,6 @@ def build_reply(
         act.info = {**policy, **(act.info or {})}  # the session's own; policies without info may say None
     except Exception as error:  # noqa: BLE001 - becomes the reply
         return Reply(request_id, error=public_error(error, ticket))
-    if more:
-        return Reply(request_id, act=act, step=session.steps + 1)
     session.steps += 1
     return Reply(request_id, act=act, step=session.steps)
 
@@ -243,7 +205,6 @@ class ReplyCollector:
         "_replies",
         "_withdraw",
         "over",
-        "part",
         "tickets",
     )
 
@@ -264,7 +225,6 @@ class ReplyCollector:
         """
         self.tickets: dict[int, PendingRequest] = {}  # the latest ticket of each request, by the request's identity
         self.over = False  # whether the caller no longer waits, so that nothing more is queued
-        self.part: Callable[[Reply], object] | None = None  # receives the replies before the last to the only request
         self._withdraw = withdraw
         self._items = items
         self._replies: list[Reply | None] = [None] * len(items)
@@ -287,12 +247,6 @@ class ReplyCollector:
         for each in self._replies:
             each.draining = asks_to_reconnect  # type: ignore[union-attr]
         self._done(self._replies)  # type: ignore[arg-type]
-
-    def put_part(self, reply: Reply) -> None:
-        """Pass on a reply before the last to the only request, unless the last one is there already."""
-        with self._lock:
-            if self.part is not None and self._replies[0] is None:
-                self.part(reply)
 
     def expire(self) -> None:
         """Answer the requests without a reply: their deadlines have passed, and those not begun are withdrawn."""

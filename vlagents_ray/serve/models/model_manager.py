@@ -17,7 +17,7 @@ from typing import Any
 
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import PolicyUnavailable, UnknownSession, VLAgentsError
-from vlagents_ray.interface import Agent, Parts
+from vlagents_ray.interface import Agent
 from vlagents_ray.policies.base.accelerator import free_memory
 from vlagents_ray.policies.base.program import Program
 from vlagents_ray.serve.models.checkpoints import Checkpoints
@@ -49,7 +49,6 @@ class ModelManager:
 
     def __init__(self, source: Checkpoints, loader: Loader, sessions: SessionTable[LoadedModel]) -> None:
         """Manage models from `loader` for `sessions`; a model's sessions are closed when it is evicted at once."""
-        self.act_parts: Parts | None = None  # whether that model gives chunks in parts
         self.continues_plans = False  # whether that model's chunks go on from the plan that is executed
         self.contract: Contract | None = None  # contract of the deployment's own model that was loaded last
         self.weights: dict[str, Any] | None = None  # weights of the deployment's own model that was loaded last
@@ -242,7 +241,7 @@ class ModelManager:
 
     def _set_own_model(self, model: LoadedModel) -> None:
         self.contract, self._fingerprint = model.contract, model.version[1]
-        self.act_parts, self.continues_plans = model.agent.act_parts, model.agent.continues_plans
+        self.continues_plans = model.agent.continues_plans
         self.weights, self.files, self.devices = model.weights, model.files, model.report.devices
 
     def _loop(self) -> None:

@@ -66,16 +66,12 @@ class Padding:
             return []
         return [row.agent for row in self._rows[:missing]]
 
-    def check_results(self, results: Sequence[Act | Exception | None]) -> None:
-        """Check the results of the dummy sessions, and discard those that failed or have made `_LIFE` acts.
-
-        None is the result of a session whose act was not finished.
-        """
+    def check_results(self, results: Sequence[Act | Exception]) -> None:
+        """Check the results of the dummy sessions, and discard those that failed or have made `_LIFE` acts."""
         used = self._rows[: len(results)]
         for row in used:
             row.acts += 1
-        failed = [isinstance(result, Exception) for result in results]
-        kept = [row for row, bad in zip(used, failed, strict=True) if not bad and row.acts < _LIFE]
+        kept = [row for row, result in zip(used, results, strict=True) if isinstance(result, Act) and row.acts < _LIFE]
         self._rows[: len(results)] = kept
 
     def _begin(self) -> Agent:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import NotTrainable, PolicyFailed
-from vlagents_ray.interface import Act, Agent, Obs, Parts
+from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.policies.wrapper import build_agent
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.config.deployment import ServerArgs
@@ -80,19 +80,8 @@ class ChildAgent(Agent):
         return [reply.error or reply.act or none for reply in self._child.call(requests)]
 
     @property
-    def act_parts(self) -> Parts | None:
-        return self._child.act_parts
-
-    @property
     def continues_plans(self) -> bool:
         return self._child.continues_plans
-
-    def act_stream(self, obs: Obs) -> Generator[Act, None, None]:
-        """Yield the parts from the child, where the sessions of a batch take turns."""
-        for reply in self._child.act_in_parts(Request("act", obs, session=self._session or "")):
-            if reply.error is not None or reply.act is None:
-                raise reply.error or PolicyFailed("act: the policy's process answered without an action")
-            yield reply.act
 
     def check_health(self) -> None:
         self._child.require_alive()

@@ -115,7 +115,6 @@ def run() -> None:
             "local": asdict(server.address),
             "contract": contract,
             "weights": models.weights,
-            "act_parts": models.act_parts,
             "continues_plans": models.continues_plans,
             "uncompiled": models.uncompiled,
             "devices": models.devices,

@@ -15,14 +15,13 @@ import subprocess
 import sys
 import threading
 from collections import deque
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
 from vlagents_ray.client.transports.shm import ShmTransport
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, ConnectionLost, PolicyFailed, PolicyUnavailable, VLAgentsError
-from vlagents_ray.interface import Parts
 from vlagents_ray.policies.loading import report_device, report_progress, report_uncompiled
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.python_env import child_main
@@ -44,7 +43,6 @@ class Child:
     def __init__(self, python: str, settings: Settings, env_vars: Mapping[str, str]) -> None:
         self.contract: Contract | None = None  # contract of the policy, set by `start`
         self.weights: dict[str, Any] | None = None  # identity of the weights, set by `start`
-        self.act_parts: Parts | None = None  # whether the policy gives chunks in parts, set by `start`
         self.continues_plans = False  # whether the policy's chunks go on from a plan, set by `start`
         self.sessions: set[str] = set()  # names of the sessions in the child
         self._python = python
@@ -83,8 +81,7 @@ class Child:
             self.close()
             raise
         self.contract = None if said["contract"] is None else Contract.from_json(said["contract"])
-        self.weights, self.act_parts = said["weights"], said["act_parts"]
-        self.continues_plans = said["continues_plans"]
+        self.weights, self.continues_plans = said["weights"], said["continues_plans"]
         threading.Thread(target=self._close_sessions, name="policy-process-sessions", daemon=True).start()
 
     def call(self, requests: Sequence[Request]) -> list[Reply]:
@@ -101,24 +98,6 @@ class Child:
         if len(replies) != len(requests):  # a single reply to the message as a whole
             raise replies[0].error or PolicyFailed(f"got {len(replies)} replies to {len(requests)} requests")
         return replies
-
-    def act_in_parts(self, request: Request) -> Generator[Reply, None, None]:
-        """Send an act, and yield the replies with the parts of its chunk; raise as `call` does.
-
-        Other calls wait until the last reply was yielded, or the generator is closed.
-        """
-        if self._transport is None:
-            raise PolicyUnavailable("the policy's process has not started")
-        request.request_id, request.parts = f"{next(self._requests):x}", True
-        with self._lock:
-            try:
-                [reply] = self._transport.call([request], _FOREVER_S)
-                yield reply
-                while reply.act is not None and reply.act.more:
-                    reply = self._transport.call_on(request, _FOREVER_S)
-                    yield reply
-            except PolicyUnavailable as error:
-                raise ConnectionLost(f"{self._ended()}; the replica is being replaced") from error
 
     def open_session(self) -> str:
         """Return a name for a new session; names are reused, since each takes memory until the connection ends."""

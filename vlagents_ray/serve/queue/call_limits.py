@@ -54,7 +54,9 @@ class PolicyCall:
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         if os.getpid() != self._process:
-            self.end_forked_child()
+            # The policy forked this process during the call: it shares the clients' sockets.
+            os.write(2, f"a child that the policy forked in {self.op!r} has returned; it is ended\n".encode())
+            os._exit(1)
         if error is not None:
             self._calls.record_error(error)
         self._calls.under_way.discard(self)
@@ -65,12 +67,6 @@ class PolicyCall:
             self._longest_s = min(self._longest_s, took_s)
         elif took_s > self._longest_s:
             self._longest_s = took_s
-
-    def end_forked_child(self) -> None:
-        """End this process if the policy forked it during the running call: it shares the clients' sockets."""
-        if os.getpid() != self._process:
-            os.write(2, f"a child that the policy forked in {self.op!r} has returned; it is ended\n".encode())
-            os._exit(1)
 
     @property
     def limit_s(self) -> float:

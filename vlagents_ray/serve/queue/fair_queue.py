@@ -71,9 +71,6 @@ class PendingRequest:
     first: int = 0  # step at which the episode begins, if the request is a reset
     preparation: Preparation | None = None  # of its observation, on another thread
     return_s: float | None = None  # recent time from an answer to the session's next request, s, if known
-    part: Callable[[Reply], object] | None = (
-        None  # receives the replies before the last, if the chunk may come in parts
-    )
 
     def answer(self, reply: Reply) -> None:
         """Deliver the reply, unless the request was answered or cancelled already."""
@@ -85,21 +82,10 @@ class PendingRequest:
             self.preparation = None
         # The callback refers to this ticket: a reference cycle would make the garbage collector pause the policy.
         done, self.done = self.done, _ignore_reply
-        self.part = None
         try:
             done(reply)
         except Exception:
             logger.exception("request %s: its caller could not take the reply", self.request.request_id)
-
-    def answer_part(self, reply: Reply) -> None:
-        """Deliver a part of the reply, unless the request was answered or cancelled already."""
-        part = self.part
-        if self.cancelled or part is None:
-            return
-        try:
-            part(reply)
-        except Exception:
-            logger.exception("request %s: its caller could not take a part", self.request.request_id)
 
     def expired(self, now: float) -> bool:
         """Return whether the deadline has passed at `now`, s."""

@@ -152,7 +152,6 @@ class PolicyReplica(EngineReplica, ReplicaWeights, ReplicaLive, ReplicaShadow, C
             "checkpoints": models.describe(),
             "config": models.config,
             "contract": None if contract is None else contract.to_json(),
-            "act_parts": models.act_parts,
             "continues_plans": models.continues_plans,
             "protocol": PROTOCOL_VERSION,
             "version": importlib.metadata.version("vlagents-ray"),

@@ -37,13 +37,12 @@ class ActionDifference:
         return float(self.by_joint.mean())
 
 
-def action_difference(live: np.ndarray, candidate: np.ndarray, *, last_rows: bool = False) -> ActionDifference:
+def action_difference(live: np.ndarray, candidate: np.ndarray) -> ActionDifference:
     """Compare the action of a candidate with that of the live policy.
 
     Args:
         live: (D,) or (H, D).
         candidate: (D,) or (H', D). Rows that only one of the two has are not compared.
-        last_rows: Whether `live` is the end of a chunk, to be compared with the last rows of `candidate`.
 
     Raises:
         ValueError: The actions have rows of different lengths, or no rows.
@@ -52,7 +51,7 @@ def action_difference(live: np.ndarray, candidate: np.ndarray, *, last_rows: boo
     rows = min(len(ours), len(theirs))
     if ours.shape[1:] != theirs.shape[1:] or rows == 0:
         raise ValueError(f"candidate's action: got {candidate.shape}, want rows as in {live.shape}")
-    ours, theirs = (ours[-rows:], theirs[-rows:]) if last_rows else (ours[:rows], theirs[:rows])
+    ours, theirs = ours[:rows], theirs[:rows]
     apart = np.abs(ours - theirs)
     lengths = np.linalg.norm(ours) * np.linalg.norm(theirs)
     cosine = float(np.vdot(ours, theirs) / lengths) if lengths else float(not (ours.any() or theirs.any()))
@@ -202,7 +201,7 @@ class Comparer:
                     "live": _described(ours),
                     "candidate": _described(theirs),
                 }
-                line["difference"] = self._compare(request, ours, theirs)
+                line["difference"] = self._compare(ours, theirs)
             lines.append(line)
         if self._log is not None:
             self._log.write(lines)
@@ -214,12 +213,12 @@ class Comparer:
             compared, self._compared = self._compared, Compared()
         return compared
 
-    def _compare(self, request: Request, ours: Reply, theirs: Reply) -> dict[str, Any] | None:
+    def _compare(self, ours: Reply, theirs: Reply) -> dict[str, Any] | None:
         """Count a comparison, and return what is recorded of it; None if the candidate has failed."""
         found: ActionDifference | None = None
         if ours.act is not None and theirs.act is not None:
             try:
-                found = action_difference(ours.act.action, theirs.act.action, last_rows=request.parts)
+                found = action_difference(ours.act.action, theirs.act.action)
             except ValueError as error:
                 logger.warning("%s", error)
         with self._lock:

@@ -75,7 +75,6 @@ class _Entry:
             history=request.history,
             session=self.session,
             rank=request.rank,
-            parts=request.parts,
         )
         self.frame, self.obs = encode_request(own), None
 
