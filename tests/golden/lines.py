@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
 import fcntl
 import os
 import re
 import socket
 import struct
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any, Protocol
+from typing import Protocol
 
 from tests.golden.masks import masked, masked_local, masked_rpyc
 
@@ -28,31 +27,35 @@ _LENGTH = re.compile(rb"\r\ncontent-length: (\d+)\r\n", re.IGNORECASE)
 
 
 class Line(Protocol):
-    """One connection of a client."""
+    """One connection of a client. `more` is what travels outside of a message."""
 
-    def send(self, data: bytes, more: list[bytes]) -> None:
-        """Send a message; `more` is what travels outside of it."""
-
-    def receive(self) -> Got:
-        """The next message; fails if there is none for `ANSWER_S`."""
-
-    def close(self) -> None:
-        """Leave."""
+    def send(self, data: bytes, more: list[bytes]) -> None: ...
+    def receive(self) -> Got: ...
+    def close(self) -> None: ...
 
 
-class TcpLine:
-    """A stream of bytes; subclasses find the messages in it."""
+class TcpLine(ABC):
+    """A stream of bytes, with messages in it."""
 
     def __init__(self, port: int) -> None:
         self._socket = socket.create_connection(("127.0.0.1", port), timeout=ANSWER_S)
         self._file = self._socket.makefile("rb")
 
     def send(self, data: bytes, more: list[bytes]) -> None:
-        self._socket.sendall(b"".join([data, *more]))
+        self._socket.sendall(data)
+
+    def receive(self) -> Got:
+        try:
+            return self._next()
+        except (EOFError, ConnectionError):
+            return "end", b""
 
     def close(self) -> None:
         self._file.close()
         self._socket.close()
+
+    @abstractmethod
+    def _next(self) -> Got: ...
 
     def _read(self, length: int) -> bytes:
         data = self._file.read(length)
@@ -60,63 +63,46 @@ class TcpLine:
             raise EOFError
         return data
 
-    def _read_head(self) -> bytes:
+    def _read_response(self) -> bytes:
         head = b""
         while not head.endswith(b"\r\n\r\n"):
             head += self._read(1)
-        return head
+        length = _LENGTH.search(head)
+        return head + self._read(int(length[1]) if length else 0)
 
 
 class HttpLine(TcpLine):
-    """Responses of HTTP, one after the other."""
+    """Requests of HTTP."""
 
-    def receive(self) -> Got:
-        try:
-            head = self._read_head()
-            length = _LENGTH.search(head)
-            return "response", masked(head + self._read(int(length[1]) if length else 0))
-        except (EOFError, ConnectionError):
-            return "end", b""
+    def _next(self) -> Got:
+        return "response", masked(self._read_response())
 
 
 class RpycLine(TcpLine):
     """Messages of RPyC: a length, whether they are compressed, a body, and a byte at the end."""
 
-    def receive(self) -> Got:
-        try:
-            head = self._read(5)
-            return "message", masked_rpyc(head + self._read(struct.unpack_from(">I", head)[0] + 1))
-        except (EOFError, ConnectionError):
-            return "end", b""
+    def _next(self) -> Got:
+        head = self._read(5)
+        return "message", masked_rpyc(head + self._read(int.from_bytes(head[:4], "big") + 1))
 
 
 class WebSocketLine(TcpLine):
-    """Frames of a WebSocket, after a handshake whose answer is the first message if anybody asks for it."""
+    """Frames of a WebSocket; `more` is the first byte, if the message is no binary one in one frame."""
 
     def __init__(self, port: int, path: str) -> None:
         super().__init__(port)
         self._socket.sendall(_HANDSHAKE.format(path=path, port=port).encode())
-        self._head = self._read_head()
-        length = _LENGTH.search(self._head)
-        self._head += self._read(int(length[1]) if length else 0)
+        self.opened: Got = ("handshake", masked(self._read_response()))
 
     def send(self, data: bytes, more: list[bytes]) -> None:
-        """`more`: the opcode, if the message is no binary one in one frame."""
         first = more[0] if more else b"\x82"
         self._socket.sendall(first + bytes([0x80 | 127]) + struct.pack(">Q", len(data)) + bytes(4) + data)
 
-    def receive(self) -> Got:
-        try:
-            first, size = self._read(2)
-            if size >= 126:
-                size = int.from_bytes(self._read(2 if size == 126 else 8), "big")
-            return _FRAME_KINDS.get(first, f"{first:02x}"), masked(self._read(size))
-        except (EOFError, ConnectionError):
-            return "end", b""
-
-    def opened(self) -> Got:
-        """The answer to the handshake."""
-        return "handshake", masked(self._head)
+    def _next(self) -> Got:
+        first, size = self._read(2)
+        if size >= 126:
+            size = int.from_bytes(self._read(2 if size == 126 else 8), "big")
+        return _FRAME_KINDS.get(first, f"{first:02x}"), masked(self._read(size))
 
 
 class UnixLine:
@@ -174,11 +160,6 @@ class CallLine:
         self._thread.shutdown()
 
 
-def handle_line(call: Callable[[bytes], Any]) -> CallLine:
-    """Calls of a coroutine, as a Serve handle makes them."""
-    return CallLine(lambda data, _: ("binary", masked(asyncio.run(call(data)))))
-
-
 class ZmqLine:
     """Messages of a REQ socket of ZeroMQ."""
 
@@ -223,5 +204,4 @@ class GrpcLine(CallLine):
 
     def close(self) -> None:
         super().close()
-        with contextlib.suppress(ValueError):
-            self._channel.close()
+        self._channel.close()

@@ -40,15 +40,21 @@ def masked(data: bytes) -> bytes:
 
 
 def masked_local(data: bytes) -> bytes:
-    """A message of the server on a Unix socket, or its head and the memory file that came with it."""
+    """A message of the server on a Unix socket, or its head and the memory file that came with it.
+
+    Which of the client's memory files are free again varies, too: it is up to Python's garbage collector.
+    """
     flags, rest = _REPLY.unpack_from(data)[1], data[_REPLY.size :]
-    head = _REPLY.pack(0, flags, 0)  # which files are free again depends on Python's garbage collector, too
-    if not flags & _COMPACT:
-        return head + masked(rest)
-    (count,) = struct.unpack_from("<I", rest)
-    end = 4 + count * _ANSWER.size
-    answers = [_ANSWER.pack(*one[:-5], *[0.0] * 5) for one in _ANSWER.iter_unpack(rest[4:end])]
-    return head + rest[:4] + b"".join(answers) + rest[end:]
+    return _REPLY.pack(0, flags, 0) + (_without_times(rest) if flags & _COMPACT else masked(rest))
+
+
+def _without_times(answers: bytes) -> bytes:
+    try:
+        end = 4 + int.from_bytes(answers[:4], "little") * _ANSWER.size
+        each = [_ANSWER.pack(*one[:-5], *[0.0] * 5) for one in _ANSWER.iter_unpack(answers[4:end])]
+    except struct.error:
+        return answers
+    return answers[:4] + b"".join(each) + answers[end:]
 
 
 def masked_rpyc(data: bytes) -> bytes:
@@ -166,17 +172,18 @@ def described(data: bytes) -> list[str]:
 
 def described_locally(data: bytes) -> list[str]:
     """A message of `masked_local`, one field a line."""
-    flags = _REPLY.unpack_from(data)[1]
-    head, rest = [f"flags = {flags}"], data[_REPLY.size :]
+    flags, rest = _REPLY.unpack_from(data)[1], data[_REPLY.size :]
     if not flags & _COMPACT:
-        return [*head, *described(rest)]
-    (count,) = struct.unpack_from("<I", rest)
-    end = 4 + count * _ANSWER.size
-    if len(rest) < end:
-        return [*head, as_text(rest)]
-    named = "request_id, step, flags, dimensions, H, D, batch size, times"
-    answers = [f"answer: {named} = {(one[0].rstrip(bytes(1)), *one[1:])}" for one in _ANSWER.iter_unpack(rest[4:end])]
-    return [*head, *answers, f"actions = {as_text(rest[end:])}"]
+        return [f"flags = {flags}", *described(rest)]
+    count = int.from_bytes(rest[:4], "little")
+    if len(rest) < 4 + count * _ANSWER.size:
+        return [f"flags = {flags}", as_text(rest)]
+    found = [f"flags = {flags}"]
+    names = ("request_id", "step", "flags", "dimensions", "H", "D", "batch_size")
+    for place in range(count):
+        answer = _ANSWER.unpack_from(rest, 4 + place * _ANSWER.size)
+        found += [f"answer {place}: {name} = {value}" for name, value in zip(names, answer, strict=False)]
+    return [*found, f"actions = {as_text(rest[4 + count * _ANSWER.size :])}"]
 
 
 def _lines(value: Any, path: str, blob: Callable[[int], bytes] | None = None) -> Iterator[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import threading
 import time
@@ -18,16 +19,8 @@ from asgi_server import served
 from dialect_server import METADATA
 from in_process_replicas import Replicas
 
-from tests.golden.lines import (
-    GrpcLine,
-    HttpLine,
-    Line,
-    RpycLine,
-    UnixLine,
-    WebSocketLine,
-    ZmqLine,
-    handle_line,
-)
+from tests.golden.lines import CallLine, GrpcLine, HttpLine, Line, RpycLine, UnixLine, WebSocketLine, ZmqLine
+from tests.golden.masks import masked
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.messages import Limits
@@ -204,7 +197,8 @@ class Server:
 
         replica: Any = SimpleNamespace(_engine=engine, _limits=LIMITS)
         replica._ask = partial(PolicyReplica._ask, replica)
-        return handle_line(partial(PolicyReplica.call, replica, f"session-{name}"))
+        call = partial(PolicyReplica.call, replica, f"session-{name}")
+        return CallLine(lambda data, _: ("binary", masked(asyncio.run(call(data)))))
 
     def _open_gateway(self, name: str) -> None:
         assert self._replicas is not None

@@ -76,7 +76,7 @@ def _played(step: Step, server: Server, endpoint: str, lines: dict[str, Line]) -
         lines.pop(step.who).close()
     elif step.what == "opens":
         assert isinstance(line, WebSocketLine)
-        got = line.opened()
+        got = line.opened
     else:
         got = line.receive()
     return step if got is None else Step(step.who, step.what, got[0], (got[1],))
