@@ -22,8 +22,8 @@ _COMPACT = 2  # of the flags
 _FRAME = struct.Struct("<4sI")
 # Of a session or a request, drawn at random; or the prefix of a request's that a gateway counts.
 _ID = re.compile(rb"(?<![0-9a-f])([0-9a-f]{32}(?![0-9a-f])|[0-9a-f]{16}(?=-[0-9a-f]))")
-_FRAME_MS = re.compile(rb'("\w+_ms":)\d+\.\d{4}(?=[,}])')
-_JSON_MS = re.compile(rb'("\w+_ms": ?)\d+(\.\d+(e-\d+)?)?(?=[,}])')
+_FRAME_MS = re.compile(rb'("\w+_ms":)-?\d+\.\d{4}(?=[,}])')
+_JSON_MS = re.compile(rb'("\w+_ms": ?)-?\d+(\.\d+)?(e-\d+)?(?=[,}])')
 _RPYC_JSON = re.compile(rb"\x0f(.{4})(\{.*\})(?=\n$)", re.DOTALL)
 _SERVERS_OWN = re.compile(rb"^(date|server): .*\r\n", re.IGNORECASE | re.MULTILINE)  # of uvicorn and websockets
 _LENGTH = re.compile(rb"(?<=\r\ncontent-length: )\d+", re.IGNORECASE)

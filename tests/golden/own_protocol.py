@@ -98,13 +98,10 @@ def episodes() -> Iterator[Scenario]:
     yield scenario("full", ("handle", "http"), begin, asks(reset(), who="b"), asks(act()), sessions=1)
     yield scenario("not ready", ("/v1/stream", "handle", "http"), begin, asks(act()), ready=False)
     pixels = [replace(SEEN, cameras={"front": PIXELS + place}) for place in (1, 2)]
-    yield scenario(
-        "a session is lost with its connection, and begins again",
-        TOGETHER,
-        asks(reset(session=first), act(session=first)),
-        [Step("a", "leaves"), server("waits")],
-        asks(act(session=first), reset(history=pixels, step=2**60), act(), who="b"),
-    )
+    again = asks(act(session=first), reset(history=pixels, step=2**60), act(), who="b")
+    lost = [asks(reset(session=first), act(session=first)), Step("a", "leaves"), server("has no session"), again]
+    yield scenario("a session is lost with its connection, and begins again", (*STREAMS, *LOCAL[:1]), *lost)
+    yield scenario("an episode begins again", ("handle", "http"), asks(reset(history=pixels, step=2**60), act()))
     yield scenario("a replica that drains", TOGETHER, begin, asks(act()), server("drains"), asks(act(), reset()))
     yield scenario(
         "a session goes to another replica",
@@ -116,20 +113,27 @@ def episodes() -> Iterator[Scenario]:
         asks(act(session=first, step=DRAWN + 2), who="b1"),
         replicas=2,
     )
-    yield scenario(
-        "a deadline that is over",
-        TOGETHER,
-        [begin, asks(reset(), who="b"), Send("a", asked("wait")), server("is acting")],
-        [Send("b", act(deadline_ms=1.0)), server("waits"), server("acts on"), gets("a"), gets("b")],
-        asks(act(deadline_ms=1e6), who="b"),
-    )
+    name, later = "a deadline that is over", asks(act(deadline_ms=1e6), who="b")
+    held = [
+        begin,
+        asks(reset(), who="b"),
+        Send("a", asked("wait")),
+        server("is acting"),
+        Send("b", act(deadline_ms=1.0)),
+    ]
+    yield scenario(name, TOGETHER[1:4], *held, gets("b"), server("acts on"), gets("a"), later)
+    by_the_policys_thread = [server("waits"), server("acts on"), gets("a"), gets("b")]
+    yield scenario(name, (STREAMS[0], *LOCAL[:1]), *held, by_the_policys_thread, later)
     yield scenario(
         "the order of answers",
         (*STREAMS, *LOCAL[:1]),
         asks([reset(session=first), reset(session=second)]),
-        [Send("a", asked("wait", session=first)), server("is acting")],
-        [Send("a", act(session=second, request_id="a-2")), Send("a", act(session="unknown")), server("waits")],
-        [server("acts on"), gets(), gets(), gets()],
+        [
+            Send("a", asked("wait", session=first)),
+            server("is acting"),
+            Send("a", act(session=second, request_id="a-2")),
+        ],
+        [server("acts on"), gets(), gets()],
     )
 
 

@@ -17,6 +17,7 @@ import pytest
 from api_key_replica import PlasmaChannel, plasma_server
 from asgi_server import served
 from dialect_server import METADATA
+from eval_fakes import wait_for
 from in_process_replicas import Replicas
 
 from tests.golden.lines import CallLine, GrpcLine, HttpLine, Line, RpycLine, UnixLine, WebSocketLine, ZmqLine
@@ -153,7 +154,8 @@ class Server:
             "drains": self.engines[0].drain,
             "is acting": lambda: self._gate.acting.wait(20) or pytest.fail("the policy was not asked"),
             "acts on": self._gate.opened.set,
-            "waits": lambda: time.sleep(0.1),
+            "has no session": lambda: wait_for(lambda: not len(self.engines[0].sessions)),
+            "waits": lambda: time.sleep(0.02),  # longer than a deadline, which is counted from what the kernel notes
         }
         happens[what]()
 
