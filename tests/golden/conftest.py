@@ -1,4 +1,4 @@
-"""The option that records the traces anew."""
+"""The option that records the traces."""
 
 from __future__ import annotations
 
@@ -6,4 +6,11 @@ import pytest
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--record", action="store_true", help="write the traces of tests/golden anew")
+    parser.addoption("--record", action="store_true", help="write the traces of tests/golden again, before all tests")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if config.getoption("--record", False):
+        from tests.golden.record import record
+
+        record()

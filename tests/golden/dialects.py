@@ -9,8 +9,8 @@ import numpy as np
 from golden import png
 
 from tests.golden.masks import masked
-from tests.golden.scenarios import Scenario, Send, asks, gets, http, scenario
-from tests.golden.traces import Step
+from tests.golden.scenarios import Send, asks, gets, http, scenario
+from tests.golden.traces import Step, Trace
 from vlagents_ray.wire.gr00t import upstream as gr00t
 from vlagents_ray.wire.lerobot import protobuf
 from vlagents_ray.wire.lerobot import upstream as lerobot
@@ -36,7 +36,7 @@ def without(theirs: dict[str, Any], key: str) -> dict[str, Any]:
     return {name: value for name, value in theirs.items() if name != key}
 
 
-def maps() -> Iterator[Scenario]:
+def maps() -> Iterator[Trace]:
     """openpi's protocol and its relatives, whose servers speak first."""
 
     def infer(**more: Any) -> bytes:
@@ -48,7 +48,7 @@ def maps() -> Iterator[Scenario]:
     begin, again = openpi.encode({"reset": True}), openpi.encode({"endpoint": "reset"})
     batches = (openpi.encode({"batch": [LIBERO, other]}), openpi.encode({"batch": [LIBERO]}))
     whole = asks(seen, seen, openpi.encode(other), begin, seen, *batches)
-    yield scenario("openpi: an episode, and a batch", at, opened, first, whole, dialects=on)
+    yield from scenario("openpi: an episode, and a batch", at, opened, first, whole, dialects=on)
     for says, sent in {
         "a missing key": openpi.encode(without(LIBERO, "observation/image")),
         "no prompt": openpi.encode(without(LIBERO, "prompt")),
@@ -58,20 +58,20 @@ def maps() -> Iterator[Scenario]:
         "rubbish": RUBBISH,
         "too much": bytes(4097),
     }.items():
-        yield scenario(f"openpi: {says}", at[:1], first, asks(sent), gets(), dialects=on)
+        yield from scenario(f"openpi: {says}", at[:1], first, asks(sent), gets(), dialects=on)
     rows = {"openpi": mapped | {"answer": "row", "execute": 1}}
-    yield scenario("openpi: rows", at[:1], first, asks(seen, seen), dialects=rows)
-    yield scenario("openpi: not ready", at[:1], opened, dialects=on, ready=False)
+    yield from scenario("openpi: rows", at[:1], first, asks(seen, seen), dialects=rows)
+    yield from scenario("openpi: not ready", at[:1], opened, dialects=on, ready=False)
     named = asks(*(infer(session_id=name) for name in ("one", "one", "two")), again, infer(), infer(endpoint="jump"))
     at, on = ("/roboarena",), {"roboarena": mapped}
-    yield scenario("roboarena: episodes, and an error", at, first, named, gets(), dialects=on)
+    yield from scenario("roboarena: episodes, and an error", at, first, named, gets(), dialects=on)
     seeded = asks(infer(seed=3), infer(), again, infer())
     errors = asks(infer(seed=-1, prompt="new"), infer(prompt="fail"), RUBBISH, infer())
     at, on = ("/v1/realtime/robot/openpi",), {"vllm_omni": mapped}
-    yield scenario("vllm_omni: episodes, and errors", at, first, seeded, errors, dialects=on)
+    yield from scenario("vllm_omni: episodes, and errors", at, first, seeded, errors, dialects=on)
 
 
-def documents() -> Iterator[Scenario]:
+def documents() -> Iterator[Trace]:
     """OpenVLA's, over HTTP."""
 
     def post(body: Any, session: str = "") -> tuple[bytes]:
@@ -83,13 +83,13 @@ def documents() -> Iterator[Scenario]:
     lone = asks(*map(post, [seen, twice, without(seen, "image"), without(seen, "instruction")]))
     kept = asks(post(seen, "s-1"), post(seen, "s-1"), post(seen | {"instruction": "place it"}, "s-1"))
     wrong = [seen | {"instruction": "fail"}, seen | {"image": PIXELS[0]}, b"{", b"[]", bytes(5000)]
-    yield scenario("openvla: requests", ("http",), lone, kept, asks(*map(post, wrong)), dialects={"openvla": {}})
+    yield from scenario("openvla: requests", ("http",), lone, kept, asks(*map(post, wrong)), dialects={"openvla": {}})
     chunk = {"openvla": {"chunk": True}}
-    yield scenario("openvla: a chunk", ("http",), asks(post(seen)), dialects=chunk)
-    yield scenario("openvla: not ready", ("http",), asks(post(seen)), dialects=chunk, ready=False)
+    yield from scenario("openvla: a chunk", ("http",), asks(post(seen)), dialects=chunk)
+    yield from scenario("openvla: not ready", ("http",), asks(post(seen)), dialects=chunk, ready=False)
 
 
-def benchmarks() -> Iterator[Scenario]:
+def benchmarks() -> Iterator[Trace]:
     """vla-eval's."""
 
     def message(kind: Any, seq: int, **payload: Any) -> bytes:
@@ -100,7 +100,7 @@ def benchmarks() -> Iterator[Scenario]:
 
     file = {"__image__": True, "format": "png", "data": png(PIXELS)}
     no_file = file | {"data": b"GIF89a"}
-    yield scenario(
+    yield from scenario(
         "vla_eval: episodes, and errors",
         ("/vla-eval",),
         asks(message("hello", 0, protocol_version=1), message("hello", 1, protocol_version=9)),
@@ -112,7 +112,7 @@ def benchmarks() -> Iterator[Scenario]:
     )
 
 
-def gateways() -> Iterator[Scenario]:
+def gateways() -> Iterator[Trace]:
     """Those with a port of their own, which are clients of the replica."""
 
     def batch(number: int = 1, text: str = "pick", key: str = "task") -> dict[str, Any]:
@@ -126,7 +126,7 @@ def gateways() -> Iterator[Scenario]:
         return gr00t.write(endpoint, data, None)
 
     flat = gr00t.flat(batch(key="annotation.human.task"))
-    yield scenario(
+    yield from scenario(
         "gr00t: requests",
         ("gr00t",),
         asks(say("ping"), say("get_modality_config"), get(batch()), get(batch()), say("reset", {"options": None})),
@@ -150,7 +150,7 @@ def gateways() -> Iterator[Scenario]:
         return call("SendObservations", *protobuf.write_observation_parts(pickle))
 
     act = call("GetActions")
-    yield scenario(
+    yield from scenario(
         "lerobot: calls",
         ("lerobot",),
         asks(act, call("Ready"), saw(0), setup(lerobot.write_instructions(robot)), saw(0), act, saw(1), act),
@@ -169,7 +169,7 @@ def gateways() -> Iterator[Scenario]:
     old = '[{"cameras": {}, "camera_data_type": "raw", "gripper": 0.5, "info": {}}, "go", {"seed": 3}]'
     ping = rpyc.request(8, rpyc.Handler.PING, rpyc.boxed_value(("hi",)))
     look = rpyc.request(9, rpyc.Handler.INSPECT, rpyc.boxed_value(()))
-    yield scenario(
+    yield from scenario(
         "vlagents: calls",
         ("vlagents",),
         asks(vlagents.get_root(1), ask("name"), ask("is_initialized"), ping, look),

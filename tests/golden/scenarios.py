@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from tests.golden.traces import Step, Trace
 from vlagents_ray.protocol.frames import CONTENT_TYPE, encode_requests
@@ -21,8 +20,7 @@ Message = Request | list[Request] | bytes | tuple[bytes, ...]
 """A request, or several; a frame that no encoder writes; or all that goes out, and what travels outside of it."""
 
 
-@dataclass(frozen=True)
-class Send:
+class Send(NamedTuple):
     """Send a message."""
 
     who: str
@@ -45,30 +43,17 @@ def server(what: str) -> Step:
     return Step("server", what)
 
 
-@dataclass(frozen=True)
-class Scenario:
-    """What happens, at which endpoints, and at a server with which settings."""
-
-    name: str
-    at: Sequence[str]
-    settings: dict[str, Any]
-    steps: Sequence[Send | Step]
-
-    def trace(self, endpoint: str) -> Trace:
-        """What is sent at an endpoint, without the answers."""
+def scenario(name: str, at: Sequence[str], *steps: Steps, **settings: Any) -> Iterator[Trace]:
+    """What is sent at each of the endpoints, without the answers."""
+    for endpoint in at:
         encoders: dict[str, Callable[[Message], tuple[bytes, ...]]] = {}
         found = []
-        for step in self.steps:
+        for step in _flat(list(steps)):
             if isinstance(step, Send):
                 encode = encoders.setdefault(step.who, _encoder(endpoint, step.who))
-                found.append(Step(step.who, "sends", data=encode(step.message)))
-            else:
-                found.append(step)
-        return Trace(self.name, [endpoint], self.settings, found)
-
-
-def scenario(name: str, at: Sequence[str], *steps: Steps, **settings: Any) -> Scenario:
-    return Scenario(name, at, settings, list(_flat(list(steps))))
+                step = Step(step.who, "sends", data=encode(step.message))  # noqa: PLW2901
+            found.append(step)
+        yield Trace(name, [endpoint], settings, found)
 
 
 def _flat(steps: list[Steps]) -> Iterator[Send | Step]:

@@ -52,8 +52,7 @@ class Trace:
 
     def sent(self) -> Trace:
         """The same without the answers."""
-        steps = [step if step.what == "sends" else Step(step.who, step.what) for step in self.steps]
-        return replace(self, steps=steps)
+        return replace(self, steps=[one if one.what == "sends" else Step(one.who, one.what) for one in self.steps])
 
     def played(self, endpoint: str, folder: Path) -> Trace:
         """Send the same to a new server; returns what came of it."""
@@ -61,9 +60,8 @@ class Trace:
             server = Server(stack, patch, folder, **self.settings)
             lines: dict[str, Line] = {}
             stack.callback(lambda: [line.close() for line in lines.values()])
-            return Trace(
-                self.name, [endpoint], self.settings, [_played(step, server, endpoint, lines) for step in self.steps]
-            )
+            steps = [_played(step, server, endpoint, lines) for step in self.steps]
+            return Trace(self.name, [endpoint], self.settings, steps)
 
 
 def _played(step: Step, server: Server, endpoint: str, lines: dict[str, Line]) -> Step:
@@ -122,15 +120,3 @@ def write(name: str, traces: Sequence[Trace]) -> None:
             words = (step.who, step.what, step.kind)
             lines += ["; ".join(filter(None, words)), *(f"  {as_text(data)}" for data in step.data)]
     (TRACES / f"{name}.txt").write_text("\n".join(lines) + "\n")
-
-
-def together(traces: Sequence[Trace]) -> list[Trace]:
-    """One trace for endpoints at which a scenario's bytes are the same."""
-    found: list[Trace] = []
-    for one in traces:
-        same = next((other for other in found if (other.name, other.steps) == (one.name, one.steps)), None)
-        if same is None:
-            found.append(one)
-        else:
-            same.endpoints += one.endpoints
-    return found
