@@ -11,15 +11,7 @@ from golden import png
 from tests.golden.masks import masked
 from tests.golden.scenarios import Send, asks, gets, http, scenario
 from tests.golden.traces import Step, Trace
-from vlagents_ray.wire.gr00t import upstream as gr00t
-from vlagents_ray.wire.lerobot import protobuf
-from vlagents_ray.wire.lerobot import upstream as lerobot
-from vlagents_ray.wire.lerobot.codec import PolicyInstructions
-from vlagents_ray.wire.openpi import codec as openpi
-from vlagents_ray.wire.openvla import codec as openvla
-from vlagents_ray.wire.vla_eval import codec as vla_eval
-from vlagents_ray.wire.vlagents import rpyc
-from vlagents_ray.wire.vlagents import upstream as vlagents
+from vlagents_ray.wire import gr00t, lerobot, openpi, openvla, rpyc, vla_eval, vlagents
 
 PIXELS = np.full((8, 8, 3), 7, np.uint8)
 JOINTS = np.array([0.25, -0.5], np.float32)
@@ -136,18 +128,18 @@ def gateways() -> Iterator[Trace]:
         dialects={"gr00t": {}},
     )
 
-    robot = PolicyInstructions("act", "me/act", ("shoulder.pos", "gripper.pos"), ("front",), 10)
+    robot = lerobot.PolicyInstructions("act", "me/act", ("shoulder.pos", "gripper.pos"), ("front",), 10)
 
     def call(method: str, *messages: bytes) -> tuple[bytes, ...]:
-        return (protobuf.method(method).encode(), *(messages or (b"",)))
+        return (lerobot.method(method).encode(), *(messages or (b"",)))
 
     def setup(pickle: bytes) -> tuple[bytes, ...]:
-        return call("SendPolicyInstructions", protobuf.write_data(pickle))
+        return call("SendPolicyInstructions", lerobot.write_data(pickle))
 
     def saw(step: int, task: str = "pick") -> tuple[bytes, ...]:
         theirs = {"observation.state": JOINTS, "observation.images.front": PIXELS, "task": task}
         pickle = lerobot.write_observation(theirs, robot, 1000.0 + step, step)
-        return call("SendObservations", *protobuf.write_observation_parts(pickle))
+        return call("SendObservations", *lerobot.write_observation_parts(pickle))
 
     act = call("GetActions")
     yield from scenario(

@@ -32,7 +32,7 @@ from vlagents_ray.serve.dialects.base import GatewayContext, ReplicaContext
 from vlagents_ray.serve.dialects.routes import dialect_routes
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
-from vlagents_ray.serve.endpoints.local.shm import ShmServer
+from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.models.checkpoints import Checkpoints
