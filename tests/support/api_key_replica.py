@@ -166,7 +166,7 @@ class KeyedReplica:
         admit = partial(self.known.keys.check, app="app")
         self.own = WebSocketServer(self.engine, LIMITS, "127.0.0.1", None, admit)
         self.local = ShmServer(self.engine, LIMITS, admit)
-        self.plasma = _plasma_server(self.engine, patch, folder)
+        self.plasma = plasma_server(self.engine, LIMITS, patch, folder)
         for each in (self.own, self.local, self.plasma):
             each.open()
         self.engine.start()
@@ -229,7 +229,7 @@ class _Near(ShmTransport):
         return {"protocol": PROTOCOL_VERSION, "contract": None}
 
 
-def _plasma_server(engine: Engine, patch: pytest.MonkeyPatch, folder: Path) -> Any:
+def plasma_server(engine: Engine, limits: Limits, patch: pytest.MonkeyPatch, folder: Path) -> Any:
     """The plasma endpoint, with channels that hold a frame as it is."""
     import ray
 
@@ -239,16 +239,18 @@ def _plasma_server(engine: Engine, patch: pytest.MonkeyPatch, folder: Path) -> A
     with pytest.MonkeyPatch.context() as for_now:
         for_now.setattr(ray._private.worker.global_worker, "node", node, raising=False)
         for_now.setattr(ray, "get_runtime_context", lambda: SimpleNamespace(get_node_id=lambda: "node"))
-        server = PlasmaServer(engine, LIMITS)
-    patch.setattr(server.pool, "claim", lambda key: _Channel(server, key))
+        server = PlasmaServer(engine, limits)
+    patch.setattr(server.pool, "claim", PlasmaChannel)
     patch.setattr(server.pool, "release", lambda _channel: None)
     return server
 
 
-class _Channel:
+class PlasmaChannel:
+    """What a client wrote, by the channel's key."""
+
     frames: ClassVar[dict[bytes, bytes]] = {}
 
-    def __init__(self, _server: Any, key: bytes) -> None:
+    def __init__(self, key: bytes) -> None:
         self.ref = SimpleNamespace(binary=lambda: key)
         self._key = key
 
@@ -450,7 +452,7 @@ def over_plasma(visitor: Visitor, _when: str) -> str:
     """A plasma channel."""
     visitor.become()
     key = visitor.name.encode().ljust(28, b"\0")
-    _Channel.frames[key] = encode_request(Request("reset", Obs(), visitor.mark))
+    PlasmaChannel.frames[key] = encode_request(Request("reset", Obs(), visitor.mark))
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:
         connection.settimeout(ANSWER_S)
         connection.connect(visitor.replica.plasma.plasma.socket)

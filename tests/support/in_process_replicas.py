@@ -39,7 +39,7 @@ from vlagents_ray.serve.scaling.session_migration import SessionMigrator
 class Replicas:
     """Engines of one policy that know each other; requests go to the first that lives and does not stop."""
 
-    def __init__(self, agents: Sequence[Agent | Checkpoints]) -> None:
+    def __init__(self, agents: Sequence[Agent | Checkpoints], **options: Any) -> None:
         self.dead: set[int] = set()
         self.frozen: set[int] = set()
         self.prefer = 0  # where new connections go, if that one lives and does not stop
@@ -50,7 +50,9 @@ class Replicas:
         self._thread = threading.Thread(target=self._loop.run_forever)
         self._thread.start()
         self.migrators = [SessionMigrator(partial(self._others, number), self._loop) for number in range(len(agents))]
-        self.engines = [Engine(agent, finder=finder) for agent, finder in zip(agents, self.migrators, strict=True)]
+        self.engines = [
+            Engine(agent, finder=finder, **options) for agent, finder in zip(agents, self.migrators, strict=True)
+        ]
         for migrator, engine in zip(self.migrators, self.engines, strict=True):
             migrator.start(engine)
             engine.start()

@@ -1,0 +1,207 @@
+"""Connections to the endpoints, which carry bytes as they are: no encoder, no decoder and no client of this package."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import re
+import socket
+import struct
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Protocol
+
+from tests.golden.masks import masked, masked_local, masked_rpyc
+
+ANSWER_S = 20.0
+Got = tuple[str, bytes]
+"""What came, in a word, and its bytes, masked."""
+
+_HANDSHAKE = (
+    "GET {path} HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+    "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Version: 13\r\n\r\n"
+)
+_FRAME_KINDS = {0x81: "text", 0x82: "binary", 0x88: "close"}
+_LENGTH = re.compile(rb"\r\ncontent-length: (\d+)\r\n", re.IGNORECASE)
+
+
+class Line(Protocol):
+    """One connection of a client. `more` is what travels outside of a message."""
+
+    def send(self, data: bytes, more: list[bytes]) -> None: ...
+    def receive(self) -> Got: ...
+    def close(self) -> None: ...
+
+
+class TcpLine(ABC):
+    """A stream of bytes, with messages in it."""
+
+    def __init__(self, port: int) -> None:
+        self._socket = socket.create_connection(("127.0.0.1", port), timeout=ANSWER_S)
+        self._file = self._socket.makefile("rb")
+
+    def send(self, data: bytes, more: list[bytes]) -> None:
+        self._socket.sendall(data)
+
+    def receive(self) -> Got:
+        try:
+            return self._next()
+        except (EOFError, ConnectionError):
+            return "end", b""
+
+    def close(self) -> None:
+        self._file.close()
+        self._socket.close()
+
+    @abstractmethod
+    def _next(self) -> Got: ...
+
+    def _read(self, length: int) -> bytes:
+        data = self._file.read(length)
+        if len(data) < length:
+            raise EOFError
+        return data
+
+    def _read_response(self) -> bytes:
+        head = b""
+        while not head.endswith(b"\r\n\r\n"):
+            head += self._read(1)
+        length = _LENGTH.search(head)
+        return head + self._read(int(length[1]) if length else 0)
+
+
+class HttpLine(TcpLine):
+    """Requests of HTTP."""
+
+    def _next(self) -> Got:
+        return "response", masked(self._read_response())
+
+
+class RpycLine(TcpLine):
+    """Messages of RPyC: a length, whether they are compressed, a body, and a byte at the end."""
+
+    def _next(self) -> Got:
+        head = self._read(5)
+        return "message", masked_rpyc(head + self._read(int.from_bytes(head[:4], "big") + 1))
+
+
+class WebSocketLine(TcpLine):
+    """Frames of a WebSocket; `more` is the first byte, if the message is no binary one in one frame."""
+
+    def __init__(self, port: int, path: str) -> None:
+        super().__init__(port)
+        self._socket.sendall(_HANDSHAKE.format(path=path, port=port).encode())
+        self.opened: Got = ("handshake", masked(self._read_response()))
+
+    def send(self, data: bytes, more: list[bytes]) -> None:
+        first = more[0] if more else b"\x82"
+        self._socket.sendall(first + bytes([0x80 | 127]) + struct.pack(">Q", len(data)) + bytes(4) + data)
+
+    def _next(self) -> Got:
+        first, size = self._read(2)
+        if size >= 126:
+            size = int.from_bytes(self._read(2 if size == 126 else 8), "big")
+        return _FRAME_KINDS.get(first, f"{first:02x}"), masked(self._read(size))
+
+
+class UnixLine:
+    """Messages of a Unix socket, whose requests lie in memory: that of memory files, or what `store` keeps."""
+
+    def __init__(self, address: str, store: Callable[[bytes, bytes], None] | None = None) -> None:
+        self._store = store
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._socket.settimeout(ANSWER_S)
+        self._socket.connect(address)
+
+    def send(self, data: bytes, more: list[bytes]) -> None:
+        """`more`: what lies in memory, if the message names any."""
+        if not more:
+            self._socket.send(data)
+        elif self._store is not None:
+            self._store(data, more[0])
+            self._socket.send(data)
+        else:
+            descriptor = os.memfd_create("golden", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+            os.write(descriptor, more[0].ljust(4096, b"\0"))
+            fcntl.fcntl(descriptor, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW)
+            socket.send_fds(self._socket, [data], [descriptor])
+            os.close(descriptor)
+
+    def receive(self) -> Got:
+        data, descriptors, _, _ = socket.recv_fds(self._socket, 2**18, 1)
+        if not data:
+            return "end", b""
+        for descriptor in descriptors:
+            with os.fdopen(descriptor, "rb") as file:
+                file.seek(0)
+                return "control, in a file", masked_local(data + file.read())
+        return "control", masked_local(data)
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+class CallLine:
+    """Calls of a function, one at a time, that returns the answer."""
+
+    def __init__(self, call: Callable[[bytes, list[bytes]], Got]) -> None:
+        self._call = call
+        self._thread = ThreadPoolExecutor(1)
+        self._calls: list[Future[Got]] = []
+
+    def send(self, data: bytes, more: list[bytes]) -> None:
+        self._calls.append(self._thread.submit(self._call, data, more))
+
+    def receive(self) -> Got:
+        return self._calls.pop(0).result(ANSWER_S)
+
+    def close(self) -> None:
+        self._thread.shutdown()
+
+
+class ZmqLine:
+    """Messages of a REQ socket of ZeroMQ."""
+
+    def __init__(self, port: int) -> None:
+        import zmq
+
+        self._context = zmq.Context()
+        self._socket = self._context.socket(zmq.REQ)
+        self._socket.setsockopt(zmq.RCVTIMEO, int(1e3 * ANSWER_S))
+        self._socket.setsockopt(zmq.LINGER, 0)
+        self._socket.connect(f"tcp://127.0.0.1:{port}")
+
+    def send(self, data: bytes, more: list[bytes]) -> None:
+        self._socket.send(data)
+
+    def receive(self) -> Got:
+        return "message", masked(self._socket.recv())
+
+    def close(self) -> None:
+        self._socket.close()
+        self._context.term()
+
+
+class GrpcLine(CallLine):
+    """Calls of gRPC's methods: the data are a method's path, `more` its message, or those of a stream."""
+
+    def __init__(self, port: int) -> None:
+        import grpc
+
+        self._channel = grpc.insecure_channel(f"127.0.0.1:{port}", [("grpc.use_local_subchannel_pool", 1)])
+        self._failed = grpc.RpcError
+        super().__init__(self._called)
+
+    def _called(self, data: bytes, more: list[bytes]) -> Got:
+        path = data.decode()
+        try:
+            if path.endswith("SendObservations"):
+                return "message", masked(self._channel.stream_unary(path)(iter(more), timeout=ANSWER_S))
+            return "message", masked(self._channel.unary_unary(path)(more[0], timeout=ANSWER_S))
+        except self._failed as error:
+            return error.code().name, masked(error.details().encode())
+
+    def close(self) -> None:
+        super().close()
+        self._channel.close()

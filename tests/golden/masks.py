@@ -1,0 +1,200 @@
+"""Bytes of the wire: without what varies by nature, as text for a file, and field by field for a reader.
+
+A message is masked by taking it apart, replacing values, and putting it together again. One that does not come out as
+it was, before any value is replaced, is not what its format says: it stays as it is, and so differs from its trace.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import struct
+from collections.abc import Callable, Iterator
+from itertools import groupby
+from typing import Any
+
+import msgpack
+import numpy as np
+
+_REPLY = struct.Struct("<QHh")  # of shared memory: files that are free again, flags, core
+_ANSWER = struct.Struct("<40sqBB2xIIIddddd")  # id, step, flags, dimensions, H, D, batch size, five times in ms
+_COMPACT = 2  # of the flags
+_FRAME = struct.Struct("<4sI")
+# Of a session or a request, drawn at random; or the prefix of a request's that a gateway counts.
+_ID = re.compile(rb"(?<![0-9a-f])([0-9a-f]{32}(?![0-9a-f])|[0-9a-f]{16}(?=-[0-9a-f]))")
+_FRAME_MS = re.compile(rb'("\w+_ms":)-?\d+\.\d{4}(?=[,}])')
+_JSON_MS = re.compile(rb'("\w+_ms": ?)-?\d+(\.\d+)?(e-\d+)?(?=[,}])')
+_RPYC_JSON = re.compile(rb"\x0f(.{4})(\{.*\})(?=\n$)", re.DOTALL)
+_SERVERS_OWN = re.compile(rb"^(date|server): .*\r\n", re.IGNORECASE | re.MULTILINE)  # of uvicorn and websockets
+_LENGTH = re.compile(rb"(?<=\r\ncontent-length: )\d+", re.IGNORECASE)
+
+
+def masked(data: bytes) -> bytes:
+    """A message of an unknown format, with zeros for ids, times and what else varies."""
+    for begin, mask in ((b"VLA\x01", _frame), (b"HTTP/1.1 ", _http)):
+        if data.startswith(begin):
+            return mask(data)
+    if (value := _unpacked(data)) is not None:
+        return msgpack.packb(_zeroed(value))
+    return _without_ids(_JSON_MS.sub(rb"\g<1>0.0", data) if data[:1] == b"{" else data)
+
+
+def masked_local(data: bytes) -> bytes:
+    """A message of the server on a Unix socket, or its head and the memory file that came with it.
+
+    Which of the client's memory files are free again varies, too: it is up to Python's garbage collector.
+    """
+    flags, rest = _REPLY.unpack_from(data)[1], data[_REPLY.size :]
+    return _REPLY.pack(0, flags, 0) + (_without_times(rest) if flags & _COMPACT else masked(rest))
+
+
+def _without_times(answers: bytes) -> bytes:
+    try:
+        end = 4 + int.from_bytes(answers[:4], "little") * _ANSWER.size
+        each = [_ANSWER.pack(*one[:-5], *[0.0] * 5) for one in _ANSWER.iter_unpack(answers[4:end])]
+    except struct.error:
+        return answers
+    return answers[:4] + b"".join(each) + answers[end:]
+
+
+def masked_rpyc(data: bytes) -> bytes:
+    """A message of RPyC: its length, and that of the JSON in it, are those of what is left."""
+    if int.from_bytes(data[:4], "big") != len(data) - 6:
+        return data
+    if (found := _RPYC_JSON.search(data)) and int.from_bytes(found[1], "big") == len(found[2]):
+        text = _JSON_MS.sub(rb"\g<1>0.0", found[2])
+        data = data[: found.start(1)] + len(text).to_bytes(4, "big") + text + data[found.end() :]
+    return (len(data) - 6).to_bytes(4, "big") + _without_ids(data[4:])
+
+
+def _without_ids(data: bytes) -> bytes:
+    return _ID.sub(lambda found: b"0" * len(found[0]), data)
+
+
+def _frame(data: bytes) -> bytes:
+    header, blobs = _taken_apart(data)
+    if header is None:
+        return data
+    return _put_together(_without_ids(_FRAME_MS.sub(rb"\g<1>0.0000", header)), blobs)
+
+
+def _taken_apart(data: bytes) -> tuple[bytes | None, list[bytes]]:
+    """The header's JSON and the blobs of a frame; None if it is no frame, or has anything else."""
+    try:
+        _, length = _FRAME.unpack_from(data)
+        at = _FRAME.size + length
+        header, blobs = data[_FRAME.size : at], []
+        for size in json.loads(header)["blobs"]:
+            at += -at % 8
+            blobs.append(data[at : at + size])
+            at += size
+    except (ValueError, KeyError, TypeError, struct.error):
+        return None, []
+    return (header, blobs) if _put_together(header, blobs) == data else (None, [])
+
+
+def _put_together(header: bytes, blobs: list[bytes]) -> bytes:
+    data = _FRAME.pack(b"VLA\x01", len(header)) + header
+    for blob in blobs:
+        data += bytes(-len(data) % 8) + blob
+    return data
+
+
+def _http(data: bytes) -> bytes:
+    head, _, body = data.partition(b"\r\n\r\n")
+    head, body_masked = _without_ids(_SERVERS_OWN.sub(b"", head + b"\r\n")), masked(body)
+    if (length := _LENGTH.search(head)) is None or int(length[0]) != len(body):
+        return head + b"\r\n" + body
+    return _LENGTH.sub(str(len(body_masked)).encode(), head) + b"\r\n" + body_masked
+
+
+def _unpacked(data: bytes) -> Any:
+    """The map or the list in msgpack; None if it is none."""
+    try:
+        value = msgpack.unpackb(data, strict_map_key=False)
+    except (ValueError, msgpack.exceptions.UnpackException):
+        return None
+    return value if isinstance(value, dict | list) and msgpack.packb(value) == data else None
+
+
+def _zeroed(value: Any, key: Any = "") -> Any:
+    if isinstance(value, dict):
+        return {key: _zeroed(item, key) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_zeroed(item) for item in value]
+    if isinstance(value, str):
+        return _without_ids(value.encode()).decode()
+    return 0.0 if isinstance(value, float) and (str(key).endswith("_ms") or key == "timestamp") else value
+
+
+def as_text(data: bytes) -> str:
+    """Bytes for a file: printable ASCII as it is, the others in hexadecimal within «», `07*192` for many alike."""
+    return re.sub(rb"[ -~]{4,}|(?:(?![ -~]{4})[\s\S])+", _run, data).decode() or "«»"
+
+
+def _run(found: re.Match[bytes]) -> bytes:
+    data = found[0]
+    if len(data) >= 4 and re.fullmatch(rb"[ -~]+", data) and len(set(data)) > 1:
+        return data
+    runs = [(value, len(list(group))) for value, group in groupby(data)]
+    pieces = [f" {value:02x}*{n} " if n > 3 else f"{value:02x}" * n for value, n in runs]
+    return f"«{'|'.join(''.join(pieces).split())}»".encode()
+
+
+def from_text(text: str) -> bytes:
+    """The inverse of `as_text`."""
+    data = b""
+    for place, part in enumerate(re.split("[«»]", text)):
+        for piece in part.split("|") if place % 2 else ():
+            value, _, number = piece.partition("*")
+            data += bytes.fromhex(value) * int(number or 1)
+        data += b"" if place % 2 else part.encode()
+    return data
+
+
+def described(data: bytes) -> list[str]:
+    """A masked message, one field a line."""
+    if data.startswith(b"HTTP/1.1 "):
+        head, _, body = data.partition(b"\r\n\r\n")
+        return [*head.decode("latin-1").split("\r\n"), *described(body)]
+    header, blobs = _taken_apart(data)
+    if header is not None:
+        return list(_lines(json.loads(header), "frame", lambda at: blobs[at]))
+    if (value := _unpacked(data)) is not None:
+        return list(_lines(value, "map"))
+    if data[:1] == b"{":
+        try:
+            return list(_lines(json.loads(data), "json"))
+        except ValueError:
+            pass
+    return [as_text(data)]
+
+
+def described_locally(data: bytes) -> list[str]:
+    """A message of `masked_local`, one field a line."""
+    flags, rest = _REPLY.unpack_from(data)[1], data[_REPLY.size :]
+    if not flags & _COMPACT:
+        return [f"flags = {flags}", *described(rest)]
+    count = int.from_bytes(rest[:4], "little")
+    if len(rest) < 4 + count * _ANSWER.size:
+        return [f"flags = {flags}", as_text(rest)]
+    found = [f"flags = {flags}"]
+    names = ("request_id", "step", "flags", "dimensions", "H", "D", "batch_size")
+    for place in range(count):
+        answer = _ANSWER.unpack_from(rest, 4 + place * _ANSWER.size)
+        found += [f"answer {place}: {name} = {value}" for name, value in zip(names, answer, strict=False)]
+    return [*found, f"actions = {as_text(rest[4 + count * _ANSWER.size :])}"]
+
+
+def _lines(value: Any, path: str, blob: Callable[[int], bytes] | None = None) -> Iterator[str]:
+    if isinstance(value, dict) and blob is not None and list(value) == ["$"]:
+        kind, *rest = value["$"]
+        if kind == "nd":
+            yield f"{path} = {rest[1]} {rest[2]} {np.frombuffer(blob(rest[0]), rest[1]).tolist()}"
+        else:
+            yield f"{path} = {kind} {as_text(blob(rest[0])) if kind in ('bin', 'img') else rest}"
+    elif isinstance(value, dict | list) and value:
+        for key, item in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from _lines(item, f"{path}.{key}", blob)
+    else:
+        yield f"{path} = {value!r}"

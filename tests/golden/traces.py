@@ -1,0 +1,122 @@
+"""Traces: what a scenario sends and gets, in a file; played again, they say what has changed."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from difflib import unified_diff
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.golden.lines import Line, WebSocketLine
+from tests.golden.masks import as_text, described, described_locally, from_text
+from tests.golden.replica import Server
+
+TRACES = Path(__file__).parent / "traces"
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step of a scenario.
+
+    Args:
+        who: A line's name; or "server", to which something happens.
+        what: "sends", "gets", "opens" (and gets the answer to the handshake), or "leaves"; of the server, `Server.do`.
+        data: What is sent or got: the message, and what travels outside of it; `kind` says how it came.
+    """
+
+    who: str
+    what: str
+    kind: str = ""
+    data: tuple[bytes, ...] = ()
+
+    def lines(self) -> list[str]:
+        """As a reader looks at it."""
+        head = f"{self.who} {self.what} {self.kind}".strip()
+        describe = described_locally if self.kind.startswith("control") else described
+        return [head, *(f"    {line}" for data in self.data for line in describe(data))]
+
+
+@dataclass
+class Trace:
+    """A scenario at the endpoints at which the same bytes go both ways."""
+
+    name: str
+    endpoints: list[str]
+    settings: dict[str, Any]
+    steps: list[Step] = field(default_factory=list)
+
+    def sent(self) -> Trace:
+        """The same without the answers."""
+        return replace(self, steps=[one if one.what == "sends" else Step(one.who, one.what) for one in self.steps])
+
+    def played(self, endpoint: str, folder: Path) -> Trace:
+        """Send the same to a new server; returns what came of it."""
+        with pytest.MonkeyPatch.context() as patch, contextlib.ExitStack() as stack:
+            server = Server(stack, patch, folder, **self.settings)
+            lines: dict[str, Line] = {}
+            stack.callback(lambda: [line.close() for line in lines.values()])
+            steps = [_played(step, server, endpoint, lines) for step in self.steps]
+            return Trace(self.name, [endpoint], self.settings, steps)
+
+
+def _played(step: Step, server: Server, endpoint: str, lines: dict[str, Line]) -> Step:
+    if step.who == "server":
+        server.do(step.what)
+        return step
+    if step.who not in lines:
+        lines[step.who] = server.line(endpoint, step.who)
+    line, got = lines[step.who], None
+    if step.what == "sends":
+        line.send(step.data[0], list(step.data[1:]))
+    elif step.what == "leaves":
+        lines.pop(step.who).close()
+    elif step.what == "opens":
+        assert isinstance(line, WebSocketLine)
+        got = line.opened
+    else:
+        got = line.receive()
+    return step if got is None else Step(step.who, step.what, got[0], (got[1],))
+
+
+def differences(recorded: Trace, played: Trace) -> str:
+    """What a reader needs to see; empty if there is nothing."""
+    found = ["another number of steps"] * (len(recorded.steps) != len(played.steps))
+    for number, (before, now) in enumerate(zip(recorded.steps, played.steps, strict=False)):
+        if before == now:
+            continue
+        lines = list(unified_diff(before.lines(), now.lines(), "recorded", "now", n=0, lineterm=""))[2:]
+        if not any(line[0] in "+-" for line in lines):  # the same to a reader, and other bytes
+            lines = [f"-{as_text(b''.join(before.data))}", f"+{as_text(b''.join(now.data))}"]
+        found += [f"step {number}: {now.who} {now.what}", *(line for line in lines if line[0] in "+-")]
+    return "\n".join(found)
+
+
+def read(name: str) -> list[Trace]:
+    """The traces in a file: of each its name, a line with its endpoints and the server's settings, and its steps."""
+    found: list[Trace] = []
+    for part in (TRACES / f"{name}.txt").read_text().split("== ")[1:]:
+        title, head, *lines = part.splitlines()
+        found.append(Trace(title, *json.loads(head)))
+        for line in lines:
+            if line.startswith("  "):
+                step = found[-1].steps.pop()
+                found[-1].steps.append(replace(step, data=(*step.data, from_text(line[2:]))))
+            else:
+                found[-1].steps.append(Step(*line.split("; ")))
+    return found
+
+
+def write(name: str, traces: Sequence[Trace]) -> None:
+    """Write a file."""
+    lines = []
+    for one in traces:
+        lines += [f"== {one.name}", json.dumps([one.endpoints, one.settings])]
+        for step in one.steps:
+            words = (step.who, step.what, step.kind)
+            lines += ["; ".join(filter(None, words)), *(f"  {as_text(data)}" for data in step.data)]
+    (TRACES / f"{name}.txt").write_text("\n".join(lines) + "\n")
