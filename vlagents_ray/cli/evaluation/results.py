@@ -38,8 +38,8 @@ def report_command(
     With --live it writes none: it shows the results in OUT as another process adds to them, until Ctrl-C.
     """
     from vlagents_ray.evaluate import Results
+    from vlagents_ray.evaluate.merge import combined
     from vlagents_ray.evaluate.report.html import FILE, write_report
-    from vlagents_ray.evaluate.results.combine import combined
 
     with errors():
         if live or live_at:

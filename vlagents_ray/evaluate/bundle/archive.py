@@ -26,7 +26,6 @@ from typing import IO, Literal
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError
 
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.evaluate.artifacts.provenance import versions
 from vlagents_ray.evaluate.artifacts.storage import (
     PROVENANCE,
     TRAJECTORIES,
@@ -35,6 +34,7 @@ from vlagents_ray.evaluate.artifacts.storage import (
     link_or_copy,
     require_below,
     storing,
+    versions,
     whole,
 )
 from vlagents_ray.evaluate.plan.config import canonical

@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.evaluate.artifacts.provenance import versions
+from vlagents_ray.evaluate.artifacts.storage import versions
 from vlagents_ray.evaluate.artifacts.trajectory import Trajectory
 from vlagents_ray.evaluate.bundle.archive import CONFIG, MANIFEST, compared, pins, versions_of
 from vlagents_ray.evaluate.plan.config import fingerprint

@@ -13,9 +13,8 @@ from vlagents_ray.envs.batch import make_batch
 from vlagents_ray.errors import ConfigError, VLAgentsError
 from vlagents_ray.evaluate.artifacts.trajectory import Trajectory
 from vlagents_ray.evaluate.bundle.checks import Finding, recorded
-from vlagents_ray.evaluate.episode.env_outputs import checked_obs, checked_step
 from vlagents_ray.evaluate.episode.episode import options_of_reset
-from vlagents_ray.evaluate.episode.failures import env_side
+from vlagents_ray.evaluate.episode.failures import checked_obs, checked_step, env_side
 from vlagents_ray.evaluate.results.reader import CellResults, Episode, Results
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.registry import env_suite, names

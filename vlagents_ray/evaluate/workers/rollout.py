@@ -32,7 +32,7 @@ from vlagents_ray.evaluate.plan.cases import EvalCase, env_program
 from vlagents_ray.evaluate.plan.config import EvalConfig, PolicyConfig
 from vlagents_ray.evaluate.plan.jobs import Job
 from vlagents_ray.evaluate.workers.agents import AgentFactory
-from vlagents_ray.evaluate.workers.logs import own_logs
+from vlagents_ray.evaluate.workers.cluster import own_logs
 from vlagents_ray.interface import Agent
 from vlagents_ray.policies.base.checkpoint import used_checkpoints
 from vlagents_ray.policies.base.checkpoint_files import weights_of
