@@ -116,7 +116,7 @@ def evaluate(
                 run = _Run(config, store, progress or SilentProgress(), tracking, only, end_at, in_process, local)
                 state, summary = run.play(factory)
         except BaseException:
-            with contextlib.suppress(StorageFailed):  # of the same disk, it may be: what went wrong first is told
+            with contextlib.suppress(StorageFailed):  # probably the same disk error; report the first one
                 conclude(config, store, "stopped")
             raise
     for stopped in (EvaluationInterrupted, OutOfTime):
@@ -187,8 +187,8 @@ class _Run:
     def play(self, factory: AgentFactory) -> tuple[str, Summary]:
         """Play all that is queued, until a signal or the deadline ends it early; returns the run's state and summary.
 
-        The summary is written before Ray is left: when a job is cancelled, its Ray is stopped at the same time and
-        answers nobody, and Slurm kills the job a few seconds later.
+        The summary is written before Ray is left: when Slurm cancels a job, Ray stops responding at once and the job is
+        killed seconds later.
         """
         if not len(self._queue):
             return "complete", conclude(self._config, self._store, "complete")
@@ -251,7 +251,7 @@ class _Run:
                 log.warning(hint)
 
     def _failed(self, job: Job, failure: Failure) -> None:
-        beyond = self._has_stopped(job)  # nobody waits for it
+        beyond = self._has_stopped(job)  # it is not needed any more
         retried = self._attempts.repeats(job, failure) and not beyond
         self._store.record_attempt(job, failure, retried=retried)
         if failure.cause == "user":

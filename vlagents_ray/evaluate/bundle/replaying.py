@@ -44,7 +44,8 @@ def require_harmless(cell: CellResults) -> None:
     """Raise `ConfigError` unless making this environment runs no code but that of a registered one.
 
     A bundle may come from a stranger: "module:Class" would be imported, and an option that is a path or a nested value
-    could name files or code of this machine. Whether code is trusted (`trust_remote_code`) is for nobody else to say.
+    could name files or code of this machine. `trust_remote_code` from a bundle is refused: only the local user
+    can grant it.
     """
     if env_suite(cell.env) not in names("envs") or ":" in cell.env:
         raise ConfigError(f"{cell.env}: is no registered environment; --trust makes it, and runs its code")
@@ -61,7 +62,7 @@ def replay_actions(cell: CellResults, episode: Episode, trajectory: Trajectory) 
     Images are neither rendered nor compared. State, gripper, rewards and success are, bit by bit.
 
     Args:
-        cell: The cell; `require_harmless` first if it is somebody else's.
+        cell: The cell; `require_harmless` first if it comes from another machine.
         episode: The episode of it.
         trajectory: Its recording.
 

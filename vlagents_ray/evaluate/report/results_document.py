@@ -30,7 +30,7 @@ class ResultsDocument:
     """Describes the results of an evaluation, or of those of a training, which any process may be writing.
 
     `read` and `video` are called on one thread. Numbers come from the folder, by the code that makes the report: so
-    they include earlier runs and, in a training, earlier versions. Nothing is read while nobody calls `read`.
+    they include earlier runs and, in a training, earlier versions. Results are read only when `read` is called.
     """
 
     reason = ""

@@ -47,7 +47,7 @@ _CHOICES = {
     "next": set[str](),
     "end": set[str](),
 }
-_AWAY_S = 3.0  # without a request of the page; then nobody watches
+_AWAY_S = 3.0  # without a request of the page, after which the operator counts as away
 _LOOK_S = 0.1  # between two live pictures while the scene is set
 _BODY = 10_000  # bytes of an answer
 _PAGE_QUALITY = 80
@@ -132,7 +132,7 @@ class Operator(Protocol):
         ...
 
     def stops(self) -> bool:
-        """Return whether the running trial is to be stopped, as it is if nobody watches any more."""
+        """Return whether the running trial is to be stopped, which also happens when the operator's page is closed."""
         ...
 
     def judge(self, trial: VisibleTrial, ending: str) -> Verdict:
@@ -190,7 +190,7 @@ class TerminalOperator(Operator):
     """An operator at a terminal. Enter stops a running trial.
 
     Args:
-        ask: Prints a question and returns the typed line, as `input` does; raises `EOFError` if nobody answers.
+        ask: Prints a question and returns the typed line, as `input` does; raises `EOFError` at the end of the input.
         say: Prints a line.
         stopping: Returns whether the running trial is to be stopped; by default, whether Enter was pressed.
     """

@@ -105,7 +105,10 @@ class PlayedTrial:
     ending: str  # in words that do not depend on the policy
 
     def judged(self, verdict: Verdict, score: float) -> EpisodeResult:
-        """Return the result with the verdict: a partial success is none in the rates, its score is the return."""
+        """Return the result with the verdict.
+
+        A partial success counts as a failure in success rates; its score is stored as the return.
+        """
         success = verdict.outcome == "success"
         return replace(
             self.result,
@@ -237,8 +240,8 @@ def play(
 def rehearse(cell: EvalCase, factory: AgentFactory, operator: Operator, obs: Obs) -> None:
     """Let a policy answer once, without moving the robot.
 
-    A mistake in the settings shows before the first trial, and what a policy does at its first answer, such as
-    compiling, takes no time of a trial, by which the policy could be told.
+    A mistake in the settings shows before the first trial. Work done on the first call, such as compilation, does not
+    slow the first trial, which would reveal which policy is running.
     """
     _, task = cell.on_robot
     unused = EpisodeStats(EpisodeKey(cell.env, 0, 0, cell.fingerprint))
