@@ -171,26 +171,12 @@ def storing(folder: Path) -> Iterator[None]:
 def _number(error: sqlite3.OperationalError, folder: Path) -> int | None:
     """The errno of an error of SQLite; None if it is not about the disk."""
     number = _SQLITE.get(str(error))
-    if number == errno.EIO and _is_full(folder):
+    disk = os.statvfs(next(one for one in (folder, *folder.absolute().parents) if one.exists()))
+    if number == errno.EIO and disk.f_bavail * disk.f_frsize < _NOTHING_LEFT:
         return errno.ENOSPC
-    if number == errno.EACCES and _is_read_only(folder):
+    if number == errno.EACCES and disk.f_flag & os.ST_RDONLY:
         return errno.EROFS
     return number
-
-
-def _is_full(folder: Path) -> bool:
-    found = _disk(folder)
-    return found.f_bavail * found.f_frsize < _NOTHING_LEFT
-
-
-def _is_read_only(folder: Path) -> bool:
-    return bool(_disk(folder).f_flag & os.ST_RDONLY)
-
-
-def _disk(folder: Path) -> os.statvfs_result:
-    """The file system that `folder` is on, or would be."""
-    there = next(one for one in (folder, *folder.absolute().parents) if one.exists())
-    return os.statvfs(there)
 
 
 def driver_code() -> dict[str, GitState | None]:

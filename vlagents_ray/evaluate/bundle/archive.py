@@ -298,7 +298,10 @@ def write_bundle(folder: Path, archive: Path, *, videos: bool = False) -> str:
         with tempfile.TemporaryDirectory(prefix=f"{archive.name}.part-", dir=archive.parent) as temporary:
             stage = Path(temporary) / "bundle"  # its name is in the page
             stage.mkdir()
-            _copy_database(folder, stage)
+            # One consistent state, also while an evaluation writes to it.
+            with reading(folder) as source, closing(sqlite3.connect(stage / DATABASE)) as target:
+                source.backup(target)
+                target.execute("PRAGMA journal_mode = DELETE")
             results = Results.load(stage)
             _link_files(folder, stage, results, videos=videos)
             _name_what_is_there(stage)
@@ -323,13 +326,6 @@ def configurations(summary: Summary) -> dict[str, str]:
     if len(texts) == 1:
         return {f"{CONFIG}.yaml": texts[0]}
     return {f"{CONFIG}-{number}.yaml": text for number, text in enumerate(texts, 1)}
-
-
-def _copy_database(folder: Path, stage: Path) -> None:
-    """Copy one consistent state of results.db, also while an evaluation writes to it."""
-    with reading(folder) as source, closing(sqlite3.connect(stage / DATABASE)) as target:
-        source.backup(target)
-        target.execute("PRAGMA journal_mode = DELETE")
 
 
 def _link_files(folder: Path, stage: Path, results: Results, *, videos: bool) -> None:

@@ -84,8 +84,8 @@ def check_derived(stated: dict[str, bytes], computed: Path, *, same_software: bo
         yield Finding(REPORT, "differs", "the database gives another page with the same software")
     else:
         yield Finding(REPORT, "not checked", "written by other software, whose page differs; --into writes it again")
-    names = sorted(name for name in stated.keys() | {path.name for path in computed.glob("*.yaml")} if _is_config(name))
-    for name in names:
+    settings = {name for name in stated if name.endswith(".yaml")} | {path.name for path in computed.glob("*.yaml")}
+    for name in sorted(name for name in settings if name.startswith(CONFIG)):
         mine = computed / name
         same = mine.is_file() and stated.get(name) == mine.read_bytes()
         if same:
@@ -93,10 +93,6 @@ def check_derived(stated: dict[str, bytes], computed: Path, *, same_software: bo
         else:
             verdict: Verdict = "differs" if same_software else "not checked"
             yield Finding(name, verdict, "is not what the database gives here")
-
-
-def _is_config(name: str) -> bool:
-    return name.startswith(CONFIG) and name.endswith(".yaml")
 
 
 def _check_summary(stated: bytes | None, computed: bytes) -> Finding:

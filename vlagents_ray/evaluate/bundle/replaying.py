@@ -195,8 +195,8 @@ def _replay(cell: CellResults, episode: Episode, trajectory: Trajectory, *, trus
         return Finding(subject, "not checked", str(error))
     result = episode.result
     if played.outcome != (result.success_once, result.success_at_end, result.first_success):
-        now = "solved" if played.outcome[0] else "not solved"
-        return Finding(subject, "differs", f"{now} here, {_outcome(result.success_once)} there; {_from(played)}")
+        now, then = ("solved" if solved else "not solved" for solved in (played.outcome[0], result.success_once))
+        return Finding(subject, "differs", f"{now} here, {then} there; {_from(played)}")
     detail = f"{played.steps} actions, every state, reward and success to the bit"
     if not played.same:
         detail = f"the same outcome, other numbers; {_from(played)}"
@@ -207,10 +207,6 @@ def _replay(cell: CellResults, episode: Episode, trajectory: Trajectory, *, trus
 
 def _from(played: Replayed) -> str:
     return f"the numbers differ from step {played.differs_from} of {played.steps} on, by at most {played.largest:.3g}"
-
-
-def _outcome(solved: bool | None) -> str:
-    return "solved" if solved else "not solved"
 
 
 def _described(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:

@@ -91,7 +91,7 @@ class ResultsDocument:
         cells = () if results is None else results.cells
         contenders = [] if results is None else results.contenders
         left_s = _left_s(results) if results is not None and state == RUNNING else None
-        failed = [(cell, one) for cell in cells for one in cell.episodes if _failed(one)]
+        failed = [(cell, one) for cell in cells for one in cell.episodes if not (one.beyond or one.result.success_once)]
         failed.sort(key=lambda found: found[1].finished, reverse=True)
         return {
             "name": self._out.name,
@@ -139,10 +139,6 @@ def _left_s(results: Results) -> float | None:
     played = sum(one.run == run.run for cell in results.cells for one in cell.episodes)
     left = sum(_planned(cell) - _done(cell) for cell in results.cells)
     return seconds_left(left, played, time.time() - run.started)
-
-
-def _failed(one: Episode) -> bool:
-    return not one.beyond and not one.result.success_once
 
 
 def _done(cell: CellResults) -> int:
