@@ -25,7 +25,7 @@ from vlagents_ray.evaluate.workers.cluster import ray_cluster
 from vlagents_ray.policies.base.checkpoint import STEP
 from vlagents_ray.serve.launch.deployment_file import own_settings
 from vlagents_ray.serve.models.checkpoints import CHOICE
-from vlagents_ray.slurm.script import UNFINISHED
+from vlagents_ray.slurm.submission import UNFINISHED
 
 if TYPE_CHECKING:
     from vlagents_ray.evaluate import Progress, Summary
