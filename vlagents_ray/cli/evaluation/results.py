@@ -267,9 +267,8 @@ def replay_dataset(
     state: str | None,
 ) -> None:
     """Play a dataset to a policy, print the errors, and write the report."""
-    from vlagents_ray.open_loop.candidates import candidate
     from vlagents_ray.open_loop.recorded import Names
-    from vlagents_ray.open_loop.replay import ReplayPlan, replay
+    from vlagents_ray.open_loop.replay import ReplayPlan, candidate, replay
     from vlagents_ray.open_loop.report import write_files
 
     if policy is None:

@@ -23,9 +23,8 @@ from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.evaluate.plan.config import EpisodeChoice, EvalConfig
 from vlagents_ray.evaluate.plan.jobs import Job
 from vlagents_ray.interface import Act, Obs
-from vlagents_ray.viewers.frame import ViewerFrame, numbers_of
 from vlagents_ray.viewers.targets import SUFFIXES, is_live, open_target
-from vlagents_ray.viewers.viewer import EpisodeViewer
+from vlagents_ray.viewers.viewer import EpisodeViewer, ViewerFrame, numbers_of
 
 if TYPE_CHECKING:
     from typing_extensions import Self
