@@ -12,9 +12,8 @@ from pathlib import Path
 import pytest
 import typer
 
-from vlagents_ray.cli import console
+from vlagents_ray.cli import console, listing
 from vlagents_ray.cli.console import PlainConsole, table
-from vlagents_ray.cli.doctor import listing
 from vlagents_ray.cli.main import envs, policies
 from vlagents_ray.envs.tabletop import Tabletop
 from vlagents_ray.registry import POLICIES, WRAPPERS
@@ -149,7 +148,7 @@ def test_no_command_prints_on_a_console_or_in_a_table_of_its_own() -> None:
         text = file.read_text()
         if file.name != "console.py":
             assert not re.search(r"\bConsole\(|Console\(stderr|\[bold\]|\[/\]|from_markup", text), file.name
-            for made in re.findall(r"\bTable\((.*)\)", text):  # dry_run.py, checks.py, which fold
+            for made in re.findall(r"\bTable\((.*)\)", text):  # evaluation/run.py, doctor.py, which fold
                 assert 'overflow="fold"' in text, (file.name, made)
 
 

@@ -9,15 +9,14 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from vlagents_ray.cli.doctor import checks as doctor
-from vlagents_ray.cli.doctor import machine
-from vlagents_ray.cli.doctor.machine import Check
+from vlagents_ray.cli import doctor
+from vlagents_ray.cli.doctor import Check
 from vlagents_ray.envs.rendering import render_probe
 from vlagents_ray.envs.rendering.egl import EglDevice
 from vlagents_ray.errors import MissingDependency
 from vlagents_ray.serve.ports import free_port
 
-GB = machine.GB
+GB = doctor.GB
 
 
 def nvidia_smi(folder: Path, monkeypatch: pytest.MonkeyPatch, script: str) -> None:
@@ -162,32 +161,32 @@ def test_h264_survives_encoding_and_decoding() -> None:
 
 
 def test_shared_memory_must_hold_the_object_store_that_ray_will_make() -> None:
-    assert machine.judge_shared_memory(total=32 * GB, free=30 * GB, memory=64 * GB).status == "ok"
-    docker_default = machine.judge_shared_memory(total=0.064 * GB, free=0.064 * GB, memory=16 * GB)
+    assert doctor.judge_shared_memory(total=32 * GB, free=30 * GB, memory=64 * GB).status == "ok"
+    docker_default = doctor.judge_shared_memory(total=0.064 * GB, free=0.064 * GB, memory=16 * GB)
     assert docker_default.status == "warn"
     assert "--shm-size=5g" in docker_default.cure
 
 
 def test_a_small_share_of_a_huge_memory_is_enough_as_ray_caps_its_store() -> None:
-    assert machine.judge_shared_memory(total=100 * GB, free=100 * GB, memory=1000 * GB).status == "ok"
+    assert doctor.judge_shared_memory(total=100 * GB, free=100 * GB, memory=1000 * GB).status == "ok"
 
 
 @pytest.mark.parametrize(
     ("free", "status"), [(0.5 * GB, "fail"), (3 * GB, "warn"), (20 * GB, "warn"), (200 * GB, "ok")]
 )
 def test_temporary_space_is_judged_by_what_is_free(free: float, status: str) -> None:
-    assert machine.judge_temp_dir("/tmp", total=1000 * GB, free=free).status == status
+    assert doctor.judge_temp_dir("/tmp", total=1000 * GB, free=free).status == status
 
 
 def test_a_temporary_folder_with_a_long_path_fails_as_sockets_will_not_fit() -> None:
-    row = machine.judge_temp_dir("/tmp/" + "x" * 60, total=100 * GB, free=90 * GB)
+    row = doctor.judge_temp_dir("/tmp/" + "x" * 60, total=100 * GB, free=90 * GB)
     assert row.status == "fail"
     assert "107" in row.detail
 
 
 def test_rays_temporary_folder_is_the_one_that_is_judged(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("RAY_TMPDIR", str(tmp_path / "missing"))
-    row = machine.temp_dir()
+    row = doctor.temp_dir()
     assert row.status == "fail"
     assert "missing" in row.detail
 
@@ -196,24 +195,24 @@ def test_rays_temporary_folder_is_the_one_that_is_judged(monkeypatch: pytest.Mon
     ("soft", "hard", "status"), [(1024, 1024, "warn"), (1024, 1_048_576, "ok"), (65536, 65536, "ok")]
 )
 def test_open_files_count_as_ray_will_raise_them(soft: int, hard: int, status: str) -> None:
-    assert machine.judge_open_files(soft, hard).status == status
+    assert doctor.judge_open_files(soft, hard).status == status
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_a_taken_port_names_its_holder_and_another_port() -> None:
     port = free_port()  # no other process takes it meanwhile
     with socket.create_server(("127.0.0.1", port)):
-        row = machine.port_free(port)
+        row = doctor.port_free(port)
     assert row.status == "warn"
     assert f"pid {os.getpid()}" in row.detail
     assert f"--port {port + 1}" in row.cure
-    assert machine.port_free(port).status == "ok"
+    assert doctor.port_free(port).status == "ok"
 
 
 def test_a_containers_memory_limit_is_what_counts(tmp_path: Path) -> None:
-    machines = machine.memory_bytes(tmp_path / "none")
+    machines = doctor.memory_bytes(tmp_path / "none")
     limit = tmp_path / "memory.max"
     limit.write_text("1000000\n")
-    assert machine.memory_bytes(limit) == 1_000_000
+    assert doctor.memory_bytes(limit) == 1_000_000
     limit.write_text("max\n")
-    assert machine.memory_bytes(limit) == machines
+    assert doctor.memory_bytes(limit) == machines

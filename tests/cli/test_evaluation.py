@@ -16,7 +16,7 @@ import pytest
 from typer.testing import CliRunner
 
 import vlagents_ray.evaluate
-from vlagents_ray.cli.evaluation import command, dry_run, policies, run, watch
+from vlagents_ray.cli.evaluation import command, policies, run
 from vlagents_ray.cli.evaluation.live import live_address
 from vlagents_ray.cli.main import app
 from vlagents_ray.evaluate import EvalConfig, OutOfTime, PolicyConfig, Results, SuiteConfig, WorkerConfig
@@ -57,7 +57,7 @@ def test_a_checkpoint_may_count_at_once_and_the_first_step_be_the_last(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     seen: list[dict[str, Any]] = []
-    monkeypatch.setattr(watch, "watch_training", lambda *_args, **options: seen.append(options))
+    monkeypatch.setattr(run, "watch_training", lambda *_args, **options: seen.append(options))
     words = [*WORDS, "--out", str(tmp_path / "out"), "--watch", str(tmp_path), "--settle", "0", "--until", "0"]
     done = CliRunner().invoke(app, words)
     assert done.exit_code == 0, done.output
@@ -237,7 +237,7 @@ def test_a_dry_run_keeps_warnings_of_what_is_meant_off_the_terminal(
         for line in said:
             logging.getLogger("ray._private.worker").warning(line)
 
-    monkeypatch.setattr(dry_run, "print_plan", measure)
+    monkeypatch.setattr(run, "print_plan", measure)
     done = CliRunner().invoke(app, [*WORDS, "--out", str(tmp_path / "out"), "--dry-run"])
     assert done.exit_code == 0, done.output
     assert [record.getMessage() for record in caplog.records if record.getMessage() in said] == [said[1]]

@@ -11,9 +11,9 @@ import typer
 import yaml
 from eval_fakes import LINE
 
-from vlagents_ray.cli.evaluation import watch
+from vlagents_ray.cli.evaluation import run
 from vlagents_ray.cli.evaluation.policies import resolve_policies
-from vlagents_ray.cli.evaluation.watch import _watched, watch_training
+from vlagents_ray.cli.evaluation.run import _watched, watch_training
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig, Progress, Results, Summary
 from vlagents_ray.evaluate.episode.records import EpisodeResult, Status
@@ -76,10 +76,10 @@ def test_an_episode_lost_in_any_round_ends_watching_with_status_1_and_no_round_e
             store.end_run("complete")
         return summarize(Results.load(config.out))
 
-    monkeypatch.setattr(watch, "evaluate_and_print", play)
-    monkeypatch.setattr(watch, "rounds", lambda *_: iter([[10], [20, 30]]))
-    monkeypatch.setattr(watch, "served", lambda config, *_: contextlib.nullcontext(config))
-    monkeypatch.setattr(watch, "ray_cluster", lambda _config: contextlib.nullcontext())
+    monkeypatch.setattr(run, "evaluate_and_print", play)
+    monkeypatch.setattr(run, "rounds", lambda *_: iter([[10], [20, 30]]))
+    monkeypatch.setattr(run, "served", lambda config, *_: contextlib.nullcontext(config))
+    monkeypatch.setattr(run, "ray_cluster", lambda _config: contextlib.nullcontext())
     with pytest.raises(typer.Exit) as ended:
         watch_training(config, tmp_path)
     assert played == [[10], [20, 30]]

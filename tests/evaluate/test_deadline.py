@@ -12,10 +12,10 @@ from flat_config import flat_config
 from manual_clock import Clock
 
 from vlagents_ray.evaluate import EvalConfig, OutOfTime, SilentProgress, evaluate
-from vlagents_ray.evaluate.deadline import CLOSING_S, MARGIN, Deadline
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.cases import EvalCase, cells
 from vlagents_ray.evaluate.plan.jobs import plan
+from vlagents_ray.evaluate.run import CLOSING_S, MARGIN, Deadline
 
 JOBS = plan(cells(flat_config(envs=["tabletop"], episodes=3, out="out")))
 

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from browser import Page, browser
 
-from vlagents_ray.open_loop.comparison import ErrorTable, FrameError
-from vlagents_ray.open_loop.replay import OpenLoopResult
+from vlagents_ray.open_loop.replay import ErrorTable, FrameError, OpenLoopResult
 from vlagents_ray.open_loop.report import write_files
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]

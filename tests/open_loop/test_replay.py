@@ -18,16 +18,15 @@ from live_server import live_server
 from recorded_sessions import Brightness, recorded, seen
 from typer.testing import CliRunner
 
-from vlagents_ray.cli.evaluation.open_loop import parse_episodes
+from vlagents_ray.cli.evaluation.results import parse_episodes
 from vlagents_ray.cli.main import app
 from vlagents_ray.contract import ActionSpec, Contract, StateSpec
 from vlagents_ray.errors import ConfigError, PolicyFailed
 from vlagents_ray.images import jpeg_png
 from vlagents_ray.images.mp4 import Mp4
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.open_loop.candidates import LocalAgent, Sessions, candidate
 from vlagents_ray.open_loop.recorded import Names, RecordedDataset
-from vlagents_ray.open_loop.replay import ReplayPlan, replay
+from vlagents_ray.open_loop.replay import LocalAgent, ReplayPlan, Sessions, candidate, replay
 from vlagents_ray.open_loop.report import line_chart, write_files
 from vlagents_ray.policies.random import Random
 from vlagents_ray.robot.record import Recorder

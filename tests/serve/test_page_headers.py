@@ -14,12 +14,12 @@ import pytest
 from live_server import live_server
 
 import vlagents_ray
-from vlagents_ray.evaluate.robot.web_operator import PageOperator
+from vlagents_ray.evaluate.robot.operator import PageOperator
 from vlagents_ray.serve.live.endpoint import page_server
 from vlagents_ray.serve.live.fleet import Fleet
 
 PACKAGE = Path(vlagents_ray.__file__).parent
-SERVES = {"evaluate/robot/web_operator.py", "serve/endpoints/http_messages.py"}  # all modules that send HTML
+SERVES = {"evaluate/robot/operator.py", "serve/endpoints/http_messages.py"}  # all modules that send HTML
 
 
 @contextmanager

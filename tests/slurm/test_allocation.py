@@ -6,7 +6,7 @@ import os
 
 import pytest
 
-from vlagents_ray.slurm.allocation import Allocation, Ports
+from vlagents_ray.slurm.job import Allocation, Ports
 
 ENVIRONMENT = {"SLURM_JOB_ID": "4711", "SLURM_JOB_NUM_NODES": "3", "SLURM_NODEID": "1", "SLURM_CPUS_ON_NODE": "1"}
 

@@ -7,7 +7,7 @@ import socket
 import subprocess
 from pathlib import Path
 
-from vlagents_ray.slurm.announce import as_text, connection_info, write
+from vlagents_ray.slurm.job import as_text, connection_info, write
 
 ENVIRONMENT = {
     "SLURM_JOB_ID": "12",

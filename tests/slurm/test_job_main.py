@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from vlagents_ray.slurm.job_main import end_of_job
+from vlagents_ray.slurm.job import end_of_job
 
 
 def squeue_says(text: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

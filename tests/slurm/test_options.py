@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.slurm.options import first_index, split
+from vlagents_ray.slurm.submission import first_index, split
 
 KNOWN = {"--policy": True, "--resume": False, "--out": True}
 

@@ -12,8 +12,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.slurm.script import BODY, Script
-from vlagents_ray.slurm.submission import SubmissionFailed, outside_of_jobs, submit
+from vlagents_ray.slurm.submission import BODY, Script, SubmissionFailed, outside_of_jobs, submit
 
 SETTINGS = (b"python", b"folder", b"setup", b"resubmit", b"unfinished")
 SBATCH = """#!/bin/bash

@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterable
 from eval_fakes import ToZero
 
 from vlagents_ray.evaluate import EvalConfig, Results
-from vlagents_ray.evaluate.artifacts.provenance import versions
 from vlagents_ray.evaluate.artifacts.recorder import save
+from vlagents_ray.evaluate.artifacts.storage import versions
 from vlagents_ray.evaluate.plan.jobs import plan
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.evaluate.workers.rollout import Rollout

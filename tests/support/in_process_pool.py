@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from vlagents_ray.evaluate import run
-from vlagents_ray.evaluate.workers.in_process import InProcessWorkers
+from vlagents_ray.evaluate.workers.worker import InProcessWorkers
 
 
 @contextlib.contextmanager

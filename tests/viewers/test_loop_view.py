@@ -13,7 +13,7 @@ from vlagents_ray.chunking.player import ChunkPlayer
 from vlagents_ray.robot import run_loop
 from vlagents_ray.robot.simulated import SimulatedRobot
 from vlagents_ray.viewers import EpisodeViewer, ViewerFrame, open_viewers
-from vlagents_ray.viewers.loop_view import LoopView
+from vlagents_ray.viewers.viewer import LoopView
 
 HZ, ROWS, CHUNKS = 100.0, 4, 3
 

@@ -32,7 +32,7 @@ from vlagents_ray.cli.tune.command import tune_command
 from vlagents_ray.naming import did_you_mean
 
 if TYPE_CHECKING:
-    from vlagents_ray.cli.doctor.listing import Listed
+    from vlagents_ray.cli.listing import Listed
     from vlagents_ray.evaluate import Progress
 
 OneName = Annotated[str | None, typer.Argument(metavar="[NAME]", help="Say all about this one alone.")]
@@ -90,7 +90,7 @@ app.add_typer(slurm, name="slurm")
 @app.command()
 def policies(name: OneName = None, as_json: AsJson = False) -> None:
     """List the policies and wrappers: what they are, whether their packages are here, and what installs the rest."""
-    from vlagents_ray.cli.doctor.listing import policies_and_wrappers
+    from vlagents_ray.cli.listing import policies_and_wrappers
 
     _list(list(policies_and_wrappers()), name, as_json=as_json)
 
@@ -98,14 +98,14 @@ def policies(name: OneName = None, as_json: AsJson = False) -> None:
 @app.command()
 def envs(name: OneName = None, as_json: AsJson = False) -> None:
     """List the environments: their tasks, whether they run here, and what installs the rest."""
-    from vlagents_ray.cli.doctor.listing import environments
+    from vlagents_ray.cli.listing import environments
 
     _list(list(environments()), name, as_json=as_json)
 
 
 def _list(listed: Sequence[Listed], name: str | None, *, as_json: bool) -> None:
     """Print a listing: a line for each and what installs the rest, or all that there is to say of one name."""
-    from vlagents_ray.cli.doctor.listing import installing
+    from vlagents_ray.cli.listing import installing
 
     chosen = [one for one in listed if name in (None, one.name)]
     if not chosen:
@@ -132,7 +132,7 @@ def _list(listed: Sequence[Listed], name: str | None, *, as_json: bool) -> None:
 @app.command()
 def doctor(port: Annotated[int, typer.Option(help="The port that a server would take.")] = 8000) -> None:
     """Check this machine: Python, Ray, GPU, rendering, shared memory, ports, video; each with the cure."""
-    from vlagents_ray.cli.doctor.checks import run
+    from vlagents_ray.cli.doctor import run
 
     raise typer.Exit(run(out, port))
 

@@ -13,7 +13,7 @@ from urllib.parse import urlsplit
 import typer
 
 from vlagents_ray.cli.console import errors, out
-from vlagents_ray.cli.doctor.listing import require_packages
+from vlagents_ray.cli.listing import require_packages
 from vlagents_ray.cli.options import Address, Set, parse_settings
 from vlagents_ray.cli.ray_session import RESTART, exit_if_ray_is_lost, quiet_ray
 from vlagents_ray.errors import ConfigError

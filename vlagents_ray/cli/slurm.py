@@ -13,9 +13,7 @@ from vlagents_ray.cli.console import errors, out
 from vlagents_ray.cli.evaluation.command import config_from_options, evaluate_command
 from vlagents_ray.cli.serve import serve_command
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.slurm.options import first_index, split
-from vlagents_ray.slurm.script import Script
-from vlagents_ray.slurm.submission import submit
+from vlagents_ray.slurm.submission import Script, first_index, split, submit
 
 if TYPE_CHECKING:
     from vlagents_ray.evaluate import EvalConfig

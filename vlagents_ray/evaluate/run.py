@@ -4,26 +4,25 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from vlagents_ray.errors import ConfigError, StorageFailed, from_code
-from vlagents_ray.evaluate.artifacts.provenance import (
+from vlagents_ray.evaluate.artifacts.recorder import Artifacts, save, save_views
+from vlagents_ray.evaluate.artifacts.storage import (
     driver_code,
     policy_code,
     save_diffs,
+    storing,
     versions,
 )
-from vlagents_ray.evaluate.artifacts.recorder import Artifacts, save
-from vlagents_ray.evaluate.artifacts.storage import storing
-from vlagents_ray.evaluate.artifacts.viewing import save_views
-from vlagents_ray.evaluate.deadline import Deadline
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.episode.records import EpisodeResult, WorkerInfo
 from vlagents_ray.evaluate.plan.cases import EvalCase, require_envs
 from vlagents_ray.evaluate.plan.config import EvalConfig
-from vlagents_ray.evaluate.plan.jobs import Job, JobQueue, plan
+from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job, JobQueue, plan
 from vlagents_ray.evaluate.report.html import FILE as REPORT
 from vlagents_ray.evaluate.report.html import write_report
 from vlagents_ray.evaluate.report.progress import Progress, SilentProgress
@@ -34,17 +33,16 @@ from vlagents_ray.evaluate.results.summary import Summary, summarize, write_summ
 from vlagents_ray.evaluate.trackers import TrackerFeed
 from vlagents_ray.evaluate.workers.agents import AgentFactory, agents, factory_program
 from vlagents_ray.evaluate.workers.cluster import ray_cluster, unused_gpus
-from vlagents_ray.evaluate.workers.dispatch import FailedAttempts, dispatch
-from vlagents_ray.evaluate.workers.in_process import InProcessWorkers
 from vlagents_ray.evaluate.workers.pool import WorkerPool
 from vlagents_ray.evaluate.workers.rollout import Report
-from vlagents_ray.evaluate.workers.worker import Workers
+from vlagents_ray.evaluate.workers.worker import FailedAttempts, InProcessWorkers, Workers, dispatch
 from vlagents_ray.interface import Agent
 from vlagents_ray.ray_tools.signals import stop_signals
 
 log = logging.getLogger(__name__)
-
 POLL_S = 0.25  # how soon a signal is noticed
+MARGIN = 1.25  # by which the next episode may be longer than the longest so far
+CLOSING_S = 10.0  # for workers to close their simulators, and for the report to be written
 
 
 class EvaluationInterrupted(KeyboardInterrupt):
@@ -118,7 +116,7 @@ def evaluate(
                 run = _Run(config, store, progress or SilentProgress(), tracking, only, end_at, in_process, local)
                 state, summary = run.play(factory)
         except BaseException:
-            with contextlib.suppress(StorageFailed):  # of the same disk, it may be: what went wrong first is told
+            with contextlib.suppress(StorageFailed):  # probably the same disk error; report the first one
                 conclude(config, store, "stopped")
             raise
     for stopped in (EvaluationInterrupted, OutOfTime):
@@ -189,8 +187,8 @@ class _Run:
     def play(self, factory: AgentFactory) -> tuple[str, Summary]:
         """Play all that is queued, until a signal or the deadline ends it early; returns the run's state and summary.
 
-        The summary is written before Ray is left: when a job is cancelled, its Ray is stopped at the same time and
-        answers nobody, and Slurm kills the job a few seconds later.
+        The summary is written before Ray is left: when Slurm cancels a job, Ray stops responding at once and the job is
+        killed seconds later.
         """
         if not len(self._queue):
             return "complete", conclude(self._config, self._store, "complete")
@@ -253,7 +251,7 @@ class _Run:
                 log.warning(hint)
 
     def _failed(self, job: Job, failure: Failure) -> None:
-        beyond = self._has_stopped(job)  # nobody waits for it
+        beyond = self._has_stopped(job)  # it is not needed any more
         retried = self._attempts.repeats(job, failure) and not beyond
         self._store.record_attempt(job, failure, retried=retried)
         if failure.cause == "user":
@@ -293,3 +291,39 @@ class _Run:
             dropped = self._queue.drop(job.cell.fingerprint)
             self._left[job.key.settings] -= dropped
             self._progress.stopped(job.cell, stopping.at, dropped)
+
+
+class Deadline:
+    """Measures the duration of episodes in the driver: the start of a simulator and waiting for a policy included."""
+
+    def __init__(
+        self, end_at: float | None, known_s: Iterable[float] = (), now: Callable[[], float] = time.time
+    ) -> None:
+        """`end_at` is in seconds since 1970, None for no deadline; `known_s` are durations of earlier episodes, s."""
+        self._end_at = end_at
+        self._longest_s = max(known_s, default=0.0)
+        self._now = now
+        self._begun: dict[EpisodeKey, float] = {}
+
+    def begin(self, jobs: Iterable[Job]) -> None:
+        """Note that a worker begins these episodes."""
+        self._begun |= dict.fromkeys((job.key for job in jobs), self._now())
+
+    def end(self, job: Job) -> None:
+        """Note that an attempt at this episode has ended, successful or not."""
+        begun = self._begun.pop(job.key, None)
+        if begun is not None:
+            self._longest_s = max(self._longest_s, self._now() - begun)
+
+    @property
+    def leaves_room(self) -> bool:
+        """Whether one more episode would end in time."""
+        return self._left_s() > self._longest_s * MARGIN
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the episodes that are being played have to be abandoned."""
+        return self._left_s() <= 0
+
+    def _left_s(self) -> float:
+        return float("inf") if self._end_at is None else self._end_at - CLOSING_S - self._now()

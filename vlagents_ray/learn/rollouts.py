@@ -19,9 +19,9 @@ from vlagents_ray.evaluate.plan.config import EvalConfig
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job, JobQueue
 from vlagents_ray.evaluate.workers.agents import agents
 from vlagents_ray.evaluate.workers.cluster import ray_cluster
-from vlagents_ray.evaluate.workers.dispatch import FailedAttempts, dispatch
 from vlagents_ray.evaluate.workers.pool import WorkerPool
 from vlagents_ray.evaluate.workers.rollout import Report
+from vlagents_ray.evaluate.workers.worker import FailedAttempts, dispatch
 from vlagents_ray.interface import Agent
 from vlagents_ray.learn.columns import EXTRA, RowMemory
 from vlagents_ray.learn.transitions import WANTED, TransitionRecorder

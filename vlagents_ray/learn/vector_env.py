@@ -10,9 +10,8 @@ import numpy as np
 from vlagents_ray.contract import Contract
 from vlagents_ray.envs.batch import BatchEnv, make_batch
 from vlagents_ray.errors import ConfigError, InvalidAction, InvalidInput, NotReset
-from vlagents_ray.evaluate.episode.env_outputs import checked_obs, checked_step
 from vlagents_ray.evaluate.episode.episode import options_of_reset
-from vlagents_ray.evaluate.episode.failures import env_side
+from vlagents_ray.evaluate.episode.failures import checked_obs, checked_step, env_side
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.learn.columns import EXTRA
 from vlagents_ray.registry import require

@@ -3,24 +3,172 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+import uuid
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from vlagents_ray.client.agent import RemoteAgent
+from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, PolicyFailed, VLAgentsError
-from vlagents_ray.interface import Agent
-from vlagents_ray.open_loop.candidates import Sessions
-from vlagents_ray.open_loop.comparison import ErrorTable, FrameError, worst
+from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.open_loop.recorded import Names, RecordedDataset, RecordedEpisode, RecordedSession, find_datasets
+from vlagents_ray.protocol.messages import Reply, Request
+from vlagents_ray.serve.config.deployment import ServerArgs
+from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.launch.deployment_file import own_settings, policy_application
 from vlagents_ray.serve.models.checkpoints import CHOICE, STEP
+from vlagents_ray.serve.python_env.child_agent import make_agent, version_of
+from vlagents_ray.serve.python_env.probe import with_process
 from vlagents_ray.serve.weights.updates import OPTION
 
+Sessions = Callable[[], Agent]
+_WORST = 10
 _SHOWN = 500  # most frames of the episode that is drawn
+"""Opens a session; each is closed by who asked for it."""
+
+
+class LocalAgent(Agent):
+    """One session of an engine in this process."""
+
+    def __init__(self, engine: Engine) -> None:
+        self._engine = engine
+        self._session = uuid.uuid4().hex
+
+    @property
+    def contract(self) -> Contract | None:
+        return self._engine.contract
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        return self._ask(Request("reset", obs, instruction, kwargs, rank="simulation")).info or {}
+
+    def act(self, obs: Obs) -> Act:
+        act = self._ask(Request("act", obs, rank="simulation")).act
+        if act is None:
+            raise PolicyFailed("act: the policy answered without an action")
+        return act
+
+    def close(self) -> None:
+        self._ask(Request("close", rank="simulation"))
+
+    def _ask(self, request: Request) -> Reply:
+        answer: Future[Reply] = Future()
+        self._engine.submit(self._session, request, answer.set_result)
+        reply = answer.result()
+        if reply.error is not None:
+            raise reply.error
+        return reply
+
+
+@contextmanager
+def candidate(source: str) -> Iterator[Sessions]:
+    """Load a policy for the time of the context.
+
+    Args:
+        source: The URL of a server; or a registered name or a deployment file, which is loaded in this process.
+
+    Yields:
+        Opens its sessions, which share its batches.
+    """
+    if "://" in source:
+        yield partial(RemoteAgent, source, rank="simulation", codec="exact")
+        return
+    application = policy_application(source)
+    args = ServerArgs(**application.args)
+    args = args.model_copy(update={"environment": with_process(args.environment)})
+    engine = Engine(
+        args.checkpoints.of(partial(make_agent, args), own_settings(application)),
+        max_batch_size=args.batch.max_size,
+        patience=args.batch.patience,
+        batch_sizes=args.batch.sizes or (),
+        version=version_of(args),
+        limits=args.limits.call_limits(),
+    )
+    try:
+        engine.start()
+        yield partial(LocalAgent, engine)
+    finally:
+        engine.close()
+
+
+@dataclass
+class ErrorTable:
+    """Sums over the frames so far, for each step of the horizon (H) and each number of an action (D)."""
+
+    dim: int
+    absolute: np.ndarray = field(init=False)  # (H, D), of the errors' absolute values
+    square: np.ndarray = field(init=False)  # (H, D), of their squares
+    largest: np.ndarray = field(init=False)  # (H, D), of their absolute values
+    frames: np.ndarray = field(init=False)  # (H,)
+
+    def __post_init__(self) -> None:
+        self.absolute, self.square, self.largest = (np.zeros((0, self.dim)) for _ in range(3))
+        self.frames = np.zeros(0, np.int64)
+
+    def add(self, expected: np.ndarray, got: np.ndarray) -> float:
+        """Add a frame's chunks, (H, D) each, and return their mean absolute error."""
+        rows = len(expected)
+        if rows > len(self.frames):
+            more = ((0, rows - len(self.frames)), (0, 0))
+            self.absolute, self.square, self.largest = (
+                np.pad(one, more) for one in (self.absolute, self.square, self.largest)
+            )
+            self.frames = np.pad(self.frames, more[0])
+        error = np.abs(got.astype(np.float64) - expected.astype(np.float64))
+        self.absolute[:rows] += error
+        self.square[:rows] += error**2
+        self.largest[:rows] = np.maximum(self.largest[:rows], error)
+        self.frames[:rows] += 1
+        return float(error.mean())
+
+    def mean(self) -> np.ndarray:
+        """Return the mean absolute error, (H, D)."""
+        return np.asarray(self.absolute / self.frames[:, np.newaxis])
+
+    def to_json(self, joints: list[str]) -> dict[str, Any]:
+        """Return the errors in all, by joint, by step, and by both, in the units of the actions."""
+        total = max(1, int(self.frames.sum()))
+        mae, rms = self.absolute.sum(0) / total, np.sqrt(self.square.sum(0) / total)
+        largest = self.largest.max(0, initial=0)
+        by_step = zip(
+            self.frames, self.mean().mean(1), np.sqrt((self.square / self.frames[:, None]).mean(1)), strict=True
+        )
+        return {
+            "mae": float(mae.mean()),
+            "rmse": float(np.sqrt((rms**2).mean())),
+            "max": float(largest.max(initial=0)),
+            "by_joint": [
+                {"joint": name, "mae": float(mae[i]), "rmse": float(rms[i]), "max": float(largest[i])}
+                for i, name in enumerate(joints)
+            ],
+            "by_step": [
+                {"step": step, "frames": int(frames), "mae": float(mean), "rmse": float(root)}
+                for step, (frames, mean, root) in enumerate(by_step)
+            ],
+            "mae_by_step_and_joint": self.mean().tolist(),
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class FrameError:
+    """The mean absolute error of one frame's chunk."""
+
+    dataset: str
+    episode: int
+    frame: int
+    mae: float
+
+
+def worst(errors: list[FrameError]) -> list[FrameError]:
+    """Return the frames with the largest errors."""
+    return sorted(errors, key=lambda one: -one.mae)[:_WORST]
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,8 +24,7 @@ from vlagents_ray.interface import CAPTURED, CAUSE, INTERVENTION, SAFE, SILENT, 
 from vlagents_ray.robot.pacing import KEPT_TICKS, SPIN_S, Pacer, jitter, undisturbed
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.safety import Guard, Watchdog
-from vlagents_ray.viewers.loop_view import LoopView
-from vlagents_ray.viewers.viewer import EpisodeViewer
+from vlagents_ray.viewers.viewer import EpisodeViewer, LoopView
 
 Restart = Literal["manual", "auto"]
 logger = logging.getLogger(__name__)

@@ -1,22 +1,184 @@
-"""The submission of scripts by sbatch."""
+"""The submission of jobs: the command line's options of sbatch, the script, and sbatch."""
 
 from __future__ import annotations
 
 import json
 import os
+import re
+import shlex
 import subprocess
-from collections.abc import Mapping
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from vlagents_ray.errors import ConfigError, VLAgentsError
-from vlagents_ray.slurm.script import Script
 
+# Options of sbatch (22.05 to 24.11) without a value, or with a value after "=" only.
+_ALONE = {
+    "contiguous", "exclusive", "get-user-env", "hold", "ignore-pbs", "nice", "no-kill", "no-requeue", "overcommit",
+    "oversubscribe", "propagate", "quiet", "reboot", "requeue", "spread-job", "stepmgr", "test-only", "use-min-nodes",
+    "verbose",
+}  # fmt: skip
+_SHORT = {
+    "A": "account", "B": "extra-node-info", "C": "constraint", "D": "chdir", "F": "nodefile", "G": "gpus",
+    "H": "hold", "J": "job-name", "L": "licenses", "M": "clusters", "N": "nodes", "O": "overcommit", "S": "core-spec",
+    "a": "array", "b": "begin", "c": "cpus-per-task", "d": "dependency", "e": "error", "k": "no-kill",
+    "m": "distribution", "o": "output", "p": "partition", "q": "qos", "s": "oversubscribe", "t": "time",
+    "w": "nodelist", "x": "exclude",
+}  # fmt: skip
+# The script starts one process of Ray on each node, so these options are refused.
+_OURS = {
+    "ntasks": "--nodes and --cpus-per-task", "ntasks-per-node": "--nodes and --cpus-per-task", "n": "--nodes",
+    "ntasks-per-gpu": "--gpus-per-node", "ntasks-per-core": "--cpus-per-task", "ntasks-per-socket": "--cpus-per-task",
+    "gpus-per-task": "--gpus-per-node", "wrap": "no `--wrap`, as the script is written for you",
+    "wait": "`squeue`, and --dependency in the jobs that wait", "W": "`squeue`, and --dependency in the jobs that wait",
+    "input": "a deployment or a file of runs", "i": "a file of runs",
+}  # fmt: skip
+BODY = Path(__file__).with_name("job.sh")
+_LINE_ENDS = "\x7f\x85\u2028\u2029"
+UNFINISHED = 75  # exit status of `vlagents-ray eval` when its time is over (EX_TEMPFAIL of sysexits.h)
 RECORD = "job.json"
 _KEPT = {
     "SLURM_CONF",
     "SLURM_CLUSTERS",
 }  # the location of Slurm; the others belong to this process's own job
 _SBATCH_S = 120.0
+
+
+def split(words: Sequence[str], known: Mapping[str, bool]) -> tuple[list[str], dict[str, str | None]]:
+    """Split a command line.
+
+    Args:
+        words: The arguments.
+        known: The command's options ("--policy"), and whether each has a value.
+
+    Returns:
+        The command's own arguments, and sbatch's options by their long names; the value of an option without one is
+        None.
+
+    Raises:
+        ConfigError: An option of sbatch cannot be used here, or lacks its value.
+    """
+    own: list[str] = []
+    sbatch: dict[str, str | None] = {}
+    waiting = iter(words)
+    for word in waiting:
+        name, equals, value = word.partition("=")
+        if not word.startswith("-") or word == "-":
+            own.append(word)
+        elif name in known:
+            own.append(word)
+            if known[name] and not equals:
+                own.append(_next(waiting, name))
+        else:
+            option, attached = _sbatch(word, name, value if equals else None)
+            if option not in _ALONE and attached is None:
+                attached = _next(waiting, f"--{option}")
+            sbatch[option] = attached
+    return own, sbatch
+
+
+def _sbatch(word: str, name: str, value: str | None) -> tuple[str, str | None]:
+    """Return the long name of an option of sbatch, and its value in the same argument."""
+    option = name[2:]
+    if not word.startswith("--"):
+        letter = word[1]
+        option, value = _SHORT.get(letter, letter), word[2:] or None
+    if option in _OURS:
+        raise ConfigError(f"{word}: got an option that does not fit one Ray process on each node; want {_OURS[option]}")
+    if not word.startswith("--") and len(option) == 1:
+        raise ConfigError(f"{word}: got an option that is neither this command's nor a short one of sbatch")
+    if not re.fullmatch(r"[a-z][a-z0-9-]*", option):
+        raise ConfigError(f"{word}: got an invalid option name, want --NAME=VALUE")
+    return option, value
+
+
+def _next(words: Iterable[str], option: str) -> str:
+    value = next(iter(words), None)
+    if value is None:
+        raise ConfigError(f"{option}: got no value; want {option}=VALUE")
+    return value
+
+
+def first_index(array: str) -> str:
+    """Return the first task of an `--array`: 4 of "4-9%2"."""
+    found = re.match(r"\d+", array)
+    if found is None:
+        raise ConfigError(f"--array: got {array!r}, want numbers, as in 0-15, 1,3,7 or 0-99%4")
+    return found[0]
+
+
+@dataclass(frozen=True, slots=True)
+class Script:
+    """A job; its strings may contain %a, the number of a task of `--array`."""
+
+    name: str
+    folder: Path  # for the script and the job's logs, on a file system that all nodes share
+    arguments: Sequence[str]  # of `vlagents_ray.slurm.job`
+    options: Mapping[str, str | None]  # of sbatch; they override the defaults
+    resubmit: int = 0  # how often the job is submitted again when its time is over
+    setup: Path | None = None  # a file of shell lines that run first
+
+    @property
+    def file(self) -> Path:
+        """The file of the script."""
+        return self.folder / f"{self.name}.sh"
+
+    @property
+    def log(self) -> str:
+        """The file of the job's output, as a pattern of sbatch."""
+        return self.options.get("output") or str(self.folder.absolute() / "%j.log")
+
+    def text(self) -> str:
+        """Return the content of the script.
+
+        Raises:
+            ConfigError: A name, path or option has a control character, such as a line feed, after which the rest of a
+                comment would be a command; or quotes in a value with spaces, which sbatch cannot read.
+        """
+        defaults = {
+            "job-name": f"vlagents-ray-{self.name}",
+            "nodes": "1",
+            "ntasks-per-node": "1",
+            "chdir": os.getcwd(),
+            "output": self.log,
+            "open-mode": "append",
+            **({} if "no-requeue" in self.options else {"requeue": None}),
+        }
+        words = [
+            f"--{option}" if value is None else f"--{option}={_quoted(value)}"
+            for option, value in (defaults | dict(self.options)).items()
+        ]
+        for word in (self.name, str(self.folder), *words):
+            if any(ord(sign) < ord(" ") or sign in _LINE_ENDS for sign in word):
+                raise ConfigError(f"slurm: got {word[:200]!r}, want no control characters, such as line feeds, in it")
+        settings = {
+            "python": sys.executable,
+            "folder": str(self.folder.absolute()),
+            "setup": "" if self.setup is None else str(self.setup.absolute()),
+            "resubmit": str(self.resubmit),
+            "unfinished": str(UNFINISHED),
+        }
+        lines = [
+            "#!/bin/bash",
+            f"# Written by `vlagents-ray slurm {self.name}`; again: sbatch {shlex.quote(str(self.file))}",
+            *(f"#SBATCH {word}" for word in words),
+            "",
+            *(f"{name}={shlex.quote(value)}" for name, value in settings.items()),
+            f"arguments=({shlex.join(self.arguments)})",
+            "",
+        ]
+        return "\n".join(lines) + "\n" + BODY.read_text()
+
+
+def _quoted(value: str) -> str:
+    """Quote a value with spaces for a line of #SBATCH."""
+    if not any(sign.isspace() for sign in value):
+        return value
+    if '"' in value:
+        raise ConfigError(f"slurm: got the option {value[:200]!r}, want no quotes in a value with spaces")
+    return f'"{value}"'
 
 
 class SubmissionFailed(VLAgentsError):

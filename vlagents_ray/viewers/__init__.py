@@ -4,8 +4,7 @@ The extras "rerun" and "foxglove" install their SDKs. What is shown never delays
 `vlagents_ray.viewers.viewer`.
 """
 
-from vlagents_ray.viewers.frame import ViewerFrame
 from vlagents_ray.viewers.targets import open_viewers
-from vlagents_ray.viewers.viewer import EpisodeViewer
+from vlagents_ray.viewers.viewer import EpisodeViewer, ViewerFrame
 
 __all__ = ["EpisodeViewer", "ViewerFrame", "open_viewers"]

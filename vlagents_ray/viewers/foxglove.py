@@ -7,7 +7,7 @@ from typing import Any
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.registry import require
-from vlagents_ray.viewers.frame import ViewerFrame
+from vlagents_ray.viewers.viewer import ViewerFrame
 
 LIVE = "ws://127.0.0.1:8765"  # where Foxglove looks by default
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.registry import require
-from vlagents_ray.viewers.frame import ViewerFrame
+from vlagents_ray.viewers.viewer import ViewerFrame
 
 APPLICATION = "vlagents_ray"
 LIVE = "rerun+http://127.0.0.1:9876/proxy"  # where `rerun`, the viewer, listens by default

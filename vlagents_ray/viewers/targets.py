@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 
 from vlagents_ray.errors import ConfigError
@@ -55,9 +54,3 @@ def require_no_server(foxglove_target: str | None) -> str | None:
     if foxglove_target is not None and is_live("foxglove", foxglove_target):
         raise ValueError(f"got {foxglove_target!r}, want a folder: only one process can listen at an address")
     return foxglove_target
-
-
-def dated_name(when: float | None = None) -> str:
-    """Return a name for an episode that begins now, or at a time in s since 1970: 20270131_183000_250 (UTC)."""
-    when = time.time() if when is None else when
-    return f"{time.strftime('%Y%m%d_%H%M%S', time.gmtime(when))}_{int(when * 1e3) % 1000:03d}"

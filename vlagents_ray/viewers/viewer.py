@@ -1,4 +1,4 @@
-"""A viewer of episodes, which never delays what it shows."""
+"""Viewers of episodes: what they show, and the thread that shows it, which drops what comes too fast."""
 
 from __future__ import annotations
 
@@ -7,19 +7,72 @@ import logging
 import os
 import queue
 import threading
-from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Protocol
 
-from vlagents_ray.viewers.frame import ViewerFrame
+import numpy as np
+
+from vlagents_ray.images.jpeg_png import encode_jpeg
+from vlagents_ray.interface import AGE, CAPTURED, INTERVENTION, PLANNED, SAFE, SILENT, WANTED, Act, Obs
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-logger = logging.getLogger(__name__)
 
+logger = logging.getLogger(__name__)
 FRAMES = 100  # in the queue: 2 s at 50 Hz, 180 MB with two cameras of 640x480
 _NICE = 5  # the writing thread runs after the loop's
+
+
+@dataclass(frozen=True, slots=True)
+class ViewerFrame:
+    """An observation, what was planned from it and executed after it. The caller does not change its arrays later."""
+
+    tick: int  # of the episode
+    time: float  # s since 1970, of the observation
+    cameras: Mapping[str, np.ndarray] = field(default_factory=dict)  # (H, W, 3) uint8 RGB
+    files: Mapping[str, bytes] = field(default_factory=dict)  # JPEG or PNG files of cameras that are not in `cameras`
+    state: Mapping[str, np.ndarray] = field(default_factory=dict)  # (D,) float32; the gripper is a part
+    executed: np.ndarray | None = None  # (D,) float32
+    planned: np.ndarray | None = None  # (D,) float32: what the newest chunk says of this tick
+    chunk: np.ndarray | None = None  # (H, D) float32, where a new one begins
+    numbers: Mapping[str, float] = field(default_factory=dict)  # times and whatever else is a number, by name
+    note: str = ""  # what a person should read, such as why the action is a safe one
+
+    @classmethod
+    def of(cls, obs: Obs, tick: int, **what: Any) -> ViewerFrame:
+        """Make a frame of an observation.
+
+        Args:
+            obs: The observation, whose arrays are copied.
+            tick: The tick of the episode.
+            what: Further fields.
+
+        Returns:
+            The frame, with the time of `info["captured_at"]` if the observation states it, else now.
+        """
+        state = {name: np.array(part) for name, part in obs.state.items()}
+        if obs.gripper is not None:
+            state["gripper"] = np.array([obs.gripper], np.float32)
+        cameras = {name: np.array(image) for name, image in obs.cameras.items()}
+        return cls(tick, **{"time": obs.info.get(CAPTURED, time.time()), **what}, cameras=cameras, state=state)
+
+    def images(self) -> dict[str, bytes]:
+        """Return a JPEG or PNG file for each camera."""
+        return {**self.files, **{name: encode_jpeg(image) for name, image in self.cameras.items()}}
+
+
+def numbers_of(info: Mapping[str, Any]) -> dict[str, float]:
+    """Return what the info of an `Act` says in numbers that viewers show: its timing, and that of a chunk player."""
+    timing = info.get("timing") or {}
+    return {**timing, **{name: float(info[name]) for name in (AGE, SILENT) if name in info}}
+
+
+def note_of(info: Mapping[str, Any]) -> str:
+    """Return why the action of an `Act` is a safe one; "" if it is the policy's."""
+    return str(info.get(SAFE, ""))
 
 
 class ViewerEpisode(Protocol):
@@ -158,3 +211,59 @@ class EpisodeViewer:
         while isinstance(frame := self._queue.get(), ViewerFrame):
             yield frame
             self._got += 1
+
+
+class LoopView:
+    """Shows one run in each of some viewers; without one, it costs nothing."""
+
+    def __init__(self, viewers: Sequence[EpisodeViewer]) -> None:
+        """Show a run in `viewers`."""
+        self._viewers = viewers
+        self._chunk: np.ndarray | None = None  # the last one that was shown
+        self._note = ""
+
+    @contextlib.contextmanager
+    def episode(self, instruction: str) -> Iterator[None]:
+        """Show what is added within the context as one episode."""
+        name = dated_name()
+        with contextlib.ExitStack() as stack:
+            for viewer in self._viewers:
+                stack.enter_context(viewer.episode(name, instruction))
+            yield
+
+    def add(self, obs: Obs, act: Act, executed: np.ndarray | None, tick: int, work_s: float, stop: str = "") -> None:
+        """Show a tick; never waits.
+
+        Args:
+            obs: The observation.
+            act: What the agent answered.
+            executed: The action that was applied, (D,) float32; None if none was.
+            tick: The tick of the control loop.
+            work_s: The time from the tick until the action was applied, s.
+            stop: Why the robot is stopped, if it is.
+        """
+        if not any(viewer.has_room for viewer in self._viewers):
+            for viewer in self._viewers:
+                viewer.dropped += 1
+            return
+        info = act.info
+        rows, note = info.get(PLANNED), stop or note_of(info)
+        spells = {"safe": SAFE in info, "intervention": INTERVENTION in info, "stopped": bool(stop)}
+        frame = ViewerFrame.of(
+            obs,
+            tick,
+            executed=None if executed is None else np.array(executed),
+            planned=info.get(WANTED) if rows is None else rows[info["row"]],
+            chunk=None if rows is self._chunk else rows,
+            numbers={**numbers_of(info), "work_ms": work_s * 1e3, **{name: float(on) for name, on in spells.items()}},
+            note=note if note != self._note else "",
+        )
+        self._chunk, self._note = self._chunk if rows is None else rows, note
+        for viewer in self._viewers:
+            viewer.add(frame)
+
+
+def dated_name(when: float | None = None) -> str:
+    """Return a name for an episode that begins now, or at a time in s since 1970: 20270131_183000_250 (UTC)."""
+    when = time.time() if when is None else when
+    return f"{time.strftime('%Y%m%d_%H%M%S', time.gmtime(when))}_{int(when * 1e3) % 1000:03d}"

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from vlagents_ray.evaluate.artifacts import provenance
-from vlagents_ray.evaluate.artifacts.provenance import policy_code, save_diffs
+from vlagents_ray.evaluate.artifacts import storage
+from vlagents_ray.evaluate.artifacts.storage import policy_code, save_diffs
 from vlagents_ray.ray_tools.git_state import GitState
 
 DIRTY = GitState("c" * 40, "d" * 64, b"-a\n+b\n")
@@ -22,7 +22,7 @@ def test_each_difference_is_stored_once_under_its_digest(tmp_path: Path) -> None
 
 
 def test_the_difference_of_a_policy_is_known_only_if_its_server_has_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(provenance, "code_of", lambda _target: DIRTY)
+    monkeypatch.setattr(storage, "code_of", lambda _target: DIRTY)
     assert policy_code({"policy": "noop", "code": DIRTY.to_json()}) is DIRTY
     assert policy_code({"policy": "noop", "code": CLEAN.to_json()}) is None
     assert policy_code({"policy": "noop"}) is None

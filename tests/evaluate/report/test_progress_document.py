@@ -17,8 +17,7 @@ from vlagents_ray.evaluate.plan.cases import cells
 from vlagents_ray.evaluate.plan.config import EvalConfig
 from vlagents_ray.evaluate.plan.jobs import Job, plan
 from vlagents_ray.evaluate.report import results_document
-from vlagents_ray.evaluate.report.progress_document import ProgressDocument
-from vlagents_ray.evaluate.report.results_document import ResultsDocument
+from vlagents_ray.evaluate.report.results_document import ProgressDocument, ResultsDocument
 from vlagents_ray.evaluate.results.reader import rate_of
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.evaluate.results.summary import summarize

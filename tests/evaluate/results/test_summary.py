@@ -11,7 +11,7 @@ from eval_fakes import LINE, OTHER_LINE
 from rich.console import Console
 
 from vlagents_ray.evaluate import EvalConfig, Summary, print_summary, synchronous_twin
-from vlagents_ray.evaluate.artifacts.provenance import versions
+from vlagents_ray.evaluate.artifacts.storage import versions
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult
 from vlagents_ray.evaluate.plan.cases import cells

@@ -12,9 +12,8 @@ from eval_fakes import LINE, OTHER_LINE, ToZero
 from in_process_evaluation import play
 
 from vlagents_ray.errors import MissingDependency
-from vlagents_ray.evaluate import EvalConfig, evaluate
-from vlagents_ray.evaluate.trackers import TrackerFeed, tracking
-from vlagents_ray.evaluate.trackers.base import About, TrackerRun
+from vlagents_ray.evaluate import EvalConfig, evaluate, trackers
+from vlagents_ray.evaluate.trackers import About, TrackerFeed, TrackerRun
 
 Config = Callable[..., EvalConfig]
 
@@ -49,9 +48,9 @@ class Broken(Listener):
 
 @pytest.fixture(autouse=True)
 def listening(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tracking, "require", lambda _name: None)
-    runs = {"wandb": f"{__name__}:Listener", "tensorboard": f"{__name__}:Broken"}
-    monkeypatch.setattr(tracking, "_RUNS", runs)
+    monkeypatch.setattr(trackers, "require", lambda _name: None)
+    runs = {"wandb": Listener, "tensorboard": Broken}
+    monkeypatch.setattr(trackers, "_RUNS", runs)
     for kept in (Listener.begun, Listener.told, Listener.shown, Listener.finished):
         kept.clear()
 

@@ -9,7 +9,7 @@ from manual_clock import Clock
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig, WorkerConfig
-from vlagents_ray.evaluate.workers.placement import CapacityMonitor
+from vlagents_ray.evaluate.workers.cluster import CapacityMonitor
 
 pytestmark = pytest.mark.usefixtures("cluster")
 

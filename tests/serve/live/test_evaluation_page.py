@@ -16,7 +16,7 @@ from live_server import Address
 from recorded_results import record, runs
 
 from vlagents_ray.evaluate.plan.cases import EvalCase, cells
-from vlagents_ray.evaluate.report.progress_document import ProgressDocument
+from vlagents_ray.evaluate.report.results_document import ProgressDocument
 from vlagents_ray.serve.access.api_keys import Keys
 from vlagents_ray.serve.live.endpoint import page_server
 from vlagents_ray.serve.live.fleet import Fleet

@@ -168,12 +168,12 @@ def evaluate_command(
         if dry_run and (live or live_at):
             raise ConfigError("--dry-run and --live exclude each other: nothing is played that could be watched")
         if on_robot:
-            from vlagents_ray.cli.evaluation.robot import run_on_robot
+            from vlagents_ray.cli.evaluation.run import run_on_robot
 
             run_on_robot(evaluation, address, operator=operator or "page", unblinded=unblind)
             return
         if dry_run:
-            from vlagents_ray.cli.evaluation.dry_run import print_plan
+            from vlagents_ray.cli.evaluation.run import print_plan
 
             with quiet_ray(None):
                 print_plan(evaluation)
@@ -184,7 +184,7 @@ def evaluate_command(
 
             page = live_address(live_at)
         if watch is not None:
-            from vlagents_ray.cli.evaluation.watch import watch_training
+            from vlagents_ray.cli.evaluation.run import watch_training
 
             watch_training(evaluation, watch, address, live=page, **watching)
         else:

@@ -14,8 +14,7 @@ import typer
 from vlagents_ray.cli.console import out
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.report.progress import Progress
-from vlagents_ray.evaluate.report.progress_document import ProgressDocument
-from vlagents_ray.evaluate.report.results_document import ResultsDocument
+from vlagents_ray.evaluate.report.results_document import ProgressDocument, ResultsDocument
 from vlagents_ray.serve.access.api_keys import load_keys
 from vlagents_ray.serve.live.endpoint import page_server, require_watch_keys
 from vlagents_ray.serve.live.fleet import Fleet

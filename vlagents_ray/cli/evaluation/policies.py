@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
-from vlagents_ray.cli.doctor.listing import require_packages
+from vlagents_ray.cli.listing import require_packages
 from vlagents_ray.cli.options import YAML_SUFFIXES
 from vlagents_ray.cli.ray_session import quiet_ray
 from vlagents_ray.contract import require_match

@@ -4,20 +4,49 @@ from __future__ import annotations
 
 import errno
 import os
+import platform
 import shutil
 import sqlite3
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 from vlagents_ray.errors import ConfigError, StorageFailed
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
 from vlagents_ray.naming import plain
+from vlagents_ray.ray_tools.git_state import GitState, code_in, code_of
+from vlagents_ray.registry import names
 
 VIDEOS, TRAJECTORIES, PROVENANCE = "videos", "trajectories", "provenance"
+_RESUME = "what was recorded is kept: go on with --resume"
+_FULL = f"make room; {_RESUME}"
+_REFUSED = "make it writable, or choose another folder"
+_BROKEN = f"see the system's log (dmesg), and mend the disk; {_RESUME}"
+_CURES = {
+    errno.ENOSPC: ("the disk is full", _FULL),
+    errno.EDQUOT: ("your quota on this disk is used up", _FULL),
+    errno.EFBIG: ("a file would be larger than is allowed here (ulimit -f)", f"allow more; {_RESUME}"),
+    errno.EROFS: ("is on a read-only file system", _REFUSED),
+    errno.EACCES: ("you may not write there", _REFUSED),
+    errno.EPERM: ("you may not write there", _REFUSED),
+    errno.ENOTDIR: ("something on the way there is no folder", "choose another folder"),
+    errno.EEXIST: ("is there, and no folder", "choose another folder"),
+    errno.EIO: ("the disk reports an error", _BROKEN),
+    errno.ESTALE: ("the file server has lost the folder", f"mount it again; {_RESUME}"),
+}
+# SQLite reports these texts in place of the system's errno.
+_SQLITE = {
+    "database or disk is full": errno.ENOSPC,
+    "attempt to write a readonly database": errno.EROFS,
+    "unable to open database file": errno.EACCES,
+    "disk I/O error": errno.EIO,
+}
+_NOTHING_LEFT = 2**16  # bytes: SQLite has no word for a full disk where it extends a memory-mapped file
 
 
 def episode_folder(out: Path, kind: str, cell: EvalCase) -> Path:
@@ -123,32 +152,6 @@ def link_or_copy(source: Path, target: Path) -> None:
             shutil.copyfile(source, part)
 
 
-_RESUME = "what was recorded is kept: go on with --resume"
-_FULL = f"make room; {_RESUME}"
-_REFUSED = "make it writable, or choose another folder"
-_BROKEN = f"see the system's log (dmesg), and mend the disk; {_RESUME}"
-_CURES = {
-    errno.ENOSPC: ("the disk is full", _FULL),
-    errno.EDQUOT: ("your quota on this disk is used up", _FULL),
-    errno.EFBIG: ("a file would be larger than is allowed here (ulimit -f)", f"allow more; {_RESUME}"),
-    errno.EROFS: ("is on a read-only file system", _REFUSED),
-    errno.EACCES: ("you may not write there", _REFUSED),
-    errno.EPERM: ("you may not write there", _REFUSED),
-    errno.ENOTDIR: ("something on the way there is no folder", "choose another folder"),
-    errno.EEXIST: ("is there, and no folder", "choose another folder"),
-    errno.EIO: ("the disk reports an error", _BROKEN),
-    errno.ESTALE: ("the file server has lost the folder", f"mount it again; {_RESUME}"),
-}
-# SQLite reports these texts in place of the system's errno.
-_SQLITE = {
-    "database or disk is full": errno.ENOSPC,
-    "attempt to write a readonly database": errno.EROFS,
-    "unable to open database file": errno.EACCES,
-    "disk I/O error": errno.EIO,
-}
-_NOTHING_LEFT = 2**16  # bytes: SQLite has no word for a full disk where it extends a memory-mapped file
-
-
 @contextmanager
 def storing(folder: Path) -> Iterator[None]:
     """Raise `StorageFailed` in place of an error of the disk that `folder` is on, with its cause and its cure.
@@ -168,23 +171,44 @@ def storing(folder: Path) -> Iterator[None]:
 def _number(error: sqlite3.OperationalError, folder: Path) -> int | None:
     """The errno of an error of SQLite; None if it is not about the disk."""
     number = _SQLITE.get(str(error))
-    if number == errno.EIO and _is_full(folder):
+    disk = os.statvfs(next(one for one in (folder, *folder.absolute().parents) if one.exists()))
+    if number == errno.EIO and disk.f_bavail * disk.f_frsize < _NOTHING_LEFT:
         return errno.ENOSPC
-    if number == errno.EACCES and _is_read_only(folder):
+    if number == errno.EACCES and disk.f_flag & os.ST_RDONLY:
         return errno.EROFS
     return number
 
 
-def _is_full(folder: Path) -> bool:
-    found = _disk(folder)
-    return found.f_bavail * found.f_frsize < _NOTHING_LEFT
+def driver_code() -> dict[str, GitState | None]:
+    """The git state of the working directory and of this package; None where there is no git repository."""
+    return {"folder": code_in(Path.cwd()), "vlagents_ray": code_of("vlagents_ray")}
 
 
-def _is_read_only(folder: Path) -> bool:
-    return bool(_disk(folder).f_flag & os.ST_RDONLY)
+def versions() -> dict[str, Any]:
+    """The versions of Python, of packages and of the platform in the driver, and `driver_code` as JSON."""
+    packages = {}
+    for name in ("vlagents-ray", "ray", "numpy", "av"):
+        try:
+            packages[name] = version(name)
+        except PackageNotFoundError:
+            packages[name] = "not installed"
+    code = {name: None if one is None else one.to_json() for name, one in driver_code().items()}
+    return {"python": platform.python_version(), "platform": platform.platform(), **packages, "code": code}
 
 
-def _disk(folder: Path) -> os.statvfs_result:
-    """The file system that `folder` is on, or would be."""
-    there = next(one for one in (folder, *folder.absolute().parents) if one.exists())
-    return os.statvfs(there)
+def policy_code(metadata: dict[str, Any]) -> GitState | None:
+    """The git state of a policy's code, diff included, if it is the same here as on its server; else None."""
+    policy = metadata.get("policy")
+    here = code_of(names("policies").get(policy, policy)) if isinstance(policy, str) else None
+    return here if here is not None and here.to_json() == metadata.get("code") else None
+
+
+def save_diffs(out: Path, found: Iterable[GitState | None]) -> None:
+    """Write the diff of each git state from its commit to `out/provenance/SHA256.diff`, once."""
+    for code in found:
+        if code is None or code.diff_sha256 is None:
+            continue
+        path = out / PROVENANCE / f"{code.diff_sha256}.diff"
+        if not path.exists():
+            with whole(path) as part:
+                part.write_bytes(code.diff)

@@ -1,18 +1,150 @@
-"""Plays some of a bundle's episodes again by their recorded actions."""
+"""Plays the recorded actions of a bundle's episodes in their environments, and compares. No policy is needed."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from typing import Any
 
-from vlagents_ray.errors import VLAgentsError
-from vlagents_ray.evaluate.artifacts.trajectory import Trajectory
-from vlagents_ray.evaluate.bundle.actions import Replayed, replay_actions, require_harmless
-from vlagents_ray.evaluate.bundle.consistency import recorded
-from vlagents_ray.evaluate.bundle.finding import Finding
-from vlagents_ray.evaluate.results.reader import CellResults, Episode, Results
+import numpy as np
 
+from vlagents_ray.envs.batch import make_batch
+from vlagents_ray.errors import ConfigError, VLAgentsError
+from vlagents_ray.evaluate.artifacts.trajectory import Trajectory
+from vlagents_ray.evaluate.bundle.checks import Finding, recorded
+from vlagents_ray.evaluate.episode.episode import options_of_reset
+from vlagents_ray.evaluate.episode.failures import checked_obs, checked_step, env_side
+from vlagents_ray.evaluate.results.reader import CellResults, Episode, Results
+from vlagents_ray.interface import Act, Obs
+from vlagents_ray.registry import env_suite, names
+
+_CODE = re.compile("trust.*|module|source_dir")  # options that say whose code is run, though they may be words
+_WORD = re.compile(r"\w[\w.+-]{0,63}")  # a value that is text, and no path, URL or "module:Class"
 _SHOWN = 80  # characters of a value
+
+
+@dataclass(frozen=True, slots=True)
+class Replayed:
+    """What came of the recorded actions."""
+
+    steps: int
+    outcome: tuple[bool, bool, int | None]  # success once, success at the end, steps after which it was first solved
+    differs_from: int | None  # the first step whose state, reward or success is another; 0 is the reset
+    largest: float  # difference of a number of the state or of a reward
+    described: Mapping[str, Any]  # by the environment here
+
+    @property
+    def same(self) -> bool:
+        """Whether every number is the same to the bit."""
+        return self.differs_from is None
+
+
+def require_harmless(cell: CellResults) -> None:
+    """Raise `ConfigError` unless making this environment runs no code but that of a registered one.
+
+    A bundle may come from a stranger: "module:Class" would be imported, and an option that is a path or a nested value
+    could name files or code of this machine. `trust_remote_code` from a bundle is refused: only the local user
+    can grant it.
+    """
+    if env_suite(cell.env) not in names("envs") or ":" in cell.env:
+        raise ConfigError(f"{cell.env}: is no registered environment; --trust makes it, and runs its code")
+    for kind in ("env_options", "reset_options"):
+        stated = cell.settings.get(kind) or {}
+        odd = {name: value for name, value in stated.items() if _CODE.fullmatch(name) or not _is_plain(value)}
+        if odd:
+            raise ConfigError(f"{cell.env}: got the {kind} {odd}, which could name files or code; --trust takes them")
+
+
+def replay_actions(cell: CellResults, episode: Episode, trajectory: Trajectory) -> Replayed:
+    """Play the actions of `trajectory` in the environment of `cell`, from the episode's seed on.
+
+    Images are neither rendered nor compared. State, gripper, rewards and success are, bit by bit.
+
+    Args:
+        cell: The cell; `require_harmless` first if it comes from another machine.
+        episode: The episode of it.
+        trajectory: Its recording.
+
+    Raises:
+        ConfigError: The environment does not take these options, or is unknown here; also `MissingDependency`.
+        EnvFailed: The simulator failed.
+    """
+    key = episode.result.key
+    with env_side("make"):
+        env = make_batch(cell.env, 1, **(cell.settings.get("env_options") or {}))
+    try:
+        env.looked_at = False
+        with env_side("reset"):
+            contract = env.contract
+            begin = options_of_reset(env, key.episode, cell.settings.get("reset_options"))
+            [first] = env.reset(seeds=[key.seed], options=[begin])
+        compared = _Comparison(trajectory)
+        compared.add(0, checked_obs(first, contract, "reset", images=False))
+        for number, action in enumerate(trajectory.actions, 1):
+            with env_side("step"):
+                [obs], [reward], [terminated], [truncated], [info] = env.step([Act(action)])
+                step = checked_step(obs, reward, terminated, truncated, info, contract, images=False)
+            compared.add(number, step.obs)
+            compared.add_outcome(number, step.reward, step.success)
+        with env_side("describe"):
+            return compared.result(env.describe())
+    finally:
+        with env_side("close"):
+            env.close()
+
+
+class _Comparison:
+    """Compares what the environment gives with a recording, step by step."""
+
+    def __init__(self, recorded: Trajectory) -> None:
+        self._recorded = recorded
+        self._from: int | None = None
+        self._largest = 0.0
+        self._success: list[bool] = []
+
+    def add(self, number: int, obs: Obs) -> None:
+        """Compare observation `number`."""
+        now = {part: np.asarray(values, np.float32) for part, values in obs.state.items()}
+        if now.keys() != self._recorded.state.keys() or (obs.gripper is None) != (self._recorded.gripper is None):
+            self._differ(number, float("inf"))
+            return
+        pairs = [(self._recorded.state[part][number], values) for part, values in now.items()]
+        if self._recorded.gripper is not None:
+            pairs.append((self._recorded.gripper[number], np.asarray(obs.gripper, np.float32)))
+        for before, values in pairs:
+            self._compare(number, np.asarray(before), np.asarray(values))
+
+    def add_outcome(self, number: int, reward: float, success: bool) -> None:
+        """Compare what action `number`, from 1, led to."""
+        self._success.append(success)
+        self._compare(number, self._recorded.rewards[number - 1], np.float64(reward))
+        if bool(self._recorded.success[number - 1]) != success:
+            self._differ(number, 0.0)
+
+    def result(self, described: Mapping[str, Any]) -> Replayed:
+        """Return what came of all actions."""
+        first = next((number for number, success in enumerate(self._success, 1) if success), None)
+        outcome = (first is not None, bool(self._success and self._success[-1]), first)
+        return Replayed(len(self._success), outcome, self._from, self._largest, described)
+
+    def _compare(self, number: int, before: Any, now: Any) -> None:
+        if before.shape != now.shape:
+            self._differ(number, float("inf"))
+        elif before.tobytes() != now.tobytes():
+            self._differ(number, float(np.max(np.abs(np.asarray(before, np.float64) - np.asarray(now, np.float64)))))
+
+    def _differ(self, number: int, by: float) -> None:
+        self._from = number if self._from is None else self._from
+        self._largest = max(self._largest, by)
+
+
+def _is_plain(value: object) -> bool:
+    if isinstance(value, list):
+        return all(_is_plain(one) for one in value)
+    if isinstance(value, str):
+        return _WORD.fullmatch(value) is not None
+    return value is None or isinstance(value, bool | int | float)
 
 
 def check_replays(results: Results, most: int, *, trust: bool) -> Iterator[Finding]:
@@ -63,8 +195,8 @@ def _replay(cell: CellResults, episode: Episode, trajectory: Trajectory, *, trus
         return Finding(subject, "not checked", str(error))
     result = episode.result
     if played.outcome != (result.success_once, result.success_at_end, result.first_success):
-        now = "solved" if played.outcome[0] else "not solved"
-        return Finding(subject, "differs", f"{now} here, {_outcome(result.success_once)} there; {_from(played)}")
+        now, then = ("solved" if solved else "not solved" for solved in (played.outcome[0], result.success_once))
+        return Finding(subject, "differs", f"{now} here, {then} there; {_from(played)}")
     detail = f"{played.steps} actions, every state, reward and success to the bit"
     if not played.same:
         detail = f"the same outcome, other numbers; {_from(played)}"
@@ -75,10 +207,6 @@ def _replay(cell: CellResults, episode: Episode, trajectory: Trajectory, *, trus
 
 def _from(played: Replayed) -> str:
     return f"the numbers differ from step {played.differs_from} of {played.steps} on, by at most {played.largest:.3g}"
-
-
-def _outcome(solved: bool | None) -> str:
-    return "solved" if solved else "not solved"
 
 
 def _described(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:

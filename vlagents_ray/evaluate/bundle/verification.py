@@ -11,12 +11,19 @@ from pathlib import Path
 
 from vlagents_ray.errors import ConfigError, VLAgentsError
 from vlagents_ray.evaluate.artifacts.storage import storing
-from vlagents_ray.evaluate.bundle.archive import CONFIG, MOST_BYTES, PACKAGES, Manifest, unpack
-from vlagents_ray.evaluate.bundle.consistency import check_cells, check_derived, check_digests, check_trajectories
-from vlagents_ray.evaluate.bundle.environment import check_packages, check_versions, check_weights, same_software
-from vlagents_ray.evaluate.bundle.finding import Finding
+from vlagents_ray.evaluate.bundle.archive import CONFIG, MOST_BYTES, PACKAGES, Manifest, unpack, write_derived
+from vlagents_ray.evaluate.bundle.checks import (
+    Finding,
+    check_cells,
+    check_derived,
+    check_digests,
+    check_packages,
+    check_trajectories,
+    check_versions,
+    check_weights,
+    same_software,
+)
 from vlagents_ray.evaluate.bundle.replaying import check_replays
-from vlagents_ray.evaluate.bundle.writing import write_derived
 from vlagents_ray.evaluate.report.html import FILE as REPORT
 from vlagents_ray.evaluate.results.database import FILE as DATABASE
 from vlagents_ray.evaluate.results.reader import Results

@@ -20,8 +20,14 @@ from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.contract import Contract
 from vlagents_ray.envs.base import BatchEnv, Environment
 from vlagents_ray.errors import CheckpointFailed, ConfigError, InvalidAction, PolicyFailed, VLAgentsError
-from vlagents_ray.evaluate.episode.env_outputs import EnvStep, checked_instruction, checked_obs, checked_step
-from vlagents_ray.evaluate.episode.failures import env_side, policy_side
+from vlagents_ray.evaluate.episode.failures import (
+    EnvStep,
+    checked_instruction,
+    checked_obs,
+    checked_step,
+    env_side,
+    policy_side,
+)
 from vlagents_ray.evaluate.episode.latency import ChunkExecutor, Tick
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.episode.stats import EpisodeStats

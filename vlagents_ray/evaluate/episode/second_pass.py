@@ -10,9 +10,8 @@ import numpy as np
 
 from vlagents_ray.envs.base import BatchEnv, Options
 from vlagents_ray.errors import VLAgentsError
-from vlagents_ray.evaluate.episode.env_outputs import checked_obs, checked_step
 from vlagents_ray.evaluate.episode.episode import Watch
-from vlagents_ray.evaluate.episode.failures import env_side
+from vlagents_ray.evaluate.episode.failures import checked_obs, checked_step, env_side
 from vlagents_ray.interface import Act, Obs
 
 

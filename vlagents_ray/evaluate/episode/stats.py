@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.errors import PolicyFailed
-from vlagents_ray.evaluate.episode.env_outputs import EnvStep
+from vlagents_ray.evaluate.episode.failures import EnvStep
 from vlagents_ray.evaluate.episode.latency import Tick
 from vlagents_ray.evaluate.episode.records import Ending, EpisodeResult
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey

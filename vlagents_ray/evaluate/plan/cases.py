@@ -24,7 +24,7 @@ from vlagents_ray.naming import plain
 from vlagents_ray.policies.base.program import Program, code_of_class, files_named, with_defaults
 from vlagents_ray.registry import env_class, env_suite, env_task
 
-_COUNTS = "executed actions"  # what rows are placed by (`client.plan.Plan`); scores from when it was ticks are others
+_COUNTS = "executed actions"  # by which rows of a chunk are indexed; scores by another index are not comparable
 
 
 @dataclass(frozen=True)
@@ -82,17 +82,17 @@ class EvalCase:
 
     @cached_property
     def fingerprint(self) -> str:
-        """Stands for `settings` in the keys of episodes."""
+        """Fingerprint of `settings`, in the keys of episodes."""
         return fingerprint(self.settings)
 
     @cached_property
     def kind(self) -> str:
-        """Stands for the process that a worker must be to play it."""
+        """Fingerprint of the worker settings; cases with the same value can share a worker process."""
         return fingerprint(self.worker.model_dump())
 
     @cached_property
     def place(self) -> str:
-        """Stands for the environment that a worker must have made to play it."""
+        """Fingerprint of the environment; a worker plays cases with the same value without making another one."""
         return fingerprint([self.env, self.suite.env_options, self.suite.num_envs, self.kind])
 
     @cached_property
@@ -130,7 +130,7 @@ def contender(policy: str, step: int | None) -> str:
 def cells(config: EvalConfig) -> list[EvalCase]:
     """Every cell that `config` asks for: checkpoint by checkpoint, in each suite by suite and env by env.
 
-    Raises `UnknownEnv` for an env that nobody knows, `ConfigError` for one that stands twice under one name, or
+    Raises `UnknownEnv` for an unknown env, `ConfigError` for one that stands twice under one name, or
     in two suites that do not differ: their episodes would have the same keys; and for names that differ only by signs
     that a file's name cannot have: their episodes would have the same files.
     """
@@ -170,7 +170,7 @@ def cells(config: EvalConfig) -> list[EvalCase]:
 
 
 def require_envs(config: EvalConfig) -> None:
-    """`UnknownEnv` for a task that nobody knows, `ConfigError` for options that its env does not take."""
+    """Raise `UnknownEnv` for an unknown task, `ConfigError` for options that its env does not take."""
     for cell in cells(config):
         if cell.robot is None:
             env_arguments(cell.env, cell.suite.env_options)

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.artifacts.storage import inside, outcome
-from vlagents_ray.evaluate.report.progress import seconds_left
+from vlagents_ray.evaluate.episode.failures import Failure
+from vlagents_ray.evaluate.episode.records import EpisodeResult
+from vlagents_ray.evaluate.plan.cases import EvalCase
+from vlagents_ray.evaluate.plan.jobs import Job
+from vlagents_ray.evaluate.report.progress import Progress, SilentProgress, seconds_left
 from vlagents_ray.evaluate.results.database import FILE, RUNNING
 from vlagents_ray.evaluate.results.reader import CellResults, Episode, Results, rate_of
 from vlagents_ray.evaluate.results.statistics import Rate
@@ -18,13 +23,14 @@ _FAILURES = 24  # most failures in the document, the newest ones
 _TEXT = 300  # most characters of an error or an instruction
 _EVERY_S = 1.0  # least time between two readings of the results
 _SHARE = 0.04  # of a core, for reading them
+WAITING, ENDED, STOPPED = "waiting", "ended", "stopped"
 
 
 class ResultsDocument:
     """Describes the results of an evaluation, or of those of a training, which any process may be writing.
 
     `read` and `video` are called on one thread. Numbers come from the folder, by the code that makes the report: so
-    they include earlier runs and, in a training, earlier versions. Nothing is read while nobody calls `read`.
+    they include earlier runs and, in a training, earlier versions. Results are read only when `read` is called.
     """
 
     reason = ""
@@ -85,7 +91,7 @@ class ResultsDocument:
         cells = () if results is None else results.cells
         contenders = [] if results is None else results.contenders
         left_s = _left_s(results) if results is not None and state == RUNNING else None
-        failed = [(cell, one) for cell in cells for one in cell.episodes if _failed(one)]
+        failed = [(cell, one) for cell in cells for one in cell.episodes if not (one.beyond or one.result.success_once)]
         failed.sort(key=lambda found: found[1].finished, reverse=True)
         return {
             "name": self._out.name,
@@ -135,10 +141,6 @@ def _left_s(results: Results) -> float | None:
     return seconds_left(left, played, time.time() - run.started)
 
 
-def _failed(one: Episode) -> bool:
-    return not one.beyond and not one.result.success_once
-
-
 def _done(cell: CellResults) -> int:
     """Return the number of episodes with a result, those that infrastructure lost included."""
     return sum(not one.beyond for one in cell.episodes)
@@ -169,3 +171,75 @@ def _curves(results: Results) -> list[dict[str, Any]]:
             point = {"step": cells[0].step, "whole": whole} | _rate(rate_of(cells, "success_once"))
             points.setdefault(cells[0].policy, []).append(point)
     return [{"policy": policy, "points": found} for policy, found in points.items()]
+
+
+class ProgressDocument(ResultsDocument, Progress):
+    """Describes an evaluation that calls it as its `Progress`. The page's thread may read it meanwhile."""
+
+    def __init__(self, out: Path, shown: Progress | None = None, *, goes_on: bool = False) -> None:
+        """Describe the results in a folder.
+
+        Args:
+            out: The folder, which may not be there yet.
+            shown: Gets each call, too: the progress on the terminal.
+            goes_on: Whether further evaluations follow each other, as those of a training's checkpoints.
+        """
+        super().__init__(out)
+        self.goes_on = goes_on
+        self._shown = shown or SilentProgress()
+        self._state = STARTING
+        self._changed = True
+
+    def begin(self, cells: Sequence[EvalCase], recorded: Mapping[str, Rate], left: int) -> None:
+        """Note that an evaluation runs."""
+        self._change(RUNNING)
+        self._shown.begin(cells, recorded, left)
+
+    def episode(self, cell: EvalCase, result: EpisodeResult) -> None:
+        """Note that there is a result."""
+        self._changed = True
+        self._shown.episode(cell, result)
+
+    def retry(self, job: Job, failure: Failure) -> None:
+        """Note that there was a retry."""
+        self._changed = True
+        self._shown.retry(job, failure)
+
+    def stopped(self, cell: EvalCase, at: int, spared: int) -> None:
+        """Note that fewer episodes are planned."""
+        self._changed = True
+        self._shown.stopped(cell, at, spared)
+
+    def end(self) -> None:
+        """Note that this evaluation has ended."""
+        if self.goes_on:
+            self._change(WAITING)
+        else:
+            self.close()
+        self._shown.end()
+
+    def close(self) -> None:
+        """Note that no evaluation follows: the state is that of the last run."""
+        if self._state != STOPPED:
+            self._change(ENDED)
+
+    def fail(self, reason: str) -> None:
+        """Note that an error ended the evaluation."""
+        self.reason = reason
+        self._change(STOPPED)
+
+    def is_due(self, *, rested: bool) -> bool:
+        """Return whether there is something new; how it ended is told at once."""
+        final = self._changed and self._state in (ENDED, STOPPED)
+        due = final or (rested and (self._changed or self._state == RUNNING))
+        if due:
+            self._changed = False
+        return due
+
+    def state(self, results: Results | None) -> str:
+        """Return how the evaluation stands: once it has ended, as its last run says."""
+        return super().state(results) if self._state == ENDED else self._state
+
+    def _change(self, state: str) -> None:
+        self._state = state
+        self._changed = True

@@ -319,7 +319,7 @@ class Store:
     def _other_plan(self, db: sqlite3.Connection) -> list[Change]:
         """Return what the results have and this plan lacks: a plan may grow, and steps of a policy may follow.
 
-        A trainer evaluates one version of one policy after the other into one folder, each with a plan of its own: of
+        A trainer evaluates one version of one policy after the other into one folder, each with its plan: of
         the other policies its plan lacks nothing.
         """
         trained = all(self._pushed.values())

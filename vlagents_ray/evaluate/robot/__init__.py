@@ -5,11 +5,9 @@
 methods.
 """
 
-from vlagents_ray.evaluate.robot.operator import Operator, Verdict, VisibleTrial
+from vlagents_ray.evaluate.robot.operator import Operator, PageOperator, TerminalOperator, Verdict, VisibleTrial
 from vlagents_ray.evaluate.robot.run import TrialsInterrupted, evaluate_on_robot, planned_cells, unblind
-from vlagents_ray.evaluate.robot.schedule import Trial, schedule
-from vlagents_ray.evaluate.robot.terminal import TerminalOperator
-from vlagents_ray.evaluate.robot.web_operator import PageOperator
+from vlagents_ray.evaluate.robot.trial import Trial, schedule
 
 __all__ = [
     "Operator",

@@ -1,16 +1,64 @@
-"""The person at the robot: what is asked of them, and what they are shown."""
+"""The person at the robot: what they are asked and shown, at a terminal or at a page in the browser."""
 
 from __future__ import annotations
 
+import asyncio
+import json
+import secrets
+import select
+import socket
+import sys
+import threading
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from importlib.resources import files as package_files
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol
+
+import numpy as np
+import uvicorn
+from starlette.applications import Starlette
+from starlette.background import BackgroundTask
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import Request
+from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response
+from starlette.routing import Mount, Route
 
 from vlagents_ray.errors import ConfigError
+from vlagents_ray.evaluate.artifacts.storage import whole
+from vlagents_ray.images.jpeg_png import decode, encode_jpeg
 from vlagents_ray.interface import Obs
+from vlagents_ray.naming import distinct
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
 
 Outcome = Literal["success", "failure", "partial", "repeat"]
+SCENES = "scenes"
+_KEPT_QUALITY = 92  # JPEG, of the picture that trials are compared with
+_OUTCOMES: dict[str, Outcome] = {"s": "success", "f": "failure", "p": "partial", "r": "repeat"}
+_Phase = Literal["scene", "playing", "verdict", "next", "end"]
+_CHOICES = {
+    "scene": {"ready", "end"},
+    "playing": {"stop"},
+    "verdict": {"success", "failure", "partial", "repeat"},
+    "next": set[str](),
+    "end": set[str](),
+}
+_AWAY_S = 3.0  # without a request of the page, after which the operator counts as away
+_LOOK_S = 0.1  # between two live pictures while the scene is set
+_BODY = 10_000  # bytes of an answer
+_PAGE_QUALITY = 80
+_FILES = {"operator.html": "text/html", "operator.css": "text/css", "operator.js": "text/javascript"}
+_HEADERS = {
+    "content-security-policy": "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
+    "img-src 'self' data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "cache-control": "no-store",
+    "referrer-policy": "no-referrer",
+    "x-content-type-options": "nosniff",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +132,7 @@ class Operator(Protocol):
         ...
 
     def stops(self) -> bool:
-        """Return whether the running trial is to be stopped, as it is if nobody watches any more."""
+        """Return whether the running trial is to be stopped, which also happens when the operator's page is closed."""
         ...
 
     def judge(self, trial: VisibleTrial, ending: str) -> Verdict:
@@ -101,3 +149,289 @@ class Operator(Protocol):
             KeyboardInterrupt: The operator has left. The trial will be played again.
         """
         ...
+
+
+def start_pictures(out: Path, place: str) -> dict[str, Path]:
+    """Return the JPEG of each camera at the first start of a scene; {} before that.
+
+    Args:
+        out: The folder of results.
+        place: The scene's name in files.
+    """
+    return {path.stem: path for path in sorted((out / SCENES / place).glob("*.jpg"))}
+
+
+def save_start(out: Path, place: str, obs: Obs) -> None:
+    """Save the pictures of a scene at its start, in place of earlier ones."""
+    for camera, name in distinct(obs.cameras).items():
+        with whole(out / SCENES / place / f"{name}.jpg") as part:
+            part.write_bytes(encode_jpeg(obs.cameras[camera], _KEPT_QUALITY))
+
+
+def save_overlay(start: Path, now: np.ndarray) -> Path:
+    """Save the mean of a start picture and the same camera's picture now, beside the former's folder.
+
+    Args:
+        start: The JPEG of the start picture.
+        now: (H, W, 3) uint8.
+
+    Returns:
+        The new JPEG; it has the size of `now`, and only `now` if the sizes differ.
+    """
+    before = decode(start.read_bytes())
+    mean = now if before.shape != now.shape else ((before.astype(np.uint16) + now) // 2).astype(np.uint8)
+    path = start.parent.with_name(f"overlay-{start.name}")
+    with whole(path) as part:
+        part.write_bytes(encode_jpeg(mean, _KEPT_QUALITY))
+    return path
+
+
+class TerminalOperator(Operator):
+    """An operator at a terminal. Enter stops a running trial.
+
+    Args:
+        ask: Prints a question and returns the typed line, as `input` does; raises `EOFError` at the end of the input.
+        say: Prints a line.
+        stopping: Returns whether the running trial is to be stopped; by default, whether Enter was pressed.
+    """
+
+    def __init__(
+        self,
+        ask: Callable[[str], str] = input,
+        say: Callable[[str], None] = print,
+        stopping: Callable[[], bool] | None = None,
+    ) -> None:
+        self._ask = ask
+        self._say = say
+        self._stopping = _enter_pressed if stopping is None else stopping
+
+    def prepare(self, trial: VisibleTrial, observe: Callable[[], Obs]) -> bool:
+        self._say(f"\ntrial {trial.number} of {trial.total}: {trial.task}, scene {trial.scene}")
+        if trial.message:
+            self._say(f"  {trial.message}")
+        self._say(f"  {trial.instruction}")
+        if trial.setup:
+            self._say(f"  {trial.setup}")
+        for picture in trial.start.values():
+            self._say(f"  set it as in {picture}")
+        while True:
+            try:
+                typed = self._ask("Enter when the scene is ready, l to look at it over the start picture, q to end: ")
+            except EOFError:
+                return False
+            if typed.strip().lower() in ("", "q"):
+                return not typed.strip()
+            if typed.strip().lower() == "l":
+                self._look(trial, observe())
+
+    def watch(self, obs: Obs) -> None:
+        """Show nothing: the operator sees the robot."""
+
+    def stops(self) -> bool:
+        return self._stopping()
+
+    def judge(self, trial: VisibleTrial, ending: str) -> Verdict:
+        self._say(f"trial {trial.number} has ended: {ending}")
+        choices = "s success, f failure, p partial, r repeat" if trial.rubric else "s success, f failure, r repeat"
+        while True:
+            try:
+                outcome = _OUTCOMES.get(self._ask(f"verdict ({choices}): ").strip().lower())
+                if outcome is None:
+                    continue
+                earned = self._earned(trial) if outcome == "partial" and trial.rubric else ()
+                verdict = Verdict(outcome, earned, self._ask("why: " if outcome == "repeat" else "note: ").strip())
+            except EOFError:
+                raise KeyboardInterrupt from None
+            try:
+                verdict.score(trial.rubric)
+            except ConfigError as error:
+                self._say(str(error))
+            else:
+                return verdict
+
+    def _earned(self, trial: VisibleTrial) -> tuple[str, ...]:
+        return tuple(
+            part
+            for part, points in trial.rubric.items()
+            if self._ask(f"  {part} ({points:g} points), reached? y/n: ").strip().lower().startswith("y")
+        )
+
+    def _look(self, trial: VisibleTrial, obs: Obs) -> None:
+        if not trial.start:
+            self._say("  this scene has no start picture yet: it is taken when you begin")
+        for camera, name in distinct(obs.cameras).items():
+            if name in trial.start:
+                self._say(f"  {save_overlay(trial.start[name], obs.cameras[camera])}")
+
+
+def _enter_pressed() -> bool:
+    """Whether a line was typed at the terminal; False for an input that is no terminal, which is not read ahead."""
+    if not sys.stdin.isatty() or not select.select([sys.stdin], [], [], 0)[0]:
+        return False
+    sys.stdin.readline()
+    return True
+
+
+class PageOperator(Operator):
+    """An operator at a page in the browser. Use as a context manager: the page is served within it.
+
+    The page is on the loopback interface, and its address has a random part, without which there is no answer. A
+    running trial is stopped if the page has asked for nothing for 3 s, as when it was closed. At the end of the context
+    an open page says whether the evaluation is complete.
+
+    Args:
+        say: Prints a line: the page's address.
+        port: The port; 0 takes a free one.
+    """
+
+    def __init__(self, say: Callable[[str], None] = print, port: int = 0) -> None:
+        self._say = say
+        self._port = port
+        self._changed = threading.Condition()
+        self._phase: _Phase = "next"
+        self._trial: VisibleTrial | None = None
+        self._ending = ""
+        self._answer: dict[str, Any] | None = None
+        self._obs: Obs | None = None
+        self._asked_at = 0.0  # when the page asked last
+        self._end_shown = threading.Event()
+        self.url = ""
+        """The page's address within the context."""
+
+    def __enter__(self) -> Self:
+        listening = socket.create_server(("127.0.0.1", self._port))
+        token = secrets.token_urlsafe(24)
+        self.url = f"http://127.0.0.1:{listening.getsockname()[1]}/{token}/"
+        app = Starlette(routes=[Mount(f"/{token}", routes=self._routes())])
+        settings = uvicorn.Config(app, log_config=None, access_log=False, lifespan="off", ws="none")
+        self._server = uvicorn.Server(settings)
+        self._thread = threading.Thread(
+            target=lambda: asyncio.run(self._server.serve([listening])), name="vlagents-ray-operator", daemon=True
+        )
+        self._thread.start()
+        self._say(f"the operator's page: {self.url}")
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        with self._changed:
+            self._phase, self._answer = "end", None
+            if kind is None:
+                self._ending = "The evaluation is complete: close this page"
+            elif issubclass(kind, KeyboardInterrupt):
+                self._ending = "The evaluation was interrupted: --resume goes on with it, at a new address"
+            else:
+                self._ending = "The evaluation ended with an error: see the terminal"
+        if self._is_watched():
+            self._end_shown.wait(_AWAY_S)
+        self._server.should_exit = self._server.force_exit = True
+        self._thread.join()
+
+    def prepare(self, trial: VisibleTrial, observe: Callable[[], Obs]) -> bool:
+        self._enter("scene", trial)
+        while (answer := self._wait(_LOOK_S)) is None:
+            if self._is_watched():
+                self._obs = observe()
+        self._enter("playing" if answer["do"] == "ready" else "next", trial)
+        return bool(answer["do"] == "ready")
+
+    def watch(self, obs: Obs) -> None:
+        self._obs = obs
+
+    def stops(self) -> bool:
+        return self._answer is not None or not self._is_watched()
+
+    def judge(self, trial: VisibleTrial, ending: str) -> Verdict:
+        self._enter("verdict", trial, ending)
+        while (answer := self._wait(1.0)) is None:
+            pass
+        self._enter("next", trial)
+        return _verdict(answer)
+
+    def _enter(self, phase: _Phase, trial: VisibleTrial, ending: str = "") -> None:
+        with self._changed:
+            self._phase, self._trial, self._ending, self._answer = phase, trial, ending, None
+
+    def _wait(self, seconds: float) -> dict[str, Any] | None:
+        with self._changed:
+            self._changed.wait_for(lambda: self._answer is not None, seconds)
+            return self._answer
+
+    def _is_watched(self) -> bool:
+        return time.monotonic() - self._asked_at < _AWAY_S
+
+    def _routes(self) -> list[Route]:
+        return [
+            Route("/", self._file),
+            Route("/{name:str}", self._file),
+            Route("/now/state", self._state),
+            Route("/now/camera/{name:path}", self._camera),
+            Route("/start/{name:path}", self._start),
+            Route("/now/answer", self._take, methods=["POST"]),
+        ]
+
+    async def _file(self, http: Request) -> Response:
+        name = http.path_params.get("name", "operator.html")
+        if name not in _FILES:
+            return PlainTextResponse("not found", 404)
+        text = (package_files("vlagents_ray.evaluate.robot") / "page" / name).read_text(encoding="utf-8")
+        return Response(text, media_type=_FILES[name], headers=_HEADERS)
+
+    async def _state(self, _: Request) -> Response:
+        self._asked_at = time.monotonic()
+        obs = self._obs
+        with self._changed:
+            shown = None if self._trial is None else self._trial.to_json()
+            state = {"phase": self._phase, "trial": shown, "ending": self._ending, "answered": self._answer is not None}
+        cameras = [] if obs is None else sorted(distinct(obs.cameras).values())
+        sent = BackgroundTask(self._end_shown.set) if state["phase"] == "end" else None
+        return JSONResponse(state | {"cameras": cameras}, background=sent)
+
+    async def _camera(self, http: Request) -> Response:
+        obs = self._obs
+        names = {} if obs is None else {name: camera for camera, name in distinct(obs.cameras).items()}
+        camera = names.get(http.path_params["name"])
+        if obs is None or camera is None:
+            return PlainTextResponse("not found", 404)
+        picture = await run_in_threadpool(encode_jpeg, obs.cameras[camera], _PAGE_QUALITY)
+        return Response(picture, media_type="image/jpeg", headers=_HEADERS)
+
+    async def _start(self, http: Request) -> Response:
+        trial = self._trial
+        path = None if trial is None else trial.start.get(http.path_params["name"])
+        return PlainTextResponse("not found", 404) if path is None else FileResponse(path, headers=_HEADERS)
+
+    async def _take(self, http: Request) -> Response:
+        """Take an answer, unless it is for another trial or another question than the present one."""
+        if not http.headers.get("content-type", "").startswith("application/json"):
+            return PlainTextResponse("want application/json", 415)
+        body = b""
+        async for part in http.stream():
+            body += part
+            if len(body) > _BODY:
+                return PlainTextResponse(f"want at most {_BODY} bytes", 413)
+        try:
+            answer = json.loads(body)
+            if not isinstance(answer["do"], str):
+                raise TypeError
+            about = answer["phase"], answer["trial"], answer["attempt"]
+            verdict = _verdict(answer) if answer["phase"] == "verdict" else None
+        except (ValueError, TypeError, KeyError, RecursionError):
+            return PlainTextResponse("want phase, trial, attempt, do, earned, note", 400)
+        with self._changed:
+            trial = self._trial
+            if trial is None or about != (self._phase, trial.number, trial.attempt) or self._answer is not None:
+                return PlainTextResponse("the trial has gone on meanwhile", 409)
+            if answer["do"] not in _CHOICES[self._phase]:
+                return PlainTextResponse(f"do: want one of {sorted(_CHOICES[self._phase])}", 400)
+            try:
+                if verdict is not None:
+                    verdict.score(trial.rubric)
+            except ConfigError as error:
+                return PlainTextResponse(str(error), 400)
+            self._answer = answer
+            self._changed.notify_all()
+        return JSONResponse({})
+
+
+def _verdict(answer: dict[str, Any]) -> Verdict:
+    return Verdict(answer["do"], tuple(map(str, answer.get("earned", ()))), str(answer.get("note", "")))

@@ -9,8 +9,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from vlagents_ray.errors import ConfigError, VLAgentsError, from_code
-from vlagents_ray.evaluate.artifacts.provenance import driver_code, save_diffs, versions
-from vlagents_ray.evaluate.artifacts.storage import storing
+from vlagents_ray.evaluate.artifacts.storage import driver_code, save_diffs, storing, versions
 from vlagents_ray.evaluate.episode.failures import Failure, explain
 from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult
 from vlagents_ray.evaluate.plan.cases import EvalCase, cells
@@ -21,10 +20,8 @@ from vlagents_ray.evaluate.results.database import FILE as RESULTS
 from vlagents_ray.evaluate.results.stopping import Stopping
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.evaluate.results.summary import Summary
-from vlagents_ray.evaluate.robot.operator import Operator, Verdict, VisibleTrial
-from vlagents_ray.evaluate.robot.pictures import save_start, start_pictures
-from vlagents_ray.evaluate.robot.schedule import Trial, schedule
-from vlagents_ray.evaluate.robot.trial import PlayedTrial, WatchedRobot, play, rehearse
+from vlagents_ray.evaluate.robot.operator import Operator, Verdict, VisibleTrial, save_start, start_pictures
+from vlagents_ray.evaluate.robot.trial import PlayedTrial, Trial, WatchedRobot, play, rehearse, schedule
 from vlagents_ray.evaluate.robot.trial_log import LoggedTrial, TrialLog, logged_plan
 from vlagents_ray.evaluate.run import conclude
 from vlagents_ray.evaluate.workers.agents import AgentFactory, agents

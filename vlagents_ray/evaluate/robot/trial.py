@@ -1,9 +1,11 @@
-"""One trial: a policy drives the robot until the task's time is over, the policy is done, or the operator stops it."""
+"""The trials of an evaluation on a robot: their order, and how one is played."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+import hashlib
+import hmac
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -23,17 +25,75 @@ from vlagents_ray.evaluate.episode.failures import env_side, policy_side
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.episode.stats import EpisodeStats
 from vlagents_ray.evaluate.plan.cases import EvalCase
-from vlagents_ray.evaluate.plan.config import RobotConfig
-from vlagents_ray.evaluate.plan.jobs import EpisodeKey
+from vlagents_ray.evaluate.plan.config import RobotConfig, canonical
+from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job
 from vlagents_ray.evaluate.robot.operator import Operator, Verdict
-from vlagents_ray.evaluate.robot.schedule import Trial
 from vlagents_ray.evaluate.workers.agents import AgentFactory
 from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.naming import plain
 from vlagents_ray.robot import Guard, LoopReport, Robot, Watchdog, run_loop
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.safety import measured_state
 
 _WAIT_S = 1.0  # deadline of a tick in the modes that wait for an answer
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """A trial, and what its operator must not see: the policy, which is `job.cell.policy`."""
+
+    number: int  # from 1, in the order in which they are played
+    scene: int  # from 1; each policy plays each scene of a task once
+    job: Job
+
+    @property
+    def task(self) -> tuple[str, str]:
+        """(suite, env)."""
+        return self.job.cell.suite.name, self.job.cell.env
+
+    @property
+    def place(self) -> str:
+        """The name of the scene in files."""
+        return plain("-".join((*filter(None, self.task), f"scene{self.scene}")))
+
+
+def schedule(cells: Iterable[EvalCase], key: bytes) -> list[Trial]:
+    """Draw the order of all trials: task by task, scene by scene, and in each scene every policy once.
+
+    With k policies, each k scenes in a row (of one seed) have the rows of a k x k Latin square in a drawn order, whose
+    columns are the policies in a drawn order. So each policy is first, second, and so on equally often in them, and
+    after an incomplete rest the counts differ by one at most. What is drawn depends on the key, the names of policies,
+    suites and environments, and the seeds, by HMAC-SHA256.
+
+    Args:
+        cells: The cells of the plan, all on a robot.
+        key: Who has it knows which policy plays in which trial.
+
+    Returns:
+        The trials in the order in which they are played.
+    """
+    tasks: dict[tuple[str, str], dict[str, EvalCase]] = {}
+    for cell in cells:
+        tasks.setdefault((cell.suite.name, cell.env), {})[cell.contender] = cell
+    trials: list[Trial] = []
+    for task, contenders in tasks.items():
+        suite = next(iter(contenders.values())).suite
+        for place, seed in enumerate(suite.seeds):
+            for i in range(suite.episodes):
+                block, row = divmod(i, len(contenders))
+                columns = _drawn(key, [*task, seed, block, "policy"], contenders)
+                shifts = _drawn(key, [*task, seed, block, "row"], map(str, range(len(contenders))))
+                shift = int(shifts[row])
+                for name in columns[shift:] + columns[:shift]:
+                    cell = contenders[name]
+                    job = Job(EpisodeKey(cell.env, i, seed + i, cell.fingerprint), cell)
+                    trials.append(Trial(len(trials) + 1, place * suite.episodes + i + 1, job))
+    return trials
+
+
+def _drawn(key: bytes, what: list[str | int], names: Iterable[str]) -> list[str]:
+    """The names in the order of their authentication codes, whatever order they have in the plan."""
+    return sorted(names, key=lambda name: hmac.digest(key, canonical([*what, name]).encode(), hashlib.sha256))
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +105,10 @@ class PlayedTrial:
     ending: str  # in words that do not depend on the policy
 
     def judged(self, verdict: Verdict, score: float) -> EpisodeResult:
-        """Return the result with the verdict: a partial success is none in the rates, its score is the return."""
+        """Return the result with the verdict.
+
+        A partial success counts as a failure in success rates; its score is stored as the return.
+        """
         success = verdict.outcome == "success"
         return replace(
             self.result,
@@ -177,8 +240,8 @@ def play(
 def rehearse(cell: EvalCase, factory: AgentFactory, operator: Operator, obs: Obs) -> None:
     """Let a policy answer once, without moving the robot.
 
-    A mistake in the settings shows before the first trial, and what a policy does at its first answer, such as
-    compiling, takes no time of a trial, by which the policy could be told.
+    A mistake in the settings shows before the first trial. Work done on the first call, such as compilation, does not
+    slow the first trial, which would reveal which policy is running.
     """
     _, task = cell.on_robot
     unused = EpisodeStats(EpisodeKey(cell.env, 0, 0, cell.fingerprint))

@@ -1,17 +1,27 @@
-"""The Ray cluster that plays the episodes."""
+"""The Ray cluster of an evaluation: what its workers need, where they are placed, and their logs."""
 
 from __future__ import annotations
 
+import contextlib
+import logging
 import os
-from collections.abc import Iterator
+import socket
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from math import ceil
+from pathlib import Path
+from time import monotonic
 from typing import Any
+from urllib.parse import urlsplit
 
 import ray
+from ray.exceptions import GetTimeoutError, RayError
+from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from vlagents_ray.client.credentials import withheld
+from vlagents_ray.client.transports.serve_handle import ReplicaNodes
 from vlagents_ray.envs.rendering.graphics import GPUS, SHARE
+from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.episode.records import WorkerInfo
 from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.evaluate.plan.config import EvalConfig, WorkerConfig
@@ -26,6 +36,9 @@ THREAD_VARIABLES = (
     "OPENCV_FOR_THREADS_NUM",
     "LP_NUM_THREADS",  # llvmpipe and lavapipe, Mesa's software renderers
 )
+log = logging.getLogger(__name__)
+MOST_BYTES = 64_000  # most bytes of a kept log, all files together
+TIMEOUT_S = 5.0  # s for another node to read it
 
 
 @contextmanager
@@ -88,3 +101,122 @@ def unused_gpus(cell: EvalCase, where: WorkerInfo) -> str | None:
 
 def _kinds(config: EvalConfig) -> list[WorkerConfig]:
     return [config.worker, *(suite.worker for suite in config.suites if suite.worker is not None)]
+
+
+class Placement:
+    """Chooses the node of a worker: that of a replica which it will use, as long as there is room.
+
+    Only the replicas of policies that this cluster serves are known, `serve://APP`.
+    """
+
+    def __init__(self) -> None:
+        self._replicas: dict[str, ReplicaNodes] = {}  # nodes of the replicas, by application
+
+    def node(self, url: str | None, workers: Mapping[str | None, int]) -> str | None:
+        """Return Ray's id of the node for one more worker of the policy at `url`; None for any node.
+
+        `workers` is the number of workers on each node: nodes with many replicas get many.
+        """
+        parts = urlsplit(url or "")
+        if parts.scheme != "serve":
+            return None
+        replicas = self._replicas.setdefault(parts.netloc, ReplicaNodes(parts.netloc)).query()
+        return fewest(replicas, workers)
+
+
+def fewest(replicas: Mapping[str, int], workers: Mapping[str | None, int]) -> str | None:
+    """Return the node with the fewest workers for each replica after one more is placed there; the first of equals."""
+    return min(replicas, key=lambda node: (workers.get(node, 0) + 1) / replicas[node], default=None)
+
+
+def strategy(node: str | None) -> Any:
+    """Return Ray's scheduling strategy for a worker on `node`, or on another node if that one is full or gone."""
+    if node is None:
+        return "SPREAD"
+    return NodeAffinitySchedulingStrategy(node, soft=True, _spill_on_unavailable=True)
+
+
+class CapacityMonitor:
+    """Decides whether an evaluation goes on while the cluster has no room for some of its workers.
+
+    It goes on as long as other workers play: a worker's node may have been lost, and may return.
+    """
+
+    def __init__(self, config: EvalConfig, now: Callable[[], float] = monotonic) -> None:
+        self._config = config
+        self._now = now
+        self._last_played = now()  # time at which an episode was last being played
+        self._warned = False  # whether the user was warned that there is no room for all
+
+    def note_playing(self) -> None:
+        """Note that an episode is being played."""
+        self._last_played = self._now()
+
+    def note_started(self) -> None:
+        """Note that a worker has started."""
+        self._warned = False
+
+    def timed_out(self, since: float) -> bool:
+        """Whether a worker that was requested at `since` has waited for too long."""
+        return self._now() - since > self._config.place_timeout_s
+
+    def report_shortage(self, worker: WorkerConfig, running: int) -> None:
+        """Warn that a worker has waited too long while `running` run.
+
+        Raises `ConfigError` if no episode is played either.
+        """
+        idle_too_long = self.timed_out(self._last_played)
+        if self._warned and not idle_too_long:
+            return
+        self._warned = True
+        want = {"CPU": worker.cpus, "GPU": worker.gpus}
+        message = (
+            f"the cluster found no room for a worker in {self._config.place_timeout_s:g} s: each wants {want}, "
+            f"free are {ray.available_resources()} of {ray.cluster_resources()}; lower `workers` or "
+            f"`worker.cpus`, or raise `place_timeout_s` if the cluster is still growing"
+        )
+        if idle_too_long:
+            raise ConfigError(message)
+        log.warning("going on with %d of %d workers: %s", running, self._config.workers, message)
+
+
+def own_logs() -> list[str]:
+    """Return the files of this process's standard output and error; in a Ray worker, Ray's log files."""
+    found = []
+    for number in (1, 2):
+        with contextlib.suppress(OSError):  # no /proc
+            found.append(os.readlink(f"/proc/self/fd/{number}"))
+    return [path for path in dict.fromkeys(found) if Path(path).is_file()]
+
+
+def tail(paths: Sequence[str]) -> str:
+    """Return the end of each file under its name, except of missing files."""
+    parts = []
+    for path in paths:
+        with contextlib.suppress(OSError), open(path, "rb") as file:
+            file.seek(max(0, os.fstat(file.fileno()).st_size - MOST_BYTES // len(paths)))
+            parts.append(f"== {Path(path).name}\n{file.read().decode(errors='replace').strip()}")
+    return "\n".join(parts)
+
+
+def tail_at(host: str, paths: Sequence[str]) -> str:
+    """Return `tail` of files on any host of the cluster; "" if the host is lost.
+
+    Raises:
+        TimeoutError: The host does not answer.
+    """
+    if host == socket.gethostname():
+        return tail(paths)
+    nodes = [node["NodeID"] for node in ray.nodes() if node["Alive"] and node["NodeManagerHostname"] == host]
+    if not nodes:
+        return ""
+    there = NodeAffinitySchedulingStrategy(nodes[0], soft=False)
+    try:
+        read: str = ray.get(
+            ray.remote(tail).options(num_cpus=0, scheduling_strategy=there).remote(list(paths)), timeout=TIMEOUT_S
+        )
+    except GetTimeoutError:
+        raise TimeoutError(f"host {host} did not answer within {TIMEOUT_S:g} s") from None
+    except RayError:  # the node is gone with its files
+        return ""
+    return read

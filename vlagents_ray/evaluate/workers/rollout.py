@@ -32,13 +32,13 @@ from vlagents_ray.evaluate.plan.cases import EvalCase, env_program
 from vlagents_ray.evaluate.plan.config import EvalConfig, PolicyConfig
 from vlagents_ray.evaluate.plan.jobs import Job
 from vlagents_ray.evaluate.workers.agents import AgentFactory
-from vlagents_ray.evaluate.workers.logs import own_logs
+from vlagents_ray.evaluate.workers.cluster import own_logs
 from vlagents_ray.interface import Agent
 from vlagents_ray.policies.base.checkpoint import used_checkpoints
 from vlagents_ray.policies.base.checkpoint_files import weights_of
 from vlagents_ray.policies.base.program import loaded_code
 from vlagents_ray.protocol.json_messages import plain_values
-from vlagents_ray.ray_tools.git_state import GitState, code_of
+from vlagents_ray.ray_tools.git_state import code_of
 from vlagents_ray.registry import env_class
 
 log = logging.getLogger(__name__)
@@ -146,7 +146,11 @@ class Rollout:
         if self._env is None or self._place != cell.place:
             self._env = self._make_env(cell)
             # The driver may have another numpy, which cannot read this one's pickles.
-            setup.env = EnvInfo(plain_values(self._env.describe()), self._env.contract.to_json(), _code(cell))
+            setup.env = EnvInfo(
+                plain_values(self._env.describe()),
+                self._env.contract.to_json(),
+                code_of(env_class(cell.env).__module__),
+            )
             setup.env = replace(setup.env, program=env_program(cell, loaded_code), host=socket.gethostname())
         agent, env = self._agent, self._env
         if setup.env is not None or setup.policy is not None:
@@ -274,10 +278,6 @@ class Rollout:
         if env is not None:
             with env_side("close"):
                 env.close()
-
-
-def _code(cell: EvalCase) -> GitState | None:
-    return code_of(env_class(cell.env).__module__)
 
 
 def _metadata(agent: Agent) -> dict[str, Any]:

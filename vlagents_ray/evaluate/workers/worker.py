@@ -1,24 +1,32 @@
-"""The driver's handles of workers, and the time limits of a worker's phases."""
+"""Workers of an evaluation: what they have in common, their jobs, and a worker in this process."""
 
 from __future__ import annotations
 
+import functools
+import logging
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from vlagents_ray.errors import PolicyFailed, VLAgentsError, from_code
+from vlagents_ray.evaluate.artifacts.recorder import RecorderFactory, Recording
 from vlagents_ray.evaluate.episode.episode import Phase
+from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.evaluate.plan.config import EvalConfig, WorkerConfig
-from vlagents_ray.evaluate.plan.jobs import Job
-from vlagents_ray.evaluate.workers.rollout import Heartbeat, Report
+from vlagents_ray.evaluate.plan.jobs import Job, JobQueue
+from vlagents_ray.evaluate.workers.agents import AgentFactory
+from vlagents_ray.evaluate.workers.rollout import Heartbeat, Report, Rollout
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
+
 WATCH_S = 1.0  # s between two queries of a busy worker
 GRACE_S = 5.0  # s that a call past its deadline has to fail by itself
+log = logging.getLogger(__name__)
 
 
 @dataclass(slots=True, eq=False)
@@ -131,3 +139,106 @@ class PhaseTimeouts:
         if silent_s > max(limit_s, self._env_s) + GRACE_S + WATCH_S:
             return f"no sign of life for {silent_s:.0f} s, last seen in {heartbeat.phase}; the worker was killed"
         return None
+
+
+def dispatch(pool: Workers, queue: JobQueue, begin: Callable[[tuple[Job, ...]], None] = lambda _jobs: None) -> None:
+    """Hand waiting jobs to idle workers, and start workers while more are needed; `begin` is called with the jobs."""
+    for worker in pool.idle():
+        if jobs := queue.take(worker.kind, worker.env_place, pool.working()):
+            begin(jobs)
+            pool.dispatch(worker, jobs)
+    while (cell := queue.needs_worker(pool.kinds(), pool.unoccupied())) is not None and pool.free_slot():
+        pool.start(cell)
+
+
+class FailedAttempts:
+    """Decides whether an attempt is repeated, and when too many episodes in a row were lost."""
+
+    def __init__(self, config: EvalConfig) -> None:
+        self._config = config
+        self._lost = 0  # episodes in a row
+        self._policy_errors = 0  # episodes in a row
+
+    def repeats(self, job: Job, failure: Failure) -> bool:
+        """Whether the episode of a failed attempt is to be played again."""
+        return failure.cause != "user" and job.attempt <= self._config.retries
+
+    def note_played(self) -> None:
+        """Note that an episode was played to its end."""
+        self._lost = self._policy_errors = 0
+
+    def note_policy_error(self, error: str) -> None:
+        """Note that an error of the policy ended an episode.
+
+        Raises:
+            PolicyFailed: The error, if it ended too many episodes in a row.
+        """
+        self._policy_errors += 1
+        if self._policy_errors == self._config.abort_after:
+            raise PolicyFailed(
+                f"{self._policy_errors} episodes in a row ended by an error of the policy: {error.strip()}; mend the "
+                f"policy and evaluate it with a new --out, or raise abort_after"
+            )
+
+    def note_lost(self, failure: Failure, cure: str) -> None:
+        """Note that an episode was lost, its last attempt to `failure`.
+
+        Raises:
+            VLAgentsError: The failure, if too many episodes in a row were lost; the message ends with the `cure`.
+        """
+        self._lost += 1
+        if self._lost == self._config.abort_after:
+            raise from_code(
+                failure.code, f"{self._lost} episodes in a row lost to infrastructure; {cure}: {failure.message}"
+            )
+
+
+class InProcessWorkers(Workers):
+    """One worker without Ray, which plays while it is waited for. No time limit can end a simulator that hangs."""
+
+    def __init__(
+        self, config: EvalConfig, agent_factory: AgentFactory, recorder_factory: RecorderFactory = Recording
+    ) -> None:
+        super().__init__()
+        self._make = functools.partial(Rollout, config, agent_factory, recorder_factory)
+        self._rollout = self._make()
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def free_slot(self) -> bool:
+        """Return whether the worker may start; ends one of another kind that is idle."""
+        for worker in self.idle():
+            self._workers.remove(worker)
+        return not self._workers
+
+    def start(self, cell: EvalCase) -> None:
+        """Start the worker, which is ready once it is waited for."""
+        self._workers.append(WorkerHandle(cell.worker, cell.kind, actor=None, starting=self, started_at=0.0))
+
+    def dispatch(self, worker: WorkerHandle, jobs: tuple[Job, ...]) -> None:
+        """Let the worker play `jobs`, side by side, when it is waited for."""
+        worker.jobs = jobs
+
+    def wait(self, timeout_s: float) -> Iterator[tuple[Job, Report]]:
+        """Play the episodes that were dispatched, however long it takes, and yield their reports."""
+        for worker in self._workers:
+            worker.starting = None
+            jobs, worker.jobs = worker.jobs, ()
+            if not jobs:
+                continue
+            reports = self._rollout.run(jobs)
+            if reports[0].env is not None:
+                worker.env_place = jobs[0].cell.place
+            if any(one.failure is not None and one.failure.cause == "worker" for one in reports):
+                self.close()
+                worker.env_place = None
+            yield from zip(jobs, reports, strict=True)
+
+    def close(self) -> None:
+        """Close the simulator and the connection; further episodes begin with new ones."""
+        broken, self._rollout = self._rollout, self._make()
+        try:
+            broken.close()
+        except VLAgentsError as error:
+            log.warning("closing the env: %s", error)

@@ -14,9 +14,8 @@ from dataclasses import dataclass
 from vlagents_ray.naming import plain
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.live.tap import Answer, LiveTap, Seen
-from vlagents_ray.viewers.frame import ViewerFrame
-from vlagents_ray.viewers.targets import dated_name, open_target
-from vlagents_ray.viewers.viewer import EpisodeFormat, ViewerEpisode
+from vlagents_ray.viewers.targets import open_target
+from vlagents_ray.viewers.viewer import EpisodeFormat, ViewerEpisode, ViewerFrame, dated_name
 
 logger = logging.getLogger(__name__)
 

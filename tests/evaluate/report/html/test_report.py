@@ -11,9 +11,9 @@ from eval_fakes import LINE
 from recorded_results import HOSTILE, better_later, record, runs
 
 from vlagents_ray.evaluate import EvalConfig, Results
-from vlagents_ray.evaluate.report.html import comparison, write_report
+from vlagents_ray.evaluate.report.html import success, write_report
+from vlagents_ray.evaluate.report.html.charts import MINUS
 from vlagents_ray.evaluate.report.html.episodes import Gallery
-from vlagents_ray.evaluate.report.html.numbers import MINUS
 from vlagents_ray.evaluate.results.store import Store
 
 
@@ -204,7 +204,7 @@ def test_many_checkpoints_are_compared_with_the_best_first(tmp_path: Path) -> No
 def test_of_very_many_checkpoints_only_the_pairs_that_are_asked_for_most_are_compared(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(comparison, "MOST_COMPARED", 20)
+    monkeypatch.setattr(success, "MOST_COMPARED", 20)
     results = record(runs(tmp_path, steps=list(range(200, 2001, 200)), episodes=6), better_later)
     words = section_of(Read(write_report(results, tmp_path / "report.html")), "Comparison")
     assert "45 pairs of so many checkpoints are left out" in words  # of 55

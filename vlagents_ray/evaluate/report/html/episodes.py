@@ -94,7 +94,7 @@ class Errors:
 
 
 class Gallery:
-    """How the page at `page` shows the videos of `results`, and what of its budget is spent."""
+    """Chooses which videos the report embeds or links, within a size budget."""
 
     def __init__(self, results: Results, page: Path, mode: Videos, budget: int = BUDGET) -> None:
         self._results = results

@@ -13,13 +13,18 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from vlagents_ray.evaluate.artifacts.storage import storing, whole
-from vlagents_ray.evaluate.report.html import charts, numbers
-from vlagents_ray.evaluate.report.html.comparison import compare_all, real_time_gaps
+from vlagents_ray.evaluate.report.html import charts
+from vlagents_ray.evaluate.report.html.charts import duration, interval, interval_name, number, percent, quantity
 from vlagents_ray.evaluate.report.html.episodes import AT_ONCE, Gallery, Videos, episodes, errors, failures
 from vlagents_ray.evaluate.report.html.latency import latency
-from vlagents_ray.evaluate.report.html.numbers import duration, interval, interval_name, number, percent, quantity
 from vlagents_ray.evaluate.report.html.provenance import configuration, protocol, repeat
-from vlagents_ray.evaluate.report.html.success import learning_curves, success_over_time, success_table
+from vlagents_ray.evaluate.report.html.success import (
+    compare_all,
+    learning_curves,
+    real_time_gaps,
+    success_over_time,
+    success_table,
+)
 from vlagents_ray.evaluate.results.reader import Results, by_timing, rate_of
 from vlagents_ray.evaluate.results.summary import Summary, summarize
 
@@ -134,9 +139,9 @@ def _templates() -> Environment:
         lstrip_blocks=True,
     )
     formats = ("duration", "interval", "interval_name", "moment", "number", "p_value", "percent", "points", "quantity")
-    env.filters.update({name: getattr(numbers, name) for name in formats})
+    env.filters.update({name: getattr(charts, name) for name in formats})
     env.filters.update(interval_glyph=charts.interval_glyph, px=charts.px, json=partial(json.dumps, ensure_ascii=False))
-    env.globals.update(PLOT=charts.PLOT, AT_ONCE=AT_ONCE, NONE=numbers.NONE, MINUS=numbers.MINUS)
+    env.globals.update(PLOT=charts.PLOT, AT_ONCE=AT_ONCE, NONE=charts.NONE, MINUS=charts.MINUS)
     for kind in ("css", "js"):  # ours, and no template: nothing in them is escaped
         env.globals[kind] = Markup((files(__package__ or "") / f"report.{kind}").read_text("utf-8").strip())  # noqa: S704
     return env

@@ -1,29 +1,48 @@
-"""Whether the files of a bundle say the same: database, summary, report, settings and trajectories."""
+"""Whether the files of a bundle say the same, and whether the software and weights here are those of the bundle."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import math
+import re
 import zipfile
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from vlagents_ray.errors import ConfigError
+from vlagents_ray.evaluate.artifacts.storage import versions
 from vlagents_ray.evaluate.artifacts.trajectory import Trajectory
-from vlagents_ray.evaluate.bundle.archive import CONFIG, MANIFEST
-from vlagents_ray.evaluate.bundle.finding import Finding, Verdict
+from vlagents_ray.evaluate.bundle.archive import CONFIG, MANIFEST, compared, pins, versions_of
 from vlagents_ray.evaluate.plan.config import fingerprint
 from vlagents_ray.evaluate.report.html import FILE as REPORT
 from vlagents_ray.evaluate.results.reader import Episode, Results, reading, table
 from vlagents_ray.evaluate.results.summary import FILE as SUMMARY
+from vlagents_ray.evaluate.results.summary import checkpoint_of, pushed_of, weights_of
 
+Verdict = Literal["equal", "differs", "other here", "not checked"]
 MOST_TRAJECTORY = 2**30  # bytes of one, unpacked
 _TOLERANCE = 1e-9  # relative: sums of floating-point numbers may differ in their last bits
 _SHOWN = 3  # differences in a finding
+_RUN_PACKAGES = ("vlagents-ray", "ray", "numpy", "av")  # those that `versions` names
+_PACKAGES_SHOWN = 8
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One check.
+
+    "differs" means that the bundle contradicts itself, or that a replay had another outcome; "other here" that software
+    or numbers here are not those there, which alone is no fault of the bundle.
+    """
+
+    subject: str
+    verdict: Verdict
+    detail: str
 
 
 def check_cells(results: Results) -> Finding:
@@ -65,8 +84,8 @@ def check_derived(stated: dict[str, bytes], computed: Path, *, same_software: bo
         yield Finding(REPORT, "differs", "the database gives another page with the same software")
     else:
         yield Finding(REPORT, "not checked", "written by other software, whose page differs; --into writes it again")
-    names = sorted(name for name in stated.keys() | {path.name for path in computed.glob("*.yaml")} if _is_config(name))
-    for name in names:
+    settings = {name for name in stated if name.endswith(".yaml")} | {path.name for path in computed.glob("*.yaml")}
+    for name in sorted(name for name in settings if name.startswith(CONFIG)):
         mine = computed / name
         same = mine.is_file() and stated.get(name) == mine.read_bytes()
         if same:
@@ -74,10 +93,6 @@ def check_derived(stated: dict[str, bytes], computed: Path, *, same_software: bo
         else:
             verdict: Verdict = "differs" if same_software else "not checked"
             yield Finding(name, verdict, "is not what the database gives here")
-
-
-def _is_config(name: str) -> bool:
-    return name.startswith(CONFIG) and name.endswith(".yaml")
 
 
 def _check_summary(stated: bytes | None, computed: bytes) -> Finding:
@@ -175,3 +190,77 @@ def _finding(subject: str, odd: list[str], fine: str) -> Finding:
 def check_digests(odd: list[str], number: int) -> Finding:
     """What the archive's list of digests says of its files."""
     return _finding("digests", odd, f"{number} files have the SHA-256 that {MANIFEST} states")
+
+
+def same_software(written_by: dict[str, Any]) -> bool:
+    """Whether the versions that wrote a bundle are those here: Python, packages and code."""
+    here = versions()
+    return all(_plain(written_by.get(name)) == _plain(here[name]) for name in ("python", *_RUN_PACKAGES)) and (
+        _commit(written_by) == _commit(here)
+    )
+
+
+def check_versions(results: Results) -> Iterator[Finding]:
+    """Compare what the last run was made with to what is here."""
+    there, here = results.runs[-1].versions, versions()
+    odd = [
+        f"{name} {there.get(name)} there, {here[name]} here"
+        for name in ("python", "platform", *_RUN_PACKAGES)
+        if there.get(name) != here[name]
+    ]
+    if odd:
+        yield Finding("versions", "other here", "; ".join(odd))
+    else:
+        yield Finding("versions", "equal", f"Python {here['python']}, {', '.join(_RUN_PACKAGES)} and the platform")
+    was, now = _commit(there), _commit(here)
+    if was[0] is None or now[0] is None:
+        where = "there" if was[0] is None else "here"
+        yield Finding("code", "not checked", f"vlagents-ray has no git commit {where}: it is an installed package")
+    elif was == now:
+        yield Finding("code", "equal", f"vlagents-ray at commit {was[0]}")
+    else:
+        yield Finding("code", "other here", f"vlagents-ray at commit {_text(was)} there, {_text(now)} here")
+
+
+def check_packages(lock: str, results: Results) -> Iterator[Finding]:
+    """Compare the bundle's lock with the run that it is to be the lock of, and with the packages here."""
+    there = versions_of(lock)
+    run = {name: results.runs[-1].versions.get(name) for name in _RUN_PACKAGES}
+    strange = [
+        f"{name} {there[name]} in the lock, {run[name]} in the run"
+        for name in _RUN_PACKAGES
+        if name in there and run[name] not in (None, there[name])
+    ]
+    if strange:
+        yield Finding("packages.txt", "other here", f"of another environment than the run's: {'; '.join(strange)}")
+    same, odd = compared(there, versions_of(pins()))
+    if odd:
+        more = f"; and {len(odd) - _PACKAGES_SHOWN} more" if len(odd) > _SHOWN else ""
+        yield Finding(
+            "packages", "other here", f"{same} of {len(there)} are here; {'; '.join(odd[:_PACKAGES_SHOWN])}{more}"
+        )
+    else:
+        yield Finding("packages", "equal", f"all {len(there)} are here in these versions")
+
+
+def check_weights(results: Results) -> Iterator[Finding]:
+    """Say which weights the episodes were played by: a bundle holds none, so that nothing is checked."""
+    for contender in results.contenders:
+        cells = results.of(contender)
+        named = [one for cell in cells for one in (checkpoint_of(cell), weights_of(cell), pushed_of(cell)) if one]
+        said = ", ".join(dict.fromkeys(named)) or "no server reported any"
+        yield Finding(f"weights of {contender}", "not checked", f"{said}; a bundle holds no weights")
+
+
+def _commit(found: dict[str, Any]) -> tuple[str | None, str | None]:
+    code = found.get("code")
+    state = code.get("vlagents_ray") if isinstance(code, dict) else None
+    return (state.get("commit"), state.get("diff_sha256")) if isinstance(state, dict) else (None, None)
+
+
+def _text(commit: tuple[str | None, str | None]) -> str:
+    return f"{commit[0]} with changes" if commit[1] else f"{commit[0]}"
+
+
+def _plain(version: object) -> str:
+    return re.sub(r"\s+", "", str(version))

@@ -19,6 +19,7 @@ from vlagents_ray.registry import env_class, names, policy_class, wrapper_class
 if TYPE_CHECKING:
     from ray.serve.schema import ServeDeploySchema
 
+
 # Of a model family: the modules that it needs, the variables one of which names a checkout in place of the first of
 # these, and the file in requirements/ that installs the rest.
 _NEEDS: dict[str, tuple[tuple[str, ...], tuple[str, ...], str]] = {

@@ -1,0 +1,362 @@
+"""The programs of a job, which `job.sh` starts.
+
+    python -m vlagents_ray.slurm.job address               print the address of this node, where Ray's head will be
+    python -m vlagents_ray.slurm.job node                  run Ray on this node until the step ends
+    python -m vlagents_ray.slurm.job eval [--fill CPUS] -- WORDS
+    python -m vlagents_ray.slurm.job serve [--key] --app NAME=ROUTE... -- WORDS
+    python -m vlagents_ray.slurm.job announce FOLDER PORT NAME=ROUTE...
+
+`eval` and `serve` run on the first node: they wait for Ray on all nodes, and are replaced by `vlagents-ray eval` or
+`vlagents-ray serve` with the arguments WORDS. `announce` prints how to reach the server when it is ready.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import json
+import os
+import shlex
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from vlagents_ray.client.credentials import KEY_VARIABLE
+from vlagents_ray.ray_tools.session import FILES
+
+HEAD = "VLAGENTS_RAY_HEAD"  # variable with the address of the first node, exported by the job's script
+_FIRST_PORT, _PORTS, _JOBS = 10_000, 4, 2_500  # below the ports that the package and the system assign
+_REST = ("--block", "--disable-usage-stats", "--log-color=false")
+_OBJECTS = 0.25  # share of the memory for Ray's object store, in /dev/shm; Ray's default is 0.3 of the machine's
+_SHORT = "/tmp"  # noqa: S108 - the names of Ray's sockets are limited to 107 bytes
+_AT_ONCE = {"RAY_GRACEFUL_SHUTDOWN_DRAIN_TIMEOUT_S": "0"}  # Ray would drain for 30 s, without use here
+_HEAD_S = 120.0  # time limit for the head to listen
+_NODES_S = 300.0  # time limit for all nodes to join
+_COMMAND = "from vlagents_ray.cli import main; main()"  # runs with this Python, independent of PATH
+FILE = "server.json"
+_POLL_S = 0.5
+_MOST_S = 3600.0  # limit for loading the policies
+_TEXT = """\
+serving {names} in job {job}, until it ends; all of this, and the key, is in {file}
+on the cluster's network:   {url}
+from elsewhere, first:      {ssh}
+                            and use http://localhost:{port} in its place
+
+    {key}
+
+    from vlagents_ray import Obs, RemoteAgent
+    with RemoteAgent("{url}") as agent:
+        agent.reset(obs, "pick up the cube")   # obs = Obs(cameras=..., state=...)
+        print(agent.act(obs).action)
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Ports:
+    """The ports of a job, derived from its number so that jobs on the same node have different ones."""
+
+    gcs: int  # Ray's head
+    client: int  # Ray Client, which cannot be disabled
+    metrics: int  # Ray's monitor, which cannot be disabled
+    serve: int  # the policy server
+
+
+@dataclass(frozen=True, slots=True)
+class Allocation:
+    """The resources of a job, as a process on one of its nodes sees them."""
+
+    job: int
+    nodes: int
+    node: int  # number of this node, from 0; the head is 0
+    cpus: int  # on this node
+    gpus: int  # on this node
+    memory: int | None  # on this node, bytes; None if Slurm does not manage memory
+
+    @classmethod
+    def here(cls, environ: Mapping[str, str] = os.environ) -> Allocation:
+        """Read the allocation of this process."""
+        cpus = int(environ["SLURM_CPUS_ON_NODE"])
+        return cls(
+            job=int(environ["SLURM_JOB_ID"]),
+            nodes=int(environ["SLURM_JOB_NUM_NODES"]),
+            node=int(environ.get("SLURM_NODEID", "0")),
+            cpus=min(cpus, len(os.sched_getaffinity(0))),  # a task may be bound to fewer
+            gpus=_gpus(environ),
+            memory=_memory(environ, cpus),
+        )
+
+    @property
+    def ports(self) -> Ports:
+        """The ports of the job, the same on all nodes."""
+        first = _FIRST_PORT + self.job % _JOBS * _PORTS
+        return Ports(*range(first, first + _PORTS))
+
+    def ray_start(self, head: str, folder: str) -> list[str]:
+        """Return the command that starts Ray on this node with the allocated resources.
+
+        Args:
+            head: The address of the first node.
+            folder: A folder on this node for Ray's sockets, logs and spilled objects, in a subfolder that Ray opens to
+                every user.
+        """
+        ports = self.ports
+        if self.node == 0:
+            where = ["--head", f"--node-ip-address={head}", f"--port={ports.gcs}", "--include-dashboard=false"]
+            where += [f"--ray-client-server-port={ports.client}"]
+        else:
+            where = [f"--address={head}:{ports.gcs}"]
+        given = [f"--num-cpus={self.cpus}", f"--num-gpus={self.gpus}"]
+        if self.memory is not None:
+            objects = int(self.memory * _OBJECTS)
+            given += [f"--object-store-memory={objects}", f"--memory={self.memory - objects}"]
+        # The other listeners use free ports, as Ray's defaults are the same numbers for every cluster.
+        free = ["--min-worker-port=0", "--max-worker-port=0", "--dashboard-agent-listen-port=0"]
+        return ["ray", "start", *where, *given, *free, f"--temp-dir={folder}/{FILES}", *_REST]
+
+
+def _gpus(environ: Mapping[str, str]) -> int:
+    if (count := environ.get("SLURM_GPUS_ON_NODE")) is not None:
+        return int(count)
+    return len([one for one in environ.get("SLURM_STEP_GPUS", "").split(",") if one])
+
+
+def _memory(environ: Mapping[str, str], cpus: int) -> int | None:
+    """Return the memory in bytes; Slurm counts MiB, and 0 is all of the node's."""
+    mebibytes = int(environ.get("SLURM_MEM_PER_NODE", "0")) or int(environ.get("SLURM_MEM_PER_CPU", "0")) * cpus
+    return mebibytes * 2**20 or None
+
+
+def print_address() -> None:
+    """Print the address of this node as Ray determines it."""
+    from ray.util import get_node_ip_address
+
+    sys.stdout.write(f"{get_node_ip_address()}\n")
+
+
+def run_node() -> int:
+    """Run Ray and remove its files; the exit status of the head's Ray is that of the step."""
+    allocation = Allocation.here()
+    head = os.environ[HEAD]
+    if allocation.node:
+        wait_for_head(head, allocation.ports.gcs)
+    environment = os.environ | {"AUTOSCALER_METRIC_PORT": str(allocation.ports.metrics), **_AT_ONCE}
+    asked = threading.Event()
+    with tempfile.TemporaryDirectory(prefix=f"vlr-{allocation.job}-", dir=_SHORT, ignore_cleanup_errors=True) as folder:
+        ray = subprocess.Popen(allocation.ray_start(head, folder), env=environment)  # noqa: S603 - our own command
+
+        def end(_number: int, _frame: FrameType | None) -> None:
+            asked.set()
+            ray.terminate()
+
+        signal.signal(signal.SIGTERM, end)
+        status = ray.wait()
+    if asked.is_set():
+        return 0
+    sys.stdout.write(f"Ray ended with {status}\n")
+    return 0 if allocation.node else status  # the job continues without a node that is not the head
+
+
+def wait_for_head(host: str, port: int, timeout_s: float = _HEAD_S) -> None:
+    """Wait until Ray's head listens; after `timeout_s` the process exits with a message."""
+    deadline = time.monotonic() + timeout_s
+    while True:
+        try:
+            socket.create_connection((host, port), timeout=5).close()
+        except OSError as error:
+            if time.monotonic() > deadline:
+                sys.exit(
+                    f"Ray's head at {host}:{port} does not listen after {timeout_s:g} s ({error}); see its node's log"
+                )
+            time.sleep(0.5)
+        else:
+            return
+
+
+def run_command(arguments: Sequence[str]) -> None:
+    """Wait for Ray, and replace this process by the command."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("what", choices=["eval", "serve"])
+    parser.add_argument(
+        "--fill", type=float, metavar="CPUS", help="start workers of so many CPUs each on all CPUs but one"
+    )
+    parser.add_argument("--closing", type=float, default=0.0, help="s before the job's end, to end in order")
+    parser.add_argument("--key", action="store_true", help="create an API key")
+    parser.add_argument("--port", type=int, help="port of the server; by default derived from the job's number")
+    parser.add_argument("--app", action="append", default=[], help="an application and its route")
+    end_of_own = arguments.index("--")
+    given = parser.parse_args(arguments[:end_of_own])
+    allocation, head = Allocation.here(), os.environ[HEAD]
+    address = f"{head}:{allocation.ports.gcs}"
+    wait_for_head(head, allocation.ports.gcs)
+    cpus = wait_for_nodes(address, allocation.nodes)
+    words = [*arguments[end_of_own + 1 :], f"--address={address}"]
+    if given.what == "eval":
+        end = end_of_job(allocation.job)
+        words += ["--resume", "--replica-per-gpu"]
+        if given.fill is not None:
+            words += [f"--workers={max(1, int((cpus - 1) / given.fill))}", f"--worker-cpus={given.fill:g}"]
+        words += [] if end is None else [f"--end-at={end - given.closing:.0f}"]
+    else:
+        words += _server_options(given, allocation)
+    os.execv(sys.executable, [sys.executable, "-c", _COMMAND, given.what, *words])  # noqa: S606 - no shell
+
+
+def wait_for_nodes(address: str, number: int, timeout_s: float = _NODES_S) -> int:
+    """Wait until a number of nodes have joined the cluster.
+
+    Args:
+        address: The address of Ray's head, host:port.
+        number: The number of nodes.
+        timeout_s: The time limit, s; afterwards the process exits with a list of the nodes that joined.
+
+    Returns:
+        The number of CPUs of the cluster.
+    """
+    import ray
+
+    deadline = time.monotonic() + timeout_s
+    while not ray.is_initialized():
+        try:
+            ray.init(address=address, logging_level="ERROR", log_to_driver=False)
+        except (ConnectionError, RuntimeError) as error:  # Ray does not run on this node yet
+            if time.monotonic() > deadline:
+                sys.exit(f"no Ray at {address} in {timeout_s:g} s: {error}")
+    try:
+        while len(alive := [node for node in ray.nodes() if node["Alive"]]) < number:
+            if time.monotonic() > deadline:
+                sys.exit(f"{len(alive)} of {number} nodes joined Ray in {timeout_s:g} s: {_names(alive)}; see the logs")
+            time.sleep(0.5)
+        sys.stdout.write(f"Ray runs on {_names(alive)}\n")
+        sys.stdout.flush()
+        return int(ray.cluster_resources().get("CPU", 1))
+    finally:
+        ray.shutdown()
+
+
+def _names(nodes: list[dict[str, Any]]) -> str:
+    found = sorted(((one["NodeManagerHostname"], one["Resources"]) for one in nodes), key=lambda one: one[0])
+    return ", ".join(f"{name} ({has.get('CPU', 0):g} CPUs, {has.get('GPU', 0):g} GPUs)" for name, has in found)
+
+
+def end_of_job(job: int) -> float | None:
+    """Return the time at which Slurm ends the job, s since 1970; None if never. Newer versions set a variable."""
+    if (variable := os.environ.get("SLURM_JOB_END_TIME")) is not None:
+        return float(variable)
+    command = ["squeue", "--noheader", f"--jobs={job}", "--format=%e"]
+    end = subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()  # noqa: S603
+    return None if end in ("NONE", "Unknown", "N/A") else datetime.datetime.fromisoformat(end).timestamp()
+
+
+def _server_options(given: argparse.Namespace, allocation: Allocation) -> list[str]:
+    """Return the options of `serve` for its address and keys, and start the process that announces them."""
+    from vlagents_ray.serve.access.key_store import new_key
+
+    folder = Path(os.environ["RAY_AUTH_TOKEN_PATH"]).parent  # the job's folder, which only its user can read
+    port = given.port or allocation.ports.serve
+    words = ["--host=0.0.0.0", f"--port={port}"]
+    key = ""
+    if given.key:
+        keys = folder / "keys.json"
+        keys.unlink(missing_ok=True)  # keys of the same job before it was requeued
+        key = new_key(keys, f"job-{allocation.job}")
+        words.append(f"--keys={keys}")
+    announcing = [sys.executable, "-m", "vlagents_ray.slurm.job", "announce", str(folder), str(port), *given.app]
+    subprocess.Popen(announcing, env=os.environ | {KEY_VARIABLE: key})  # noqa: S603 - our own arguments
+    return words
+
+
+def announce(words: Sequence[str]) -> None:
+    """Wait until each application is ready, write the file, and print it to the job's log."""
+    folder, port, apps = Path(words[0]), int(words[1]), dict(one.split("=", 1) for one in words[2:])
+    deadline = time.monotonic() + _MOST_S
+    server = os.getppid()
+    while not all(_answers(f"http://127.0.0.1:{port}{route.rstrip('/')}/healthz") for route in apps.values()):
+        if time.monotonic() > deadline or os.getppid() != server:  # the server has ended, and its log says why
+            return
+        time.sleep(_POLL_S)
+    found = connection_info(apps, port, os.environ)
+    write(folder / FILE, found)
+    sys.stdout.write(as_text(found, folder / FILE))
+    sys.stdout.flush()
+
+
+def connection_info(apps: Mapping[str, str], port: int, environ: Mapping[str, str]) -> dict[str, Any]:
+    """Return what a client needs to connect.
+
+    Args:
+        apps: The applications and their routes.
+        port: The server's port.
+        environ: The environment of the job.
+
+    Returns:
+        The content of the file, with the URL of each application, the key, and a command for a tunnel.
+    """
+    host = socket.gethostname()
+    url = f"http://{host}:{port}"
+    login = environ.get("SLURM_SUBMIT_HOST", host)
+    user = environ.get("SLURM_JOB_USER", environ.get("USER", ""))
+    return {
+        "job": int(environ["SLURM_JOB_ID"]),
+        "host": host,
+        "address": environ[HEAD],
+        "port": port,
+        "url": url,
+        "apps": {name: url + route.rstrip("/") for name, route in apps.items()},
+        "key": environ.get(KEY_VARIABLE) or None,
+        "ssh": f"ssh -N -L {port}:{host}:{port} {user}@{login}",
+    }
+
+
+def as_text(found: Mapping[str, Any], file: Path) -> str:
+    """Return the connection's information as text for people, without the key: logs are read by others."""
+    url = next(iter(found["apps"].values()))
+    key = f"export {KEY_VARIABLE}=(the key that you were given; none, if the server is --insecure)"
+    if found["key"]:
+        read = "import json, sys; print(json.load(open(sys.argv[1]))['key'])"
+        key = f'export {KEY_VARIABLE}=$(python3 -c "{read}" {shlex.quote(str(file))})'
+    names = ", ".join(found["apps"])
+    return _TEXT.format(**{**found, "url": url, "key": key, "names": names, "file": file})
+
+
+def write(file: Path, found: Mapping[str, Any]) -> None:
+    """Write the file, which contains a key, atomically and readable by its owner only."""
+    part = file.with_suffix(".part")
+    part.touch(mode=0o600)
+    part.write_text(json.dumps(found, indent=2) + "\n")
+    part.replace(file)
+
+
+def _answers(url: str) -> bool:
+    try:
+        with urllib.request.urlopen(url, timeout=5):  # noqa: S310 - our own server
+            return True
+    except (urllib.error.URLError, OSError):
+        return False
+
+
+def main() -> None:
+    """Run the program that the first argument names."""
+    what, *words = sys.argv[1:]
+    if what == "address":
+        print_address()
+    elif what == "node":
+        sys.exit(run_node())
+    elif what == "announce":
+        announce(words)
+    else:
+        run_command([what, *words])
+
+
+if __name__ == "__main__":
+    main()
