@@ -11,7 +11,7 @@ from pathlib import Path
 
 import yaml
 
-from vlagents_ray.bench.checkpoints.recipe import Recipe, SizeName, WrittenCheckpoint
+from benchmarks.checkpoints.recipe import Recipe, SizeName, WrittenCheckpoint
 from vlagents_ray.errors import ConfigError, MissingDependency
 from vlagents_ray.naming import did_you_mean
 from vlagents_ray.registry import require
@@ -66,7 +66,7 @@ def write_checkpoint(family: str, folder: Path, size: SizeName = "full", dtype: 
         raise MissingDependency(
             f"{family}: {sys.executable} has no {', '.join(missing)}; run this command in the family's environment: "
             f"`vlagents-ray env make requirements/{known.environment}.txt --into .venv-{known.environment}`, then "
-            f"`.venv-{known.environment}/bin/vlagents-ray bench checkpoint {family} {folder}`"
+            f"`.venv-{known.environment}/bin/python -m benchmarks.checkpoints {family} {folder}`"
         )
     folder = folder.absolute()
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):

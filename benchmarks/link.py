@@ -18,13 +18,20 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import typer
+
+from benchmarks import peers as others
 from vlagents_ray.bench.clients import OwnClient
+from vlagents_ray.bench.figures import check_plot_file, plot_round_trips
+from vlagents_ray.bench.line_client import die_with_parent, own_stdout
 from vlagents_ray.bench.line_process import LineProcess, our_environment
-from vlagents_ray.bench.peers import peer_clients
-from vlagents_ray.bench.peers.peer import die_with_parent, own_stdout
+from vlagents_ray.bench.machine import measured_on
 from vlagents_ray.bench.rtt import measure
+from vlagents_ray.cli.bench import Calls, Json, Plot, show_round_trips
+from vlagents_ray.cli.console import errors, progress, save
+from vlagents_ray.cli.options import parse_list
 from vlagents_ray.errors import ConfigError, VLAgentsError
 
 RATE = "1gbit"
@@ -35,6 +42,7 @@ CLIENTS = (
     OwnClient("websocket", "auto"),
     OwnClient("http", "jpeg"),
 )
+_INSIDE = "--inside"  # then JSON: this process is in the server's namespace
 SHM = "vlagents shm"  # does not cross a network
 _SERVER, _CLIENT = "10.197.44.1", "10.197.44.2"
 _BULK = 64 * 2**20  # bytes, to see what the link carries
@@ -58,17 +66,17 @@ def measure_link(
         calls: Round trips of each client.
         rate: As `tc` takes it.
         delay: Each way, as `tc` takes it; None adds none.
-        peers: Names of other policy servers, as in `measure_rtt`.
+        peers: Names of other policy servers, as in `measure_with_peers`.
         peers_python: The Python in which they are installed.
         progress: Is called with lines of progress.
 
     Returns:
-        What `measure_rtt(...).to_json()` returns, and "link".
+        What `measure_with_peers` returns, and "link".
 
     Raises:
         ConfigError: This machine or user cannot make network namespaces; the message has the cure.
     """
-    command = [*enter(), sys.executable, "-m", "vlagents_ray.bench.link"]
+    command = [*enter(), sys.executable, "-m", "benchmarks.link", _INSIDE]
     settings = {
         "calls": calls,
         "rate": rate,
@@ -76,7 +84,7 @@ def measure_link(
         "peers": list(peers),
         "peers_python": str(peers_python.absolute()),  # not resolved: a virtual environment's Python is a link
     }
-    with LineProcess("the link", [*command, json.dumps(settings)], our_environment(), end_s=_END_S) as inside:
+    with LineProcess("the link", [*command, json.dumps(settings)], _environment(), end_s=_END_S) as inside:
         while True:
             line = inside.read(_RUN_S)
             if "progress" in line:
@@ -88,13 +96,19 @@ def measure_link(
                 return found
 
 
+def _environment() -> dict[str, str]:
+    """Return the variables with which a process finds the package and this folder."""
+    ours = our_environment()["PYTHONPATH"]
+    return {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[1]), ours])}
+
+
 def enter() -> list[str]:
     """Return the command that runs another one in a network namespace of its own, as root or in a user namespace."""
     if missing := [tool for tool in _TOOLS if shutil.which(tool) is None]:
         raise ConfigError(f"link: {', '.join(missing)} not found; install iproute2 and util-linux")
     refusals = []
     for command in (["unshare", "--net"], ["unshare", "--user", "--map-root-user", "--net"]):
-        done = subprocess.run([*command, "true"], capture_output=True, text=True, check=False)  # noqa: S603
+        done = subprocess.run([*command, "true"], capture_output=True, text=True, check=False)
         if done.returncode == 0:
             return command
         refusals.append(done.stderr.strip())
@@ -146,7 +160,7 @@ class EmulatedLink:
         with socket.create_server((_SERVER, 0)) as server:
             server.settimeout(30)
             command = [*self.prefix, sys.executable, "-c", code.format(server.getsockname()[1])]
-            with subprocess.Popen(command) as sender:  # noqa: S603 - this very Python
+            with subprocess.Popen(command) as sender:
                 connection, _ = server.accept()
                 with connection:
                     begun, got = time.perf_counter(), 0
@@ -168,7 +182,7 @@ def shaping(rate: str, delay: str | None) -> list[list[str]]:
 
 
 def _run(command: Sequence[str]) -> None:
-    done = subprocess.run(list(command), capture_output=True, text=True, check=False)  # noqa: S603 - ip and tc
+    done = subprocess.run(list(command), capture_output=True, text=True, check=False)
     if done.returncode == 0:
         return
     reason = done.stderr.strip()
@@ -179,15 +193,16 @@ def _run(command: Sequence[str]) -> None:
 
 def _inside(calls: int, rate: str, delay: str | None, peers: Sequence[str], peers_python: str, progress: Any) -> Any:
     """Run the benchmark in the server's namespace."""
-    others, absent, versions = peer_clients(peers, Path(peers_python))
-    others = [way for way in others if way.name != SHM]
+    python = Path(peers_python)
+    clients, absent, versions = others.peer_clients(peers, python)
+    clients = [one for one in clients if one.name != SHM]
     with EmulatedLink(rate, delay) as link:
         carried = link.megabits()
         progress(f"the link carries {carried:.0f} Mbit/s")
-        found = measure(
-            CLIENTS, others, calls, Path(peers_python), absent, versions, progress, host=_SERVER, prefix=link.prefix
-        )  # fmt: skip
-    return {**found.to_json(), "link": {"rate": rate, "delay": delay, "measured_mbit_per_s": carried}}
+        starters = others.starters(clients, python, host=_SERVER, prefix=link.prefix)
+        found = measure(CLIENTS, calls, progress, others=starters, skipped=absent, host=_SERVER, prefix=link.prefix)
+    made = {"rate": rate, "delay": delay, "measured_mbit_per_s": carried}
+    return {**found.to_json(), "versions": versions, "link": made}
 
 
 def _interrupt_with_stdin() -> None:
@@ -201,7 +216,7 @@ def _interrupt_with_stdin() -> None:
     threading.Thread(target=wait, daemon=True).start()
 
 
-def main() -> None:
+def _run_inside(settings: str) -> None:
     """Run the process inside; writes lines of JSON with "progress", then one with "result" or "error"."""
     die_with_parent()
     out = own_stdout()
@@ -212,12 +227,38 @@ def main() -> None:
         print(json.dumps(line), file=out, flush=True)
 
     try:
-        say(result=_inside(**json.loads(sys.argv[1]), progress=lambda text: say(progress=text)))
+        say(result=_inside(**json.loads(settings), progress=lambda text: say(progress=text)))
     except VLAgentsError as error:
         say(error=str(error))
     except KeyboardInterrupt:
         sys.exit(130)
 
 
+def main(
+    calls: Calls = 600,
+    rate: Annotated[str, typer.Option(help="Of the link, as tc writes it.")] = RATE,
+    delay: Annotated[str | None, typer.Option(help="Each way, as tc writes it: 2ms. Needs the kernel's netem.")] = None,
+    peers: others.Peers = "vlagents,openpi",
+    peers_python: others.PeersPython = others.PYTHON,
+    json_file: Json = None,
+    plot: Plot = None,
+) -> None:
+    """Round trips over a link of 1 Gbit/s between two network namespaces on this machine."""
+    with errors():
+        check_plot_file(plot)
+        origin = measured_on("python -m benchmarks.link")
+        found = measure_link(
+            calls, rate=rate, delay=delay, peers=parse_list(peers), peers_python=peers_python, progress=progress
+        )  # fmt: skip
+        title = f"round trip of one act over {found['link']['measured_mbit_per_s']:.0f} Mbit/s"
+        show_round_trips(found, title)
+        save({**origin, **found, "versions": origin["versions"] | found["versions"]}, json_file)
+        if plot is not None:
+            plot_round_trips(found, plot, title)
+
+
 if __name__ == "__main__":
-    main()
+    if sys.argv[1:2] == [_INSIDE]:
+        _run_inside(sys.argv[2])
+    else:
+        typer.run(main)

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from vlagents_ray.bench.checkpoints.weights import parameters_on_meta, write_weights
+from benchmarks.checkpoints.weights import parameters_on_meta, write_weights
 from vlagents_ray.errors import ConfigError
 
 pytestmark = pytest.mark.torch
@@ -22,7 +22,7 @@ _PEAK = """
 import resource, sys
 from pathlib import Path
 import torch
-from vlagents_ray.bench.checkpoints.weights import parameters_on_meta, write_weights
+from benchmarks.checkpoints.weights import parameters_on_meta, write_weights
 
 def peak():
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

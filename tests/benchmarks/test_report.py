@@ -1,4 +1,4 @@
-"""The README's section follows from the figures alone."""
+"""The section of docs/measured.md follows from the figures alone."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from vlagents_ray.bench.report.section import BEGIN, DEFAULT, END, JPEG, outcomes, replaced, section
+from benchmarks.report import BEGIN, DEFAULT, END, JPEG, outcomes, replaced, section
 from vlagents_ray.errors import ConfigError
 
 
@@ -27,7 +27,7 @@ def round_trips(ours: dict[str, float], theirs: dict[str, float]) -> dict[str, A
 THEIRS = {"vlagents shm": 0.5, "vlagents JPEG": 2.0, "openpi": 0.6, "OpenVLA REST": 3.0}
 RESULTS: dict[str, Any] = {
     "date": "2026-01-02",
-    "command": "vlagents-ray bench report",
+    "command": "python -m benchmarks.report",
     "machine": {"cpu": "a CPU", "cores": 2, "memory_gb": 24, "kernel": "6.1", "load": 0.1},
     "versions": {"ray": "2.60.0", "vlagents": "0.3.0"},
     "skipped": {},
@@ -82,7 +82,7 @@ def test_the_section_names_machine_date_versions_and_command() -> None:
     text = section(RESULTS)
     for part in (
         "2026-01-02",
-        "`vlagents-ray bench report`",
+        "`python -m benchmarks.report`",
         "a CPU, 2 cores",
         "ray 2.60.0",
         "vla-eval (not installed)",
@@ -116,7 +116,7 @@ def test_only_what_is_between_the_markers_is_replaced() -> None:
 
 
 @pytest.mark.parametrize("text", ["", BEGIN, END + BEGIN, f"{BEGIN}{END}{BEGIN}{END}"])
-def test_a_readme_without_a_pair_of_markers_is_refused(text: str) -> None:
+def test_a_page_without_a_pair_of_markers_is_refused(text: str) -> None:
     with pytest.raises(ConfigError, match="bench"):
         replaced(text, "new")
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.bench.checkpoints.recipe import Recipe, WrittenCheckpoint
-from vlagents_ray.bench.checkpoints.tokenizer import fast_tokenizer
-from vlagents_ray.bench.checkpoints.weights import parameters_on_meta, write_weights
+from benchmarks.checkpoints.recipe import Recipe, WrittenCheckpoint
+from benchmarks.checkpoints.tokenizer import fast_tokenizer
+from benchmarks.checkpoints.weights import parameters_on_meta, write_weights
 from vlagents_ray.policies.base.accelerator import ensure_torchvision
 from vlagents_ray.registry import require
 

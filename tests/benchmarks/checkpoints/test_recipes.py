@@ -9,9 +9,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from vlagents_ray.bench.checkpoints import recipes
-from vlagents_ray.bench.checkpoints.recipe import Recipe, WrittenCheckpoint
-from vlagents_ray.bench.checkpoints.recipes import FAMILIES, Family, write_checkpoint
+from benchmarks.checkpoints import recipes
+from benchmarks.checkpoints.recipe import Recipe, WrittenCheckpoint
+from benchmarks.checkpoints.recipes import FAMILIES, Family, write_checkpoint
 from vlagents_ray.errors import ConfigError, MissingDependency
 from vlagents_ray.serve.launch.deployment_file import server_args
 
@@ -71,7 +71,7 @@ def test_what_is_in_a_folder_stays(tmp_path: Path, known: Known) -> None:
 
 def test_a_missing_package_names_the_environment_with_it(tmp_path: Path, known: Known) -> None:
     known("no_such_package")
-    with pytest.raises(MissingDependency, match=r"no_such_package.*requirements/hf\.txt.*checkpoint own"):
+    with pytest.raises(MissingDependency, match=r"no_such_package.*requirements/hf\.txt.*benchmarks\.checkpoints own"):
         write_checkpoint("own", tmp_path / "made")
     assert list(tmp_path.iterdir()) == []
 

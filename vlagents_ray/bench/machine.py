@@ -14,11 +14,15 @@ from typing import Any
 PACKAGES = ("vlagents-ray", "ray", "numpy", "torch", "jax", "transformers", "lerobot")
 
 
-def measured_on() -> dict[str, Any]:
-    """Return date, command, machine and versions as JSON values; call it before measuring, as it states the load."""
+def measured_on(program: str = "vlagents-ray") -> dict[str, Any]:
+    """Return date, command, machine and versions as JSON values; call it before measuring, as it states the load.
+
+    Args:
+        program: The first words of the command, before the arguments of this process.
+    """
     return {
         "date": datetime.datetime.now(datetime.timezone.utc).date().isoformat(),
-        "command": shlex.join(["vlagents-ray", *sys.argv[1:]]),
+        "command": " ".join([program, shlex.join(sys.argv[1:])]).rstrip(),
         "machine": _machine(),
         "versions": _versions() | {"Python": platform.python_version()},
     }

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from eval_fakes import wait_for
 
-from vlagents_ray.bench.link import enter, measure_link, refused, shaping
+from benchmarks.link import enter, measure_link, refused, shaping
 from vlagents_ray.errors import ConfigError
 
 
@@ -42,7 +42,7 @@ def test_both_namespaces_end_with_a_bench_that_was_killed() -> None:
         assert "run it as root" in str(error)  # noqa: PT017 - a machine without namespaces has only this to show
         return
     code = (
-        "import time\nfrom vlagents_ray.bench.link import EmulatedLink\n"
+        "import time\nfrom benchmarks.link import EmulatedLink\n"
         "with EmulatedLink('1gbit', None) as link:\n    print(link.prefix[1], flush=True)\n    time.sleep(60)"
     )
     with subprocess.Popen([*command, sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as bench:
@@ -72,7 +72,7 @@ def test_round_trips_over_a_link_or_the_reason_why_not(tmp_path: Path) -> None:
     medians = {way["way"]: way["median_ms"] for way in found["ways"]}
     assert medians["websocket, raw"] > 301_056 * 8 / 100e6 * 1e3  # the time that its bytes take
     assert medians["websocket, jpeg"] < medians["websocket, raw"]
-    assert "peers-setup" in found["skipped"]["openpi"]
+    assert "benchmarks.peers" in found["skipped"]["openpi"]
     assert told[0].startswith("the link carries")
     left = subprocess.run(["ip", "-brief", "link"], capture_output=True, text=True, check=True).stdout
     assert "vlagents" not in left

@@ -1,42 +1,37 @@
 """What every script here needs: the line protocol, and that it ends with the benchmark.
 
-A client writes one line of JSON when it is connected and warm. Then each line that it reads is a number
-of calls to make, which it answers with a JSON list of their milliseconds. The end of its standard input
-ends it, as does the death of its parent. Standard library and numpy only: it runs in other environments.
+Standard library and numpy only, as it runs in other environments.
 """
 
 from __future__ import annotations
 
-import ctypes
+import importlib.util
 import json
 import os
 import select
-import signal
 import socket
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable
-from typing import Any, TextIO
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TextIO
 
 import numpy as np
 
-WARM_UP = 20  # calls
+if TYPE_CHECKING:
+    from vlagents_ray.bench.line_client import die_with_parent, obey, own_stdout, timed
+else:  # the peers' Python has no vlagents_ray: the file is loaded by its path
+    _FILE = Path(__file__).parents[2] / "vlagents_ray" / "bench" / "line_client.py"
+    _SPEC = importlib.util.spec_from_file_location("line_client", _FILE)
+    _MODULE = importlib.util.module_from_spec(_SPEC)
+    _SPEC.loader.exec_module(_MODULE)
+    die_with_parent, obey = _MODULE.die_with_parent, _MODULE.obey
+    own_stdout, timed = _MODULE.own_stdout, _MODULE.timed
+
+__all__ = ["die_with_parent", "obey", "observation", "own_stdout", "run", "timed", "wait_for_port"]
+
 _START_S = 60.0
-_PR_SET_PDEATHSIG = 1
-
-
-def die_with_parent() -> None:
-    """Ask the kernel to kill this process when its parent dies, however that happens. Linux only."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-
-
-def own_stdout() -> TextIO:
-    """Return the standard output, for the protocol alone; what anything else prints goes to standard error."""
-    out = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)
-    return out
 
 
 def end_with_stdin() -> None:
@@ -48,25 +43,6 @@ def end_with_stdin() -> None:
         os._exit(0)
 
     threading.Thread(target=wait, daemon=True).start()
-
-
-def timed(prepare: Callable[[], Any], call: Callable[[Any], object], calls: int) -> list[float]:
-    """Make `calls` calls; returns the milliseconds of each, without those of `prepare`, which makes the observation."""
-    taken = []
-    for _ in range(calls):
-        obs = prepare()
-        begun = time.perf_counter()
-        call(obs)
-        taken.append((time.perf_counter() - begun) * 1e3)
-    return taken
-
-
-def obey(lines: Iterable[str], out: TextIO, measure: Callable[[int], list[float]], said: dict[str, Any]) -> None:
-    """Warm up, say that it is ready (`said`), and answer each line until there is none."""
-    measure(WARM_UP)
-    print(json.dumps(said), file=out, flush=True)
-    for line in lines:
-        print(json.dumps(measure(int(line))), file=out, flush=True)
 
 
 def observation(path: str) -> dict[str, np.ndarray]:

@@ -1,4 +1,4 @@
-"""The benchmark section of the README: everything is measured in one go, judged by targets, and written as Markdown.
+"""The figures of docs/measured.md: everything is measured in one go, judged by targets, and written as Markdown.
 
 Figures of `python -m benchmarks.evaluation --report FILE` in the same file are judged, too.
 """
@@ -9,15 +9,21 @@ import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from vlagents_ray.bench import link
-from vlagents_ray.bench.report.machine import measured_on
-from vlagents_ray.bench.rtt import measure_rtt
+import typer
+from rich.text import Text
+
+from benchmarks import link
+from benchmarks.peers import PYTHON, PeersPython
+from benchmarks.rtt import measure_with_peers
+from vlagents_ray.bench.machine import measured_on
 from vlagents_ray.bench.throughput import ThroughputPlan, measure_throughput
+from vlagents_ray.cli.bench import Calls
+from vlagents_ray.cli.console import errors, out, progress, table
 from vlagents_ray.errors import ConfigError
 
-COMMAND = "vlagents-ray bench report"
+COMMAND = "python -m benchmarks.report"
 BEGIN, END = "<!-- bench -->", "<!-- /bench -->"
 _MET = {True: "yes", False: "**no**", None: ""}
 Results = Mapping[str, Any]  # of `collect`
@@ -43,7 +49,7 @@ def collect(
         "command": COMMAND,
         "skipped": {},
     }
-    results["rtt"] = measure_rtt(calls, peers=["all"], peers_python=peers_python, progress=progress).to_json()
+    results["rtt"] = measure_with_peers(calls, peers=["all"], peers_python=peers_python, progress=progress)
     results["versions"] |= results["rtt"]["versions"]
     try:
         results["link"] = link.measure_link(link_calls, peers=link.PEERS, peers_python=peers_python, progress=progress)
@@ -54,13 +60,13 @@ def collect(
     return results
 
 
-def write(results: Mapping[str, Any], readme: Path, json_file: Path | None) -> None:
-    """Write the section into the README; the figures, from which it can be made again, into `json_file`."""
-    text = replaced(readme.read_text(), section(results))
+def write(results: Mapping[str, Any], page: Path, json_file: Path | None) -> None:
+    """Write the section into the page; the figures, from which it can be made again, into `json_file`."""
+    text = replaced(page.read_text(), section(results))
     if json_file is not None:
         json_file.parent.mkdir(parents=True, exist_ok=True)
         json_file.write_text(json.dumps(results, indent=1) + "\n")
-    readme.write_text(text)
+    page.write_text(text)
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,6 +179,7 @@ def _decibels(way: Results) -> str:
 
 
 def unmeasured(what: str, wanted: str) -> Outcome:
+    """Return the line of a target that was not measured."""
     return Outcome(what, wanted, "not measured", None)
 
 
@@ -181,7 +188,7 @@ def replaced(text: str, section: str) -> str:
     before, begin, rest = text.partition(BEGIN)
     _, end, after = rest.partition(END)
     if not begin or not end or BEGIN in after or END in before + after:
-        raise ConfigError(f"the README has no single pair {BEGIN} … {END}; put it where the figures belong")
+        raise ConfigError(f"the page has no single pair {BEGIN} … {END}; put it where the figures belong")
     return f"{before}{BEGIN}\n{section.strip()}\n{END}{after}"
 
 
@@ -274,3 +281,46 @@ def _skipped(results: Mapping[str, Any]) -> Iterator[str]:
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     lines = [head, ["---"] * len(head), *rows]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def show_outcomes(lines: Sequence[Outcome]) -> None:
+    """Print targets, and whether they are met."""
+    if not lines:
+        return
+    rows = table("", "wanted", "measured", "met")
+    met = {True: Text("yes"), False: Text("no", "red"), None: Text("")}
+    for one in lines:
+        rows.add_row(one.what, one.wanted, one.measured, met[one.met])
+    out.print(rows)
+
+
+def main(
+    page: Annotated[Path, typer.Option(help="Its text between the bench markers is replaced.")] = Path(
+        "docs/measured.md"
+    ),
+    json_file: Annotated[Path, typer.Option("--json", help="Keep the figures here.")] = Path("benchmarks/latest.json"),
+    calls: Calls = 1000,
+    seconds: Annotated[float, typer.Option(min=0.1, help="Of each measurement of the throughput.")] = 2.0,
+    peers_python: PeersPython = PYTHON,
+    from_json: Annotated[bool, typer.Option("--from-json", help="Measure nothing: use the figures in --json.")] = False,
+) -> None:
+    """Measure round trips, the link and throughput, and write the figures of docs/measured.md again."""
+    with errors():
+        if not page.is_file():
+            raise ConfigError(f"--page {page}: does not exist")
+        replaced(page.read_text(), "")  # raises without markers, before anything is measured
+        if from_json:
+            try:
+                results = json.loads(json_file.read_text())
+            except (OSError, ValueError) as error:
+                raise ConfigError(f"--json {json_file}: cannot be read ({error})") from error
+        else:
+            results = collect(
+                peers_python, calls=calls, link_calls=calls, plan=ThroughputPlan(seconds=seconds), progress=progress
+            )  # fmt: skip
+        write(results, page, None if from_json else json_file)
+    out.print(f"wrote {page}")
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -14,13 +14,27 @@ import json
 import subprocess
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Annotated
+
+import typer
 
 from vlagents_ray.bench.line_process import START_S, Driver, LineProcess, ProcessDriver
+from vlagents_ray.bench.rtt import LOOPBACK, StartClient
 from vlagents_ray.errors import ConfigError
+from vlagents_ray.serve.launch.server import free_port
 
 SCRIPTS = Path(__file__).parent
 REQUIREMENTS = SCRIPTS / "requirements.txt"
+FOLDER = Path(".venv-peers")
+PYTHON = FOLDER / "bin" / "python"
+
+# Options of the measurements.
+Peers = Annotated[str, typer.Option(help="vlagents, openpi, openvla, vla-eval, with commas between them, or 'all'.")]
+PeersPython = Annotated[
+    Path, typer.Option(help="The Python of the peers' environment, which `python -m benchmarks.peers` makes.")
+]
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +65,7 @@ def peer_clients(names: Sequence[str], python: Path) -> tuple[list[PeerClient], 
         raise ConfigError(f"peers: got {sorted(unknown)}, want some of {list(PEERS)}, or 'all'")
     if not wanted:
         return [], {}, {}
-    cure = "`vlagents-ray bench peers-setup` makes an environment for them"
+    cure = "`python -m benchmarks.peers` makes an environment for them"
     if not python.is_file():
         return [], dict.fromkeys(wanted, f"no Python at {python}; {cure}, --peers-python names another"), {}
     versions = installed(python, sorted({d for one in PEER_CLIENTS for d in one.distributions}))
@@ -73,7 +87,7 @@ def installed(python: Path, distributions: Sequence[str]) -> dict[str, str]:
     )
     command = [str(python), "-c", code, *distributions]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=START_S, check=True)  # noqa: S603
+        done = subprocess.run(command, capture_output=True, text=True, timeout=START_S, check=True)
         versions: dict[str, str] = json.loads(done.stdout)
     except (OSError, subprocess.SubprocessError, ValueError) as error:
         raise ConfigError(f"--peers-python {python}: cannot run it ({error}); name a Python") from error
@@ -82,16 +96,23 @@ def installed(python: Path, distributions: Sequence[str]) -> dict[str, str]:
 
 @contextlib.contextmanager
 def peer_connected(
-    client: PeerClient, python: Path, host: str, port: int, obs: Path, prefix: Sequence[str] = ()
+    client: PeerClient, python: Path, obs: Path, *, host: str = LOOPBACK, prefix: Sequence[str] = ()
 ) -> Iterator[Driver]:
     """Start a peer's server on `host`, and its client (its command begins with `prefix`), until the context ends."""
-    command, address = [str(python), str(SCRIPTS / client.script)], (host, str(port))
+    command, address = [str(python), str(SCRIPTS / client.script)], (host, str(free_port(host)))
     alone = {"PYTHONPATH": ""}  # nothing of ours in the peer's environment
     with (
         LineProcess(f"{client.name}, server", [*command, "serve", *address], alone),
         LineProcess(client.name, [*prefix, *command, "drive", *address, str(obs), client.mode], alone) as process,
     ):
         yield ProcessDriver(process)
+
+
+def starters(
+    clients: Sequence[PeerClient], python: Path, *, host: str = LOOPBACK, prefix: Sequence[str] = ()
+) -> dict[str, StartClient]:
+    """Return what starts each client, by its name, as `measure` takes it."""
+    return {one.name: partial(peer_connected, one, python, host=host, prefix=prefix) for one in clients}
 
 
 def set_up(folder: Path, progress: Callable[[str], None] = lambda _: None) -> Path:

@@ -123,7 +123,7 @@ def _wait(command: subprocess.Popen[bytes]) -> None:
 
 
 def _start(*words: str) -> subprocess.Popen[bytes]:
-    return subprocess.Popen([sys.executable, __file__, *words], stdin=subprocess.PIPE)  # noqa: S603 - this file
+    return subprocess.Popen([sys.executable, __file__, *words], stdin=subprocess.PIPE)
 
 
 if __name__ == "__main__":
