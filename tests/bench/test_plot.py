@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from tests.benchmarks.test_report import RESULTS
 
+from tests.benchmarks.test_report import RESULTS
 from vlagents_ray.bench.figures import check_plot_file, plot_round_trips
 from vlagents_ray.errors import ConfigError
 

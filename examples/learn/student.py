@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import torch
+from colours import BINS, WORDS, named_colour, places
+from torch import nn
 
 from vlagents_ray.contract import Contract
 from vlagents_ray.envs.tabletop.env import Tabletop
 from vlagents_ray.errors import MissingCamera, MissingState
 from vlagents_ray.interface import BEHAVIOUR, WANT, Act, Agent, Obs
-from vlagents_ray.learn.tabletop.colours import BINS, WORDS, named_colour, places
-from vlagents_ray.registry import require
 
 ACTION = 4  # numbers of an action: x, y, z, gripper
 STATE = 4  # of the robot's own state: x, y, z, gripper
@@ -42,65 +42,51 @@ def inputs(obs: Obs, colour: str) -> np.ndarray:
     return np.concatenate([places(obs.cameras["front"]).ravel(), robot, word]).astype(np.float32)
 
 
-@functools.cache
-def looking() -> Any:
-    """Return the class of networks that look at places whose colours the word selects, and where the fingers are."""
-    torch = require("torch")
-    nn = torch.nn
+class LookingNetwork(nn.Module):
+    """Looks at places whose colours the word selects, and where the fingers are."""
 
-    class Looking(nn.Module):  # type: ignore[misc, name-defined]
-        """Inputs (B, INPUTS) to features (B, FEATURES)."""
+    def __init__(self) -> None:
+        super().__init__()
+        self.look = nn.Linear(len(WORDS), BINS * _LOOKS)
+        self.aim = nn.Linear(2, 2)  # from the camera's places to the robot's
+        with torch.no_grad():
+            self.aim.weight.copy_(torch.eye(2) * _METRES / 10)
+            self.aim.bias.zero_()
 
-        def __init__(self) -> None:
-            super().__init__()
-            self.look = nn.Linear(len(WORDS), BINS * _LOOKS)
-            self.aim = nn.Linear(2, 2)  # from the camera's places to the robot's
-            with torch.no_grad():
-                self.aim.weight.copy_(torch.eye(2) * _METRES / 10)
-                self.aim.bias.zero_()
-
-        def features(self, inputs: Any) -> Any:
-            seen, robot, word = inputs.split([3 * BINS, STATE, len(WORDS)], dim=-1)
-            seen = seen.unflatten(-1, (BINS, 3))
-            scores = 8 * self.look(word).unflatten(-1, (_LOOKS, BINS)) + torch.log(seen[:, None, :, 0] + 1e-4)
-            looked = scores.softmax(-1) @ seen  # (B, LOOKS, 3)
-            away = self.aim(looked[..., 1:]) - robot[:, None, :2]
-            scales = [away, torch.tanh(4 * away), torch.tanh(20 * away)]
-            return torch.cat([torch.cat([looked, *scales], -1).flatten(1), robot], -1)
-
-    return Looking
+    def features(self, inputs: torch.Tensor) -> torch.Tensor:
+        """Return what the heads of the network get, (B, FEATURES), from inputs (B, INPUTS)."""
+        seen, robot, word = inputs.split([3 * BINS, STATE, len(WORDS)], dim=-1)
+        seen = seen.unflatten(-1, (BINS, 3))
+        scores = 8 * self.look(word).unflatten(-1, (_LOOKS, BINS)) + torch.log(seen[:, None, :, 0] + 1e-4)
+        looked = scores.softmax(-1) @ seen  # (B, LOOKS, 3)
+        away = self.aim(looked[..., 1:]) - robot[:, None, :2]
+        scales = [away, torch.tanh(4 * away), torch.tanh(20 * away)]
+        return torch.cat([torch.cat([looked, *scales], -1).flatten(1), robot], -1)
 
 
-def head(out: int) -> Any:
+def head(out: int) -> nn.Module:
     """Return a new perceptron from features to `out` numbers."""
-    nn, hidden = require("torch").nn, 192
+    hidden = 192
     return nn.Sequential(
         nn.Linear(FEATURES, hidden), nn.SiLU(), nn.Linear(hidden, hidden), nn.SiLU(), nn.Linear(hidden, out)
     )
 
 
-def make_network(seed: int = 0) -> Any:
-    """Return a new network: inputs (B, INPUTS) to means of actions (B, 4) and values (B,); `log_std` is (4,)."""
-    torch = require("torch")
+class Network(LookingNetwork):
+    """Inputs (B, INPUTS) to means of actions (B, 4) and values (B,); `log_std` is (4,)."""
 
-    class Network(looking()):  # type: ignore[misc]
-        """Moves by the features."""
+    def __init__(self) -> None:
+        super().__init__()
+        self.policy, self.value = head(ACTION), head(1)
+        self.log_std = nn.Parameter(torch.full((ACTION,), -2.3))
 
-        def __init__(self) -> None:
-            super().__init__()
-            self.policy, self.value = head(ACTION), head(1)
-            self.log_std = torch.nn.Parameter(torch.full((ACTION,), -2.3))
-
-        def forward(self, inputs: Any) -> tuple[Any, Any]:
-            features = self.features(inputs)
-            return self.policy(features), self.value(features).squeeze(-1)
-
-    return seeded(Network, seed)
+    def forward(self, inputs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        features = self.features(inputs)
+        return self.policy(features), self.value(features).squeeze(-1)
 
 
-def seeded(make: Callable[[], Any], seed: int) -> Any:
+def seeded(make: Callable[[], nn.Module], seed: int) -> Any:
     """Return a new network with random weights of this seed, and leave torch's own generator as it was."""
-    torch = require("torch")
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         return make()
@@ -112,7 +98,7 @@ class Student(Agent):
     trainable = "network"
     shared = ("network",)
     behaviour: tuple[str, ...] = ("logprob", "value")  # what it states for a learner
-    make_network = staticmethod(make_network)
+    network_class: type[LookingNetwork] = Network
 
     def __init__(self, seed: int = 0) -> None:
         self.seed = seed
@@ -121,8 +107,8 @@ class Student(Agent):
         self._draws = np.random.default_rng(seed)
 
     def initialize(self) -> None:
-        require("torch").set_num_threads(1)
-        self.network = self.make_network(self.seed)
+        torch.set_num_threads(1)
+        self.network = seeded(self.network_class, self.seed)
 
     @property
     def contract(self) -> Contract:
@@ -139,14 +125,13 @@ class Student(Agent):
         return {}
 
     def act(self, obs: Obs) -> Act:
-        return self.act_batch([obs], [self])[0]  # type: ignore[return-value]
+        return self.act_batch([obs], [self])[0]
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
         """Compute the actions of all sessions, in passes of one size, so that neighbours change no bit of a result."""
-        torch = require("torch")
         rows = np.zeros((-len(obs) // _ROWS * -_ROWS, INPUTS), np.float32)
         for row, one, session in zip(rows, obs, sessions, strict=False):
-            row[:] = inputs(one, session._colour)  # type: ignore[attr-defined]
+            row[:] = inputs(one, session._colour)
         with torch.inference_mode():
             passes = [self.network(part) for part in torch.from_numpy(rows).split(_ROWS)]
             outputs = [torch.cat(parts)[: len(obs)].numpy() for parts in zip(*passes, strict=True)]

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from colours import named_colour, puck_position
 
 from vlagents_ray.contract import Contract
 from vlagents_ray.envs.tabletop.env import Tabletop
 from vlagents_ray.errors import MissingCamera, MissingState, NotReset
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.learn.tabletop.colours import named_colour, puck_position
 
 _STEP = 0.03  # m, travel of the fingertips at an action of 1
 _GRASP_Z = 0.006  # m

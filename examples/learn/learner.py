@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import ExitStack
 from copy import deepcopy
 from typing import Any
 
 import numpy as np
+import torch
+from colours import named_colour
+from student import ACTION, INPUTS, LookingNetwork, Network, inputs, seeded
 
 from vlagents_ray.client import RemoteAgent
 from vlagents_ray.interface import Obs
-from vlagents_ray.learn.tabletop.colours import named_colour
-from vlagents_ray.learn.tabletop.student import ACTION, INPUTS, inputs, make_network
-from vlagents_ray.registry import require
 
 DISCOUNT, TRACE = 0.98, 0.95  # gamma and lambda of generalised advantage estimation (arXiv 1506.02438)
 _CLIP = 0.2  # of PPO's ratio (arXiv 1707.06347)
@@ -108,7 +108,7 @@ class NetworkLearner(ABC):
 
     want: tuple[str, ...]
     """What the student states for `improve`, beside its actions."""
-    make_network: Callable[[int], Any]
+    network_class: type[LookingNetwork]
     batch = 256
     """Transitions of a step."""
     steps_at_once = 500
@@ -118,13 +118,13 @@ class NetworkLearner(ABC):
 
     def __init__(self, seed: int = 0) -> None:
         """Make a new network."""
-        self._torch, self._seed = require("torch"), seed
+        self._seed = seed
         self.steps = 0
         """The number of steps so far."""
-        self.network = self.make_network(seed)
+        self.network = seeded(self.network_class, seed)
         look = list(self.network.look.parameters())
         others = [one for name, one in self.network.named_parameters() if not name.startswith("look.")]
-        self._optimizer = self._torch.optim.Adam([{"params": look, "lr": _LOOK_RATE}, {"params": others, "lr": _RATE}])
+        self._optimizer = torch.optim.Adam([{"params": look, "lr": _LOOK_RATE}, {"params": others, "lr": _RATE}])
         self._seen = np.empty((0, INPUTS), np.float32)
         self._advised = np.empty((0, ACTION), np.float32)  # what the teacher would have done at each
 
@@ -138,8 +138,8 @@ class NetworkLearner(ABC):
             "steps": self.steps,
             "network": self.network.state_dict(),
             "optimizer": self._optimizer.state_dict(),
-            "seen": self._torch.from_numpy(self._seen),
-            "advised": self._torch.from_numpy(self._advised),
+            "seen": torch.from_numpy(self._seen),
+            "advised": torch.from_numpy(self._advised),
         }
 
     def restore(self, checkpoint: Mapping[str, Any]) -> None:
@@ -161,7 +161,7 @@ class NetworkLearner(ABC):
 
     def imitate(self, steps: int) -> float:
         """Take steps towards the advice; return the error of the last step."""
-        error, rng = self._torch.zeros(()), self._generator()
+        error, rng = torch.zeros(()), self._generator()
         for _ in range(steps):
             error = self._distance_to_advice(rng)
             self._step(error)
@@ -189,11 +189,11 @@ class NetworkLearner(ABC):
     def _error(self, seen: Any, actions: np.ndarray) -> Any:
         """Return the error of the network's actions: the mean squared one."""
         mean, _ = self.network(seen)
-        return ((mean - self._torch.from_numpy(actions)) ** 2).mean()
+        return ((mean - torch.from_numpy(actions)) ** 2).mean()
 
     def _clipped(self, ratio: Any, gain: Any) -> Any:
         """Return the clipped objective of PPO for ratios of probabilities, and advantages."""
-        return self._torch.minimum(ratio * gain, ratio.clamp(1 - _CLIP, 1 + _CLIP) * gain).mean()
+        return torch.minimum(ratio * gain, ratio.clamp(1 - _CLIP, 1 + _CLIP) * gain).mean()
 
     def _generator(self) -> np.random.Generator:
         """Return one that a learner which goes on from a checkpoint has as well."""
@@ -204,12 +204,12 @@ class NetworkLearner(ABC):
         return rng.integers(number, size=min(self.batch, number))
 
     def _tensor(self, values: np.ndarray, rows: np.ndarray) -> Any:
-        return self._torch.from_numpy(np.asarray(values, np.float32)[rows])
+        return torch.from_numpy(np.asarray(values, np.float32)[rows])
 
     def _step(self, loss: Any) -> None:
         self._optimizer.zero_grad()
         loss.backward()
-        self._torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
+        torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
         self._optimizer.step()
         self.steps += 1
 
@@ -220,10 +220,10 @@ class PPOLearner(NetworkLearner):
     want = ("logprob", "value")
     steps_at_once = 40  # ten times the transitions of 32 episodes: more would fit their noise
     rate: float | None = 1e-4
-    make_network = staticmethod(make_network)
+    network_class = Network
 
     def improve(self, columns: Mapping[str, np.ndarray], steps: int) -> None:
-        torch, rng = self._torch, self._begin_improving()
+        rng = self._begin_improving()
         seen, (gain, targets), kept = inputs_of(columns), advantages(columns), np.flatnonzero(until_solved(columns))
         gain = (gain - gain[kept].mean()) / (gain[kept].std() + 1e-6)
         for _ in range(steps):

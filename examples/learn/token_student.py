@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-
-from vlagents_ray.learn.tabletop.student import ACTION, Student, head, looking, seeded
+import torch
+from student import ACTION, LookingNetwork, Student, head
 
 TOKENS = 11  # bins of each number of an action, whose middles are from -1 to 1
 
@@ -23,28 +23,23 @@ def actions_of(tokens: np.ndarray) -> np.ndarray:
     return found
 
 
-def make_token_network(seed: int = 0) -> Any:
-    """Return a new network: inputs (B, INPUTS) to log-probabilities (B, 4, TOKENS) and entropies (B,), nats."""
+class TokenNetwork(LookingNetwork):
+    """Inputs (B, INPUTS) to log-probabilities of tokens (B, 4, TOKENS) and entropies (B,), nats."""
 
-    class TokenNetwork(looking()):  # type: ignore[misc]
-        """Chooses a token for each number of an action by the features."""
+    def __init__(self) -> None:
+        super().__init__()
+        self.policy = head(ACTION * TOKENS)
 
-        def __init__(self) -> None:
-            super().__init__()
-            self.policy = head(ACTION * TOKENS)
-
-        def forward(self, inputs: Any) -> tuple[Any, Any]:
-            logprobs = self.policy(self.features(inputs)).unflatten(-1, (ACTION, TOKENS)).log_softmax(-1)
-            return logprobs, -(logprobs.exp() * logprobs).sum((-2, -1))
-
-    return seeded(TokenNetwork, seed)
+    def forward(self, inputs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        logprobs = self.policy(self.features(inputs)).unflatten(-1, (ACTION, TOKENS)).log_softmax(-1)
+        return logprobs, -(logprobs.exp() * logprobs).sum((-2, -1))
 
 
 class TokenStudent(Student):
     """Acts by the likeliest tokens, or draws them at temperature 1 if something is wanted for a learner."""
 
     behaviour = ("logprob", "entropy", "replay")
-    make_network = staticmethod(make_token_network)
+    network_class = TokenNetwork
 
     def _best(self, *outputs: Any) -> np.ndarray:
         return actions_of(outputs[0].argmax(-1))

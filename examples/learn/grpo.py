@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-
-from vlagents_ray.learn.tabletop.learner import NetworkLearner, episodes, inputs_of, until_solved
-from vlagents_ray.learn.tabletop.token_student import make_token_network, tokens_of
+import torch
+from learner import NetworkLearner, episodes, inputs_of, until_solved
+from token_student import TokenNetwork, tokens_of
 
 _EPSILON = 1e-6  # beside the standard deviation of a group
 
@@ -37,7 +37,7 @@ class GRPOLearner(NetworkLearner):
     batch = 512
     steps_at_once = 20
     rate = 1e-4  # what few episodes say is mostly noise, which larger or more steps would learn
-    make_network = staticmethod(make_token_network)
+    network_class = TokenNetwork
 
     def improve(self, columns: Mapping[str, np.ndarray], steps: int) -> None:
         """Take steps of GRPO on the transitions of the student's own episodes, without a value and a reference policy.
@@ -65,4 +65,4 @@ class GRPOLearner(NetworkLearner):
     def _logprob(self, seen: Any, tokens: np.ndarray) -> Any:
         """Return the log-probabilities of tokens, (B, 4)."""
         logprobs, _ = self.network(seen)
-        return logprobs.gather(-1, self._torch.from_numpy(tokens)[..., None]).squeeze(-1)
+        return logprobs.gather(-1, torch.from_numpy(tokens)[..., None]).squeeze(-1)
