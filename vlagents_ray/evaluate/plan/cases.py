@@ -24,7 +24,7 @@ from vlagents_ray.naming import plain
 from vlagents_ray.policies.base.program import Program, code_of_class, files_named, with_defaults
 from vlagents_ray.registry import env_class, env_suite, env_task
 
-_COUNTS = "executed actions"  # what rows are placed by (`client.plan.Plan`); scores from when it was ticks are others
+_COUNTS = "executed actions"  # what rows are placed by (`chunking.buffer.ChunkBuffer`); scores from when it was ticks are others
 
 
 @dataclass(frozen=True)
