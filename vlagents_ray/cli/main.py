@@ -26,7 +26,7 @@ from vlagents_ray.cli.new import new
 from vlagents_ray.cli.robot.command import robot_command
 from vlagents_ray.cli.serve import serve_command
 from vlagents_ray.cli.slurm import slurm
-from vlagents_ray.cli.tune.command import tune_command
+from vlagents_ray.cli.tune import tune_command
 from vlagents_ray.naming import did_you_mean
 
 if TYPE_CHECKING:

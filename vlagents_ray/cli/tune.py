@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-import datetime
-import shlex
-import sys
+import os
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+import yaml
 
 from vlagents_ray.cli.console import errors, out, progress, table
 from vlagents_ray.cli.options import YAML_SUFFIXES, is_run_file, parse_dims, parse_list
-from vlagents_ray.errors import ConfigError, MissingDependency
+from vlagents_ray.errors import ConfigError
 
 if TYPE_CHECKING:
+    from vlagents_ray.bench.evaluation import MeasuredEvaluation
     from vlagents_ray.bench.tuning.choice import MeasuredPoint
 
 
@@ -36,7 +36,9 @@ def tune_command(
     p99_ms: Annotated[
         float | None, typer.Option("--p99-ms", min=0, help="Of robots: the longest round trip of 99 in 100, ms.")
     ] = None,
-    out_file: Annotated[Path | None, typer.Option("--out", help="The tuned file; default: FILE.tuned.yaml.")] = None,
+    plot: Annotated[
+        Path | None, typer.Option("--plot", help="Draw latency against throughput here: .png, .svg or .pdf.")
+    ] = None,
     minutes: Annotated[float, typer.Option(min=0.1, help="That all of it may take.")] = 5.0,
     max_workers: Annotated[
         int | None, typer.Option(min=1, help="Of a file of runs: the most workers to try; default: twice the cores.")
@@ -59,16 +61,15 @@ def tune_command(
         list[str], typer.Option(metavar="PART=N", help="Numbers in a part for which the policy does not say.")
     ] = [],  # noqa: B006
 ) -> None:
-    """Find the best settings of a file by measuring, and write it with the figures.
+    """Find the best settings of a file by measuring, and print those to change.
 
     Of a deployment file: batch size, compilation and precision. Of a file of runs: workers, and environments a worker.
     """
     began = time.monotonic()
+    from vlagents_ray.bench.figures import check_plot_file
     from vlagents_ray.bench.tuning.choice import TuningGoal, choose, chosen_settings, default_point, figures
     from vlagents_ray.bench.tuning.picture import plot_latency
     from vlagents_ray.bench.tuning.tuner import TunePlan, Tuner
-    from vlagents_ray.bench.tuning.yaml_text import with_comments, with_settings_in_text
-    from vlagents_ray.cli.tune.evaluation import tune_evaluation
     from vlagents_ray.serve.config.deployment import ServerArgs
     from vlagents_ray.serve.launch.deployment_file import policy_application
 
@@ -76,13 +77,13 @@ def tune_command(
         goal = TuningGoal(wanted.value, p99_ms)
         if file.suffix not in YAML_SUFFIXES:
             raise ConfigError(f"got {str(file)!r}, want a deployment file or a file of runs (.yaml)")
-        where = out_file or file.with_suffix(f".tuned{file.suffix}")
+        check_plot_file(plot)
         if is_run_file(file):
-            if goal.kind != "throughput" or dtypes or frames or app or state:
+            if goal.kind != "throughput" or dtypes or frames or app or state or plot:
                 raise ConfigError(
-                    "--for, --dtypes, --frames, --app and --state are of deployment files; leave them out"
+                    "--for, --dtypes, --frames, --app, --state and --plot are of deployment files; leave them out"
                 )
-            tune_evaluation(file, where, minutes=minutes, max_workers=max_workers, began=began)
+            tune_evaluation(file, minutes=minutes, max_workers=max_workers, began=began)
             return
         application = policy_application(str(file), app)
         args = ServerArgs(**application.args)
@@ -92,28 +93,57 @@ def tune_command(
         )  # fmt: skip
         tuner = Tuner(plan, progress, began)
         points = tuner.measure()
-        _show(points, tuner.left_out, f"{args.policy} on {tuner.device}")
+        title = f"{args.policy} on {tuner.device}"
+        head, *rows = figures(points)
+        _show(head, rows, tuner.left_out, title)
         chosen, default = choose(points, goal), default_point(points, goal, args.batch.max_size)
-        text = with_settings_in_text(
-            file.read_text(), application.name, chosen_settings(chosen, args.batch, tuner.fixed)
-        )  # fmt: skip
-        took = f"{time.monotonic() - began:.0f} s"
-        lines = [f"chosen: {_words(chosen)}", f"the file as it was: {_words(default)}"]
-        for line in lines:
-            out.print(line)
-        head = (
-            f"Tuned on {datetime.date.today()} in {took} on {tuner.device}, by vlagents-ray {shlex.join(sys.argv[1:])}"
-        )
-        left_out = [f"left out: {sentence}" for sentence in tuner.left_out]
-        where.write_text(with_comments(text, [head, *lines, *left_out], figures(points, chosen)))
-        out.print(f"wrote {where}, after {took}")
-        picture = where.with_suffix(".svg")
-        try:
-            plot_latency(points, chosen, default, goal, picture, f"{args.policy} on {tuner.device}")
-        except MissingDependency as error:
-            out.print(f"no picture of latency against throughput: {error}", style="yellow")
-        else:
-            out.print(f"wrote {picture}")
+        settings = chosen_settings(chosen, args.batch, tuner.fixed)
+        _show_choice(_words(chosen), _words(default), began, f"below args of {application.name!r} in {file}", settings)
+        if plot is not None:
+            plot_latency(points, chosen, default, goal, plot, title)
+            out.print(f"wrote {plot}")
+
+
+def tune_evaluation(file: Path, *, minutes: float, max_workers: int | None, began: float) -> None:
+    """Serve the policies of a file of runs, measure, and print the numbers to change.
+
+    Args:
+        file: The file of runs.
+        minutes: That the measurements may take, from `began`.
+        max_workers: The most workers to try; None: twice as many as this machine has cores.
+        began: s of `time.monotonic`.
+    """
+    from vlagents_ray.bench.evaluation import EvaluationTuner
+    from vlagents_ray.cli.evaluation.command import read_run
+    from vlagents_ray.cli.evaluation.policies import served
+    from vlagents_ray.evaluate import EvalConfig
+
+    config = EvalConfig.model_validate(read_run(file))
+    most = max(max_workers or 2 * (os.cpu_count() or 1), config.workers)
+    with served(config.model_copy(update={"workers": most})) as ready:
+        own = ready.model_copy(update={"workers": config.workers})
+        tuner = EvaluationTuner(own, began + 60 * minutes, most, progress=progress)
+        tuner.measure()
+    _show(_HEAD, [_row(one) for one in tuner.found], tuner.left_out, f"{file}, on {os.cpu_count()} cores")
+    before, chosen = tuner.found[0], tuner.chosen
+    settings: dict[str, Any] = {} if chosen.workers == before.workers else {"workers": chosen.workers}
+    if chosen.num_envs != before.num_envs:
+        settings["suites"] = [{"num_envs": chosen.num_envs} for _ in config.suites]
+    _show_choice(_evaluation_words(chosen), _evaluation_words(before), began, f"in {file}", settings)
+
+
+_HEAD = ("workers", "envs a worker", "episodes/min", "start s", "memory MiB", "whole evaluation, min")
+
+
+def _row(one: MeasuredEvaluation) -> list[str]:
+    numbers = [f"{one.episodes_per_min:.1f}", f"{one.start_s:.1f}", f"{one.memory_mib:.0f}", f"{one.total_s / 60:.1f}"]
+    return [str(one.workers), str(one.num_envs), *numbers]
+
+
+def _evaluation_words(one: MeasuredEvaluation) -> str:
+    workers = f"{one.workers} worker{'s' if one.workers > 1 else ''}"
+    envs = f"{one.num_envs} environment{'s' if one.num_envs > 1 else ''} each"
+    return f"{workers} with {envs}, {one.total_s / 60:.1f} minutes"
 
 
 def _words(point: MeasuredPoint | None) -> str:
@@ -125,13 +155,20 @@ def _words(point: MeasuredPoint | None) -> str:
     return f"{point.variant.name}, {sessions(point.sessions)}: {figures}"
 
 
-def _show(points: Sequence[MeasuredPoint], left_out: Sequence[str], title: str) -> None:
-    from vlagents_ray.bench.tuning.choice import figures
-
-    [_, *head], *rows = figures(points, None)
+def _show(head: Sequence[str], rows: Sequence[Sequence[str]], left_out: Sequence[str], title: str) -> None:
     shown = table(*head, title=title)
     for row in rows:
-        shown.add_row(*row[1:])
+        shown.add_row(*row)
     out.print(shown)
     for sentence in left_out:
         out.print(f"left out: {sentence}", style="yellow")
+
+
+def _show_choice(chosen: str, own: str, began: float, where: str, settings: Mapping[str, Any]) -> None:
+    """Print the choice, beside what the file gives as it is, and the settings to change as YAML."""
+    out.print(f"chosen: {chosen}\nthe file as it is: {own}\nafter {time.monotonic() - began:.0f} s")
+    if not settings:
+        out.print("nothing to change")
+        return
+    text = yaml.safe_dump(dict(settings), sort_keys=False, default_flow_style=None)
+    out.print(f"set {where}:\n\n{text}")
