@@ -25,16 +25,16 @@ FLOWS: dict[str, tuple[str, list[tuple[str, str]], list[tuple[str, str]], tuple[
     ),
     "shared_memory": (
         "Shared memory: same machine, same user",
-        [("RemoteAgent", "client/agent"), ("memory file", "client/transports/local/shm")],
+        [("RemoteAgent", "client/agent"), ("memory file", "client/transports/shm")],
         [("policy", "policies/"), ("batch queue", "serve/engine, serve/queue"),
-         ("shm endpoint", "serve/endpoints/local/shm")],
+         ("shm endpoint", "serve/endpoints/shm")],
         ("Unix socket", "100 bytes and a descriptor"),
     ),
     "plasma": (
         "Plasma: same Ray node, where the Unix socket is out of reach",
-        [("RemoteAgent", "client/agent"), ("object store", "client/transports/local/plasma")],
+        [("RemoteAgent", "client/agent"), ("object store", "client/transports/plasma")],
         [("policy", "policies/"), ("batch queue", "serve/engine, serve/queue"),
-         ("plasma endpoint", "serve/endpoints/local/plasma")],
+         ("plasma endpoint", "serve/endpoints/plasma")],
         ("plasma object", "raw pixels, one copy"),
     ),
     "websocket": (
