@@ -65,10 +65,10 @@ demo: setup
 
 # Some minutes; the other policy servers get an environment of their own, in .venv-peers.
 bench: setup
-	$(BIN)/vlagents-ray bench peers-setup
-	$(BIN)/vlagents-ray bench report
+	$(BIN)/python -m benchmarks.peers
+	$(BIN)/python -m benchmarks.report
 	$(BIN)/python -m benchmarks.evaluation --peers all --report benchmarks/latest.json
-	$(BIN)/vlagents-ray bench report --from-json
+	$(BIN)/python -m benchmarks.report --from-json
 
 check: lint type
 	@echo '== quick tests'

@@ -1,5 +1,8 @@
 """Measurements that developers repeat, in a checkout: `python -m benchmarks.NAME --help`.
 
+`rtt` and `link` compare round trips with those of other policy servers (`peers`), on one machine and over a link;
+`report` measures these and throughput, judges them, and writes docs/measured.md; `checkpoints` makes checkpoints of
+random weights.
 `overhead` compares an evaluation with bare environments, `evaluation` with the peers' own; `soak` lets one run for
 long; `scaling` has more and more workers play on a Ray cluster over several `hosts`, which are made on one machine;
 `autoscaling` watches replicas while `robots` and rollouts come and go; `hop` measures a child process behind a replica,

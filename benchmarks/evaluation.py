@@ -34,10 +34,10 @@ import typer
 
 import vlagents_ray
 from benchmarks.environments import TIMED_TABLETOP, read_episode_times
+from benchmarks.peers import PYTHON, SCRIPTS, PeersPython, peer_clients
+from benchmarks.report import evaluation_outcomes, show_outcomes
 from vlagents_ray.bench.line_process import LineProcess, ProcessFailed, our_environment
-from vlagents_ray.bench.peers import SCRIPTS, peer_clients
-from vlagents_ray.bench.report.section import evaluation_outcomes
-from vlagents_ray.cli.bench import DEFAULT_PEERS_PYTHON, Json, PeersPython, show_outcomes, show_skipped
+from vlagents_ray.cli.bench import Json, show_skipped
 from vlagents_ray.cli.console import errors, out, progress, save, table
 from vlagents_ray.cli.options import parse_list
 from vlagents_ray.errors import ConfigError
@@ -234,10 +234,10 @@ def main(
     size: Annotated[int, typer.Option(min=32, help="Pixels a side of the image.")] = 224,
     max_steps: Annotated[int, typer.Option(min=1, help="Steps of an episode.")] = 80,
     env_ms: Annotated[float, typer.Option(min=0, help="CPU time that each env step takes more.")] = 0.0,
-    peers_python: PeersPython = DEFAULT_PEERS_PYTHON,
+    peers_python: PeersPython = PYTHON,
     json_file: Json = None,
     report: Annotated[
-        Path | None, typer.Option(help="Add the figures to this file of `vlagents-ray bench report --json`.")
+        Path | None, typer.Option(help="Add the figures to this file of `python -m benchmarks.report --json`.")
     ] = None,
 ) -> None:
     """Episodes a minute of whole evaluations: `vlagents-ray eval`, and the peers' own commands, in turns."""

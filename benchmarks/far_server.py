@@ -15,7 +15,7 @@ from dataclasses import asdict
 import uvicorn
 
 from benchmarks.far_robot import FarPolicy
-from vlagents_ray.bench.peers.peer import die_with_parent, own_stdout
+from vlagents_ray.bench.line_client import die_with_parent, own_stdout
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, PROTOCOL_VERSION
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware

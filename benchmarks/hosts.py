@@ -27,7 +27,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from vlagents_ray.bench.link import shaping
+from benchmarks.link import shaping
 from vlagents_ray.errors import ConfigError, VLAgentsError
 
 _NETWORK = "198.18.0."  # RFC 2544's, for tests of networks

@@ -29,8 +29,8 @@ import typer
 from websockets.sync.client import connect
 
 from vlagents_ray.bench.clients import observation
+from vlagents_ray.bench.line_client import die_with_parent, own_stdout
 from vlagents_ray.bench.line_process import START_S, LineProcess, our_environment
-from vlagents_ray.bench.peers.peer import die_with_parent, own_stdout
 from vlagents_ray.cli.bench import Json
 from vlagents_ray.cli.console import errors, out, progress, save, table
 from vlagents_ray.client.agent import RemoteAgent

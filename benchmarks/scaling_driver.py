@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 from benchmarks.environments import ACTION_DIM, SLEEPING_ENV
 from benchmarks.overhead import cpu_seconds, recorded, steady
-from vlagents_ray.bench.peers.peer import die_with_parent, own_stdout
+from vlagents_ray.bench.line_client import die_with_parent, own_stdout
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig, SilentProgress, SuiteConfig, WorkerConfig, evaluate
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.cases import EvalCase

@@ -25,8 +25,8 @@ import numpy as np
 import typer
 
 from benchmarks.environments import TIMED_TABLETOP, EpisodeTimes, read_episode_times
-from vlagents_ray.bench.report.section import Outcome, unmeasured
-from vlagents_ray.cli.bench import Json, show_outcomes
+from benchmarks.report import Outcome, show_outcomes, unmeasured
+from vlagents_ray.cli.bench import Json
 from vlagents_ray.cli.console import errors, out, progress, save
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig, Results, SilentProgress, SuiteConfig, evaluate
 from vlagents_ray.evaluate.episode.records import EpisodeResult

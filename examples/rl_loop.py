@@ -6,8 +6,8 @@ their transitions (REINFORCE) and pushes new weights. In the folder of this file
     vlagents-ray serve own_policy:Servo
     python rl_loop.py http://localhost:8000
 
-It needs the extra 'learn'. `vlagents-ray learn tabletop` is the same loop around a torch policy that sees images and
-reads words, with cloning, PPO, a teacher and GRPO: docs/tutorials/learn.md.
+It needs the extra 'learn'. learn/train.py is the same loop around a torch policy that sees images and reads words, with
+cloning, PPO, a teacher and GRPO: docs/tutorials/learn.md.
 """
 
 import sys

@@ -59,12 +59,6 @@ def test_it_is_the_same_after_a_trip_through_statistics_as_float_tensors() -> No
     assert DatasetContract.from_statistics(np.array(numbers, np.float16).tolist()) == ABOUT
 
 
-def test_an_older_dataset_has_no_state_of_an_environment() -> None:
-    data = ABOUT.to_json()
-    del data["environment"]
-    assert DatasetContract.from_json(data) == replace(ABOUT, environment=())
-
-
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"state": []}', '{"contract": {"wings": 2}, "state": []}'])
 def test_what_is_no_contract_is_an_error_with_the_cure(text: str) -> None:
     with pytest.raises(ConfigError, match=r"cannot be read.*newer vlagents-ray"):

@@ -64,7 +64,7 @@ def test_the_wheel_holds_every_module_and_the_licence_and_no_tests(wheel: Path) 
     names = set(zipfile.ZipFile(wheel).namelist())
     modules = {str(path.relative_to(ROOT)) for path in (ROOT / "vlagents_ray").rglob("*.py")}
     assert modules - names == set()
-    assert {"vlagents_ray/py.typed", "vlagents_ray/bench/peers/requirements.txt"} <= names
+    assert "vlagents_ray/py.typed" in names
     page = ROOT / "vlagents_ray/evaluate/report/html"
     resources = {str(path.relative_to(ROOT)) for pattern in ("report.*", "templates/*") for path in page.glob(pattern)}
     assert len(resources) >= 4

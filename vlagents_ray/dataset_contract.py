@@ -80,7 +80,7 @@ class DatasetContract:
                 tuple(map(str, data["state"])),
                 {str(key): str(name) for key, name in data["cameras"].items()},
                 {int(place): _centre(centre) for place, centre in data["angles"].items()},
-                tuple(map(str, data.get("environment", ()))),  # older datasets have none
+                tuple(map(str, data["environment"])),
             )
             if unknown := {*found.state, *found.environment} - {*(found.contract.state or {}), GRIPPER}:
                 raise ValueError(f"its contract has no state {sorted(unknown)}")

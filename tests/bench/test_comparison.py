@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from vlagents_ray.bench.report.comparison import compare_figures, read_figures
-from vlagents_ray.bench.report.machine import measured_on
+from vlagents_ray.bench.comparison import compare_figures, read_figures
+from vlagents_ray.bench.machine import measured_on
 from vlagents_ray.errors import ConfigError
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.bench.test_report import RESULTS
+from tests.benchmarks.test_report import RESULTS
 from vlagents_ray.bench.figures import check_plot_file, plot_round_trips
 from vlagents_ray.errors import ConfigError
 

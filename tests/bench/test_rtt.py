@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping
-from pathlib import Path
 
 import pytest
 
 from vlagents_ray.bench.clients import OWN_CLIENTS, connect, observation, own_clients
 from vlagents_ray.bench.line_process import Driver
-from vlagents_ray.bench.peers import installed, peer_clients
 from vlagents_ray.bench.rtt import ROUND, in_turns
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.images.jpeg_png import encode_jpeg
@@ -58,26 +55,3 @@ def test_a_codec_is_written_in_words() -> None:
     assert connect("http://127.0.0.1:1", "websocket", "jpeg 90 420", rank="robot").transport == "websocket"
     with pytest.raises(ValueError, match="codec"):
         connect("http://127.0.0.1:1", "websocket", "gif")
-
-
-def test_peers_are_named(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"vlagent'.*want some of"):
-        peer_clients(["vlagent"], tmp_path)
-    assert peer_clients([], tmp_path) == ([], {}, {})
-
-
-def test_a_peer_that_is_not_installed_is_skipped_by_name_with_the_cure(tmp_path: Path) -> None:
-    found, skipped, _ = peer_clients(["openpi"], tmp_path / "python")
-    assert found == []
-    assert "peers-setup" in skipped["openpi"]
-    found, skipped, _ = peer_clients(["vlagents"], Path(sys.executable))  # rpyc conflicts with nothing, but is not here
-    assert found == []
-    assert set(skipped) == {"vlagents"}
-    assert "vlagents, rpyc not installed" in skipped["vlagents"]
-    assert "peers-setup" in skipped["vlagents"]
-
-
-def test_versions_are_those_of_the_other_python() -> None:
-    assert set(installed(Path(sys.executable), ["numpy", "no-such-thing"])) == {"numpy"}
-    with pytest.raises(ConfigError, match="peers-python"):
-        installed(Path("/bin/false"), ["numpy"])

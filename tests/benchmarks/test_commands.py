@@ -8,17 +8,24 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from benchmarks import autoscaling, evaluation, far_away, hop, scaling
+from benchmarks import autoscaling, evaluation, far_away, hop, link, report, rtt, scaling
+from benchmarks.checkpoints import __main__ as checkpoints
 
 
 @pytest.mark.parametrize(
     ("module", "words", "text"),
     [
         (autoscaling, ["--plot", "a.gif"], ".png"),
+        (checkpoints, ["smolvl", "made"], "smolvla"),
+        (checkpoints, ["act", "made", "--dtype", "bfloat16"], "float32"),
+        (checkpoints, ["act", "made", "--size", "huge"], "small"),
         (evaluation, ["--episodes", "5"], "multiple of the 2 workers"),
         (evaluation, ["--peers", "nobody"], "nobody"),
         (far_away, ["--modes", "async,nobody"], "nobody"),
         (hop, ["--python", "nowhere"], "nowhere"),
+        (link, ["--plot", "a.gif"], ".png"),
+        (report, ["--page", "nowhere.md"], "nowhere.md"),
+        (rtt, ["--peers", "nobody"], "nobody"),
         (scaling, ["--workers", "2,4"], "from 1 on"),
         (scaling, ["--nodes", "none"], "--nodes"),
     ],

@@ -20,9 +20,9 @@ from benchmarks.evaluation import (
     ratios,
     their_runs,
 )
+from benchmarks.peers import SCRIPTS
+from benchmarks.report import evaluation_outcomes
 from vlagents_ray.bench.line_process import ProcessFailed
-from vlagents_ray.bench.peers import SCRIPTS
-from vlagents_ray.bench.report.section import evaluation_outcomes
 from vlagents_ray.envs import make_env
 from vlagents_ray.envs.base import known_contract
 from vlagents_ray.errors import ConfigError

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import re
 from pathlib import Path
@@ -10,14 +9,12 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from vlagents_ray.cli.bench import _MOVED
 from vlagents_ray.cli.main import app
 
 
 @pytest.mark.parametrize(
     ("words", "text"),
     [
-        (["rtt", "--peers", "nobody"], "nobody"),
         (["rtt", "--transports", "smoke"], "smoke"),
         (["rtt", "--plot", "a.gif"], ".png"),
         (["throughput", "--clients", "few"], "few"),
@@ -28,10 +25,6 @@ from vlagents_ray.cli.main import app
         (["throughput", "--config", "{"], "JSON"),
         (["throughput", "--config", '{"base_ms": 1}'], "--policy"),
         (["throughput", "--model", "huge"], "size"),
-        (["checkpoint", "smolvl", "made"], "smolvla"),
-        (["checkpoint", "act", "made", "--dtype", "bfloat16"], "float32"),
-        (["checkpoint", "act", "made", "--size", "huge"], "small"),
-        (["report", "--readme", "nowhere.md"], "nowhere.md"),
     ],
 )
 def test_mistakes_are_told_in_a_line(words: list[str], text: str) -> None:
@@ -39,27 +32,6 @@ def test_mistakes_are_told_in_a_line(words: list[str], text: str) -> None:
     assert done.exit_code == 2, done.output
     assert text in done.stderr
     assert "Traceback" not in done.output
-
-
-@pytest.mark.parametrize(
-    ("words", "instead"),
-    [
-        (["soak", "--episodes", "1000"], "python -m benchmarks.soak --episodes 1000"),
-        (
-            ["eval", "maniskill/PushCube-v1", "--rounds", "5"],
-            "python -m benchmarks.overhead maniskill/PushCube-v1 --rounds 5",
-        ),
-        (["scaling", "--help"], "python -m benchmarks.scaling"),
-    ],
-)
-def test_what_is_no_user_measurement_any_more_names_the_module_to_run(words: list[str], instead: str) -> None:
-    done = CliRunner().invoke(app, ["bench", *words])
-    assert instead in " ".join(done.output.split())
-    assert done.exit_code == (0 if "--help" in words else 2)
-
-
-def test_every_command_that_moved_is_a_module_of_benchmarks() -> None:
-    assert all(importlib.util.find_spec(f"benchmarks.{module}") for module in _MOVED.values())
 
 
 def test_a_policy_is_measured_with_other_settings_than_its_files(tmp_path: Path) -> None:

@@ -1,17 +1,16 @@
-"""`vlagents-ray tune` writes a deployment file with the figures that it was chosen by."""
+"""`vlagents-ray tune` prints the settings of a file to change, with the figures that they were chosen by."""
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
+from typing import Any
 
 import pytest
+import yaml
 from typer.testing import CliRunner
 
-from vlagents_ray.bench.tuning import picture
-from vlagents_ray.cli.evaluation.command import read_run
 from vlagents_ray.cli.main import app
-from vlagents_ray.errors import MissingDependency
-from vlagents_ray.evaluate import EvalConfig
 from vlagents_ray.serve.launch.deployment_file import server_args
 
 FILE = """\
@@ -35,41 +34,43 @@ def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return made
 
 
-def test_the_tuned_file_has_the_settings_the_figures_and_the_old_lines(file: Path) -> None:
+def printed_settings(output: str) -> dict[str, Any]:
+    """Return the YAML at the end of the output, after the line that says where it belongs."""
+    found: dict[str, Any] = yaml.safe_load(re.split(r"\nset .*:\n", output)[1])
+    return found
+
+
+def test_the_settings_to_change_are_printed_with_the_figures(file: Path) -> None:
     done = CliRunner().invoke(app, ["tune", str(file), *QUICK])
     assert done.exit_code == 0, done.output
-    written = file.with_name("mine.tuned.yaml")
-    assert f"wrote {written}" in done.output
-    args = server_args(str(written))
-    assert args.config["compile"] is True
+    assert "actions off by" in done.output
+    assert "\nchosen: compile: true, " in done.output
+    assert "\nthe file as it is: own settings, 2 sessions: " in done.output
+    assert f"set below args of 'mine' in {file}:" in done.output
+    settings = printed_settings(done.output)
+    assert settings["config"]["compile"] is True
+    tuned = yaml.safe_load(FILE)
+    for section, values in settings.items():
+        tuned["applications"][0]["args"].setdefault(section, {}).update(values)
+    file.write_text(yaml.safe_dump(tuned))
+    args = server_args(str(file))
     assert args.config["batch_sizes"][-1] == args.batch.max_size
-    text = written.read_text()
-    assert text.startswith("# Tuned on ")
-    for line in ("# chosen: compile: true, ", "# the file as it was: own settings, 2 sessions: ", "actions off by"):
-        assert line in text
-    assert "# What drives my robot\n" in text
-    assert "  - name: mine  # a name\n" in text
-    assert file.read_text() == FILE
-    assert file.with_name("mine.tuned.svg").read_text().startswith("<?xml")
 
 
-def test_without_matplotlib_there_is_no_picture(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def missing(file: Path | None) -> None:
-        raise MissingDependency("'matplotlib' is not installed")
-
-    monkeypatch.setattr(picture, "check_plot_file", missing)
-    words = ["tune", str(file), *QUICK, "--for", "robots", "--p99-ms", "60000", "--out", str(file.parent / "out.yaml")]
+def test_a_picture_is_drawn_where_it_is_asked_for(file: Path) -> None:
+    plot = file.with_name("mine.svg")
+    words = ["tune", str(file), *QUICK, "--for", "robots", "--p99-ms", "60000", "--plot", str(plot)]
     done = CliRunner().invoke(app, words)
     assert done.exit_code == 0, done.output
-    assert "no picture of latency against throughput: 'matplotlib'" in done.output
-    assert (file.parent / "out.yaml").is_file()
+    assert plot.read_text().startswith("<?xml")
+    assert {path.name for path in file.parent.iterdir()} == {"mine.yaml", "mine.svg"}
 
 
-def test_a_goal_that_nothing_reaches_writes_no_file(file: Path) -> None:
+def test_a_goal_that_nothing_reaches_is_an_error(file: Path) -> None:
     done = CliRunner().invoke(app, ["tune", str(file), *QUICK, "--for", "robots", "--p99-ms", "0.000001"])
     assert done.exit_code == 1
     assert "the shortest p99 of a round trip was" in done.stderr
-    assert not file.with_name("mine.tuned.yaml").exists()
+    assert "\nset " not in done.output
 
 
 @pytest.mark.parametrize(
@@ -81,6 +82,7 @@ def test_a_goal_that_nothing_reaches_writes_no_file(file: Path) -> None:
         (["nowhere.yaml", "--p99-ms", "60"], "--for robots"),
         (["FILE", "--state", "joints=some"], "joints"),
         (["FILE", "--app", "yours"], "mine"),
+        (["FILE", "--plot", "a.gif"], ".png"),
         (["FILE", "--frames", "."], "trajectory"),
     ],
 )
@@ -101,11 +103,11 @@ def test_a_file_of_runs_gets_workers_and_environments(tmp_path: Path) -> None:
     )
     done = CliRunner().invoke(app, ["tune", str(file), "--max-workers", "1", "--minutes", "0.2"])
     assert done.exit_code == 0, done.output
-    text = file.with_name("runs.tuned.yaml").read_text()
-    assert text.startswith("# Tuned on ")
-    assert "# chosen: 1 worker with " in text
-    assert "# mine\npolicies: [{source: scripted}]\n" in text
-    assert EvalConfig.model_validate(read_run(file.with_name("runs.tuned.yaml"))).workers == 1
+    [words] = re.findall("^chosen: 1 worker with (.*)", done.output, re.MULTILINE)
+    if words.startswith("1 environment each"):
+        assert "nothing to change" in done.output
+    else:
+        assert words.startswith(f"{printed_settings(done.output)['suites'][0]['num_envs']} environments each")
 
 
 def test_options_of_deployment_files_are_refused_for_a_file_of_runs(tmp_path: Path) -> None:

@@ -253,13 +253,10 @@ def test_results_are_not_merged_into_results(part: Callable[..., Path]) -> None:
         merge(a, [a, b])
 
 
-def with_weights(folder: Path, weights: str | None) -> Path:
-    """All its episodes as if these weights had played them; None: as if it were older than the column."""
+def with_weights(folder: Path, weights: str) -> Path:
+    """All its episodes as if these weights had played them."""
     with closing(sqlite3.connect(folder / "results.db")) as db:
-        if weights is None:
-            db.execute("ALTER TABLE episodes DROP COLUMN weights")
-        else:
-            db.execute("UPDATE episodes SET weights = ?", (weights,))
+        db.execute("UPDATE episodes SET weights = ?", (weights,))
         db.commit()
     return folder
 
@@ -269,7 +266,7 @@ def test_other_weights_under_the_same_name_are_not_merged(part: Callable[..., Pa
     with pytest.raises(ConfigError, match=r"played by several weights under one name: .*'x'.*'y'.*merge those apart"):
         merge(tmp_path / "out", [a, b])
     with_weights(b, "x")
-    merge(tmp_path / "same", [a, b, with_weights(part("c", 0, 1), None)])
+    merge(tmp_path / "same", [a, b])
     found = {one.result.weights for cell in Results.load(tmp_path / "same").cells for one in cell.episodes}
     assert found == {"x"}
 

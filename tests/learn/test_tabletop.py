@@ -1,4 +1,4 @@
-"""`vlagents-ray learn tabletop`: student, teacher and learner in one process, and the whole loop at a small size."""
+"""examples/learn: student, teacher and learner in one process, and the whole loop at a small size."""
 
 from __future__ import annotations
 
@@ -7,31 +7,29 @@ import json
 import os
 import signal
 import subprocess
-import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
 import pytest
+from colours import named_colour, puck_position
 from eval_fakes import wait_for
-from live_server import LivePage
+from learner import RPDLearner, advantages, advice, inputs_of
 from ray_processes import end, processes, ray_folder
+from student import Student
 from tabletop_runs import ended, start_run, table
+from teacher import Teacher
+from train import ENV_OPTIONS, LearnPlan, Method, RunCheckpoints
 
 from vlagents_ray import Act, Agent, Obs
 from vlagents_ray.cli.options import read_run_file
 from vlagents_ray.envs.tabletop.env import Tabletop
 from vlagents_ray.errors import ConfigError, InvalidObservation, MissingCamera
 from vlagents_ray.interface import BEHAVIOUR, WANT
-from vlagents_ray.learn.tabletop.colours import named_colour, puck_position
-from vlagents_ray.learn.tabletop.learner import RPDLearner, advantages, advice, inputs_of
-from vlagents_ray.learn.tabletop.plan import LearnPlan, Method
-from vlagents_ray.learn.tabletop.run import ENV_OPTIONS, RunCheckpoints
-from vlagents_ray.learn.tabletop.student import Student
-from vlagents_ray.learn.tabletop.teacher import Teacher
 from vlagents_ray.testing.agents import check_agent
+
+pytestmark = pytest.mark.torch
 
 
 class ServedTeacher(Teacher):
@@ -106,7 +104,6 @@ def test_the_teacher_lifts_the_puck_and_gives_the_same_advice_to_others() -> Non
     np.testing.assert_array_equal(advice(ServedTeacher(), found), found["action"])  # type: ignore[arg-type]
 
 
-@pytest.mark.torch
 def test_the_student_keeps_what_an_agent_promises_and_neighbours_change_no_bit() -> None:
     student = Student()
     student.initialize()
@@ -127,7 +124,6 @@ def test_the_student_keeps_what_an_agent_promises_and_neighbours_change_no_bit()
     assert said["value"] == also["value"]
 
 
-@pytest.mark.torch
 def test_a_log_probability_is_that_of_the_normal_distribution_that_was_drawn_from() -> None:
     import torch
 
@@ -153,7 +149,6 @@ def test_advantages_are_those_of_the_formula() -> None:
     np.testing.assert_allclose(targets, gain + np.array([0.5, 0.25, 0, 0.75, 0.5]), rtol=1e-6)
 
 
-@pytest.mark.torch
 def test_the_learner_imitates_and_the_advised_one_stays_near_the_advice() -> None:
     learner, rows = taught()
     before, after = learner.imitate(1), learner.imitate(300)
@@ -165,7 +160,6 @@ def test_the_learner_imitates_and_the_advised_one_stays_near_the_advice() -> Non
     assert learner.state()["policy.0.weight"].ne(unchanged).any()
 
 
-@pytest.mark.torch
 def test_a_learner_goes_on_from_a_checkpoint_to_the_same_bit(tmp_path: Path) -> None:
     import torch
 
@@ -242,40 +236,22 @@ def folder() -> Iterator[Path]:
         yield folder
 
 
-@dataclass
-class WatchedRun:
-    """A run in which nothing was killed, and what its live page said meanwhile."""
-
-    table: dict[str, Any]
-    steps: set[int]  # that the curves have a point at
-    states: set[str]  # of the evaluation
-
-
 @pytest.fixture(scope="module")
-def undisturbed(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> WatchedRun:
-    """A run that ends by itself, watched while it learns."""
+def undisturbed(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """The table of a run in which nothing was killed."""
     out = tmp_path_factory.mktemp("runs") / "whole"
-    page, seen, states = LivePage(), set[int](), set[str]()
-    with start_run(folder, out, "--live-at", page.address) as run:
-        while run.poll() is None:
-            seen |= set(page.steps())
-            states |= {page.evaluation().get("state", "")}
-            time.sleep(0.2)
+    with start_run(folder, out) as run:
         printed = ended(run, folder)
     assert "demonstrations: 8 of 8 episodes solved" in printed
-    assert f"live: {page.url}/live" in printed
     assert (out / "report.html").is_file()
     found = table(out)
     assert list(found) == ["bc@300", "rpd@400"]
-    return WatchedRun(found, seen, states)
+    return found
 
 
 @pytest.mark.server
-@pytest.mark.torch
 @pytest.mark.slow
-def test_a_killed_run_that_nobody_watches_goes_on_to_the_same_table(
-    folder: Path, undisturbed: WatchedRun, tmp_path: Path
-) -> None:
+def test_a_killed_run_goes_on_to_the_same_table(folder: Path, undisturbed: dict[str, Any], tmp_path: Path) -> None:
     out = tmp_path / "run"
     with start_run(folder, out) as run:
         wait_until_rpd_learns(run, out)
@@ -283,13 +259,12 @@ def test_a_killed_run_that_nobody_watches_goes_on_to_the_same_table(
     end(folder)
     with start_run(folder, out, "--resume") as run:
         assert "demonstrations:" not in ended(run, folder)
-    assert table(out) == undisturbed.table
+    assert table(out) == undisturbed
 
 
 @pytest.mark.server
-@pytest.mark.torch
 @pytest.mark.slow
-def test_killed_replicas_and_workers_change_nothing(folder: Path, undisturbed: WatchedRun, tmp_path: Path) -> None:
+def test_killed_replicas_and_workers_change_nothing(folder: Path, undisturbed: dict[str, Any], tmp_path: Path) -> None:
     out, pushed, killed = tmp_path / "run", tmp_path / "pushed", tmp_path / "killed"
     with start_run(folder, out, before=HELD.format(pushed=str(pushed), killed=str(killed))) as run:
         wait_for(lambda: pushed.exists() or run.poll() is not None, timeout_s=400)
@@ -298,23 +273,15 @@ def test_killed_replicas_and_workers_change_nothing(folder: Path, undisturbed: W
                 os.kill(pid, signal.SIGKILL)
         killed.touch()
         assert "once more, as the policy was restarted" in ended(run, folder)
-    assert table(out) == undisturbed.table
-
-
-@pytest.mark.server
-@pytest.mark.torch
-@pytest.mark.slow
-def test_a_run_is_watched_while_it_learns(undisturbed: WatchedRun) -> None:
-    assert {300, 400} <= undisturbed.steps  # those that are evaluated
-    assert "waiting" in undisturbed.states
+    assert table(out) == undisturbed
 
 
 # A run that waits when the replica of `rpd` holds the weights of its second iteration, before episodes are played.
 HELD = """
 import pathlib, time
-from vlagents_ray.learn.tabletop.run import _LearnRun
+from train import LearnRun
 
-collect, pushed, killed = _LearnRun._collect, pathlib.Path({pushed!r}), pathlib.Path({killed!r})
+collect, pushed, killed = LearnRun._collect, pathlib.Path({pushed!r}), pathlib.Path({killed!r})
 
 def held(self, rollouts, version):
     if version == 350:
@@ -323,7 +290,7 @@ def held(self, rollouts, version):
             time.sleep(0.1)
     return collect(self, rollouts, version)
 
-_LearnRun._collect = held
+LearnRun._collect = held
 """
 
 

@@ -10,18 +10,20 @@ import numpy as np
 import pytest
 import yaml
 from eval_fakes import wait_for
+from grpo import GRPOLearner, group_advantages
+from learner import inputs_of
 from ray_processes import end, ray_folder
 from tabletop_runs import ended, start_run, table
+from teacher import Teacher
+from token_student import TOKENS, TokenStudent, actions_of, tokens_of
+from train import ENV_OPTIONS
 
 from vlagents_ray import Act, Obs
 from vlagents_ray.envs.tabletop.env import Tabletop
 from vlagents_ray.interface import BEHAVIOUR, WANT
-from vlagents_ray.learn.tabletop.grpo import GRPOLearner, group_advantages
-from vlagents_ray.learn.tabletop.learner import inputs_of
-from vlagents_ray.learn.tabletop.run import ENV_OPTIONS
-from vlagents_ray.learn.tabletop.teacher import Teacher
-from vlagents_ray.learn.tabletop.token_student import TOKENS, TokenStudent, actions_of, tokens_of
 from vlagents_ray.testing.agents import check_agent
+
+pytestmark = pytest.mark.torch
 
 STEPS = 6  # of an episode
 
@@ -86,7 +88,6 @@ def test_advantages_are_those_of_the_formula_and_groups_of_one_outcome_have_none
     np.testing.assert_allclose(group_advantages(columns).reshape(8, 3), expected, rtol=1e-6)
 
 
-@pytest.mark.torch
 def test_the_student_keeps_what_an_agent_promises_and_neighbours_change_no_bit() -> None:
     check_agent(TokenStudent(), instructions=["lift the red puck", "lift the blue puck", "lift the green puck"])
     (student, obs), (other, _) = ready(seed=3), ready("lift the blue puck", seed=4)
@@ -102,7 +103,6 @@ def test_the_student_keeps_what_an_agent_promises_and_neighbours_change_no_bit()
     assert set(said) == set(student.contract.behaviour)
 
 
-@pytest.mark.torch
 def test_a_log_probability_is_that_of_the_softmax_which_the_tokens_are_drawn_from() -> None:
     import torch
 
@@ -125,7 +125,6 @@ def test_a_log_probability_is_that_of_the_softmax_which_the_tokens_are_drawn_fro
     np.testing.assert_array_equal(student.act(obs).action, actions_of(softmax.probs.argmax(-1).numpy()))
 
 
-@pytest.mark.torch
 def test_the_learner_imitates_the_tokens_of_actions() -> None:
     teacher, env = Teacher(), Tabletop("lift", **ENV_OPTIONS)
     obs, _ = env.reset(seed=0)
@@ -142,7 +141,6 @@ def test_the_learner_imitates_the_tokens_of_actions() -> None:
     np.testing.assert_array_equal(student.act(obs).action, actions_of(tokens_of(action)))
 
 
-@pytest.mark.torch
 def test_the_tokens_of_the_better_episodes_of_a_group_become_likelier() -> None:
     import torch
 
@@ -163,7 +161,6 @@ def test_the_tokens_of_the_better_episodes_of_a_group_become_likelier() -> None:
     assert min(gained[0], gained[3]) > 0 > max(gained[1], gained[2])
 
 
-@pytest.mark.torch
 def test_without_a_group_of_both_outcomes_the_weights_stay() -> None:
     student, _ = ready()
     columns = transitions([student] * 2, [10, 10], [False, False])
@@ -174,7 +171,6 @@ def test_without_a_group_of_both_outcomes_the_weights_stay() -> None:
 
 
 @pytest.mark.server
-@pytest.mark.torch
 @pytest.mark.slow
 def test_the_example_killed_after_an_iteration_goes_on_to_the_table_of_a_whole_run(tmp_path: Path) -> None:
     example = yaml.safe_load((Path(__file__).parents[2] / "examples/learn/grpo.yaml").read_text())

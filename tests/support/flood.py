@@ -137,7 +137,7 @@ def _raw_frame() -> bytes:
 
 
 def _probe() -> bytes:
-    return b"VLA?\1\0\0\0" + _frame()  # as clients of earlier versions measured codecs
+    return b"VLA?\0\0\0\0" + _frame()
 
 
 def _map(**more: Any) -> bytes:

@@ -11,7 +11,7 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
-from vlagents_ray.bench.peers import REQUIREMENTS, set_up
+from benchmarks.peers import REQUIREMENTS, set_up
 from vlagents_ray.serve.python_env.create import python_in
 
 FOLDER = Path(os.environ.get("VLAGENTS_PEERS", Path(__file__).parents[2] / ".venv-peers"))

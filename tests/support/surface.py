@@ -190,7 +190,7 @@ def database() -> Iterator[str]:
     connection = sqlite3.connect(":memory:")
     module = importlib.import_module("vlagents_ray.evaluate.results.database")
     yield f"version: {module.VERSION}"
-    connection.executescript(module.SCHEMA + module.WORKERS)
+    connection.executescript(module.SCHEMA)
     for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table' ORDER BY name").fetchall():
         found = connection.execute(f"PRAGMA table_info({name})").fetchall()
         yield f"{name}: {', '.join(f'{column[1]} {column[2]}' for column in found)}"

@@ -1,4 +1,4 @@
-"""Runs of `vlagents-ray learn tabletop`, each in a Ray of its own."""
+"""Runs of examples/learn/train.py, each in a Ray of its own."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 from subprocess import PIPE
 
+from example_files import EXAMPLES
 from ray_processes import processes
 
 from vlagents_ray.evaluate import Results
@@ -15,9 +16,10 @@ from vlagents_ray.evaluate.results.summary import pushed_of
 
 
 def start_run(folder: Path, out: Path, *options: str, before: str = "") -> subprocess.Popen[str]:
-    """Start the command with the plan of `folder`, where its Ray is, in a process that runs `before` first."""
-    code = before + "\nfrom vlagents_ray.cli import main; main()"
-    command = [sys.executable, "-c", code, "learn", "tabletop"]
+    """Start the example with the plan of `folder`, where its Ray is, in a process that runs `before` first."""
+    script = str(EXAMPLES / "learn" / "train.py")
+    code = f"import sys; sys.argv[0] = {script!r}; sys.path.insert(0, {str(EXAMPLES / 'learn')!r})\nimport train\n"
+    command = [sys.executable, "-c", f"{code}{before}\ntrain.typer.run(train.main)"]
     command += [str(folder / "plan.yaml"), "--out", str(out), *options]
     return subprocess.Popen(
         command, env=os.environ | {"RAY_TMPDIR": str(folder)}, stdout=PIPE, stderr=subprocess.STDOUT, text=True

@@ -1,7 +1,7 @@
 """Clients of ours, each in a process of its own or a Ray actor: `python -m vlagents_ray.bench.clients JSON`.
 
-The peers' clients run in such processes too; and one inside another network namespace must. A process holds one
-client, which makes calls when it is its turn (`BenchCaller`), or several, which make load (`LoadGenerator`).
+A process holds one client, which makes calls when it is its turn (`BenchCaller`), or several, which make load
+(`LoadGenerator`).
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from typing import Any, get_args
 
 import numpy as np
 
+from vlagents_ray.bench.line_client import WARM_UP, die_with_parent, obey, own_stdout, timed
 from vlagents_ray.bench.line_process import CALL_S, START_S, Driver, LineProcess, ProcessDriver, our_environment
-from vlagents_ray.bench.peers.peer import WARM_UP, die_with_parent, obey, own_stdout, timed
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.transports.select import TransportName
 from vlagents_ray.errors import ConfigError

@@ -1,4 +1,4 @@
-"""Processes of a benchmark: each obeys the line protocol of `peers/peer.py`, and never outlives this process."""
+"""Processes of a benchmark: each obeys the line protocol of `line_client`, and never outlives this process."""
 
 from __future__ import annotations
 

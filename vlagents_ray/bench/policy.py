@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.bench.clients import observation
-from vlagents_ray.bench.peers.peer import die_with_parent, own_stdout
+from vlagents_ray.bench.line_client import die_with_parent, own_stdout
 from vlagents_ray.bench.tuning.measured_policy import (
     MeasuredPolicy,
     QueuedTurn,

@@ -1,4 +1,4 @@
-"""Round trips of one `act`: every transport of ours, and the peers' servers, interleaved in one run.
+"""Round trips of one `act` by every transport, interleaved in one run.
 
 The observation is that of the paper's measurement: two 224x224 RGB cameras and seven joints. All ways
 take turns in short rounds, in an order drawn anew each time, so that whatever else the machine does hits
@@ -13,6 +13,7 @@ import contextlib
 import random
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,18 +23,19 @@ import numpy as np
 from vlagents_ray.bench.clients import OwnClient, connected, observation, own_clients, save_observation
 from vlagents_ray.bench.figures import RoundTrips, lost_db, ratios
 from vlagents_ray.bench.line_process import Driver
-from vlagents_ray.bench.peers import PeerClient, peer_clients, peer_connected
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.noop import Noop
 from vlagents_ray.serve.launch.deployment_file import deployment
-from vlagents_ray.serve.launch.server import free_port, running_server
+from vlagents_ray.serve.launch.server import running_server
 
 POLICY = "vlagents_ray.bench.rtt:MeasuredNoop"
 LOOPBACK = "127.0.0.1"
 ROUND = 100  # calls of one way before it is the next one's turn
 UNBROKEN = 200  # rounds' worth of calls without a break: a second or two
 ON_NODE = ("shm", "plasma")
+
+StartClient = Callable[[Path], AbstractContextManager[Driver]]  # from the file of the observation, a client of a server
 
 
 class MeasuredNoop(Noop):
@@ -53,7 +55,6 @@ class RoundTripsOfAll:
     ours: tuple[RoundTrips, ...]
     theirs: tuple[RoundTrips, ...] = ()
     skipped: Mapping[str, str] = field(default_factory=dict)
-    versions: Mapping[str, str] = field(default_factory=dict)  # of the peers' packages
     steady: tuple[RoundTrips, ...] = ()  # of the ways on the node, one after the other, each without a break
     psnr_db: Mapping[str, float | None] = field(default_factory=dict)  # of what the policy saw, by way; None: all of it
 
@@ -65,55 +66,58 @@ class RoundTripsOfAll:
             "ratios": ratios(self.ours, self.theirs),
             "steady": [trips.to_json() for trips in self.steady],
             "skipped": dict(self.skipped),
-            "versions": dict(self.versions),
         }
 
 
 def measure_rtt(
-    calls: int = 1000,
-    *,
-    transports: Sequence[str] = (),
-    peers: Sequence[str] = (),
-    peers_python: Path = Path("python"),
-    progress: Callable[[str], None] = lambda _: None,
+    calls: int = 1000, *, transports: Sequence[str] = (), progress: Callable[[str], None] = lambda _: None
 ) -> RoundTripsOfAll:
-    """Measure `calls` round trips of each client (rounded up to whole rounds), on servers started for them.
+    """Measure `calls` round trips by each transport (rounded up to whole rounds), on a server started for them.
 
-    `transports` are those of ours, by default all. `peers` are names from `vlagents_ray.bench.peers.PEERS`, or
-    "all"; one that is not installed for `peers_python` is in `skipped`, with the cure.
+    Args:
+        calls: Round trips of each client.
+        transports: Names of transports; by default all.
+        progress: Is called with lines of progress.
     """
     own, skipped = own_clients(transports)
-    others, absent, versions = peer_clients(peers, peers_python)
-    return measure(own, others, calls, peers_python, skipped | absent, versions, progress)
+    return measure(own, calls, progress, skipped=skipped)
 
 
 def measure(
     own: Sequence[OwnClient],
-    others: Sequence[PeerClient],
     calls: int,
-    peers_python: Path,
-    skipped: Mapping[str, str],
-    versions: Mapping[str, str],
     progress: Callable[[str], None],
     *,
+    others: Mapping[str, StartClient] | None = None,
+    skipped: Mapping[str, str] | None = None,
     host: str = LOOPBACK,
     prefix: Sequence[str] = (),
 ) -> RoundTripsOfAll:
-    """Measure all clients against servers on `host`; the commands of the clients begin with `prefix`."""
+    """Measure clients of ours, and others by name with servers of their own, in turns.
+
+    Args:
+        own: Clients of a server that is started on `host`.
+        calls: Round trips of each client.
+        progress: Is called with lines of progress.
+        others: Starts each other client, and its server.
+        skipped: Names of what is not measured, with the reasons.
+        host: The address of our server.
+        prefix: The first words of the command of each of our clients.
+    """
+    others = others or {}
     drivers: dict[str, Driver] = {}
     with contextlib.ExitStack() as stack:
         obs = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "observation.npz"
         save_observation(observation(), obs)
-        for peer in others:  # before Ray, whose start is what takes the time
-            client = peer_connected(peer, peers_python, host, free_port(host), obs, prefix)
-            drivers[peer.name] = stack.enter_context(client)
+        for name, start in others.items():  # before Ray, whose start is what takes the time
+            drivers[name] = stack.enter_context(start(obs))
         # Without keys: another host than loopback is one end of a link that only this run knows.
         server = stack.enter_context(running_server(deployment(POLICY), host=host, insecure=host != LOOPBACK))
         [(app, url)] = server.apps.items()
         for one in own:
             drivers[one.name] = stack.enter_context(connected(one, url, app, prefix))
         if not drivers:
-            raise ConfigError("nothing to measure: want a transport or a peer")
+            raise ConfigError("nothing to measure: want a transport or another server")
         said = {name: driver.ready() for name, driver in drivers.items()}
         found = in_turns(drivers, calls, progress)
         steady = [
@@ -123,9 +127,8 @@ def measure(
         ]
     return RoundTripsOfAll(
         tuple(found[one.name] for one in own),
-        tuple(found[peer.name] for peer in others),
-        skipped,
-        versions,
+        tuple(found[name] for name in others),
+        skipped or {},
         tuple(steady),
         {one.name: said[one.name]["psnr_db"] for one in own},
     )

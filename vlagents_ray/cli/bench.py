@@ -2,27 +2,20 @@
 
 from __future__ import annotations
 
-import json
-import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.text import Text
 
 from vlagents_ray.cli.console import errors, out, progress, save, table
 from vlagents_ray.cli.options import Set, parse_counts, parse_dims, parse_list, parse_policy, parse_settings
-from vlagents_ray.errors import ConfigError
 
 if TYPE_CHECKING:
-    from vlagents_ray.bench.report.section import Outcome
     from vlagents_ray.bench.throughput import ThroughputPlan
 
-bench = typer.Typer(no_args_is_help=True, help="Measure on this machine what the README claims.")
-
-PEERS_DIR = Path(".venv-peers")
-DEFAULT_PEERS_PYTHON = PEERS_DIR / "bin" / "python"
+bench = typer.Typer(no_args_is_help=True, help="Measure transports and policies on this machine.")
 
 # Options that several commands have.
 Calls = Annotated[int, typer.Option(min=1, help="Round trips by each way.")]
@@ -30,68 +23,29 @@ Seconds = Annotated[float, typer.Option(min=0.1, help="Of each measurement.")]
 Rounds = Annotated[int, typer.Option(min=1)]
 Json = Annotated[Path | None, typer.Option("--json", help="Write the figures here.")]
 Plot = Annotated[Path | None, typer.Option("--plot", help="Draw the figures here: .png, .svg or .pdf.")]
-PeersPython = Annotated[
-    Path, typer.Option(help="The Python of the peers' environment, which `bench peers-setup` makes.")
-]
-Peers = Annotated[str, typer.Option(help="vlagents, openpi, openvla, vla-eval, with commas between them, or 'all'.")]
+Transports = Annotated[str, typer.Option(help="shm,websocket,http,handle,plasma; default: all.")]
 
 
 @bench.command("rtt")
 def bench_rtt(
     calls: Calls = 1000,
-    transports: Annotated[str, typer.Option(help="Of ours: shm,websocket,http,handle,plasma; default: all.")] = "",
-    peers: Peers = "",
-    peers_python: PeersPython = DEFAULT_PEERS_PYTHON,
+    transports: Transports = "",
     json_file: Json = None,
     plot: Plot = None,
 ) -> None:
-    """Round trips to a `noop` policy on this machine: every transport, and other policy servers, interleaved."""
+    """Round trips to a `noop` policy on this machine by every transport, in turns."""
     from vlagents_ray.bench.figures import check_plot_file, plot_round_trips
-    from vlagents_ray.bench.report.machine import measured_on
+    from vlagents_ray.bench.machine import measured_on
     from vlagents_ray.bench.rtt import measure_rtt
 
     with errors():
         check_plot_file(plot)
         origin = measured_on()
-        found = measure_rtt(
-            calls,
-            transports=parse_list(transports),
-            peers=parse_list(peers),
-            peers_python=peers_python,
-            progress=progress,
-        ).to_json()
+        found = measure_rtt(calls, transports=parse_list(transports), progress=progress).to_json()
         show_round_trips(found, "round trip of one act on this machine")
-        save(_joined(origin, found), json_file)
+        save({**origin, **found}, json_file)
         if plot is not None:
             plot_round_trips(found, plot)
-
-
-@bench.command("link")
-def bench_link(
-    calls: Calls = 600,
-    rate: Annotated[str, typer.Option(help="Of the link, as tc writes it.")] = "1gbit",
-    delay: Annotated[str | None, typer.Option(help="Each way, as tc writes it: 2ms. Needs the kernel's netem.")] = None,
-    peers: Peers = "vlagents,openpi",
-    peers_python: PeersPython = DEFAULT_PEERS_PYTHON,
-    json_file: Json = None,
-    plot: Plot = None,
-) -> None:
-    """Round trips over a link of 1 Gbit/s between two network namespaces on this machine."""
-    from vlagents_ray.bench.figures import check_plot_file, plot_round_trips
-    from vlagents_ray.bench.link import measure_link
-    from vlagents_ray.bench.report.machine import measured_on
-
-    with errors():
-        check_plot_file(plot)
-        origin = measured_on()
-        found = measure_link(
-            calls, rate=rate, delay=delay, peers=parse_list(peers), peers_python=peers_python, progress=progress
-        )  # fmt: skip
-        title = f"round trip of one act over {found['link']['measured_mbit_per_s']:.0f} Mbit/s"
-        show_round_trips(found, title)
-        save(_joined(origin, found), json_file)
-        if plot is not None:
-            plot_round_trips(found, plot, title)
 
 
 @bench.command("throughput")
@@ -118,7 +72,7 @@ def bench_throughput(
     json_file: Json = None,
 ) -> None:
     """Actions a second of many clients on one replica, against the ideal, or the bare policy in the same run."""
-    from vlagents_ray.bench.report.machine import measured_on
+    from vlagents_ray.bench.machine import measured_on
     from vlagents_ray.bench.throughput import ThroughputPlan, measure_throughput
 
     with errors():
@@ -132,7 +86,7 @@ def bench_throughput(
         )  # fmt: skip
         found = measure_throughput(plan, progress)
     show_throughput(found)
-    save(_joined(origin, found), json_file)
+    save({**origin, **found}, json_file)
 
 
 @bench.command("policy")
@@ -150,8 +104,8 @@ def bench_policy(
     json_file: Json = None,
 ) -> None:
     """Actions a second of one policy alone, by batch size: bare, and behind its batch queue; without Ray."""
+    from vlagents_ray.bench.machine import measured_on
     from vlagents_ray.bench.policy import PolicyPlan, measure_policy
-    from vlagents_ray.bench.report.machine import measured_on
     from vlagents_ray.serve.launch.deployment_file import server_args
 
     with errors():
@@ -160,22 +114,7 @@ def bench_policy(
         plan = PolicyPlan(args, batches, seconds, rounds, image, parse_dims(state, "--state"))
         found = measure_policy(plan, progress)
     show_policy(found)
-    save(_joined(origin, found), json_file)
-
-
-@bench.command("checkpoint")
-def bench_checkpoint(
-    family: Annotated[str, typer.Argument(help="pi0, smolvla, pi05, act, diffusion or openvla.")],
-    folder: Annotated[Path, typer.Argument(help="A new folder.")],
-    size: Annotated[Literal["full", "small"], typer.Option(help="full: as published; small: for a CPU.")] = "full",
-    dtype: Annotated[str | None, typer.Option(help="Of the weights; default: bfloat16, if the family has it.")] = None,
-) -> None:
-    """Random weights of a family's true size, and a deployment file of them; run it in the family's environment."""
-    from vlagents_ray.bench.checkpoints.recipes import write_checkpoint
-
-    with errors():
-        written = write_checkpoint(family, folder, size, dtype)
-    out.print(f"{written.parameters:,} parameters: vlagents-ray bench policy {folder / 'deployment.yaml'} --json FILE")
+    save({**origin, **found}, json_file)
 
 
 @bench.command("compare")
@@ -184,7 +123,7 @@ def bench_compare(
     new: Annotated[Path, typer.Argument(help="Another one, of the same command.")],
 ) -> None:
     """Two runs side by side: each figure of both, and in what their machines and versions differ."""
-    from vlagents_ray.bench.report.comparison import compare_figures, read_figures
+    from vlagents_ray.bench.comparison import compare_figures, read_figures
 
     with errors():
         found = compare_figures(read_figures(old), read_figures(new))
@@ -200,80 +139,8 @@ def bench_compare(
             out.print(f"{title}: {line}", style="yellow")
 
 
-@bench.command("peers-setup")
-def bench_peers_setup(
-    folder: Annotated[Path, typer.Option("--dir", help="Folder of the environment.")] = PEERS_DIR,
-) -> None:
-    """Install other policy servers, at pinned versions, in a Python environment of their own."""
-    from vlagents_ray.bench.peers import set_up
-
-    with errors():
-        python = set_up(folder, progress)
-    used = "" if folder == PEERS_DIR else f" --peers-python {python}"
-    out.print(f"ready: vlagents-ray bench rtt --peers all{used}")
-
-
-@bench.command("report")
-def bench_report(
-    readme: Annotated[
-        Path, typer.Option("--page", "--readme", help="Its text between the bench markers is replaced.")
-    ] = Path("docs/measured.md"),
-    json_file: Annotated[Path, typer.Option("--json", help="Keep the figures here.")] = Path("benchmarks/latest.json"),
-    calls: Calls = 1000,
-    seconds: Annotated[float, typer.Option(min=0.1, help="Of each measurement of the throughput.")] = 2.0,
-    peers_python: PeersPython = DEFAULT_PEERS_PYTHON,
-    from_json: Annotated[bool, typer.Option("--from-json", help="Measure nothing: use the figures in --json.")] = False,
-) -> None:
-    """Measure everything, and write the README's benchmark section anew."""
-    from vlagents_ray.bench.report.section import collect, replaced, write
-    from vlagents_ray.bench.throughput import ThroughputPlan
-
-    with errors():
-        if not readme.is_file():
-            raise ConfigError(f"--readme {readme}: does not exist")
-        replaced(readme.read_text(), "")  # raises without markers, before anything is measured
-        if from_json:
-            try:
-                results = json.loads(json_file.read_text())
-            except (OSError, ValueError) as error:
-                raise ConfigError(f"--json {json_file}: cannot be read ({error})") from error
-        else:
-            results = collect(
-                peers_python, calls=calls, link_calls=calls, plan=ThroughputPlan(seconds=seconds), progress=progress
-            )  # fmt: skip
-        write(results, readme, None if from_json else json_file)
-    out.print(f"wrote {readme}")
-
-
-# Measurements that only developers repeat, in a checkout: the command that they were, and the module that they are.
-_MOVED = {
-    "eval": "overhead",
-    "evaluation": "evaluation",
-    "hop": "hop",
-    "soak": "soak",
-    "scaling": "scaling",
-    "autoscaling": "autoscaling",
-}
-_ANY = {"allow_extra_args": True, "ignore_unknown_options": True}
-
-
-def _moved(context: typer.Context) -> None:
-    words = shlex.join(["python", "-m", f"benchmarks.{_MOVED[str(context.info_name)]}", *context.args])
-    with errors():
-        raise ConfigError(f"`bench {context.info_name}` is not in the package any more; in a checkout run `{words}`")
-
-
-for _name, _module in _MOVED.items():
-    bench.command(_name, hidden=True, context_settings=_ANY, help=f"Moved: python -m benchmarks.{_module}")(_moved)
-
-
-def _joined(origin: Mapping[str, Any], found: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the figures with what they depend on, where peers' versions are among the versions."""
-    return {**origin, **found, "versions": {**origin["versions"], **found.get("versions", {})}}
-
-
 def show_round_trips(found: Mapping[str, Any], title: str) -> None:
-    """Print a row for each client, the fastest first; beside ours, the ratios to the peers."""
+    """Print a row for each client, the fastest first; beside ours, the ratios to other servers."""
     theirs = [peer["way"] for peer in found["peers"]]
     rows = table("way", "median ms", "95 % interval", "p99 ms", *(f"/ {name}" for name in theirs))
     rows.title = f"{title}: two 224x224 RGB cameras, no-op policy"
@@ -330,17 +197,6 @@ def show_throughput(found: Mapping[str, Any]) -> None:
         )
         out.print(f"{name}: {row['actions_per_s']:.1f} actions/s, {row['of_ideal']:.3f} of the ideal{waits}")
     show_skipped(found)
-
-
-def show_outcomes(lines: Sequence[Outcome]) -> None:
-    """Print targets, and whether they are met."""
-    if not lines:
-        return
-    rows = table("", "wanted", "measured", "met")
-    met = {True: Text("yes"), False: Text("no", "red"), None: Text("")}
-    for one in lines:
-        rows.add_row(one.what, one.wanted, one.measured, met[one.met])
-    out.print(rows)
 
 
 def show_skipped(found: Mapping[str, Any]) -> None:

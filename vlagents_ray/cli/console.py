@@ -80,9 +80,8 @@ def _model_of(error: ValidationError) -> tuple[type | None, str | None]:
     from vlagents_ray.evaluate import EvalConfig
     from vlagents_ray.evaluate.exports.hub import HubSettings
     from vlagents_ray.evaluate.exports.vla_eval import VlaEvalSettings
-    from vlagents_ray.learn.tabletop.plan import LearnPlan
 
-    options = {EvalConfig: None, LearnPlan: None, HubSettings: "--set", VlaEvalSettings: "--set"}
+    options = {EvalConfig: None, HubSettings: "--set", VlaEvalSettings: "--set"}
     return next(((model, option) for model, option in options.items() if model.__name__ == error.title), (None, None))
 
 

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -24,16 +23,14 @@ from vlagents_ray.cli.evaluation.results import (
 )
 from vlagents_ray.cli.keys import keys
 from vlagents_ray.cli.new import new
-from vlagents_ray.cli.options import Live, LiveAt, parse_list, read_run_file
 from vlagents_ray.cli.robot.command import robot_command
 from vlagents_ray.cli.serve import serve_command
 from vlagents_ray.cli.slurm import slurm
-from vlagents_ray.cli.tune.command import tune_command
+from vlagents_ray.cli.tune import tune_command
 from vlagents_ray.naming import did_you_mean
 
 if TYPE_CHECKING:
     from vlagents_ray.cli.listing import Listed
-    from vlagents_ray.evaluate import Progress
 
 OneName = Annotated[str | None, typer.Argument(metavar="[NAME]", help="Say all about this one alone.")]
 AsJson = Annotated[bool, typer.Option("--json", help="As JSON, for programs.")]
@@ -45,7 +42,6 @@ app = typer.Typer(
     help="Serve Vision-Language-Action models with Ray, and evaluate them in parallel simulation.",
 )
 env = typer.Typer(no_args_is_help=True, help="Python environments for policies that the server's own does not suit.")
-learn = typer.Typer(no_args_is_help=True, help="Policies that learn, with their server in the loop.")
 app.command("serve")(serve_command)
 
 
@@ -82,7 +78,6 @@ app.command("verify")(verify_command)
 app.add_typer(bench, name="bench")
 app.add_typer(env, name="env")
 app.add_typer(keys, name="keys")
-app.add_typer(learn, name="learn")
 app.add_typer(new, name="new")
 app.add_typer(slurm, name="slurm")
 
@@ -140,47 +135,6 @@ def doctor(port: Annotated[int, typer.Option(help="The port that a server would 
 @env.callback()
 def _group() -> None:
     """Keep `make` a command of its own."""
-
-
-@learn.callback()
-def _learn_group() -> None:
-    """Keep `tabletop` a command of its own."""
-
-
-@learn.command("tabletop")
-def learn_tabletop_command(
-    file: Annotated[Path | None, typer.Argument(help="Settings (.yaml), such as examples/learn/rpd.yaml.")] = None,
-    out_dir: Annotated[Path | None, typer.Option("--out", help="Folder of the results.")] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Of the networks and of the training's episodes.")] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with what is in --out.")] = False,
-    track: Annotated[str, typer.Option(help="Show success rates in: wandb, trackio, tensorboard.")] = "",
-    live: Live = False,
-    live_at: LiveAt = None,
-) -> None:
-    """A small policy learns to lift pucks, in minutes: from demonstrations, with a teacher's advice, and alone."""
-    from vlagents_ray.cli.evaluation.live import live_address, live_progress
-    from vlagents_ray.cli.ray_session import RESUME, exit_if_ray_is_lost, quiet_ray
-    from vlagents_ray.evaluate import SilentProgress, print_summary
-    from vlagents_ray.learn.tabletop.plan import LearnPlan
-    from vlagents_ray.learn.tabletop.progress import LearnBar
-    from vlagents_ray.learn.tabletop.run import learn_tabletop
-
-    given = {"out": out_dir, "seed": seed, "resume": resume or None, "track": parse_list(track) or None}
-    with errors():
-        settings = {} if file is None else read_run_file(file, "file of settings", "`methods`")
-        settings |= {name: value for name, value in given.items() if value is not None}
-        plan = LearnPlan.model_validate(settings)
-        page = live_address(live_at) if live or live_at else None
-
-        def watched(urls: Collection[str]) -> AbstractContextManager[Progress]:
-            return live_progress(plan.out, urls, page, SilentProgress(), goes_on=True)
-
-        try:
-            with quiet_ray(None), exit_if_ray_is_lost(RESUME), LearnBar(out) as bar:
-                summary = learn_tabletop(plan, bar, watched)
-        except KeyboardInterrupt:
-            raise KeyboardInterrupt(f"interrupted; go on with --resume --out {plan.out}") from None
-        print_summary(out, summary)
 
 
 @env.command("make")

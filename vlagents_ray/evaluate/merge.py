@@ -28,7 +28,7 @@ from vlagents_ray.evaluate.plan.config import canonical
 from vlagents_ray.evaluate.report.html import FILE as REPORT
 from vlagents_ray.evaluate.report.html import write_report
 from vlagents_ray.evaluate.results.changes import Change, changed, listed, policy_changes, program_changes
-from vlagents_ray.evaluate.results.database import FILE, SCHEMA, VERSION, WORKERS, insert
+from vlagents_ray.evaluate.results.database import FILE, SCHEMA, VERSION, insert
 from vlagents_ray.evaluate.results.reader import CellResults, Results, Run, Worker, episode_of, reading, table
 from vlagents_ray.evaluate.results.summary import Summary, checkpoint_of, summarize, weights_of, write_summary
 
@@ -85,7 +85,7 @@ def merge(out: Path, folders: Sequence[Path], *, keep_first: bool = False, accep
             conflicts += _add_episodes(merged, folder, db)
             if found:
                 last = merged.runs[-1]
-                earlier = json.loads(last.get("changes") or "[]")
+                earlier = json.loads(last["changes"] or "[]")
                 last["changes"] = canonical([*earlier, *(asdict(one) for one in found)])
     _require_one_checkpoint(merged, weights_may_differ=accept_changes)
     if conflicts and not keep_first:
@@ -135,10 +135,10 @@ def _add_cells(merged: _Merged, folder: Path, db: sqlite3.Connection) -> list[Ch
         if known["stop"] != row["stop"]:
             where = " ".join(filter(None, _name(row)))
             raise ConfigError(f"{folder}: {where} stops early by {row['stop']}, that before it by {known['stop']}")
-        programs = [None if one.get("program") is None else json.loads(one["program"]) for one in (known, row)]
+        programs = [None if one["program"] is None else json.loads(one["program"]) for one in (known, row)]
         changes |= dict.fromkeys(program_changes(f"env {row['env']}", *programs))
         for name in ("described", "contract", "code", "program"):
-            known[name] = known.get(name) or row.get(name)
+            known[name] = known[name] or row[name]
         _extend(known, row, folder)
     return list(changes)
 
@@ -193,7 +193,7 @@ def _require_one_checkpoint(merged: _Merged, *, weights_may_differ: bool) -> Non
         cell, checkpoint = merged.cells[row["cell"]], row["checkpoint"]
         if checkpoint is not None:
             checkpoints.setdefault(row["cell"], {}).setdefault(checkpoint, row["key"])
-        if (found := row.get("weights")) is not None:  # older results have none
+        if (found := row["weights"]) is not None:
             weights.setdefault((cell["policy"], cell["step"], checkpoint), {}).setdefault(found, row["key"])
     several = [(merged.cells[cell]["env"], "checkpoints", found) for cell, found in checkpoints.items()]
     named = {} if weights_may_differ else weights
@@ -235,7 +235,7 @@ def _write(merged: _Merged, path: Path) -> None:
         "workers": merged.workers,
     }
     with closing(sqlite3.connect(path)) as db:
-        db.executescript(f"BEGIN; {SCHEMA} {WORKERS} PRAGMA user_version = {VERSION}; COMMIT;")
+        db.executescript(f"BEGIN; {SCHEMA} PRAGMA user_version = {VERSION}; COMMIT;")
         with db:
             for name, rows in tables.items():
                 for row in rows:

@@ -139,7 +139,7 @@ def _is_abandoned(mark: Path, what: dict[str, Any]) -> bool:
     if what.get("job"):
         return False
     try:
-        since = what.get("at") or mark.stat().st_mtime  # files of older versions, or of a killed process, have no time
+        since = what.get("at") or mark.stat().st_mtime  # the file of a process that was killed has no time
     except FileNotFoundError:
         return False
     if time.time() - since > _ABANDONED_S:

@@ -70,24 +70,22 @@ def test_the_default_is_what_the_file_gives_as_it_is() -> None:
 def test_the_settings_are_those_that_differ_from_the_file() -> None:
     assert chosen_settings(point(OWN, 16, 1), BatchArgs(), None) == {}
     assert chosen_settings(point(BF16, 8, 1), BatchArgs(), None) == {
-        ("config", "dtype"): "bfloat16",
-        ("batch", "max_size"): 8,
+        "config": {"dtype": "bfloat16"},
+        "batch": {"max_size": 8},
     }
     assert chosen_settings(point(COMPILED, 2, 1), BatchArgs(), None) == {
-        ("config", "compile"): True,
-        ("config", "batch_sizes"): [1, 2],
-        ("batch", "max_size"): 2,
+        "config": {"compile": True, "batch_sizes": [1, 2]},
+        "batch": {"max_size": 2},
     }
 
 
 def test_fixed_sizes_of_the_file_end_at_the_chosen_one() -> None:
-    assert chosen_settings(point(OWN, 4, 1), BatchArgs(max_size=4), [1, 4, 16]) == {("config", "batch_sizes"): [1, 4]}
-    assert chosen_settings(point(OWN, 4, 1), BatchArgs(sizes=[1, 4, 16]), None) == {("batch", "sizes"): [1, 4]}
+    assert chosen_settings(point(OWN, 4, 1), BatchArgs(max_size=4), [1, 4, 16]) == {"config": {"batch_sizes": [1, 4]}}
+    assert chosen_settings(point(OWN, 4, 1), BatchArgs(sizes=[1, 4, 16]), None) == {"batch": {"sizes": [1, 4]}}
     assert chosen_settings(point(OWN, 16, 1), BatchArgs(sizes=[1, 4, 16]), [1, 4, 16]) == {}
 
 
-def test_the_chosen_row_of_the_table_is_marked() -> None:
-    points = [point(OWN, 1, 10), point(COMPILED, 4, 40)]
-    _, first, second = figures(points, points[1])
-    assert first[:3] == ["", "own settings", "1"]
-    assert second == ["*", "compile: true", "4", "40.0", "25.0", "50.0", "100", "0.100%"]
+def test_the_table_has_a_row_for_each_point() -> None:
+    _, first, second = figures([point(OWN, 1, 10), point(COMPILED, 4, 40)])
+    assert first[:2] == ["own settings", "1"]
+    assert second == ["compile: true", "4", "40.0", "25.0", "50.0", "100", "0.100%"]

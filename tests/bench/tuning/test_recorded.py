@@ -19,7 +19,7 @@ def record(file: Path, first: float, steps: int = 5, frames: int = 6, part: str 
     state = {part: first + np.arange(steps + 1, dtype=np.float32)[:, None] * np.ones(2, np.float32)}
     trajectory = Trajectory(
         np.zeros((steps, 2), np.float32), np.zeros(steps), np.zeros(steps, bool), state,
-        np.linspace(0, 1, steps + 1, dtype=np.float32), ("front",),
+        np.linspace(0, 1, steps + 1, dtype=np.float32), ("front",), np.full(steps, -1),
     )  # fmt: skip
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_bytes(trajectory.to_bytes())

@@ -185,7 +185,7 @@ def test_a_file_that_is_no_results_is_one_sentence(tmp_path: Path, damage: bytes
 def test_a_folder_that_cannot_be_written_to_is_read(config: Config, mode: str) -> None:
     begun(config()).close()
     with closing(sqlite3.connect(config().out / "results.db")) as db:
-        db.execute(f"PRAGMA journal_mode = {mode}")  # "wal": as older versions left it
+        db.execute(f"PRAGMA journal_mode = {mode}")  # "wal": as a killed evaluation leaves it
     done = python_on(READ_ONLY, config().out, COUNT)
     assert done.stdout.split() == ["1"], done.stderr
 

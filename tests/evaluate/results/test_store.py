@@ -195,19 +195,6 @@ def test_where_workers_ran_is_kept(config: Config) -> None:
     ]
 
 
-def test_results_from_before_workers_were_noted_are_read_and_gone_on_with(config: Config) -> None:
-    with Store(config()) as store:
-        store.begin_run(config(), {})
-        store.record(done(planned(config())[0].key), attempts=1)
-    with closing(sqlite3.connect(config().out / "results.db")) as db:
-        db.execute("DROP TABLE workers")
-    assert Results.load(config().out).workers == ()
-    with Store(config(resume=True)) as store:
-        store.begin_run(config(resume=True), {})
-        store.note_worker(WorkerInfo("here", None, 1, "policy", "local", None))
-    assert [(one.run, one.host) for one in Results.load(config().out).workers] == [(2, "here")]
-
-
 def test_a_results_file_of_another_version_is_refused(config: Config) -> None:
     Store(config()).close()
     with closing(sqlite3.connect(config().out / "results.db")) as db:
@@ -323,26 +310,8 @@ def test_a_server_with_other_weights_is_noticed_before_anything_is_played(config
     said = {"policy": "act", "checkpoint": "a"}
     with Store(config()) as store:
         store.begin_run(config(), {})
-        store.note_policy("policy", said)  # of an older server, which tells no weights
+        store.note_policy("policy", said)  # of a server that tells no weights
         store.note_policy("policy", said | {"weights": {"digest": "x", "revision": None}})
         store.note_policy("policy", said | {"weights": {"digest": "x", "revision": "c0ffee"}})
         with pytest.raises(ConfigError, match=r"(?s)policy policy: weights was x, is y\n.*--accept-changes"):
             store.note_policy("policy", said | {"weights": {"digest": "y", "revision": None}})
-
-
-def test_results_that_were_begun_without_weights_are_gone_on_with(config: Config) -> None:
-    first, second = (job.key for job in planned(config())[:2])
-    with Store(config()) as store:
-        store.begin_run(config(), {})
-        store.record(done(first), attempts=1)
-    with closing(sqlite3.connect(config().out / "results.db")) as db:
-        for column in ("weights", "revision", "policy_version", "policy_fingerprint", "first_policy_version"):
-            db.execute(f"ALTER TABLE episodes DROP COLUMN {column}")
-        db.commit()
-    assert [one.weights for one in recorded(config())] == [None]  # as it is
-    played = {"weights": "a", "policy_version": 7, "policy_fingerprint": "9f3c", "first_policy_version": 6}
-    with Store(config(resume=True)) as store:
-        store.begin_run(config(), {})
-        store.record(replace(done(second), **played), attempts=1)
-    for name, value in played.items():
-        assert [getattr(one, name) for one in recorded(config())] == [None, value]

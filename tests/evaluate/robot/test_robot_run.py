@@ -74,7 +74,7 @@ class Talkative(Reaching):
     """A policy whose connection logs its name."""
 
     def act(self, obs: Obs) -> Act:
-        logging.getLogger("vlagents_ray.client.recovery").warning("%s: slow, at %s", self.name, URLS[self.name])
+        logging.getLogger("vlagents_ray.client.connection").warning("%s: slow, at %s", self.name, URLS[self.name])
         logging.getLogger("ray.serve").error("replica of %s", self.name)
         return super().act(obs)
 

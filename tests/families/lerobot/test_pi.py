@@ -19,11 +19,11 @@ from lerobot.policies.rtc.configuration_rtc import RTCConfig
 from normal_steps import logprob_of_steps
 from safetensors.torch import load_file, save_file
 
+from benchmarks.checkpoints.lerobot import local_tokenizer
+from benchmarks.checkpoints.tokenizer import fast_tokenizer
 from tests.families.lerobot import tiny
 from tests.families.lerobot.conftest import TASKS, begun, view
 from tests.families.lerobot.test_upstream import Theirs, draws_of
-from vlagents_ray.bench.checkpoints.lerobot import local_tokenizer
-from vlagents_ray.bench.checkpoints.tokenizer import fast_tokenizer
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import BEHAVIOUR, DELAY, DISTRIBUTION, LEFTOVER, SAMPLES, WANT, Act
 from vlagents_ray.policies.lerobot import LeRobot

@@ -1,4 +1,4 @@
-"""π0.5 of `vlagents-ray bench checkpoint`, where transformers has openpi's changes: see `collect_ignore`."""
+"""π0.5 of `python -m benchmarks.checkpoints`, where transformers has openpi's changes: see `collect_ignore`."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.checkpoints import lerobot as recipe
+from benchmarks.checkpoints.recipe import Recipe
 from tests.families.lerobot.conftest import FILTERS
-from vlagents_ray.bench.checkpoints import lerobot as recipe
-from vlagents_ray.bench.checkpoints.recipe import Recipe
 
 pytestmark = FILTERS
 

@@ -1,4 +1,4 @@
-"""`vlagents-ray bench checkpoint` writes LeRobot checkpoints that the policy loads and acts with."""
+"""`python -m benchmarks.checkpoints` writes LeRobot checkpoints that the policy loads and acts with."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.checkpoints import lerobot as recipe
+from benchmarks.checkpoints.recipe import Recipe
+from benchmarks.checkpoints.recipes import write_checkpoint
 from tests.families.lerobot.conftest import FILTERS
-from vlagents_ray.bench.checkpoints import lerobot as recipe
-from vlagents_ray.bench.checkpoints.recipe import Recipe
-from vlagents_ray.bench.checkpoints.recipes import write_checkpoint
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.lerobot import LeRobot
 from vlagents_ray.testing.observations import random_observation

@@ -25,9 +25,9 @@ import torch
 from lerobot.policies.factory import get_policy_class
 from transformers import SmolVLMForConditionalGeneration
 
+from benchmarks.checkpoints import lerobot as recipes
+from benchmarks.checkpoints.tokenizer import byte_level, fast_tokenizer
 from tests.families.lerobot import tiny06
-from vlagents_ray.bench.checkpoints import lerobot as recipes
-from vlagents_ray.bench.checkpoints.tokenizer import byte_level, fast_tokenizer
 
 STATE, ACTION, SIDE = 6, 6, 64
 CHUNK, EXECUTED = 8, 4

@@ -12,7 +12,7 @@ import safetensors.torch
 import torch
 import transformers
 
-from vlagents_ray.bench.checkpoints.tokenizer import byte_level, fast_tokenizer
+from benchmarks.checkpoints.tokenizer import byte_level, fast_tokenizer
 
 _VISION = ("<|vision_start|>", "<|image_pad|>", "<|vision_end|>", "<|video_pad|>")
 _ACTIONS = ("<|propri|>", "<|action|>", "<|action_fast|>")  # of WALL-X

@@ -1,4 +1,4 @@
-"""`vlagents-ray bench checkpoint openvla` writes what the policy loads and acts with."""
+"""`python -m benchmarks.checkpoints openvla` writes what the policy loads and acts with."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.checkpoints import openvla as recipe
+from benchmarks.checkpoints.recipe import Recipe
+from benchmarks.checkpoints.recipes import write_checkpoint
 from tests.families.openvla.conftest import LIBRARIES
-from vlagents_ray.bench.checkpoints import openvla as recipe
-from vlagents_ray.bench.checkpoints.recipe import Recipe
-from vlagents_ray.bench.checkpoints.recipes import write_checkpoint
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.openvla.policy import OpenVLA
 from vlagents_ray.policies.openvla.sources import find_source

@@ -14,8 +14,8 @@ from typing import Any
 
 import torch
 
+from benchmarks.checkpoints import openvla as recipe
 from tests.families.openvla.upstream import module
-from vlagents_ray.bench.checkpoints import openvla as recipe
 
 KINDS = ("openvla", "remote", "oft", "oft-diffusion", "oft-film", "oft-tokens")
 DATASETS = ("bridge_orig", "libero_spatial_no_noops")

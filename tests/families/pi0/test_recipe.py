@@ -1,4 +1,4 @@
-"""`vlagents-ray bench checkpoint pi0` writes what the policy loads and acts with."""
+"""`python -m benchmarks.checkpoints pi0` writes what the policy loads and acts with."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vlagents_ray.bench.checkpoints import pi0 as recipe
-from vlagents_ray.bench.checkpoints import weights
-from vlagents_ray.bench.checkpoints.recipe import Recipe
-from vlagents_ray.bench.checkpoints.recipes import write_checkpoint
+from benchmarks.checkpoints import pi0 as recipe
+from benchmarks.checkpoints import weights
+from benchmarks.checkpoints.recipe import Recipe
+from benchmarks.checkpoints.recipes import write_checkpoint
 from vlagents_ray.policies.pi0 import Pi0
 from vlagents_ray.testing.observations import random_observation
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import torch
 
-from vlagents_ray.bench.checkpoints import pi0 as recipe
+from benchmarks.checkpoints import pi0 as recipe
 
 STATE_DIM, ACTION_DIM = recipe.STATE_DIM, recipe.ACTION_DIM
 CHUNK = 10

@@ -103,7 +103,7 @@ def default_point(points: Sequence[MeasuredPoint], goal: TuningGoal, max_size: i
     return max((one for one in own if one.reaches(goal)), key=lambda point: point.sessions, default=None)
 
 
-def chosen_settings(chosen: MeasuredPoint, batch: BatchArgs, fixed: Sequence[int] | None) -> dict[tuple[str, str], Any]:
+def chosen_settings(chosen: MeasuredPoint, batch: BatchArgs, fixed: Sequence[int] | None) -> dict[str, dict[str, Any]]:
     """Return the settings of a deployment file to change, by section and key below `args`.
 
     Args:
@@ -111,25 +111,23 @@ def chosen_settings(chosen: MeasuredPoint, batch: BatchArgs, fixed: Sequence[int
         batch: The file's settings of the batch queue.
         fixed: `batch_sizes` of the file's policy, written or by default.
     """
-    settings: dict[tuple[str, str], Any] = {("config", key): value for key, value in chosen.variant.changes.items()}
+    config, queue = dict(chosen.variant.changes), dict[str, Any]()
     sizes = chosen.variant.changes.get("batch_sizes", fixed)
     if sizes and sizes[-1] > chosen.sessions:
-        sizes = [size for size in sizes if size < chosen.sessions]
-        settings["config", "batch_sizes"] = [*sizes, chosen.sessions]
+        config["batch_sizes"] = [*(size for size in sizes if size < chosen.sessions), chosen.sessions]
     if chosen.sessions != batch.max_size and batch.sizes is not None:
-        settings["batch", "sizes"] = [size for size in batch.sizes if size <= chosen.sessions]
+        queue["sizes"] = [size for size in batch.sizes if size <= chosen.sessions]
     elif chosen.sessions != batch.max_size:
-        settings["batch", "max_size"] = chosen.sessions
-    return settings
+        queue["max_size"] = chosen.sessions
+    return {section: values for section, values in (("config", config), ("batch", queue)) if values}
 
 
-def figures(points: Sequence[MeasuredPoint], chosen: MeasuredPoint | None) -> list[list[str]]:
-    """Return a table of what was measured, with its head as the first row; the chosen row has a star."""
-    rows = [["", "settings", "sessions", "actions/s", "round trip ms", "p99 ms", "peak MiB", "actions off by"]]
+def figures(points: Sequence[MeasuredPoint]) -> list[list[str]]:
+    """Return a table of what was measured, with its head as the first row."""
+    rows = [["settings", "sessions", "actions/s", "round trip ms", "p99 ms", "peak MiB", "actions off by"]]
     for one in points:
         numbers = [f"{one.actions_per_s:.1f}", f"{one.round_trip_ms:.1f}", f"{one.p99_ms:.1f}", f"{one.peak_mib:.0f}"]
-        star = "*" if one == chosen else ""
-        rows.append([star, one.variant.name, str(one.sessions), *numbers, f"{one.difference:.3%}"])
+        rows.append([one.variant.name, str(one.sessions), *numbers, f"{one.difference:.3%}"])
     return rows
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from vlagents_ray.bench.peers.peer import die_with_parent, own_stdout
+from vlagents_ray.bench.line_client import die_with_parent, own_stdout
 from vlagents_ray.bench.tuning.measured_policy import (
     MeasuredPolicy,
     cuda,

@@ -1,4 +1,4 @@
-"""`--live`: the live page of an evaluation or of a training, for as long as the command runs."""
+"""`--live`: the live page of an evaluation, for as long as the command runs."""
 
 from __future__ import annotations
 

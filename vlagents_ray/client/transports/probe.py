@@ -1,7 +1,7 @@
 """A message that is answered at once, to measure the link: it reaches neither a session nor the policy.
 
     offset 0   b"VLA?"
-           4   uint32, not read; 0, or 1 of earlier clients, which sent a frame of images
+           4   uint32, not read
            8   any bytes, as many as the link is to carry
 
 It travels as a WebSocket message or as the body of `POST /v1/probe`, under the same limits as a request. The answer is

@@ -44,15 +44,14 @@ class Trajectory:
     state: dict[str, np.ndarray]  # (T + 1, D) float32, in the contract's units
     gripper: np.ndarray | None  # (T + 1,) float32 in [0, 1], 1 = open
     cameras: tuple[str, ...]
-    versions: np.ndarray | None = None  # (T,) int64, of the weights that chose each action; NO_VERSION where none did
+    versions: np.ndarray  # (T,) int64, of the weights that chose each action; NO_VERSION where none did
 
     def to_bytes(self) -> bytes:
         """Encode the trajectory as an .npz file, in which nothing is pickled."""
         arrays: dict[str, Any] = {"cameras": np.array(self.cameras, str)}
         arrays |= {"actions": self.actions, "rewards": self.rewards, "success": self.success}
         arrays |= {_STATE + part: values for part, values in self.state.items()}
-        optional = {"gripper": self.gripper, "versions": self.versions}
-        arrays |= {name: values for name, values in optional.items() if values is not None}
+        arrays |= {"versions": self.versions} | ({} if self.gripper is None else {"gripper": self.gripper})
         file = io.BytesIO()
         np.savez_compressed(file, **arrays)
         return file.getvalue()
@@ -69,9 +68,11 @@ class Trajectory:
             # Opened here: np.load leaves the file of a broken archive open.
             with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
                 state = {name.removeprefix(_STATE): file[name] for name in file.files if name.startswith(_STATE)}
-                gripper, versions = (file[name] if name in file.files else None for name in ("gripper", "versions"))
+                gripper = file["gripper"] if "gripper" in file.files else None
                 cameras = tuple(map(str, file["cameras"]))
-                return cls(file["actions"], file["rewards"], file["success"], state, gripper, cameras, versions)
+                return cls(
+                    file["actions"], file["rewards"], file["success"], state, gripper, cameras, file["versions"]
+                )  # fmt: skip
         except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
             raise ConfigError(f"{path}: cannot be read as a trajectory ({error})") from error
 

@@ -31,11 +31,11 @@ class EpisodeResult:
     seconds: float = 0.0  # from reset to the last step
     reset_ms: float | None = None  # reset of the environment
     env_step_ms: float | None = None  # median
-    env_seconds: float | None = None  # of the reset and all steps; None in older results
+    env_seconds: float | None = None  # of the reset and all steps; None on a robot
     acts: int = 0  # answers of the policy; fewer than steps with action chunks
     policy_ms: float | None = None  # median of one act, transport included
     policy_p95_ms: float | None = None
-    policy_seconds: float | None = None  # in which the policy computed for this episode; None in older results
+    policy_seconds: float | None = None  # in which the policy computed for this episode
     latency_ms: float | None = None  # real-time mode: median of the latency that an act counted as
     ticks_waited: int = 0  # real-time mode: steps between an observation and its answer
     ticks_held: int = 0  # the ticks among them for which no row of a chunk was left
@@ -72,7 +72,7 @@ _TIMES = {
     "timing_ms",
 }
 _POLICY = {"policy_version", "policy_fingerprint", "first_policy_version"}
-# Older results lack the weights: "weights" is checked separately, and other versions show in the actions.
+# "weights" is checked separately, and other versions of the weights show in the actions.
 _CIRCUMSTANCES = _TIMES | _POLICY | {"transport", "weights", "revision"}
 
 

@@ -22,7 +22,7 @@ from vlagents_ray.dataset_contract import (
 )
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.artifacts.storage import link_or_copy, require_there, whole_folder
-from vlagents_ray.evaluate.artifacts.trajectory import NO_VERSION, Trajectory, videos_of
+from vlagents_ray.evaluate.artifacts.trajectory import Trajectory, videos_of
 from vlagents_ray.evaluate.artifacts.video import DEFAULT_FPS
 from vlagents_ray.evaluate.results.reader import CellResults, Episode, Results
 from vlagents_ray.naming import did_you_mean, distinct
@@ -191,15 +191,9 @@ def _demonstration(
         tuple(environment),
         {part: values[:frames] for part, values in kept.items()},
         None if gripper is None else gripper[:frames],
-        _versions(trajectory)[:frames] if with_versions else None,
+        trajectory.versions[:frames] if with_versions else None,
         {camera: require_there(results.file(str(videos[camera]))) for camera in shown},
     )
-
-
-def _versions(trajectory: Trajectory) -> np.ndarray:
-    if trajectory.versions is None:  # an older file
-        return np.full(len(trajectory.actions), NO_VERSION, np.int64)
-    return trajectory.versions
 
 
 def _chosen(option: str, wanted: Sequence[str] | None, known: Sequence[str], env: str) -> list[str]:

@@ -24,8 +24,6 @@ from vlagents_ray.naming import plain
 from vlagents_ray.policies.base.program import Program, code_of_class, files_named, with_defaults
 from vlagents_ray.registry import env_class, env_suite, env_task
 
-_COUNTS = "executed actions"  # by which rows of a chunk are indexed; scores by another index are not comparable
-
 
 @dataclass(frozen=True)
 class EvalCase:
@@ -66,7 +64,7 @@ class EvalCase:
         pushed = self.policy.pushed_weights
         return {
             **({} if self.robot is None else {"robot": _settings(*self.on_robot)}),
-            **({} if pushed is None else {"pushed_weights": pushed.model_dump()}),  # older results have no such setting
+            "pushed_weights": None if pushed is None else pushed.model_dump(),
             "env": self.env,
             "env_options": self.suite.env_options,
             "reset_options": self.suite.reset_options,
@@ -77,7 +75,7 @@ class EvalCase:
             "execute": self.policy.execute,
             "codec": "jpeg" if self.policy.codec == "jpeg" else "exact",
             "num_envs": self.suite.num_envs,
-            "clock": self.suite.clock.model_dump() | {"counts": _COUNTS} if self.suite.clock else None,
+            "clock": self.suite.clock.model_dump() if self.suite.clock else None,
         }
 
     @cached_property

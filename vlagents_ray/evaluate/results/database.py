@@ -21,7 +21,7 @@ from vlagents_ray.errors import ConfigError
 
 FILE = "results.db"
 RUNNING = "running"  # the state of a run that has not ended, or was killed
-VERSION = 3
+VERSION = 1
 
 SCHEMA = """
 CREATE TABLE runs (
@@ -55,47 +55,15 @@ CREATE TABLE attempts (
 CREATE TABLE tracked (
     tracker TEXT NOT NULL, what TEXT NOT NULL, episodes INTEGER NOT NULL, PRIMARY KEY (tracker, what)
 );
-"""
-
-# Apart, because older results of this version have no such table: it is added when they are resumed.
-WORKERS = """
-CREATE TABLE IF NOT EXISTS workers (
+CREATE TABLE workers (
     run INTEGER NOT NULL REFERENCES runs, at REAL NOT NULL, host TEXT NOT NULL, node TEXT, pid INTEGER NOT NULL,
     policy TEXT NOT NULL, transport TEXT NOT NULL, renderer TEXT
 );
 """
 
 
-# Columns that older results of this version lack: they are added when those are resumed.
-_COLUMNS = {
-    "episodes": {
-        "weights": "TEXT",
-        "policy_version": "INTEGER",
-        "policy_fingerprint": "TEXT",
-        "first_policy_version": "INTEGER",
-        "env_seconds": "REAL",
-        "policy_seconds": "REAL",
-        "revision": "TEXT",
-        "env_program": "TEXT",
-        "policy_program": "TEXT",
-    },
-    "cells": {"program": "TEXT"},
-    "runs": {"changes": "TEXT"},
-}
-
-
-def complete(db: sqlite3.Connection) -> None:
-    """Give older results of this version the tables and columns that were added since."""
-    db.executescript(WORKERS)
-    for table, columns in _COLUMNS.items():
-        there = _columns(db, table)
-        for name, kind in columns.items():
-            if name not in there:
-                db.execute(f"ALTER TABLE {table} ADD COLUMN {name} {kind}")
-
-
 def insert(db: sqlite3.Connection, table: str, row: Mapping[str, Any]) -> None:
-    """Insert `row`, its values by the names of their columns, which are those of `SCHEMA` and `WORKERS`."""
+    """Insert `row`, its values by the names of their columns, which are those of `SCHEMA`."""
     columns, marks = ", ".join(row), ", ".join("?" * len(row))
     db.execute(f"INSERT INTO {table} ({columns}) VALUES ({marks})", tuple(row.values()))  # noqa: S608 (our own names)
 
@@ -119,9 +87,7 @@ def require_readable(out: Path, db: sqlite3.Connection) -> None:
         )
     for table, known in _known_columns().items():
         there = _columns(db, table)
-        if not there and table == "workers":
-            continue
-        unknown, missing = there - known, known - there - _COLUMNS.get(table, {}).keys()
+        unknown, missing = there - known, known - there
         if unknown or missing:
             got = f"the unknown columns {sorted(unknown)}" if unknown else f"none of the columns {sorted(missing)}"
             raise ConfigError(
@@ -134,7 +100,7 @@ def require_readable(out: Path, db: sqlite3.Connection) -> None:
 def _known_columns() -> dict[str, set[str]]:
     """The columns of this version, by table."""
     with contextlib.closing(sqlite3.connect(":memory:")) as db:
-        db.executescript(SCHEMA + WORKERS)
+        db.executescript(SCHEMA)
         tables = [name for (name,) in db.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
         return {table: _columns(db, table) for table in tables}
 

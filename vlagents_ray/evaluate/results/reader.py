@@ -140,7 +140,7 @@ class Results:
     cells: tuple[CellResults, ...]  # in the order of the plan
     runs: tuple[Run, ...]
     policies: dict[str, dict[str, Any]]  # the metadata of each policy's server, by the policy's name
-    workers: tuple[Worker, ...] = ()  # in the order of time; empty for old results
+    workers: tuple[Worker, ...] = ()  # in the order of time
     parts: tuple[Path, ...] = ()  # the folders, below `out`, if several were read as one (`combined`)
 
     @property
@@ -250,9 +250,7 @@ def reading(out: Path) -> Iterator[sqlite3.Connection]:
 
 
 def table(db: sqlite3.Connection, name: str, order: str = "rowid") -> Iterator[dict[str, Any]]:
-    """The rows of a table, by its columns' names; none if the file is older than the table."""
-    if db.execute("SELECT 1 FROM sqlite_master WHERE type = 'table' AND name = ?", (name,)).fetchone() is None:
-        return iter(())
+    """The rows of a table, by its columns' names."""
     return (dict(row) for row in db.execute(f"SELECT * FROM {name} ORDER BY {order}"))  # noqa: S608 (constants)
 
 
@@ -266,14 +264,14 @@ def episode_of(row: dict[str, Any]) -> Episode:
     result = EpisodeResult(**known | {"key": key, "timing_ms": json.loads(row["timing_ms"])})
     videos = tuple(require_below(path) for path in json.loads(row["videos"]))
     trajectory = None if row["trajectory"] is None else require_below(row["trajectory"])
-    programs = row.get("env_program"), row.get("policy_program")
+    programs = row["env_program"], row["policy_program"]
     return Episode(result, videos, trajectory, row["attempts"], row["run"], row["finished"], *programs)
 
 
 def _cell(row: dict[str, Any], episodes: tuple[Episode, ...], attempts: tuple[Attempt, ...]) -> CellResults:
     seeds, rule = json.loads(row.pop("seeds")), row.pop("stop")
     names = ("settings", "described", "contract", "code", "program")
-    parsed = {name: json.loads(row.get(name) or "{}") for name in names}
+    parsed = {name: json.loads(row[name] or "{}") for name in names}
     each = row["planned"] // len(seeds)
     episodes = tuple(replace(one, beyond=not _is_planned(one.result.key, seeds, each)) for one in episodes)
     stop, stopped_at = None, None
@@ -295,7 +293,7 @@ def _is_planned(key: EpisodeKey, seeds: Sequence[int], each: int) -> bool:
 
 
 def _run(row: dict[str, Any]) -> Run:
-    changes = tuple(Change(**one) for one in json.loads(row.get("changes") or "[]"))
+    changes = tuple(Change(**one) for one in json.loads(row["changes"] or "[]"))
     return Run(**row | {name: json.loads(row[name]) for name in ("config", "versions")} | {"changes": changes})
 
 

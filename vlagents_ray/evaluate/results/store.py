@@ -32,7 +32,7 @@ from vlagents_ray.evaluate.results.changes import (
     program_changes,
     program_id,
 )
-from vlagents_ray.evaluate.results.database import RUNNING, SCHEMA, VERSION, complete, insert, require_readable
+from vlagents_ray.evaluate.results.database import RUNNING, SCHEMA, VERSION, insert, require_readable
 
 
 class Store:
@@ -278,7 +278,6 @@ class Store:
             if version == 0:
                 db.executescript(f"BEGIN; {SCHEMA} PRAGMA user_version = {VERSION}; COMMIT;")
             require_readable(self._out, db)
-            complete(db)
             self._require_resumable(db, config)
             self._note_cells(db, config)
         except BaseException:

@@ -132,7 +132,7 @@ class Summary:
 
     @property
     def env_busy(self) -> float | None:
-        """The share of the workers' time in which they reset and stepped environments; None for older results."""
+        """The share of the workers' time in which they reset and stepped environments; None on a robot."""
         played = [one for one in self._counted if one.env_seconds is not None]
         return _share([one.env_seconds for one in played], sum(one.seconds for one in played))
 

@@ -251,7 +251,7 @@ def _with_defaults(config: LeRobotConfig, kind: Kind) -> LeRobotConfig:
 
 
 def _trained(settings: Any, processors: Processors) -> DatasetContract:
-    """Return the contract of the checkpoint's dataset, or one inferred from the features of an older dataset."""
+    """Return the contract of the checkpoint's dataset, or one inferred from the features of a dataset without one."""
     state, dataset = settings.robot_state_feature, processors.dataset()
     if dataset is None:
         return DatasetContract(Contract()) if state is None else _of_features(settings.input_features, processors)
@@ -269,7 +269,7 @@ def _trained(settings: Any, processors: Processors) -> DatasetContract:
 def _of_features(features: Iterable[str], processors: Processors) -> DatasetContract:
     """Infer the parts of the state, and its angles, from features and their statistics.
 
-    Our older datasets have no contract, nor do copies by LeRobot's tools without some episodes. The parts are features
+    Copies that LeRobot's tools make without some episodes have no contract. The parts are features
     beside `observation.state`; a comparison of their statistics with its own gives their order.
     """
     keys = {key.removeprefix(f"{STATE}."): key for key in features if key.startswith(f"{STATE}.")}

@@ -301,7 +301,7 @@ class Engine:
         if session.agent is None:  # an earlier reset in the queue failed, or waits for its checkpoint
             raise NotReset(f"session {ticket.session_id!r}: its last reset failed; reset again")
         step = ticket.request.step
-        if step is not None and step != session.steps and step != session.steps - session.first:  # for old clients
+        if step is not None and step != session.steps:
             raise session.wrong_step(step)
         if model is None or weights is None:
             raise UnknownSession(f"session {ticket.session_id!r}: has just been closed; reset it")

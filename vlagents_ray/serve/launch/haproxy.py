@@ -125,7 +125,7 @@ def ingress_environment(folder: Path, binary: str, listener: PublicListener | No
         _BINARY: str(_launcher(folder, binary)),
         "RAY_SERVE_HAPROXY_METRICS_SOCKET_PATH": str(folder / "metrics"),
         "RAY_SERVE_HAPROXY_CONFIG_FILE_LOC": str(folder / "haproxy.cfg"),
-        "RAY_SERVE_HAPROXY_SOCKET_PATH": str(folder / "admin"),  # short: see `joining.ray_folder`
+        "RAY_SERVE_HAPROXY_SOCKET_PATH": str(folder / "admin"),  # short, as a socket's path must be
         "RAY_SERVE_HAPROXY_SERVER_STATE_BASE": str(folder),
         "RAY_SERVE_HAPROXY_SERVER_STATE_FILE": str(folder / "server-state"),
         "RAY_SERVE_HAPROXY_METRICS_PORT": str(metrics),

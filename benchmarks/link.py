@@ -1,0 +1,264 @@
+"""Round trips over a true network link, on one machine: two network namespaces, a shaped veth pair between them.
+
+The servers live in one namespace, the clients in the other. A namespace ends with its last process, and each
+process here ends with its parent or its standard input: nothing is left, however the benchmark ends. Without
+root it runs in a user namespace, where the kernel allows that.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from benchmarks import peers as others
+from vlagents_ray.bench.clients import OwnClient
+from vlagents_ray.bench.figures import check_plot_file, plot_round_trips
+from vlagents_ray.bench.line_client import die_with_parent, own_stdout
+from vlagents_ray.bench.line_process import LineProcess, our_environment
+from vlagents_ray.bench.machine import measured_on
+from vlagents_ray.bench.rtt import measure
+from vlagents_ray.cli.bench import Calls, Json, Plot, show_round_trips
+from vlagents_ray.cli.console import errors, progress, save
+from vlagents_ray.cli.options import parse_list
+from vlagents_ray.errors import ConfigError, VLAgentsError
+
+RATE = "1gbit"
+PEERS = ("vlagents", "openpi")
+CLIENTS = (
+    OwnClient("websocket", "raw"),
+    OwnClient("websocket", "jpeg"),
+    OwnClient("websocket", "auto"),
+    OwnClient("http", "jpeg"),
+)
+_INSIDE = "--inside"  # then JSON: this process is in the server's namespace
+SHM = "vlagents shm"  # does not cross a network
+_SERVER, _CLIENT = "10.197.44.1", "10.197.44.2"
+_BULK = 64 * 2**20  # bytes, to see what the link carries
+_END_S = 60.0
+_RUN_S = 900.0
+_TOOLS = ("ip", "tc", "unshare", "nsenter")
+
+
+def measure_link(
+    calls: int = 600,
+    *,
+    rate: str = RATE,
+    delay: str | None = None,
+    peers: Sequence[str] = (),
+    peers_python: Path = Path("python"),
+    progress: Callable[[str], None] = lambda _: None,
+) -> dict[str, Any]:
+    """Measure round trips over a link, and what the link carries.
+
+    Args:
+        calls: Round trips of each client.
+        rate: As `tc` takes it.
+        delay: Each way, as `tc` takes it; None adds none.
+        peers: Names of other policy servers, as in `measure_with_peers`.
+        peers_python: The Python in which they are installed.
+        progress: Is called with lines of progress.
+
+    Returns:
+        What `measure_with_peers` returns, and "link".
+
+    Raises:
+        ConfigError: This machine or user cannot make network namespaces; the message has the cure.
+    """
+    command = [*enter(), sys.executable, "-m", "benchmarks.link", _INSIDE]
+    settings = {
+        "calls": calls,
+        "rate": rate,
+        "delay": delay,
+        "peers": list(peers),
+        "peers_python": str(peers_python.absolute()),  # not resolved: a virtual environment's Python is a link
+    }
+    with LineProcess("the link", [*command, json.dumps(settings)], _environment(), end_s=_END_S) as inside:
+        while True:
+            line = inside.read(_RUN_S)
+            if "progress" in line:
+                progress(line["progress"])
+            elif "error" in line:
+                raise ConfigError(line["error"])
+            else:
+                found: dict[str, Any] = line["result"]
+                return found
+
+
+def _environment() -> dict[str, str]:
+    """Return the variables with which a process finds the package and this folder."""
+    ours = our_environment()["PYTHONPATH"]
+    return {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[1]), ours])}
+
+
+def enter() -> list[str]:
+    """Return the command that runs another one in a network namespace of its own, as root or in a user namespace."""
+    if missing := [tool for tool in _TOOLS if shutil.which(tool) is None]:
+        raise ConfigError(f"link: {', '.join(missing)} not found; install iproute2 and util-linux")
+    refusals = []
+    for command in (["unshare", "--net"], ["unshare", "--user", "--map-root-user", "--net"]):
+        done = subprocess.run([*command, "true"], capture_output=True, text=True, check=False)
+        if done.returncode == 0:
+            return command
+        refusals.append(done.stderr.strip())
+    raise ConfigError(refused(refusals))
+
+
+def refused(reasons: Sequence[str]) -> str:
+    """Return the message to a user who may not make namespaces, with the cure."""
+    return (
+        f"link: cannot make a network namespace, neither as this user nor in a user namespace ({'; '.join(reasons)}); "
+        "run it as root, or let users make them: sysctl kernel.unprivileged_userns_clone=1 (Debian), "
+        "kernel.apparmor_restrict_unprivileged_userns=0 (Ubuntu)"
+    )
+
+
+class EmulatedLink:
+    """The client's namespace, and the shaped link to it. Made inside the server's namespace."""
+
+    def __init__(self, rate: str, delay: str | None) -> None:
+        self._holder = LineProcess("the client's namespace", ["unshare", "--net", "cat"])
+        try:
+            self._holder.request("1", 10)  # an answer: it is there
+            target = f"/proc/{self._holder.pid}/ns/net"
+            self.prefix = ["nsenter", f"--net={target}"]
+            _run(["ip", "link", "set", "lo", "up"])
+            _run(["ip", "link", "add", "vlagents0", "type", "veth", "peer", "name", "vlagents1"])
+            _run(["ip", "link", "set", "vlagents1", "netns", str(self._holder.pid)])
+            for prefix, name, address in (([], "vlagents0", _SERVER), (self.prefix, "vlagents1", _CLIENT)):
+                _run([*prefix, "ip", "address", "add", f"{address}/24", "dev", name])
+                _run([*prefix, "ip", "link", "set", name, "up"])
+                for words in shaping(rate, delay):
+                    _run([*prefix, "tc", "qdisc", "add", "dev", name, *words])
+            # Ray takes the address that leads to the world for its own; without a way there it would take one that
+            # this namespace does not have.
+            _run(["ip", "route", "add", "default", "via", _CLIENT])
+        except BaseException:
+            self._holder.close()
+            raise
+
+    def __enter__(self) -> EmulatedLink:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._holder.close()
+
+    def megabits(self) -> float:
+        """Measure the Mbit/s that TCP gets through, from client to server."""
+        code = f"import socket; s = socket.create_connection(({_SERVER!r}, {{}})); s.sendall(bytes({_BULK}))"
+        with socket.create_server((_SERVER, 0)) as server:
+            server.settimeout(30)
+            command = [*self.prefix, sys.executable, "-c", code.format(server.getsockname()[1])]
+            with subprocess.Popen(command) as sender:
+                connection, _ = server.accept()
+                with connection:
+                    begun, got = time.perf_counter(), 0
+                    while data := connection.recv(2**20):
+                        got += len(data)
+                    taken = time.perf_counter() - begun
+                sender.wait(30)
+        return got * 8 / taken / 1e6
+
+
+def shaping(rate: str, delay: str | None) -> list[list[str]]:
+    """Return the words of `tc qdisc add dev DEV …` for a link of that rate, and that delay each way."""
+    if delay is None:
+        return [["root", "tbf", "rate", rate, "burst", "64kb", "latency", "50ms"]]
+    return [
+        ["root", "handle", "1:", "netem", "delay", delay, "limit", "10000"],
+        ["parent", "1:1", "tbf", "rate", rate, "burst", "64kb", "latency", "50ms"],
+    ]
+
+
+def _run(command: Sequence[str]) -> None:
+    done = subprocess.run(list(command), capture_output=True, text=True, check=False)
+    if done.returncode == 0:
+        return
+    reason = done.stderr.strip()
+    if "netem" in command and "unknown" in reason:
+        raise ConfigError(f"--delay: this kernel has no netem ({reason}); leave it out, or load the module sch_netem")
+    raise ConfigError(f"link: `{' '.join(command)}` failed: {reason}")
+
+
+def _inside(calls: int, rate: str, delay: str | None, peers: Sequence[str], peers_python: str, progress: Any) -> Any:
+    """Run the benchmark in the server's namespace."""
+    python = Path(peers_python)
+    clients, absent, versions = others.peer_clients(peers, python)
+    clients = [one for one in clients if one.name != SHM]
+    with EmulatedLink(rate, delay) as link:
+        carried = link.megabits()
+        progress(f"the link carries {carried:.0f} Mbit/s")
+        starters = others.starters(clients, python, host=_SERVER, prefix=link.prefix)
+        found = measure(CLIENTS, calls, progress, others=starters, skipped=absent, host=_SERVER, prefix=link.prefix)
+    made = {"rate": rate, "delay": delay, "measured_mbit_per_s": carried}
+    return {**found.to_json(), "versions": versions, "link": made}
+
+
+def _interrupt_with_stdin() -> None:
+    """Interrupt this process when its standard input ends: its parent has ended, so everything is taken down."""
+
+    def wait() -> None:
+        while os.read(0, 4096):
+            pass
+        os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Thread(target=wait, daemon=True).start()
+
+
+def _run_inside(settings: str) -> None:
+    """Run the process inside; writes lines of JSON with "progress", then one with "result" or "error"."""
+    die_with_parent()
+    out = own_stdout()
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have started all this with it ignored
+    _interrupt_with_stdin()
+
+    def say(**line: Any) -> None:
+        print(json.dumps(line), file=out, flush=True)
+
+    try:
+        say(result=_inside(**json.loads(settings), progress=lambda text: say(progress=text)))
+    except VLAgentsError as error:
+        say(error=str(error))
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+
+def main(
+    calls: Calls = 600,
+    rate: Annotated[str, typer.Option(help="Of the link, as tc writes it.")] = RATE,
+    delay: Annotated[str | None, typer.Option(help="Each way, as tc writes it: 2ms. Needs the kernel's netem.")] = None,
+    peers: others.Peers = "vlagents,openpi",
+    peers_python: others.PeersPython = others.PYTHON,
+    json_file: Json = None,
+    plot: Plot = None,
+) -> None:
+    """Round trips over a link of 1 Gbit/s between two network namespaces on this machine."""
+    with errors():
+        check_plot_file(plot)
+        origin = measured_on("python -m benchmarks.link")
+        found = measure_link(
+            calls, rate=rate, delay=delay, peers=parse_list(peers), peers_python=peers_python, progress=progress
+        )  # fmt: skip
+        title = f"round trip of one act over {found['link']['measured_mbit_per_s']:.0f} Mbit/s"
+        show_round_trips(found, title)
+        save({**origin, **found, "versions": origin["versions"] | found["versions"]}, json_file)
+        if plot is not None:
+            plot_round_trips(found, plot, title)
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == [_INSIDE]:
+        _run_inside(sys.argv[2])
+    else:
+        typer.run(main)

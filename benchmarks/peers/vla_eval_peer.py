@@ -1,0 +1,134 @@
+"""vla-eval: its model server around a policy that does nothing, and its `Connection`.
+
+Images take its default codec, PNG, unless `mode` names another ("jpeg", "raw").
+
+An evaluation is one model server and a `vla-eval run --no-docker` for each shard, all on one recording, and then
+`vla-eval export`, as its script for sharded runs does. Videos are off, its default; images go raw, as compressing
+them for a server on the same machine would only cost time. `run ...` and `export ...` are its commands of those names.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any, TextIO
+
+import numpy as np
+import peer
+from vla_eval.benchmarks.base import StepBenchmark, StepResult
+from vla_eval.cli.main import main
+from vla_eval.connection import Connection
+from vla_eval.model_servers.predict import PredictModelServer
+from vla_eval.model_servers.serve import serve as serve_forever
+from vla_eval.protocol.numpy_codec import set_image_format
+
+
+class VlaEvalNoop(PredictModelServer):
+    """A model of vla-eval that answers each observation with seven zeros."""
+
+    def predict(self, obs: dict[str, Any], ctx: Any) -> dict[str, Any]:
+        return {"actions": np.zeros(7, np.float32)}
+
+
+class VlaEvalTabletop(StepBenchmark):
+    """The environment that all are measured with; each shard imports it by name."""
+
+    def __init__(self, seed: int, env: dict[str, Any]) -> None:
+        from benchmarks.environments import TimedTabletop
+        from vlagents_ray.interface import Act
+
+        super().__init__()
+        set_image_format("raw")
+        self._seed = seed
+        self._env, self._act = TimedTabletop(**env), Act
+
+    def get_tasks(self) -> list[dict[str, Any]]:
+        return [{"name": "tabletop"}]
+
+    def reset(self, task: dict[str, Any]) -> Any:
+        return self._env.reset(seed=self._seed + task["episode_idx"])[0]
+
+    def step(self, action: dict[str, Any]) -> StepResult:
+        obs, reward, terminated, truncated, info = self._env.step(self._act(action["actions"][:4]))
+        return StepResult(obs, reward, terminated or truncated, info)
+
+    def make_obs(self, raw_obs: Any, task: dict[str, Any]) -> dict[str, Any]:
+        state = np.append(raw_obs.state["xyzrpy"], np.float32(raw_obs.gripper))
+        return {"images": raw_obs.cameras, "task_description": self._env.instruction, "state": state}
+
+    def get_step_result(self, step_result: StepResult) -> dict[str, Any]:
+        return {"success": step_result.info["success"]}
+
+
+def serve(host: str, port: int) -> None:
+    """As its `run_server` does."""
+    serve_forever(VlaEvalNoop(), host, port)
+
+
+def drive(host: str, port: int, path: str, mode: str, out: TextIO) -> None:
+    """Its own client, on an event loop of its own."""
+    if mode != "png":
+        set_image_format(mode)
+    arrays = peer.observation(path)
+    obs = {
+        "images": {name: image for name, image in arrays.items() if name.startswith("camera_")},
+        "task_description": "measure",
+        "state": np.append(arrays["joints"], np.float32(arrays["gripper"])),
+    }
+    loop = asyncio.new_event_loop()
+    connection = Connection(f"ws://{host}:{port}")
+    loop.run_until_complete(connection.connect())
+    loop.run_until_complete(connection.start_episode({"task": {"name": "measure"}}))
+
+    async def measure(calls: int) -> list[float]:
+        taken = []
+        for _ in range(calls):
+            begun = loop.time()
+            await connection.act(obs)
+            taken.append((loop.time() - begun) * 1e3)
+        return taken
+
+    peer.obey(sys.stdin, out, lambda calls: loop.run_until_complete(measure(calls)), {})
+
+
+def evaluate(host: str, port: int, plan: dict[str, Any]) -> None:
+    """Start the server, play the shards, and export their results."""
+    folder = Path(plan["folder"])
+    benchmark = {
+        "benchmark": "vla_eval_peer:VlaEvalTabletop",
+        "episodes_per_task": plan["episodes"],
+        "max_steps": plan["env"]["max_steps"],
+        "params": {"seed": plan["seed"], "env": plan["env"]},
+    }
+    config = folder / "run.yaml"
+    config.write_text(json.dumps({"server": {"url": f"ws://{host}:{port}"}, "benchmarks": [benchmark]}))
+    common = ["--output-dir", str(folder), "--eval-id", "bench", "--num-shards", str(plan["workers"]), "--shard-id"]
+    server = _start("serve", host, str(port))
+    peer.wait_for_port(host, port)
+    shards = [
+        _start("run", "--no-docker", "--config", str(config), *common, str(shard)) for shard in range(plan["workers"])
+    ]
+    for shard in shards:
+        _wait(shard)
+    _wait(_start("export", str(folder / "recording-bench.sqlite")))
+    server.communicate()
+
+
+def _wait(command: subprocess.Popen[bytes]) -> None:
+    if command.wait():
+        raise RuntimeError(f"{command.args} ended with exit status {command.returncode}")
+
+
+def _start(*words: str) -> subprocess.Popen[bytes]:
+    return subprocess.Popen([sys.executable, __file__, *words], stdin=subprocess.PIPE)
+
+
+if __name__ == "__main__":
+    if sys.argv[1] in ("run", "export"):
+        peer.die_with_parent()
+        main()
+    else:
+        peer.run(serve, drive, evaluate)

@@ -1,0 +1,326 @@
+"""The figures of docs/measured.md: everything is measured in one go, judged by targets, and written as Markdown.
+
+Figures of `python -m benchmarks.evaluation --report FILE` in the same file are judged, too.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.text import Text
+
+from benchmarks import link
+from benchmarks.peers import PYTHON, PeersPython
+from benchmarks.rtt import measure_with_peers
+from vlagents_ray.bench.machine import measured_on
+from vlagents_ray.bench.throughput import ThroughputPlan, measure_throughput
+from vlagents_ray.cli.bench import Calls
+from vlagents_ray.cli.console import errors, out, progress, table
+from vlagents_ray.errors import ConfigError
+
+COMMAND = "python -m benchmarks.report"
+BEGIN, END = "<!-- bench -->", "<!-- /bench -->"
+_MET = {True: "yes", False: "**no**", None: ""}
+Results = Mapping[str, Any]  # of `collect`
+
+ON_NODE = ("plasma, Ray actor", "shm, Ray actor")  # the faster one first
+DEFAULT, JPEG = "websocket, default", "websocket, jpeg"
+LIMIT_P99 = 3.0
+LIMIT_WAIT_MS = 72.0  # two full batches of 20 ms + 16 x 1 ms
+LIMIT_VLA_EVAL = 1.3
+
+
+def collect(
+    peers_python: Path,
+    *,
+    calls: int = 1000,
+    link_calls: int = 600,
+    plan: ThroughputPlan | None = None,
+    progress: Callable[[str], None] = lambda _: None,
+) -> dict[str, Any]:
+    """Measure round trips with all peers, the link if this machine can make one, and throughput, as JSON values."""
+    results: dict[str, Any] = {
+        **measured_on(),
+        "command": COMMAND,
+        "skipped": {},
+    }
+    results["rtt"] = measure_with_peers(calls, peers=["all"], peers_python=peers_python, progress=progress)
+    results["versions"] |= results["rtt"]["versions"]
+    try:
+        results["link"] = link.measure_link(link_calls, peers=link.PEERS, peers_python=peers_python, progress=progress)
+    except ConfigError as error:
+        progress(str(error))
+        results["skipped"]["link"] = str(error)
+    results["throughput"] = measure_throughput(plan or ThroughputPlan(), progress)
+    return results
+
+
+def write(results: Mapping[str, Any], page: Path, json_file: Path | None) -> None:
+    """Write the section into the page; the figures, from which it can be made again, into `json_file`."""
+    text = replaced(page.read_text(), section(results))
+    if json_file is not None:
+        json_file.parent.mkdir(parents=True, exist_ok=True)
+        json_file.write_text(json.dumps(results, indent=1) + "\n")
+    page.write_text(text)
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """A target and what was measured: a line of the table."""
+
+    what: str
+    wanted: str
+    measured: str
+    met: bool | None  # None: not measured
+
+
+def outcomes(results: Results) -> list[Outcome]:
+    """Return every target, in order, with what was measured."""
+    rtt, link = results.get("rtt") or {}, results.get("link") or {}
+    actor = next((name for name in ON_NODE if name in rtt.get("ratios", {})), ON_NODE[0])
+    node, shm = "a Ray env actor and the replica on its node", "a local process and the replica"
+    return [
+        _ratio(rtt, f"{node} ({actor.partition(',')[0]})", actor, "vlagents shm", 0.40),
+        _ratio(rtt, f"{shm} (shm)", "shm", "vlagents shm", 0.20),
+        _ratio(rtt, f"{shm} (shm)", "shm", "openpi", 0.20),
+        _ratio(rtt, "WebSocket, JPEG at vlagents' setting (q85 4:4:4)", JPEG, "vlagents JPEG", 0.62),
+        _default(rtt),
+        _ratio(rtt, "HTTP, JPEG", "http, jpeg", "vlagents JPEG", 1.0),
+        _ratio(rtt, "HTTP, JPEG", "http, jpeg", "OpenVLA REST", 0.60),
+        _ratio(link, "WebSocket, our default, over the link", DEFAULT, "vlagents JPEG", 0.50),
+        _ratio(link, "WebSocket, our default, over the link", DEFAULT, "openpi", 0.45),
+        *(_tail(rtt, name) for name in dict.fromkeys([actor, "shm"])),
+        *_throughput_targets(results.get("throughput") or {}),
+        *(evaluation_outcomes(results["evaluation"]) if "evaluation" in results else []),
+    ]
+
+
+def evaluation_outcomes(found: Results) -> list[Outcome]:
+    """Return the targets of `benchmarks.evaluation`: all cores must count against the one process of a peer."""
+    workers = found["plan"]["workers"]
+    cores = min(found["cores"], workers)
+    limits = {"vlagents": float(cores), "vlagents, split": 1.0, "vla-eval": LIMIT_VLA_EVAL}
+    names = {
+        "vlagents": "vlagents run-eval, one process",
+        "vlagents, split": f"vlagents run-eval, {workers} processes and servers",
+        "vla-eval": f"vla-eval, {workers} shards",
+    }
+    return [
+        Outcome(
+            f"episodes a minute of whole evaluations, {workers} workers",
+            f"≥ {limits[name]:g} x {names[name]}",
+            f"{row['median']:.2f}",
+            row["median"] >= limits[name],
+        )
+        for name, row in found["ratios"].items()
+    ]
+
+
+def _ratio(part: Results, what: str, ours: str, theirs: str, limit: float) -> Outcome:
+    wanted = f"≤ {limit:.2f} x {theirs}"
+    found = part.get("ratios", {}).get(ours, {}).get(theirs)
+    if found is None:
+        return unmeasured(what, wanted)
+    low, high = found["ci95"]
+    return Outcome(what, wanted, f"{found['ratio']:.3f} ({low:.3f} to {high:.3f})", found["ratio"] <= limit)
+
+
+def _default(rtt: Results) -> Outcome:
+    """Compare time and image quality with what vlagents sends, which is our JPEG at its setting."""
+    found = _ratio(rtt, "WebSocket, our default setting", DEFAULT, "vlagents JPEG", 0.50)
+    ours, theirs = _way(rtt, DEFAULT), _way(rtt, JPEG)
+    if found.met is None or ours is None or theirs is None:
+        return found
+    as_good = ours["psnr_db"] is None or (theirs["psnr_db"] is not None and ours["psnr_db"] >= theirs["psnr_db"])
+    seen = f"{found.measured}; PSNR {_decibels(ours)}, theirs {_decibels(theirs)}"
+    return Outcome(found.what, f"{found.wanted}, PSNR no worse", seen, found.met and as_good)
+
+
+def _tail(rtt: Results, name: str) -> Outcome:
+    what, wanted = f"p99 over median, {name}, calls without a break", f"≤ {LIMIT_P99:g}, idle machine"
+    way = next((way for way in rtt.get("steady", ()) if way["way"] == name), None)
+    if way is None:
+        return unmeasured(what, wanted)
+    ratio = way["p99_ms"] / way["median_ms"]
+    return Outcome(what, wanted, f"{ratio:.1f}", ratio <= LIMIT_P99)
+
+
+def _throughput_targets(part: Results) -> Sequence[Outcome]:
+    found = []
+    for transport, limit in (("plasma", 0.95), ("handle", 0.95), ("shm", 0.95), ("websocket", 0.90)):
+        row = part.get("transports", {}).get(transport)
+        what = f"actions a second, 32 sessions, batches of 16, {transport}"
+        wanted = f"≥ {limit:.2f} of the ideal"
+        found.append(
+            Outcome(what, wanted, f"{row['of_ideal']:.3f}", row["of_ideal"] >= limit)
+            if row
+            else unmeasured(what, wanted)
+        )
+    for transport, row in part.get("transports", {}).items():
+        if row["robot"] is not None:
+            p99 = row["robot"]["wait_p99_ms"]
+            wanted = f"p99 ≤ {LIMIT_WAIT_MS:g} ms"
+            what = f"a robot's wait among 31 simulations, {transport}"
+            found.append(Outcome(what, wanted, f"{p99:.1f} ms", p99 <= LIMIT_WAIT_MS))
+    return found
+
+
+def _way(part: Results, name: str) -> Results | None:
+    return next((way for way in part.get("ways", ()) if way["way"] == name), None)
+
+
+def _decibels(way: Results) -> str:
+    return "lossless" if way["psnr_db"] is None else f"{way['psnr_db']:.1f} dB"
+
+
+def unmeasured(what: str, wanted: str) -> Outcome:
+    """Return the line of a target that was not measured."""
+    return Outcome(what, wanted, "not measured", None)
+
+
+def replaced(text: str, section: str) -> str:
+    """Put `section` between the two markers of `text`. Raises `ConfigError` unless it has both, once."""
+    before, begin, rest = text.partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not begin or not end or BEGIN in after or END in before + after:
+        raise ConfigError(f"the page has no single pair {BEGIN} … {END}; put it where the figures belong")
+    return f"{before}{BEGIN}\n{section.strip()}\n{END}{after}"
+
+
+def section(results: Mapping[str, Any]) -> str:
+    """Write what stands between the markers: targets, round trips, the link, throughput, and their origin."""
+    parts = [_origin(results), _targets(outcomes(results))]
+    if rtt := results.get("rtt"):
+        parts.append(_round_trips("Round trips of one `act` on one machine", rtt))
+    if link := results.get("link"):
+        name = (
+            f"The same over a link of {link['link']['measured_mbit_per_s']:.0f} Mbit/s between two network namespaces"
+        )
+        parts.append(_round_trips(name, link))
+    if throughput := results.get("throughput"):
+        parts.append(_throughput(throughput))
+    if skipped := list(_skipped(results)):
+        parts.append("Not measured: " + "; ".join(skipped) + ".")
+    return "\n\n".join(parts)
+
+
+def _origin(results: Mapping[str, Any]) -> str:
+    machine = results["machine"]
+    versions = ", ".join(f"{name} {version}" for name, version in results["versions"].items())
+    return (
+        f"Measured {results['date']} by `{results['command']}` on {machine['cpu']}, {machine['cores']} cores, "
+        f"{machine['memory_gb']} GB, Linux {machine['kernel']}, load average {machine['load']:.1f} before it began. "
+        f"{versions}. Two 224x224 RGB cameras, a policy that does nothing, all ways in turns of 100 calls in one run; "
+        f"in brackets 95 % intervals. A turn begins cold, which is most of what the p99 column shows."
+    )
+
+
+def _targets(lines: Sequence[Outcome]) -> str:
+    return _table(
+        ("", "wanted", "measured", "met"), [(one.what, one.wanted, one.measured, _MET[one.met]) for one in lines]
+    )
+
+
+def _round_trips(title: str, part: Mapping[str, Any]) -> str:
+    theirs = [peer["way"] for peer in part["peers"]]
+    rows = []
+    for way in sorted([*part["ways"], *part["peers"]], key=lambda one: float(one["median_ms"])):
+        low, high = way["ci95_ms"]
+        ratios = part["ratios"].get(way["way"], {})
+        name = f"*{way['way']}*" if way["way"] in theirs else way["way"]
+        rows.append(
+            (
+                name,
+                f"{way['median_ms']:.3f} ({low:.3f} to {high:.3f})",
+                f"{way['p99_ms']:.2f}",
+                *(f"{ratios[peer]['ratio']:.2f}" if peer in ratios else "" for peer in theirs),
+            )
+        )
+    return f"{title}:\n\n" + _table(("", "median ms", "p99 ms", *(f"/ {peer}" for peer in theirs)), rows)
+
+
+def _throughput(part: Mapping[str, Any]) -> str:
+    counts = [point["clients"] for row in part["transports"].values() for point in row["curve"]]
+    counts = list(dict.fromkeys(counts))
+    head = (
+        "",
+        f"of the ideal, {part['clients']} clients",
+        *(f"K = {k}" for k in counts),
+        "a robot waits, p50 / p99 ms",
+    )
+    rows = []
+    for name, row in part["transports"].items():
+        curve = {point["clients"]: point for point in row["curve"]}
+        robot = row["robot"]
+        waits = f"{robot['wait_p50_ms']:.1f} / {robot['wait_p99_ms']:.1f}" if robot else ""
+        rates = [f"{curve[k]['actions_per_s']:.0f}" if k in curve else "" for k in counts]
+        rows.append((name, f"{row['of_ideal']:.3f}", *rates, waits))
+    what = f"`{part['policy']}`" + "".join(f", {key} {value}" for key, value in part["config"].items())
+    text = (
+        f"Actions a second of one replica by K clients ({what}, batches of {part['batch']} at most; ideal "
+        f"{part['ideal_actions_per_s']:.0f}, {part['ideal_is']}), and what a robot among simulations waits:"
+    )
+    return f"{text}\n\n{_table(head, rows)}"
+
+
+def _skipped(results: Mapping[str, Any]) -> Iterator[str]:
+    for name, reason in (results.get("skipped") or {}).items():
+        yield f"{name} ({reason})"
+    found: dict[str, str] = {}
+    for part in ("rtt", "link", "throughput", "evaluation"):
+        found |= (results.get(part) or {}).get("skipped", {})
+    for name, reason in found.items():
+        yield f"{name} ({reason})"
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def show_outcomes(lines: Sequence[Outcome]) -> None:
+    """Print targets, and whether they are met."""
+    if not lines:
+        return
+    rows = table("", "wanted", "measured", "met")
+    met = {True: Text("yes"), False: Text("no", "red"), None: Text("")}
+    for one in lines:
+        rows.add_row(one.what, one.wanted, one.measured, met[one.met])
+    out.print(rows)
+
+
+def main(
+    page: Annotated[Path, typer.Option(help="Its text between the bench markers is replaced.")] = Path(
+        "docs/measured.md"
+    ),
+    json_file: Annotated[Path, typer.Option("--json", help="Keep the figures here.")] = Path("benchmarks/latest.json"),
+    calls: Calls = 1000,
+    seconds: Annotated[float, typer.Option(min=0.1, help="Of each measurement of the throughput.")] = 2.0,
+    peers_python: PeersPython = PYTHON,
+    from_json: Annotated[bool, typer.Option("--from-json", help="Measure nothing: use the figures in --json.")] = False,
+) -> None:
+    """Measure round trips, the link and throughput, and write the figures of docs/measured.md again."""
+    with errors():
+        if not page.is_file():
+            raise ConfigError(f"--page {page}: does not exist")
+        replaced(page.read_text(), "")  # raises without markers, before anything is measured
+        if from_json:
+            try:
+                results = json.loads(json_file.read_text())
+            except (OSError, ValueError) as error:
+                raise ConfigError(f"--json {json_file}: cannot be read ({error})") from error
+        else:
+            results = collect(
+                peers_python, calls=calls, link_calls=calls, plan=ThroughputPlan(seconds=seconds), progress=progress
+            )  # fmt: skip
+        write(results, page, None if from_json else json_file)
+    out.print(f"wrote {page}")
+
+
+if __name__ == "__main__":
+    typer.run(main)

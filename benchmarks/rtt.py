@@ -1,0 +1,70 @@
+"""Round trips of one `act`: every transport of ours, and other policy servers (`peers`), in turns in one run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from benchmarks import peers as others
+from vlagents_ray.bench.clients import own_clients
+from vlagents_ray.bench.figures import check_plot_file, plot_round_trips
+from vlagents_ray.bench.machine import measured_on
+from vlagents_ray.bench.rtt import measure
+from vlagents_ray.cli.bench import Calls, Json, Plot, Transports, show_round_trips
+from vlagents_ray.cli.console import errors, progress, save
+from vlagents_ray.cli.options import parse_list
+
+
+def measure_with_peers(
+    calls: int,
+    *,
+    peers: Sequence[str],
+    peers_python: Path = others.PYTHON,
+    transports: Sequence[str] = (),
+    progress: Callable[[str], None] = lambda _: None,
+) -> dict[str, Any]:
+    """Measure round trips of our transports and of other policy servers.
+
+    Args:
+        calls: Round trips of each client.
+        peers: Names of `peers.PEERS`, or "all"; one that is not installed is in "skipped", with the cure.
+        peers_python: The Python in which they are installed.
+        transports: Of ours; by default all.
+        progress: Is called with lines of progress.
+
+    Returns:
+        What `vlagents_ray.bench.rtt.measure(...).to_json()` returns, and the "versions" of the peers' packages.
+    """
+    own, skipped = own_clients(transports)
+    found, absent, versions = others.peer_clients(peers, peers_python)
+    trips = measure(own, calls, progress, others=others.starters(found, peers_python), skipped=skipped | absent)
+    return trips.to_json() | {"versions": versions}
+
+
+def main(
+    calls: Calls = 1000,
+    transports: Transports = "",
+    peers: others.Peers = "all",
+    peers_python: others.PeersPython = others.PYTHON,
+    json_file: Json = None,
+    plot: Plot = None,
+) -> None:
+    """Round trips to a `noop` policy on this machine: every transport, and other policy servers, in turns."""
+    with errors():
+        check_plot_file(plot)
+        origin = measured_on("python -m benchmarks.rtt")
+        found = measure_with_peers(
+            calls, peers=parse_list(peers), peers_python=peers_python, transports=parse_list(transports),
+            progress=progress,
+        )  # fmt: skip
+        show_round_trips(found, "round trip of one act on this machine")
+        save({**origin, **found, "versions": origin["versions"] | found["versions"]}, json_file)
+        if plot is not None:
+            plot_round_trips(found, plot)
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,52 @@
+"""A student whose actions are tokens, as those of OpenVLA, for learners of GRPO."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from student import ACTION, LookingNetwork, Student, head
+
+TOKENS = 11  # bins of each number of an action, whose middles are from -1 to 1
+
+
+def tokens_of(actions: np.ndarray) -> np.ndarray:
+    """Return the nearest token of each number of actions, int64; those beyond [-1, 1] have the outermost."""
+    found: np.ndarray = np.rint((np.clip(actions, -1.0, 1.0) + 1.0) / 2 * (TOKENS - 1)).astype(np.int64)
+    return found
+
+
+def actions_of(tokens: np.ndarray) -> np.ndarray:
+    """Return the actions of tokens, float32: the middles of their bins."""
+    found: np.ndarray = np.linspace(-1.0, 1.0, TOKENS, dtype=np.float32)[tokens]
+    return found
+
+
+class TokenNetwork(LookingNetwork):
+    """Inputs (B, INPUTS) to log-probabilities of tokens (B, 4, TOKENS) and entropies (B,), nats."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.policy = head(ACTION * TOKENS)
+
+    def forward(self, inputs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        logprobs = self.policy(self.features(inputs)).unflatten(-1, (ACTION, TOKENS)).log_softmax(-1)
+        return logprobs, -(logprobs.exp() * logprobs).sum((-2, -1))
+
+
+class TokenStudent(Student):
+    """Acts by the likeliest tokens, or draws them at temperature 1 if something is wanted for a learner."""
+
+    behaviour = ("logprob", "entropy", "replay")
+    network_class = TokenNetwork
+
+    def _best(self, *outputs: Any) -> np.ndarray:
+        return actions_of(outputs[0].argmax(-1))
+
+    def _draw(self, draws: np.random.Generator, *outputs: Any) -> tuple[np.ndarray, dict[str, Any]]:
+        logprobs, entropy = outputs
+        tokens = (logprobs + draws.gumbel(size=logprobs.shape)).argmax(-1)  # drawn from the softmax: the Gumbel trick
+        logprob = np.take_along_axis(logprobs, tokens[:, None], -1)[:, 0]
+        said = {"logprob": logprob[None], "entropy": float(entropy), "replay": {"tokens": tokens[None]}}
+        return actions_of(tokens), said

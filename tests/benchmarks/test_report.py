@@ -1,0 +1,134 @@
+"""The section of docs/measured.md follows from the figures alone."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import pytest
+
+from benchmarks.report import BEGIN, DEFAULT, END, JPEG, outcomes, replaced, section
+from vlagents_ray.errors import ConfigError
+
+
+def way(name: str, ms: float, psnr: float | None = None) -> dict[str, Any]:
+    return {"way": name, "calls": 500, "median_ms": ms, "ci95_ms": [ms, ms + 0.01], "p99_ms": 2 * ms, "psnr_db": psnr}
+
+
+def round_trips(ours: dict[str, float], theirs: dict[str, float]) -> dict[str, Any]:
+    ratios = {
+        a: {b: {"ratio": x / y, "ci95": [x / y - 0.01, x / y + 0.01]} for b, y in theirs.items()}
+        for a, x in ours.items()
+    }
+    ways = [way(name, ms, 33.0 if "jpeg" in name else None) for name, ms in ours.items()]
+    return {"ways": ways, "peers": [way(name, ms) for name, ms in theirs.items()], "ratios": ratios, "skipped": {}}
+
+
+THEIRS = {"vlagents shm": 0.5, "vlagents JPEG": 2.0, "openpi": 0.6, "OpenVLA REST": 3.0}
+RESULTS: dict[str, Any] = {
+    "date": "2026-01-02",
+    "command": "python -m benchmarks.report",
+    "machine": {"cpu": "a CPU", "cores": 2, "memory_gb": 24, "kernel": "6.1", "load": 0.1},
+    "versions": {"ray": "2.60.0", "vlagents": "0.3.0"},
+    "skipped": {},
+    "rtt": {
+        **round_trips(
+            {"plasma, Ray actor": 0.15, "shm": 0.11, JPEG: 1.2, DEFAULT: 0.6, "http, jpeg": 1.7},
+            THEIRS,
+        ),
+        "skipped": {"vla-eval": "not installed"},
+        "steady": [way("plasma, Ray actor", 0.1), {**way("shm", 0.1), "p99_ms": 0.31}],
+    },
+    "link": {
+        **round_trips({"websocket, default": 0.9}, {"vlagents JPEG": 2.0, "openpi": 2.5}),
+        "link": {"measured_mbit_per_s": 953.2},
+    },
+    "throughput": {
+        "policy": "noop", "config": {"base_ms": 20.0}, "batch": 16, "clients": 32,
+        "ideal_actions_per_s": 444.4, "ideal_is": "by arithmetic", "skipped": {},
+        "transports": {
+            "shm": {
+                "actions_per_s": 400.0, "of_ideal": 0.9, "curve": [{"clients": 32, "actions_per_s": 400.0}],
+                "robot": {"wait_p50_ms": 20.0, "wait_p99_ms": 40.0},
+            },
+        },
+    },
+}  # fmt: skip
+
+
+def test_each_target_is_judged_by_its_figure() -> None:
+    found = {(one.what, one.wanted): one for one in outcomes(RESULTS)}
+    node = found["a Ray env actor and the replica on its node (plasma)", "≤ 0.40 x vlagents shm"]
+    assert (node.measured, node.met) == ("0.300 (0.290 to 0.310)", True)
+    assert not found["a local process and the replica (shm)", "≤ 0.20 x vlagents shm"].met  # 0.11 / 0.5
+    assert found["a local process and the replica (shm)", "≤ 0.20 x openpi"].met
+    assert found["WebSocket, our default, over the link", "≤ 0.45 x openpi"].met
+    assert not found["actions a second, 32 sessions, batches of 16, shm", "≥ 0.95 of the ideal"].met
+    assert found["actions a second, 32 sessions, batches of 16, plasma", "≥ 0.95 of the ideal"].met is None
+    assert found["a robot's wait among 31 simulations, shm", "p99 ≤ 72 ms"].met
+    tails = [one for one in found.values() if one.what.startswith("p99 over median, ")]
+    assert [(one.measured, one.met) for one in tails] == [("2.0", True), ("3.1", False)]
+
+
+def test_a_default_that_loses_more_of_the_image_does_not_meet_its_target() -> None:
+    worse = copy.deepcopy(RESULTS)
+    worse["rtt"]["ways"][3]["psnr_db"] = 30.0
+    for results, met in ((RESULTS, True), (worse, False)):
+        (line,) = [one for one in outcomes(results) if one.what == "WebSocket, our default setting"]
+        assert line.met is met
+
+
+def test_the_section_names_machine_date_versions_and_command() -> None:
+    text = section(RESULTS)
+    for part in (
+        "2026-01-02",
+        "`python -m benchmarks.report`",
+        "a CPU, 2 cores",
+        "ray 2.60.0",
+        "vla-eval (not installed)",
+    ):
+        assert part in text
+    assert "| shm | 0.110 (0.110 to 0.120) | 0.22 | 0.22 | 0.06 | 0.18 | 0.04 |" in text
+    assert "| *openpi* | 0.600 (0.600 to 0.610) | 1.20 |  |  |  |  |" in text
+    assert "a link of 953 Mbit/s" in text
+
+
+def test_what_was_not_measured_is_said() -> None:
+    text = section({**RESULTS, "rtt": None, "link": None, "throughput": None, "skipped": {"link": "no right to"}})
+    assert "| not measured |" in text
+    assert "link (no right to)" in text
+
+
+def test_every_row_of_a_table_has_as_many_cells_as_its_head() -> None:
+    cells = 0
+    for line in section(RESULTS).splitlines():
+        if not line.startswith("|"):
+            cells = 0
+            continue
+        cells = cells or line.count("|")
+        assert line.count("|") == cells
+
+
+def test_only_what_is_between_the_markers_is_replaced() -> None:
+    text = f"# Title\n{BEGIN}\nold\n{END}\nrest\n"
+    assert replaced(text, "new") == f"# Title\n{BEGIN}\nnew\n{END}\nrest\n"
+    assert replaced(replaced(text, "new"), "new") == replaced(text, "new")
+
+
+@pytest.mark.parametrize("text", ["", BEGIN, END + BEGIN, f"{BEGIN}{END}{BEGIN}{END}"])
+def test_a_page_without_a_pair_of_markers_is_refused(text: str) -> None:
+    with pytest.raises(ConfigError, match="bench"):
+        replaced(text, "new")
+
+
+def test_evaluations_are_judged_where_they_were_measured() -> None:
+    found = {
+        "cores": 2,
+        "plan": {"workers": 2},
+        "ratios": {"vla-eval": {"median": 1.29}},
+        "skipped": {"vlagents": "gone"},
+    }
+    assert not any("evaluations" in one.what for one in outcomes(RESULTS))
+    text = section(RESULTS | {"evaluation": found})
+    assert "| ≥ 1.3 x vla-eval, 2 shards | 1.29 | **no** |" in text
+    assert "vlagents (gone)" in text

@@ -1,0 +1,174 @@
+"""`vlagents-ray tune`: settings of a deployment file or a file of runs, measured on this machine."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Mapping, Sequence
+from enum import Enum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+import yaml
+
+from vlagents_ray.cli.console import errors, out, progress, table
+from vlagents_ray.cli.options import YAML_SUFFIXES, is_run_file, parse_dims, parse_list
+from vlagents_ray.errors import ConfigError
+
+if TYPE_CHECKING:
+    from vlagents_ray.bench.evaluation import MeasuredEvaluation
+    from vlagents_ray.bench.tuning.choice import MeasuredPoint
+
+
+class Wanted(str, Enum):
+    """What `--for` takes."""
+
+    robots = "robots"
+    throughput = "throughput"
+
+
+def tune_command(
+    file: Annotated[Path, typer.Argument(help="A deployment file, or a file of runs of `vlagents-ray eval`.")],
+    wanted: Annotated[
+        Wanted, typer.Option("--for", help="The most actions a second, or the most robots within --p99-ms.")
+    ] = Wanted.throughput,
+    p99_ms: Annotated[
+        float | None, typer.Option("--p99-ms", min=0, help="Of robots: the longest round trip of 99 in 100, ms.")
+    ] = None,
+    plot: Annotated[
+        Path | None, typer.Option("--plot", help="Draw latency against throughput here: .png, .svg or .pdf.")
+    ] = None,
+    minutes: Annotated[float, typer.Option(min=0.1, help="That all of it may take.")] = 5.0,
+    max_workers: Annotated[
+        int | None, typer.Option(min=1, help="Of a file of runs: the most workers to try; default: twice the cores.")
+    ] = None,
+    max_batch: Annotated[int, typer.Option(min=1, help="The largest batch to try.")] = 32,
+    seconds: Annotated[float, typer.Option(min=0.1, help="Of each measurement.")] = 2.0,
+    dtypes: Annotated[
+        str | None,
+        typer.Option(help="To try, as bfloat16,int8; default: the one that suits the accelerator, if any."),
+    ] = None,
+    tolerance: Annotated[
+        float, typer.Option(min=0, help="How far actions may be off, as a share of their range.")
+    ] = 0.01,
+    frames: Annotated[
+        Path | None, typer.Option(help="A folder of recorded trajectories to act on; default: random observations.")
+    ] = None,
+    app: Annotated[str | None, typer.Option(help="Of the file, if it holds several.")] = None,
+    image: Annotated[int, typer.Option(min=1, help="Pixels a side, where the policy takes any image.")] = 224,
+    state: Annotated[
+        list[str], typer.Option(metavar="PART=N", help="Numbers in a part for which the policy does not say.")
+    ] = [],  # noqa: B006
+) -> None:
+    """Find the best settings of a file by measuring, and print those to change.
+
+    Of a deployment file: batch size, compilation and precision. Of a file of runs: workers, and environments a worker.
+    """
+    began = time.monotonic()
+    from vlagents_ray.bench.figures import check_plot_file
+    from vlagents_ray.bench.tuning.choice import TuningGoal, choose, chosen_settings, default_point, figures
+    from vlagents_ray.bench.tuning.picture import plot_latency
+    from vlagents_ray.bench.tuning.tuner import TunePlan, Tuner
+    from vlagents_ray.serve.config.deployment import ServerArgs
+    from vlagents_ray.serve.launch.deployment_file import policy_application
+
+    with errors():
+        goal = TuningGoal(wanted.value, p99_ms)
+        if file.suffix not in YAML_SUFFIXES:
+            raise ConfigError(f"got {str(file)!r}, want a deployment file or a file of runs (.yaml)")
+        check_plot_file(plot)
+        if is_run_file(file):
+            if goal.kind != "throughput" or dtypes or frames or app or state or plot:
+                raise ConfigError(
+                    "--for, --dtypes, --frames, --app, --state and --plot are of deployment files; leave them out"
+                )
+            tune_evaluation(file, minutes=minutes, max_workers=max_workers, began=began)
+            return
+        application = policy_application(str(file), app)
+        args = ServerArgs(**application.args)
+        plan = TunePlan(
+            args, goal, max_batch, minutes, seconds, tolerance, None if dtypes is None else parse_list(dtypes), frames,
+            image, parse_dims(state, "--state"),
+        )  # fmt: skip
+        tuner = Tuner(plan, progress, began)
+        points = tuner.measure()
+        title = f"{args.policy} on {tuner.device}"
+        head, *rows = figures(points)
+        _show(head, rows, tuner.left_out, title)
+        chosen, default = choose(points, goal), default_point(points, goal, args.batch.max_size)
+        settings = chosen_settings(chosen, args.batch, tuner.fixed)
+        _show_choice(_words(chosen), _words(default), began, f"below args of {application.name!r} in {file}", settings)
+        if plot is not None:
+            plot_latency(points, chosen, default, goal, plot, title)
+            out.print(f"wrote {plot}")
+
+
+def tune_evaluation(file: Path, *, minutes: float, max_workers: int | None, began: float) -> None:
+    """Serve the policies of a file of runs, measure, and print the numbers to change.
+
+    Args:
+        file: The file of runs.
+        minutes: That the measurements may take, from `began`.
+        max_workers: The most workers to try; None: twice as many as this machine has cores.
+        began: s of `time.monotonic`.
+    """
+    from vlagents_ray.bench.evaluation import EvaluationTuner
+    from vlagents_ray.cli.evaluation.command import read_run
+    from vlagents_ray.cli.evaluation.policies import served
+    from vlagents_ray.evaluate import EvalConfig
+
+    config = EvalConfig.model_validate(read_run(file))
+    most = max(max_workers or 2 * (os.cpu_count() or 1), config.workers)
+    with served(config.model_copy(update={"workers": most})) as ready:
+        own = ready.model_copy(update={"workers": config.workers})
+        tuner = EvaluationTuner(own, began + 60 * minutes, most, progress=progress)
+        tuner.measure()
+    _show(_HEAD, [_row(one) for one in tuner.found], tuner.left_out, f"{file}, on {os.cpu_count()} cores")
+    before, chosen = tuner.found[0], tuner.chosen
+    settings: dict[str, Any] = {} if chosen.workers == before.workers else {"workers": chosen.workers}
+    if chosen.num_envs != before.num_envs:
+        settings["suites"] = [{"num_envs": chosen.num_envs} for _ in config.suites]
+    _show_choice(_evaluation_words(chosen), _evaluation_words(before), began, f"in {file}", settings)
+
+
+_HEAD = ("workers", "envs a worker", "episodes/min", "start s", "memory MiB", "whole evaluation, min")
+
+
+def _row(one: MeasuredEvaluation) -> list[str]:
+    numbers = [f"{one.episodes_per_min:.1f}", f"{one.start_s:.1f}", f"{one.memory_mib:.0f}", f"{one.total_s / 60:.1f}"]
+    return [str(one.workers), str(one.num_envs), *numbers]
+
+
+def _evaluation_words(one: MeasuredEvaluation) -> str:
+    workers = f"{one.workers} worker{'s' if one.workers > 1 else ''}"
+    envs = f"{one.num_envs} environment{'s' if one.num_envs > 1 else ''} each"
+    return f"{workers} with {envs}, {one.total_s / 60:.1f} minutes"
+
+
+def _words(point: MeasuredPoint | None) -> str:
+    if point is None:
+        return "not measured, or out of the goal"
+    from vlagents_ray.bench.tuning.choice import sessions
+
+    figures = f"{point.actions_per_s:.1f} actions/s, p99 {point.p99_ms:.1f} ms"
+    return f"{point.variant.name}, {sessions(point.sessions)}: {figures}"
+
+
+def _show(head: Sequence[str], rows: Sequence[Sequence[str]], left_out: Sequence[str], title: str) -> None:
+    shown = table(*head, title=title)
+    for row in rows:
+        shown.add_row(*row)
+    out.print(shown)
+    for sentence in left_out:
+        out.print(f"left out: {sentence}", style="yellow")
+
+
+def _show_choice(chosen: str, own: str, began: float, where: str, settings: Mapping[str, Any]) -> None:
+    """Print the choice, beside what the file gives as it is, and the settings to change as YAML."""
+    out.print(f"chosen: {chosen}\nthe file as it is: {own}\nafter {time.monotonic() - began:.0f} s")
+    if not settings:
+        out.print("nothing to change")
+        return
+    text = yaml.safe_dump(dict(settings), sort_keys=False, default_flow_style=None)
+    out.print(f"set {where}:\n\n{text}")
