@@ -12,7 +12,7 @@ import pytest
 from vlagents_ray.contract import CameraSpec
 from vlagents_ray.envs import make_env
 from vlagents_ray.envs.maniskill import ManiSkill, factory
-from vlagents_ray.envs.maniskill.tasks import INSTRUCTIONS, instruction_for
+from vlagents_ray.envs.maniskill.factory import INSTRUCTIONS, instruction_for
 from vlagents_ray.errors import ConfigError, EnvFailed, InvalidAction, NotReset, UnknownEnv
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.testing import check_env

@@ -8,7 +8,7 @@ import pytest
 
 from vlagents_ray.envs.batch import SequentialBatch, make_batch
 from vlagents_ray.envs.maniskill import ManiSkill
-from vlagents_ray.envs.maniskill.batch import ManiSkillBatch
+from vlagents_ray.envs.maniskill.env import ManiSkillBatch
 from vlagents_ray.errors import ConfigError, NotReset
 from vlagents_ray.interface import HIGH_RES, Act
 from vlagents_ray.policies.experts import expert_for

@@ -1,9 +1,13 @@
-"""The import of LIBERO in processes without a terminal, several of which may do it at once."""
+"""LIBERO's package: its import by several processes without a terminal, and its meshes and textures.
+
+The import may happen in several processes at once. Nothing here downloads the meshes and textures.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import functools
+import hashlib
 import importlib.util
 import json
 import os
@@ -12,16 +16,25 @@ import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
-from vlagents_ray.envs.rendering.headless import prepare_rendering
+from vlagents_ray.envs.rendering.graphics import prepare_rendering
 from vlagents_ray.envs.rendering.render_probe import EGL_CURE
-from vlagents_ray.envs.robosuite.importing import importing_robosuite
+from vlagents_ray.envs.robosuite.base import importing_robosuite
 from vlagents_ray.errors import EnvFailed, MissingDependency
 from vlagents_ray.registry import require
 
 _CONFIG = "LIBERO_CONFIG_PATH"
+VARIABLE = "LIBERO_ASSETS"
+_DATASET = "lerobot/libero-assets"  # hf-libero's own source of them
+_CACHE = Path(".cache") / "libero" / "assets"  # in the home, where hf-libero's own download puts them
+_NEEDED = ("articulated_objects", "scenes", "stable_hope_objects", "stable_scanned_objects", "turbosquid_objects")
+
+CURE = (
+    f"download them once: hf download {_DATASET} --repo-type dataset --local-dir libero-assets; then "
+    f"set {VARIABLE} to that folder on every node, or the env's option `assets`"
+)
 
 
-def root() -> Path:
+def package_folder() -> Path:
     """The package's folder with its problems and initial states; raises `MissingDependency`."""
     require("libero")
     spec = importlib.util.find_spec("libero.libero")
@@ -31,10 +44,10 @@ def root() -> Path:
 
 
 @functools.cache
-def load() -> Path:
-    """Import LIBERO and robosuite, once a process; returns `root()`."""
+def import_libero() -> Path:
+    """Import LIBERO and robosuite, once a process; returns `package_folder()`."""
     prepare_rendering()
-    folder = root()
+    folder = package_folder()
     try:
         with _own_config(folder), importing_robosuite("libero"), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # warnings of upstream code; LIBERO itself changes the filters
@@ -69,3 +82,33 @@ def _own_config(folder: Path) -> Iterator[None]:
                 del os.environ[_CONFIG]
             else:
                 os.environ[_CONFIG] = before
+
+
+def find_assets(chosen: str | None = None) -> Path:
+    """Find the folder of the assets: `chosen`, or the one that `LIBERO_ASSETS` names, or that of hf-libero itself.
+
+    Args:
+        chosen: The folder in the env's options; None if it has none.
+
+    Returns:
+        The folder.
+
+    Raises:
+        EnvFailed: There is no such folder, or it lacks a part; the message has the command for the download.
+    """
+    named = chosen or os.environ.get(VARIABLE)
+    places = [Path(named)] if named else [package_folder() / "assets", Path.home() / _CACHE]
+    folder = next((place for place in places if place.is_dir()), None)
+    if folder is None:
+        looked = " and ".join(str(place) for place in places)
+        raise EnvFailed(f"libero: no assets (meshes and textures) in {looked}; {CURE}")
+    lacks = [part for part in _NEEDED if not (folder / part).is_dir()]
+    if lacks:
+        raise EnvFailed(f"libero: the assets in {folder} lack {lacks}; {CURE}")
+    return folder.resolve()
+
+
+def assets_digest(folder: Path) -> str:
+    """Return a digest of a folder, which is equal if relative paths and sizes of all files are."""
+    files = sorted((str(path.relative_to(folder)), path.stat().st_size) for path in folder.rglob("*") if path.is_file())
+    return hashlib.sha256(repr(files).encode()).hexdigest()[:16]
