@@ -13,7 +13,7 @@ from vlagents_ray.bench.checkpoints.recipe import Recipe
 from vlagents_ray.bench.checkpoints.recipes import write_checkpoint
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.openvla.policy import OpenVLA
-from vlagents_ray.policies.openvla.sources import find_source
+from vlagents_ray.policies.openvla.prismatic import find_source
 from vlagents_ray.testing.observations import random_observation
 
 pytestmark = [pytest.mark.source("OPENVLA_SRC"), *LIBRARIES]

@@ -11,8 +11,7 @@ import numpy as np
 from PIL import Image
 from pydantic import BaseModel, Field
 
-from vlagents_ray.policies.arro.parts import Detection, Images
-from vlagents_ray.policies.arro.regions import box_of, flat, largest, overlap, split
+from vlagents_ray.policies.arro.parts import Detection, Images, box_of, flat, largest, overlap, split
 
 _HUES = {"red": 0.0, "orange": 28.0, "yellow": 48.0, "green": 132.0, "cyan": 180.0, "blue": 216.0, "purple": 275.0}
 
