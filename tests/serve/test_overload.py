@@ -67,11 +67,11 @@ from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.admission import Admission, MessageAdmission, NeedsDecodingThread
 from vlagents_ray.serve.engine.dispatch import Dispatcher
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.wire import gr00t as gr00t_codec
 from vlagents_ray.wire import json_numpy, msgpack
-from vlagents_ray.wire.gr00t import codec as gr00t_codec
-from vlagents_ray.wire.openpi import codec as openpi_codec
-from vlagents_ray.wire.openvla import codec as openvla_codec
-from vlagents_ray.wire.vla_eval import codec as vla_eval_codec
+from vlagents_ray.wire import openpi as openpi_codec
+from vlagents_ray.wire import openvla as openvla_codec
+from vlagents_ray.wire import vla_eval as vla_eval_codec
 
 JPEG = jpeg_png.encode_jpeg(np.full((32, 32, 3), 9, np.uint8))
 PNG = jpeg_png.encode_png(np.full((32, 32, 3), 9, np.uint8))

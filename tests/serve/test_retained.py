@@ -29,12 +29,12 @@ from vlagents_ray.protocol.frames import decode_replies, encode_request
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, STREAM_BYTES, Limits, Request
 from vlagents_ray.serve.access import api_keys
 from vlagents_ray.serve.access.api_keys import NoKey
+from vlagents_ray.serve.dialects import gr00t
 from vlagents_ray.serve.dialects.base import GatewayContext
-from vlagents_ray.serve.dialects.gr00t import handler as gr00t
 from vlagents_ray.serve.engine.admission import Admission
 from vlagents_ray.serve.engine.dispatch import REFUSALS
-from vlagents_ray.wire.lerobot.upstream import read_chunk
-from vlagents_ray.wire.pickles.tensors import _CONSTANT
+from vlagents_ray.wire.lerobot import read_chunk
+from vlagents_ray.wire.pickles import _CONSTANT
 
 SLACK = 48 * 2**20  # bytes of buffers in the kernel's and the interpreter's own care
 SEEN = Obs({"front": np.zeros((8, 8, 3), np.uint8)})

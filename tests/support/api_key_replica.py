@@ -70,7 +70,7 @@ from vlagents_ray.serve.live.snapshot import ReplicaView
 from vlagents_ray.serve.ports import free_port, reserve
 from vlagents_ray.serve.weights.updates import PushResult
 from vlagents_ray.weights.safetensors import ValueSpec, header_of, read_header
-from vlagents_ray.wire.vla_eval import codec as vla_eval_codec
+from vlagents_ray.wire import vla_eval as vla_eval_codec
 
 ANSWER_S = 10.0
 LIMITS = Limits(body_bytes=2**20)
@@ -156,7 +156,7 @@ class KeyedReplica:
         patch.setattr(api_keys, "_CHECK_S", 0.0)
         patch.setattr(access_middleware, "_TICK_S", 0.02)
         patch.setattr(periodic.each_half_second, "_period_s", 0.02)
-        patch.setattr("vlagents_ray.serve.dialects.gr00t.handler._TICK_MS", 20)
+        patch.setattr("vlagents_ray.serve.dialects.gr00t._TICK_MS", 20)
         self.known = ChangingKeys()
         self.at_gateway = self.known.another()  # of another process
         self.policy = Recorder()

@@ -47,8 +47,8 @@ from vlagents_ray.serve.endpoints.local.shm import ShmServer
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.wire import json_numpy
-from vlagents_ray.wire.openpi import codec as openpi_codec
-from vlagents_ray.wire.vla_eval import codec as vla_eval_codec
+from vlagents_ray.wire import openpi as openpi_codec
+from vlagents_ray.wire import vla_eval as vla_eval_codec
 
 HEIGHT, WIDTH = 2304, 4096  # of the largest image
 IMAGES = 4  # of these in the largest request

@@ -21,7 +21,7 @@ from vlagents_ray.errors import (
 )
 from vlagents_ray.protocol.messages import Limits
 from vlagents_ray.serve.presets import presets, read_mapping
-from vlagents_ray.wire.mapping.mapping import KeyMapping
+from vlagents_ray.wire.mapping import KeyMapping
 
 IMAGE = np.random.default_rng(0).integers(0, 256, (6, 8, 3), np.uint8)
 LIBERO = {

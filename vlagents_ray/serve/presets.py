@@ -12,7 +12,7 @@ from typing import Any
 
 from vlagents_ray.registry import DIALECTS, dialect_class, names
 from vlagents_ray.wire import presets as wire_presets
-from vlagents_ray.wire.mapping.mapping import KeyMapping
+from vlagents_ray.wire.mapping import KeyMapping
 
 
 def read_mapping(value: str | Mapping[str, Any]) -> KeyMapping:

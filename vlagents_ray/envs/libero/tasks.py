@@ -25,7 +25,7 @@ from vlagents_ray.envs.rendering.render_probe import failing
 from vlagents_ray.errors import ConfigError, UnknownEnv
 from vlagents_ray.naming import did_you_mean
 from vlagents_ray.registry import require
-from vlagents_ray.wire.pickles.arrays import read_pickled_array
+from vlagents_ray.wire.pickles import read_pickled_array
 
 VARIABLE = "LIBERO_FILES"
 _PROBLEMS, _STATES = "bddl_files", "init_files"

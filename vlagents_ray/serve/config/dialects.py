@@ -17,7 +17,7 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.protocol.messages import RankName
 from vlagents_ray.registry import DIALECTS, dialect_class, names
 from vlagents_ray.serve.presets import read_mapping
-from vlagents_ray.wire.mapping.mapping import KeyMapping
+from vlagents_ray.wire.mapping import KeyMapping
 
 MappingSetting = str | dict[str, Any]
 
@@ -30,7 +30,7 @@ class DialectConfig(BaseModel):
     mapping: MappingSetting | None = Field(
         default=None,
         description="how the client's observations become ours: a preset's name, or an object, see "
-        "vlagents_ray.wire.mapping.mapping; unset: the client uses our names",
+        "vlagents_ray.wire.mapping; unset: the client uses our names",
     )
     rank: RankName = Field(default="robot", description="class of its requests: robots go before simulations")
 
