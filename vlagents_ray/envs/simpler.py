@@ -141,7 +141,8 @@ class Simpler(SimulatorEnv):
     @classmethod
     def missing(cls) -> str | None:
         """Say why SIMPLER cannot run here; its assets are in no package."""
-        return ManiSkill.missing() or _missing_assets(_asset_folder())
+        folder = Path(os.environ.get("MS_ASSET_DIR", Path.home() / ".maniskill"))
+        return ManiSkill.missing() or _missing_assets(folder)
 
     def renderer(self) -> Renderer | None:
         found: Renderer | None = self._alive().renderer()
@@ -198,10 +199,6 @@ def _own_lists() -> Any:
     twins = require("mani_skill.envs.tasks.digital_twins.base_env").BaseDigitalTwinEnv
     twins._objects_to_remove_from_greenscreen, twins._rgb_overlay_images = [], {}
     return twins
-
-
-def _asset_folder() -> Path:
-    return Path(os.environ.get("MS_ASSET_DIR", Path.home() / ".maniskill"))
 
 
 def _missing_assets(folder: Path) -> str | None:

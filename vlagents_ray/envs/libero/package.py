@@ -17,7 +17,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from vlagents_ray.envs.rendering.graphics import prepare_rendering
-from vlagents_ray.envs.rendering.render_probe import EGL_CURE
+from vlagents_ray.envs.rendering.render_probe import failing
 from vlagents_ray.envs.robosuite.base import importing_robosuite
 from vlagents_ray.errors import EnvFailed, MissingDependency
 from vlagents_ray.registry import require
@@ -48,17 +48,15 @@ def import_libero() -> Path:
     """Import LIBERO and robosuite, once a process; returns `package_folder()`."""
     prepare_rendering()
     folder = package_folder()
-    try:
-        with _own_config(folder), importing_robosuite("libero"), warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # warnings of upstream code; LIBERO itself changes the filters
-            require("libero.libero.benchmark")
-            require("libero.libero.envs")
-    except MissingDependency:
-        raise
-    except Exception as error:
-        about_egl = "EGL" in str(error) or "OpenGL" in str(error)
-        cure = f"; {EGL_CURE}" if about_egl else ""
-        raise EnvFailed(f"libero could not be imported: {type(error).__name__}: {error}{cure}") from error
+    with (
+        failing("libero", "import its package"),
+        _own_config(folder),
+        importing_robosuite("libero"),
+        warnings.catch_warnings(),
+    ):
+        warnings.simplefilter("ignore")  # warnings of upstream code; LIBERO itself changes the filters
+        require("libero.libero.benchmark")
+        require("libero.libero.envs")
     return folder
 
 

@@ -96,17 +96,17 @@ class ManiSkill(SimulatorEnv):
         self.max_steps = factory.step_limit(self._name, max_steps, self._own_limit)
         self._given_instruction = instruction
         self._reconfigure = reconfigure
-        self._env = Simulator(
-            self._name,
+        self._env = _simulator(
             task,
-            obs_mode="rgb+state",
+            width=width,
+            height=height,
+            shader=shader,
             cameras=cameras,
             record_size=self._record_size,
             sim_backend=sim_backend,
             render_backend=render_backend,
             control_mode=control_mode,
             reward_mode=reward_mode,
-            sensors=factory.sensor_settings(self._name, width, height, shader),
         )
         self._resources.callback(self._env.close)
         self._contract = self._env.contract(self._env.action)
@@ -169,18 +169,12 @@ class ManiSkillBatch(BatchEnv):
         task: str = "PushCube-v1",
         *,
         num_envs: int,
-        width: int = 224,
-        height: int = 224,
-        cameras: Sequence[str] | None = None,
-        control_mode: str | None = None,
         instruction: str | None = None,
         max_steps: int | None = None,
         sim_backend: str = "physx_cuda",
-        render_backend: str = "auto",
-        shader: str | None = None,
-        reward_mode: str | None = None,
         reconfigure: bool = True,
         record_size: Sequence[int] | None = None,
+        **options: Any,
     ) -> None:
         """Make the environments with the options of `ManiSkill`, whose errors this raises.
 
@@ -199,18 +193,7 @@ class ManiSkillBatch(BatchEnv):
         self._instruction = instruction
         self._reconfigure = reconfigure
         self._playing = self._steps = 0
-        self._simulator = Simulator(
-            f"maniskill/{task}",
-            task,
-            num_envs=num_envs,
-            obs_mode="rgb+state",
-            cameras=cameras,
-            sim_backend=sim_backend,
-            render_backend=render_backend,
-            control_mode=control_mode,
-            reward_mode=reward_mode,
-            sensors=factory.sensor_settings(f"maniskill/{task}", width, height, shader),
-        )
+        self._simulator = _simulator(task, num_envs=num_envs, sim_backend=sim_backend, **options)
         self._contract = self._simulator.contract(self._simulator.action)
 
     @property
@@ -255,6 +238,14 @@ class ManiSkillBatch(BatchEnv):
     def close(self) -> None:
         self._playing = 0
         self._simulator.close()
+
+
+def _simulator(
+    task: str, *, width: int = 224, height: int = 224, shader: str | None = None, **options: Any
+) -> Simulator:
+    name = f"maniskill/{task}"
+    sensors = factory.sensor_settings(name, width, height, shader)
+    return Simulator(name, task, obs_mode="rgb+state", sensors=sensors, **options)
 
 
 def _described(simulator: Simulator, reconfigure: bool, max_steps: int, own_limit: int | None) -> dict[str, Any]:

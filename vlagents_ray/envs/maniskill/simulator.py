@@ -45,8 +45,8 @@ class Simulator:
         cameras: Sequence[str] | None = None,
         record_size: Size | None = None,
         sim_backend: str,
-        render_backend: str,
-        control_mode: str | None,
+        render_backend: str = "auto",
+        control_mode: str | None = None,
         reward_mode: str | None = None,
         sensors: Mapping[str, Any],
     ) -> None:

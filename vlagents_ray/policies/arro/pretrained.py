@@ -148,7 +148,8 @@ class Sam2Segmenter:
         torch = require("torch")
         made = []
         for image, embedded, own in zip(images, self._embedded(images), boxes, strict=True):
-            scaled = torch.as_tensor(own * (self._side / _size(image)), dtype=self._model.dtype)
+            corners = np.array([image.shape[1], image.shape[0]] * 2, np.float32)  # width, height, width, height
+            scaled = torch.as_tensor(own * (self._side / corners), dtype=self._model.dtype)
             outputs = self._decoded(embedded, input_boxes=scaled[None], multimask_output=False)
             made.append(_upscaled(outputs.pred_masks[0, :, 0], image))
         return made
@@ -279,11 +280,6 @@ class Sam2Tracker:
 def _pixels(processor: Any, images: Images, model: Any) -> Any:
     """Return images of any sizes as one (B, 3, side, side) tensor on the model's device."""
     return processor(writable(images), return_tensors="pt")["pixel_values"].to(model.device, model.dtype)
-
-
-def _size(image: np.ndarray) -> np.ndarray:
-    """Return width and height twice, in the order of a box's corners."""
-    return np.array([image.shape[1], image.shape[0]] * 2, np.float32)
 
 
 def _upscaled(logits: Any, image: np.ndarray) -> np.ndarray:
