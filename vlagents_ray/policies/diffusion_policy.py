@@ -76,10 +76,7 @@ class DiffusionPolicy(ModelPolicy):
     """The policy of a Diffusion Policy checkpoint, which calls the module's `predict_action` for a whole batch."""
 
     Config: ClassVar[type] = DiffusionPolicyConfig
-
-    def __init__(self, config: DiffusionPolicyConfig) -> None:
-        super().__init__(config)
-        self.config: DiffusionPolicyConfig = config
+    config: DiffusionPolicyConfig
 
     @property
     def history(self) -> int:

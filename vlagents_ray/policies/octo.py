@@ -87,10 +87,7 @@ class Octo(ModelPolicy):
     """The policy of an Octo checkpoint: a row for each session, with its window of frames and its noise."""
 
     Config: ClassVar[type] = OctoConfig
-
-    def __init__(self, config: OctoConfig) -> None:
-        super().__init__(config)
-        self.config: OctoConfig = config
+    config: OctoConfig
 
     @property
     def history(self) -> int:
