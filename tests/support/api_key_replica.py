@@ -38,8 +38,8 @@ from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.connection import Connection
 from vlagents_ray.client.credentials import Credentials
 from vlagents_ray.client.transports.codec_selection import CodecChoice
-from vlagents_ray.client.transports.local.shm import ShmTransport
 from vlagents_ray.client.transports.probe import bytes_probe
+from vlagents_ray.client.transports.shm import ShmTransport
 from vlagents_ray.errors import BY_CODE, VLAgentsError
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.frames import decode_replies, decode_reply, encode_request
@@ -60,7 +60,7 @@ from vlagents_ray.serve.dialects.routes import dialect_routes
 from vlagents_ray.serve.endpoints import access_middleware, websocket_connection
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
-from vlagents_ray.serve.endpoints.local.shm import ShmServer
+from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.endpoints.weights import weights_routes
 from vlagents_ray.serve.engine.engine import Engine
@@ -233,7 +233,7 @@ def _plasma_server(engine: Engine, patch: pytest.MonkeyPatch, folder: Path) -> A
     """The plasma endpoint, with channels that hold a frame as it is."""
     import ray
 
-    from vlagents_ray.serve.endpoints.local.plasma import PlasmaServer
+    from vlagents_ray.serve.endpoints.plasma import PlasmaServer
 
     node = SimpleNamespace(plasma_store_socket_name=str(folder / "plasma_store"))
     with pytest.MonkeyPatch.context() as for_now:

@@ -25,8 +25,7 @@ from vlagents_ray.errors import (
     MissingState,
 )
 from vlagents_ray.protocol.arrays import Buffer
-from vlagents_ray.protocol.budget import Budget
-from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Budget, Limits
 from vlagents_ray.protocol.observations import is_number
 from vlagents_ray.wire.mapping import KeyMapping
 from vlagents_ray.wire.pickles import NUMPY_CALLS, TORCH_CALLS, Name, fields_of, read_pickle, text, write_record

@@ -15,8 +15,7 @@ import numpy as np
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge, shown
 from vlagents_ray.images.codecs import decode_files
 from vlagents_ray.protocol.arrays import read_array
-from vlagents_ray.protocol.budget import Budget
-from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Budget, Limits
 from vlagents_ray.wire.msgpack import pack, unpack
 
 PROTOCOL_VERSION = 1

@@ -16,8 +16,7 @@ from vlagents_ray.errors import InvalidAction, InvalidObservation, MalformedMess
 from vlagents_ray.images.codecs import decode_files
 from vlagents_ray.interface import GOAL_IMAGE, Act, Obs
 from vlagents_ray.protocol.arrays import read_array
-from vlagents_ray.protocol.budget import Budget
-from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Budget, Limits
 from vlagents_ray.protocol.observations import is_number
 from vlagents_ray.wire import json_numpy, rpyc
 

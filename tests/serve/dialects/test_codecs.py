@@ -20,8 +20,7 @@ from mutated_messages import mutated
 
 from vlagents_ray.errors import InvalidInput, MalformedMessage, MessageTooLarge, VLAgentsError
 from vlagents_ray.images.jpeg_png import encode_jpeg, encode_png
-from vlagents_ray.protocol.budget import Budget
-from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Budget, Limits
 from vlagents_ray.wire import openpi as openpi_codec
 from vlagents_ray.wire import openvla as openvla_codec
 from vlagents_ray.wire import vla_eval as vla_eval_codec

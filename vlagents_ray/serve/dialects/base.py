@@ -57,10 +57,9 @@ from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, MalformedMessage, PolicyUnavailable, VLAgentsError
 from vlagents_ray.interface import Obs
-from vlagents_ray.protocol.budget import Budget
-from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits, RankName, Reply
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Budget, Limits, RankName, Reply
 from vlagents_ray.serve.access.api_keys import Identity, NoKey, current_caller
-from vlagents_ray.serve.config.dialects import DialectConfig, KeylessPortConfig, PortConfig
+from vlagents_ray.serve.config.dialects import DialectConfig, KeylessPortConfig, PortConfig, read_mapping
 from vlagents_ray.serve.dialects.implicit_session import ImplicitSession
 from vlagents_ray.serve.endpoints.http_messages import LONG_BYTES, problem_response
 from vlagents_ray.serve.engine.admission import Admission, MessageAdmission
@@ -68,7 +67,6 @@ from vlagents_ray.serve.engine.dispatch import Dispatcher
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.metrics_buffer import RequestTrace
 from vlagents_ray.serve.ports import LOOPBACK
-from vlagents_ray.serve.presets import read_mapping
 
 T = TypeVar("T")
 Stream = Callable[[WebSocket], Awaitable[None]]

@@ -13,7 +13,7 @@ from pydantic import Field
 from starlette.requests import Request as HttpRequest
 from starlette.responses import Response
 
-from vlagents_ray.protocol.budget import Budget
+from vlagents_ray.protocol.messages import Budget
 from vlagents_ray.serve.config.dialects import DialectConfig, MappingSetting
 from vlagents_ray.serve.dialects.http import HttpDialect
 from vlagents_ray.wire import openvla

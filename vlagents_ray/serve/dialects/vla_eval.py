@@ -23,8 +23,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from vlagents_ray.chunking.buffer import ChunkBuffer
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge, PolicyUnavailable, VLAgentsError, shown
-from vlagents_ray.protocol.budget import Budget
-from vlagents_ray.protocol.messages import RankName
+from vlagents_ray.protocol.messages import Budget, RankName
 from vlagents_ray.serve.config.dialects import DialectConfig, MappingSetting
 from vlagents_ray.serve.dialects.base import (
     POLICY_VIOLATION,

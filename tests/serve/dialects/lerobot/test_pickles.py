@@ -22,9 +22,8 @@ from lerobot_messages import FEATURES, HELPERS, TimedObservation, pickled, robot
 from many import many
 
 from vlagents_ray.errors import InvalidInput, MalformedMessage, MessageTooLarge
-from vlagents_ray.protocol.budget import Budget
-from vlagents_ray.protocol.messages import Limits
-from vlagents_ray.serve.presets import read_mapping
+from vlagents_ray.protocol.messages import Budget, Limits
+from vlagents_ray.serve.config.dialects import read_mapping
 from vlagents_ray.wire import lerobot
 
 LIMITS = Limits(body_bytes=2**20)

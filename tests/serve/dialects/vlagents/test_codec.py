@@ -15,8 +15,7 @@ from rpyc_client import document
 from vlagents_ray.errors import InvalidObservation, MalformedMessage, MessageTooLarge, VLAgentsError
 from vlagents_ray.images.jpeg_png import encode_jpeg
 from vlagents_ray.interface import GOAL_IMAGE, Act
-from vlagents_ray.protocol.budget import Budget
-from vlagents_ray.protocol.messages import Limits
+from vlagents_ray.protocol.messages import Budget, Limits
 from vlagents_ray.wire import json_numpy, vlagents
 
 LIMITS = Limits()

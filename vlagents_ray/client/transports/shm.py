@@ -1,6 +1,6 @@
 """The shared-memory transport: frames to a server on this machine.
 
-`vlagents_ray.serve.endpoints.local.shm` is the server's side.
+`vlagents_ray.serve.endpoints.shm` is the server's side.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from vlagents_ray.client.credentials import ANONYMOUS, Credentials
-from vlagents_ray.client.transports.local.unix_messages import UnixTransport
+from vlagents_ray.client.transports.unix_messages import UnixTransport
 from vlagents_ray.images.codecs import RAW
 from vlagents_ray.protocol.frames import request_parts
 from vlagents_ray.protocol.messages import LocalAddress, Request, boot_id

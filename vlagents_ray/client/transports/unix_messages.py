@@ -1,6 +1,6 @@
 """Messages on a Unix socket that say where the observations lie: what shared memory and plasma have in common.
 
-`vlagents_ray.serve.endpoints.local.unix_messages` is the server's side.
+`vlagents_ray.serve.endpoints.unix_messages` is the server's side.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import ClassVar
 
 from vlagents_ray.client.transports.base import is_answer
 from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, PolicyUnavailable, VLAgentsError
-from vlagents_ray.images import cpu_affinity
+from vlagents_ray.images import thread_map
 from vlagents_ray.protocol import shm_layout
 from vlagents_ray.protocol.frames import decode_replies
 from vlagents_ray.protocol.messages import LocalAddress, Reply, Request
@@ -142,7 +142,7 @@ class UnixTransport(ABC):
                     self._writer = shm_layout.ShmWriter()
                 self._answers_fast = time.perf_counter() - begun < _FAST_S
                 if self._answers_fast:
-                    cpu_affinity.leave(self._core)
+                    thread_map.leave(self._core)
                 return replies
 
     def _open(self, timeout_s: float) -> socket.socket:

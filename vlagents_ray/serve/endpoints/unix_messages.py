@@ -1,7 +1,7 @@
 """Requests from processes on this machine: messages on Unix sockets that locate the observations in shared memory.
 
-A `Payload` reads that memory: the client's memory files (`vlagents_ray.serve.endpoints.local.shm`), or channels in the
-node's object store (`vlagents_ray.serve.endpoints.local.plasma`). The policy thread reads the sockets itself, so that a
+A `Payload` reads that memory: the client's memory files (`vlagents_ray.serve.endpoints.shm`), or channels in the
+node's object store (`vlagents_ray.serve.endpoints.plasma`). The policy thread reads the sockets itself, so that a
 request needs no change of threads; while a batch runs for milliseconds, another thread reads them
 (`vlagents_ray.serve.queue.poller`). Only processes of the same user may connect. Sessions end with their connection.
 """
@@ -23,9 +23,9 @@ from typing import ClassVar, Protocol
 
 import numpy as np
 
-from vlagents_ray.client.transports.local.unix_messages import peer_uid
+from vlagents_ray.client.transports.unix_messages import peer_uid
 from vlagents_ray.errors import PolicyUnavailable, VLAgentsError
-from vlagents_ray.images import cpu_affinity
+from vlagents_ray.images import thread_map
 from vlagents_ray.protocol import shm_layout
 from vlagents_ray.protocol.frames import decode_requests, encode_replies
 from vlagents_ray.protocol.messages import OPS, Limits, LocalAddress, Op, Reply, Request
@@ -340,7 +340,7 @@ class UnixConnection:
             freed = self._payload.freed()
             try:
                 if len(frame) <= _INLINE:
-                    self._connection.send(LocalAddress.REPLY.pack(freed, flags, cpu_affinity.here()) + frame)
+                    self._connection.send(LocalAddress.REPLY.pack(freed, flags, thread_map.here()) + frame)
                     return
                 descriptor = os.memfd_create("vlagents-ray-reply")
                 try:

@@ -1,6 +1,6 @@
 """`serve://APP` on the replica's own node: frames in mutable plasma objects.
 
-`vlagents_ray.serve.endpoints.local.plasma` is the server's side.
+`vlagents_ray.serve.endpoints.plasma` is the server's side.
 """
 
 from __future__ import annotations
@@ -9,8 +9,8 @@ import time
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
-from vlagents_ray.client.transports.local.unix_messages import UnixTransport
 from vlagents_ray.client.transports.serve_handle import HandleTransport
+from vlagents_ray.client.transports.unix_messages import UnixTransport
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.images.codecs import RAW
 from vlagents_ray.protocol.arrays import Buffer

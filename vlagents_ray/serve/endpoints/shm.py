@@ -1,7 +1,7 @@
 """The endpoint for processes on the same machine: observations in shared memory.
 
 A client connects to an abstract Unix socket whose unguessable name is in the metadata, and passes memory files that it
-writes its frames into (`vlagents_ray.serve.endpoints.local.unix_messages`). Neither side creates a file name, so that
+writes its frames into (`vlagents_ray.serve.endpoints.unix_messages`). Neither side creates a file name, so that
 memory and socket are freed with their processes, however those end.
 """
 
@@ -21,7 +21,7 @@ import numpy as np
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge, VLAgentsError
 from vlagents_ray.protocol.messages import OPS, Limits, LocalAddress, Op, boot_id
 from vlagents_ray.serve.access.api_keys import NoKey
-from vlagents_ray.serve.endpoints.local.unix_messages import BACKLOG, Admit, UnixServer
+from vlagents_ray.serve.endpoints.unix_messages import BACKLOG, Admit, UnixServer
 from vlagents_ray.serve.engine.engine import Engine
 
 _MAX_VIEWS = 8  # number of memory files that a policy may hold views of before requests are copied
