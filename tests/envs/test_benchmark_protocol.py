@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from vlagents_ray.envs.benchmark_protocol import BenchmarkProtocol
+from vlagents_ray.envs.simulator import BenchmarkProtocol
 from vlagents_ray.registry import ENVS
 from vlagents_ray.testing.comparing import require_wireable
 

@@ -11,7 +11,7 @@ import pytest
 from vlagents_ray import Act
 from vlagents_ray.envs import make_env
 from vlagents_ray.envs.gymnasium import Gymnasium
-from vlagents_ray.envs.mapping import Pick, as_image, plain
+from vlagents_ray.envs.gymnasium.view import Pick, as_image, plain
 from vlagents_ray.errors import ConfigError, EnvFailed, InvalidAction, MissingDependency, NotReset, UnknownEnv
 from vlagents_ray.interface import HIGH_RES
 from vlagents_ray.testing import ContractViolation, check_env

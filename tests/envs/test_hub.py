@@ -14,7 +14,7 @@ from vlagents_ray.envs import make_env
 from vlagents_ray.envs.base import known_contract
 from vlagents_ray.envs.batch import make_batch
 from vlagents_ray.envs.gymnasium.hub import EnvHub, HubFile
-from vlagents_ray.envs.gymnasium.vector_batch import GymnasiumBatch
+from vlagents_ray.envs.gymnasium.vector import GymnasiumBatch
 from vlagents_ray.errors import ConfigError, EnvFailed, MissingDependency, UnknownEnv
 from vlagents_ray.interface import Act
 from vlagents_ray.testing import check_env

@@ -12,7 +12,7 @@ import pytest
 from vlagents_ray.contract import CameraSpec
 from vlagents_ray.envs import make_env
 from vlagents_ray.envs.maniskill import ManiSkill, factory
-from vlagents_ray.envs.maniskill.tasks import INSTRUCTIONS, instruction_for
+from vlagents_ray.envs.maniskill.factory import INSTRUCTIONS, instruction_for
 from vlagents_ray.errors import ConfigError, EnvFailed, InvalidAction, NotReset, UnknownEnv
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.testing import check_env
@@ -175,7 +175,7 @@ def test_only_the_cameras_asked_for_are_given_and_rendered() -> None:
     with ManiSkill("StackCube-v1", width=32, height=32, cameras=["hand_camera"]) as env:
         assert set(env.reset(seed=0)[0].cameras) == {"hand_camera"}
         assert set(env.step(command())[0].cameras) == {"hand_camera"}
-        assert set(env._simulator.env.scene.sensors) == {"hand_camera"}
+        assert set(env._env.env.scene.sensors) == {"hand_camera"}
 
 
 def test_a_read_only_action_is_executed_and_left_alone(push: ManiSkill) -> None:
@@ -279,8 +279,8 @@ def test_a_simulator_error_is_an_infrastructure_failure(push: ManiSkill, monkeyp
     def broken(action: object) -> None:
         raise RuntimeError("the physics exploded")
 
-    monkeypatch.setattr(push._simulator.env, "step", broken)
-    with pytest.raises(EnvFailed, match=r"PushCube-v1 failed in step: RuntimeError: the physics exploded"):
+    monkeypatch.setattr(push._env.env, "step", broken)
+    with pytest.raises(EnvFailed, match=r"PushCube-v1 failed to step: RuntimeError: the physics exploded"):
         push.step(command())
 
 

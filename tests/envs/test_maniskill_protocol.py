@@ -8,7 +8,7 @@ import pytest
 
 from vlagents_ray.envs.batch import SequentialBatch, make_batch
 from vlagents_ray.envs.maniskill import ManiSkill
-from vlagents_ray.envs.maniskill.batch import ManiSkillBatch
+from vlagents_ray.envs.maniskill.env import ManiSkillBatch
 from vlagents_ray.errors import ConfigError, NotReset
 from vlagents_ray.interface import HIGH_RES, Act
 from vlagents_ray.policies.experts import expert_for
@@ -58,8 +58,8 @@ def test_the_scene_is_rebuilt_for_each_episode() -> None:
         scenes, lengths = [], []
         for seed in SEEDS:
             env.reset(seed=seed)
-            scenes.append(env._simulator.env.scene)
-            lengths.append(float(env._simulator.env.peg_half_sizes[0, 0]))
+            scenes.append(env._env.env.scene)
+            lengths.append(float(env._env.env.peg_half_sizes[0, 0]))
         assert scenes[0] is not scenes[1]
         assert lengths[0] != lengths[1]  # of the peg, which is drawn when the scene is built
 

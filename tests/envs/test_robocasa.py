@@ -8,9 +8,7 @@ import pytest
 
 from vlagents_ray.contract import CameraSpec
 from vlagents_ray.envs.base import known_contract, make_env
-from vlagents_ray.envs.robocasa import RoboCasa
-from vlagents_ray.envs.robocasa.assets import require_assets
-from vlagents_ray.envs.robocasa.tasks import HORIZONS, protocol
+from vlagents_ray.envs.robocasa import HORIZONS, RoboCasa, protocol, require_assets
 from vlagents_ray.errors import ConfigError, EnvFailed, MissingDependency, UnknownEnv
 
 

@@ -72,7 +72,7 @@ def test_it_keeps_the_promises_of_an_env() -> None:
 
 
 def test_an_initial_state_is_a_configuration_of_the_tasks_own_list(carrot: Simpler) -> None:
-    twin = carrot._simulator.env
+    twin = carrot._env.env
     for state in (0, 5, 23):
         begin(carrot, state)
         where, turned = divmod(state, len(twin.quat_configs))

@@ -12,8 +12,7 @@ import pytest
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.base.checkpoint import find_adapter, used_checkpoints
 from vlagents_ray.policies.base.checkpoint_files import weights_of
-from vlagents_ray.policies.diffusion_policy.config import DiffusionPolicyConfig
-from vlagents_ray.policies.diffusion_policy.network import checkpoint_file
+from vlagents_ray.policies.diffusion_policy import DiffusionPolicyConfig, checkpoint_file
 from vlagents_ray.registry import POLICIES, named_class
 
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
@@ -22,7 +21,7 @@ NEEDED = {"openpi": {"config": "pi0_droid"}, "diffusion_policy": {"trust_checkpo
 # What needs the family's packages, and comes before the checkpoint is looked for.
 BEFORE = {
     "gr00t": ["vlagents_ray.policies.gr00t.network._use_checkout"],
-    "octo": ["vlagents_ray.policies.octo.network.octo_model_class"],
+    "octo": ["vlagents_ray.policies.octo.octo_model_class"],
     "openpi": [f"vlagents_ray.policies.openpi.policy.{name}" for name in ("use_source", "train_config")],
 }
 

@@ -33,5 +33,5 @@ def fingerprint(seen: list[Obs]) -> str:
 
 
 def world(env: Libero) -> LiberoSimulation:
-    assert env._world is not None
-    return env._world
+    assert env._env is not None
+    return env._env

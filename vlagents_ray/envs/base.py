@@ -246,6 +246,7 @@ def make_env(name: str, **options: Any) -> EvalEnv:
         UnknownEnv: The name or the task is unknown.
         ConfigError: The env has no such option, or its value is wrong.
         MissingDependency: The simulator is not installed.
+        EnvFailed: The simulator or its assets cannot be loaded.
     """
     cls, arguments = env_arguments(name, options)
     env: EvalEnv = cls(**arguments)

@@ -10,22 +10,20 @@ from __future__ import annotations
 import math
 import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from vlagents_ray.contract import ActionSpec, Contract
-from vlagents_ray.envs.base import EvalEnv, one_row, require_known
+from vlagents_ray.contract import ActionSpec
 from vlagents_ray.envs.maniskill import ManiSkill, factory
 from vlagents_ray.envs.maniskill.simulator import Moment, Simulator
-from vlagents_ray.envs.recording import record_size_of
 from vlagents_ray.envs.rendering.graphics import Renderer
-from vlagents_ray.envs.rendering.headless import prepare_rendering
-from vlagents_ray.errors import ConfigError, EnvFailed, NotReset
-from vlagents_ray.interface import Act, Obs
+from vlagents_ray.envs.simulator import SimulatorEnv
+from vlagents_ray.errors import ConfigError, EnvFailed
+from vlagents_ray.interface import Obs
 from vlagents_ray.registry import require
 
 _TOUCHING = "the object lies on its target and touches it"
@@ -59,7 +57,7 @@ class SimplerProtocol:
 PROTOCOL = SimplerProtocol()
 
 
-class Simpler(EvalEnv):
+class Simpler(SimulatorEnv):
     """One Bridge task with its WidowX 250 S, at 5 Hz.
 
     Observation: "3rd_view_camera", (480, 640, 3), as the policies of the paper had it and resized it
@@ -78,6 +76,8 @@ class Simpler(EvalEnv):
     `terminated`.
     """
 
+    suite = "simpler"
+
     def __init__(
         self,
         task: str = "PutCarrotOnPlateInScene-v1",
@@ -90,7 +90,7 @@ class Simpler(EvalEnv):
         shader: str = PROTOCOL.shader,
         record_size: Sequence[int] | None = None,
     ) -> None:
-        """Make the environment.
+        """Make the environment; raises the errors of `make_env`.
 
         Args:
             task: ManiSkill's id, one of `Simpler.tasks()`.
@@ -102,17 +102,9 @@ class Simpler(EvalEnv):
             render_backend: "cpu", "gpu", or "auto": the GPU if both SAPIEN and torch can use it.
             shader: ManiSkill's name; that of the protocol is "default".
             record_size: Height and width of a further view by the same camera, for recordings only.
-
-        Raises:
-            UnknownEnv: There is no such task.
-            ConfigError: An option has a wrong value.
-            MissingDependency: The simulator is not installed.
-            EnvFailed: The simulator or its assets cannot be loaded.
         """
         self.require_task(task)
-        self._name = f"simpler/{task}"
-        record = record_size_of(record_size, self._name)
-        prepare_rendering()
+        super().__init__(f"simpler/{task}", record_size=record_size)
         _find_assets(assets)
         own_limit = factory.registered_limit(task)
         self.max_steps = factory.step_limit(self._name, max_steps, own_limit)
@@ -120,56 +112,27 @@ class Simpler(EvalEnv):
         if shader != PROTOCOL.shader:
             self._deviations.append(f"shader is {shader}, not {PROTOCOL.shader}")
         self._task = task
-        self._instruction = instruction
-        self._steps: int | None = None
+        self._given_instruction = instruction
         twins = _own_lists()
-        self._simulator = Simulator(
+        self._env = Simulator(
             self._name,
             task,
             obs_mode=PROTOCOL.obs_mode,
-            record_size=record,
+            record_size=self._record_size,
             sim_backend=sim_backend,
             render_backend=render_backend,
             control_mode=PROTOCOL.control_mode,
             sensors={"shader_pack": shader},
         )
-        env = self._simulator.alive()
+        self._resources.callback(self._env.close)
+        env = self._env.alive()
         env._rgb_overlay_images = twins._rgb_overlay_images
         self.init_states = len(env.xyz_configs) * len(env.quat_configs)
-        self._contract = self._simulator.contract(_ACTION)
-
-    @property
-    def contract(self) -> Contract:
-        return self._contract
+        self._contract = self._env.contract(_ACTION)
 
     @property
     def instruction(self) -> str:
-        return self._simulator.instructions()[0] if self._instruction is None else self._instruction
-
-    def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
-        """Begin an episode in the initial state `options["init_state"]`, which is the only option."""
-        unknown = sorted(set(options or {}) - {"init_state"})
-        if unknown:
-            raise ConfigError(f"{self._name}: unknown reset options {unknown}, want none or 'init_state'")
-        count = self.init_states or 1
-        state = (options or {}).get("init_state", seed % count)
-        if not isinstance(state, int) or not 0 <= state < count:
-            raise ConfigError(f"{self._name}: init_state is {state!r}, want 0 to {count - 1}")
-        now = self._simulator.reset([seed], {"episode_id": require("torch").tensor([state]), "reconfigure": True})
-        self._steps = 0
-        return self._seen(now), {"success": now.success[0], "init_state": state}
-
-    def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
-        if self._steps is None:
-            raise NotReset(f"{self._name}: step before reset; call reset(seed=...) first")
-        command = _command(one_row(act, self._contract))
-        now = self._simulator.step(command[np.newaxis], look=self.looked_at)
-        self._steps += 1
-        return self._seen(now), now.rewards[0], False, self._steps >= self.max_steps, {"success": now.success[0]}
-
-    @classmethod
-    def require_task(cls, task: str | None) -> None:
-        require_known("simpler", task, cls.tasks())
+        return self._alive().instructions()[0] if self._given_instruction is None else self._given_instruction
 
     @classmethod
     def tasks(cls) -> list[str]:
@@ -178,25 +141,31 @@ class Simpler(EvalEnv):
     @classmethod
     def missing(cls) -> str | None:
         """Say why SIMPLER cannot run here; its assets are in no package."""
-        return ManiSkill.missing() or _missing_assets(_asset_folder())
+        folder = Path(os.environ.get("MS_ASSET_DIR", Path.home() / ".maniskill"))
+        return ManiSkill.missing() or _missing_assets(folder)
 
     def renderer(self) -> Renderer | None:
-        return self._simulator.renderer()
+        found: Renderer | None = self._alive().renderer()
+        return found
 
     def describe(self) -> dict[str, Any]:
         return {
-            **self._simulator.describe(),
+            **self._alive().describe(),
             "success": TWINS[self._task],
             "assets": str(require("mani_skill").ASSET_DIR.parent),
             "protocol": {**asdict(PROTOCOL), "deviations": self._deviations},
         }
 
-    def close(self) -> None:
-        self._steps = None
-        self._simulator.close()
+    def _begin(self, seed: int, state: int) -> tuple[Obs, dict[str, Any]]:
+        now = self._env.reset([seed], {"episode_id": require("torch").tensor([state]), "reconfigure": True})
+        return self._seen(now), {"success": now.success[0]}
+
+    def _advance(self, action: np.ndarray) -> tuple[Obs, float, bool, dict[str, Any]]:
+        now = self._env.step(_command(action)[np.newaxis], look=self.looked_at)
+        return self._seen(now), now.rewards[0], False, {"success": now.success[0]}
 
     def _seen(self, now: Moment) -> Obs:
-        env, [obs] = self._simulator.alive(), now.obs
+        env, [obs] = self._env.alive(), now.obs
         base = env.agent.robot.pose.inv()
         arm = env.agent.controller.controllers["arm"]
         places = [base * env.objs[name].pose for name in (env.source_obj_name, env.target_obj_name)]
@@ -230,10 +199,6 @@ def _own_lists() -> Any:
     twins = require("mani_skill.envs.tasks.digital_twins.base_env").BaseDigitalTwinEnv
     twins._objects_to_remove_from_greenscreen, twins._rgb_overlay_images = [], {}
     return twins
-
-
-def _asset_folder() -> Path:
-    return Path(os.environ.get("MS_ASSET_DIR", Path.home() / ".maniskill"))
 
 
 def _missing_assets(folder: Path) -> str | None:

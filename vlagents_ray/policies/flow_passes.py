@@ -29,7 +29,7 @@ class FlowPasses(abc.ABC):
         self._encode = compilation.core("encode", self.encode)
         self._velocity = compilation.core("velocity", self.velocity)
 
-    def look(self, images: Sequence[Any]) -> Sequence[Any]:
+    def encode_images(self, images: Sequence[Any]) -> Sequence[Any]:
         """Return what `encode` gets of images (P, 3, H, W)."""
         return images
 
@@ -42,7 +42,7 @@ class FlowPasses(abc.ABC):
             mask: (P, T) bool, which of them are no padding.
             cameras: (P, N) bool, which of the images are there.
             state: (P, S).
-            images: What `look` returned for the N images.
+            images: What `encode_images` returned for the N images.
         """
 
     @abc.abstractmethod
@@ -82,7 +82,9 @@ class FlowPasses(abc.ABC):
         if state is None:
             state = mask[:, :0].float()
         with self.adapters.rows([fingerprints[i] for i in firsts]):
-            encoded, seen = self._encode(tokens, mask, torch.stack(list(cameras), 1), state, *self.look(images))
+            encoded, seen = self._encode(
+                tokens, mask, torch.stack(list(cameras), 1), state, *self.encode_images(images)
+            )
         if list(owners) != list(range(len(mask))):
             index = torch.tensor(owners, device=mask.device)
             encoded, seen, state = encoded[index], seen[index], state[index]

@@ -20,7 +20,7 @@ from vlagents_ray.envs.rendering.graphics import (
     require_own,
 )
 from vlagents_ray.envs.rendering.render_probe import VulkanDevice, usable_devices
-from vlagents_ray.envs.robosuite.importing import importing_robosuite
+from vlagents_ray.envs.robosuite.base import importing_robosuite
 from vlagents_ray.errors import ConfigError, EnvFailed
 
 LLVMPIPE = Renderer("llvmpipe (LLVM 15.0.6, 256 bits)", software=True, cuda=None)

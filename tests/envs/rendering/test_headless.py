@@ -6,7 +6,7 @@ import os
 
 import pytest
 
-from vlagents_ray.envs.rendering import headless
+from vlagents_ray.envs.rendering import graphics
 
 
 @pytest.fixture(autouse=True)
@@ -14,11 +14,11 @@ def _nothing_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("MUJOCO_GL", "DISPLAY", "LP_NUM_THREADS"):
         monkeypatch.setenv(name, "")  # so that what the test sets is undone
         monkeypatch.delenv(name)
-    monkeypatch.setattr(headless, "_has_egl", lambda: True)
+    monkeypatch.setattr(graphics, "_has_egl", lambda: True)
 
 
 def chosen(name: str) -> str | None:
-    headless.prepare_rendering()
+    graphics.prepare_rendering()
     return os.environ.get(name)
 
 
@@ -32,7 +32,7 @@ def test_a_display_is_left_to_mujoco(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_without_an_egl_library_mujoco_stays_importable(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(headless, "_has_egl", lambda: False)
+    monkeypatch.setattr(graphics, "_has_egl", lambda: False)
     assert chosen("MUJOCO_GL") is None
 
 

@@ -15,8 +15,7 @@ from vlagents_ray.contract import StateSpec
 from vlagents_ray.errors import MissingCamera, PolicyFailed
 from vlagents_ray.interface import DISTRIBUTION, SAMPLES
 from vlagents_ray.policies.base import Row
-from vlagents_ray.policies.diffusion_policy import DiffusionPolicy
-from vlagents_ray.policies.diffusion_policy.noise import noise_of
+from vlagents_ray.policies.diffusion_policy import DiffusionPolicy, noise_of
 from vlagents_ray.testing import check_agent
 
 pytestmark = [pytest.mark.source("DIFFUSION_POLICY_SRC"), *LIBRARIES]

@@ -45,7 +45,7 @@ def save(folder: Path, kind: str = "relative") -> Path:
     from gr00t.model import MODEL_REGISTRY
     from transformers.modeling_utils import no_init_weights
 
-    from vlagents_ray.policies.gr00t.attention import built_without_flash_attention
+    from vlagents_ray.policies.gr00t.network import built_without_flash_attention
 
     [(config_class, pipeline)] = MODEL_REGISTRY.items()
     model_class, processor_class = pipeline.model_class, pipeline.processor_class

@@ -75,7 +75,7 @@ def test_each_reset_seeds_what_the_state_leaves_open(bowl: Libero, monkeypatch: 
     stood = cabinet()
     begin(bowl, state=1)
     np.testing.assert_array_equal(cabinet(), stood)
-    monkeypatch.setattr(world(bowl), "_protocol", replace(bowl._protocol, simulator_seed=8))
+    monkeypatch.setattr(world(bowl), "_protocol", replace(bowl._rules, simulator_seed=8))
     begin(bowl, state=0)
     assert not np.array_equal(cabinet(), stood)
 

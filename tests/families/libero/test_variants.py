@@ -10,8 +10,9 @@ import pytest
 import torch
 from libero_episodes import STILL, world
 
-from vlagents_ray.envs.libero import Libero, import_libero
+from vlagents_ray.envs.libero import Libero
 from vlagents_ray.envs.libero.benchmark_protocol import SUITES
+from vlagents_ray.envs.libero.package import package_folder
 from vlagents_ray.envs.libero.tasks import find_task, read_states, require_suite, task_names
 from vlagents_ray.errors import ConfigError, EnvFailed, MalformedMessage, UnknownEnv
 
@@ -20,7 +21,7 @@ MILK = "pick_up_the_milk_and_place_it_in_the_basket"
 
 def put(folder: Path, suite: str, name: str, changes: dict[str, str], states: np.ndarray | None) -> None:
     """Write a task: that of the milk with other words in its BDDL file, and its initial states."""
-    problem = (import_libero.root() / "bddl_files" / "libero_object" / f"{MILK}.bddl").read_text()
+    problem = (package_folder() / "bddl_files" / "libero_object" / f"{MILK}.bddl").read_text()
     for old, new in changes.items():
         assert old in problem
         problem = problem.replace(old, new)

@@ -14,9 +14,7 @@ import numpy as np
 import pytest
 
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.policies.octo import Octo
-from vlagents_ray.policies.octo.images import resized
-from vlagents_ray.policies.octo.network import real_actions
+from vlagents_ray.policies.octo import Octo, real_actions, resized
 
 pytestmark = [
     pytest.mark.source("OCTO_SRC"),

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.policies.octo.network import octo_model_class
+from vlagents_ray.policies.octo import octo_model_class
 
 WORDS = ["pick", "up", "the", "cube", "push", "open", "drawer", "red", "blue", "warm"]
 TOKENS, EMBEDDING, WINDOW, HORIZON, STATE = 8, 32, 2, 4, 3

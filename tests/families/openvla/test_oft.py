@@ -20,7 +20,8 @@ from vlagents_ray import Obs
 from vlagents_ray.errors import InvalidObservation, MissingCamera, MissingState
 from vlagents_ray.interface import BEHAVIOUR, DISTRIBUTION, SAMPLES, WANT, Act
 from vlagents_ray.policies.base import Row
-from vlagents_ray.policies.openvla import oft, preprocessing
+from vlagents_ray.policies.openvla import oft
+from vlagents_ray.policies.openvla.base import middle, resized
 from vlagents_ray.policies.openvla.oft import OpenVLAOFT
 from vlagents_ray.testing import check_agent
 
@@ -101,10 +102,7 @@ class Upstream:
     def act(self, obs: Obs, words: str, key: str = "bridge_orig") -> np.ndarray:
         """(8, 7)."""
         prompt = f"In: What action should the robot take to {words.lower()}?\nOut:"
-        images = [
-            Image.fromarray(preprocessing.middle(preprocessing.resized(obs.cameras[name])))
-            for name in ("front", "wrist")
-        ]
+        images = [Image.fromarray(middle(resized(obs.cameras[name]))) for name in ("front", "wrist")]
         both = [self.processor(prompt, image) for image in images]
         ranges = self.network.norm_stats[key]["proprio"]
         low, high = np.array(ranges["q01"]), np.array(ranges["q99"])

@@ -18,7 +18,7 @@ from tests.families.openvla.conftest import LIBRARIES, WORDS, begun, seen
 from tests.families.openvla.upstream import module
 from vlagents_ray.errors import InvalidObservation, MissingCamera
 from vlagents_ray.interface import BEHAVIOUR, DISTRIBUTION, SAMPLES, WANT, Act
-from vlagents_ray.policies.openvla import preprocessing
+from vlagents_ray.policies.openvla.base import middle, resized
 from vlagents_ray.policies.openvla.policy import OpenVLA
 from vlagents_ray.testing import check_agent
 
@@ -200,7 +200,7 @@ def test_each_sample_has_its_log_probability(policy: OpenVLA) -> None:
 def test_pictures_may_be_those_of_libero(loaded: Callable[..., Any]) -> None:
     cropping = loaded("openvla", center_crop=True)
     obs = seen(0)
-    want = cropping.model.base.pixels(preprocessing.middle(preprocessing.resized(obs.cameras["front"])))
+    want = cropping.model.base.pixels(middle(resized(obs.cameras["front"])))
     assert torch.equal(cropping.perceive(obs), want)
     assert not torch.equal(cropping.perceive(obs), loaded("openvla").perceive(obs))
 

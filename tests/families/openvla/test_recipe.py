@@ -13,7 +13,7 @@ from benchmarks.checkpoints.recipes import write_checkpoint
 from tests.families.openvla.conftest import LIBRARIES
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.openvla.policy import OpenVLA
-from vlagents_ray.policies.openvla.sources import find_source
+from vlagents_ray.policies.openvla.prismatic import find_source
 from vlagents_ray.testing.observations import random_observation
 
 pytestmark = [pytest.mark.source("OPENVLA_SRC"), *LIBRARIES]

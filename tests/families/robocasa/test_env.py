@@ -11,9 +11,7 @@ import pytest
 from in_process_episode import Always, play
 
 from vlagents_ray import Agent
-from vlagents_ray.envs.robocasa import RoboCasa
-from vlagents_ray.envs.robocasa.assets import TYPES
-from vlagents_ray.envs.robocasa.tasks import ATOMIC_SEEN, COMPOSITE_SEEN, COMPOSITE_UNSEEN, CONTROL_HZ
+from vlagents_ray.envs.robocasa import ATOMIC_SEEN, COMPOSITE_SEEN, COMPOSITE_UNSEEN, CONTROL_HZ, TYPES, RoboCasa
 from vlagents_ray.errors import ConfigError, EnvFailed, NotReset
 from vlagents_ray.interface import HIGH_RES, Act, Obs
 from vlagents_ray.testing import check_env

@@ -14,7 +14,7 @@ from peft_adapters import merge, pairs, save
 from vlagents_ray import Obs
 from vlagents_ray.errors import ConfigError, NotTrainable, UnknownCheckpoint, UnknownSession
 from vlagents_ray.interface import DISTRIBUTION, POLICY, SAMPLES, Act
-from vlagents_ray.policies.adapters.peft_folder import read_adapter
+from vlagents_ray.policies.adapters import read_adapter
 from vlagents_ray.serve.models.agent_copies import AgentCopies
 
 pytestmark = pytest.mark.torch

@@ -7,8 +7,7 @@ import pytest
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.arro.background import Background, BackgroundConfig
-from vlagents_ray.policies.arro.parts import make_part
-from vlagents_ray.policies.arro.regions import box_of, connected, flat, grown, overlap, split
+from vlagents_ray.policies.arro.parts import box_of, connected, flat, grown, make_part, overlap, split
 
 GREY, RED, BLUE = (200, 200, 200), (220, 40, 40), (40, 60, 220)
 

@@ -17,8 +17,7 @@ from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import ConfigError, PolicyFailed, PolicyUnavailable
 from vlagents_ray.interface import Act, Agent
 from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row
-from vlagents_ray.policies.compilation import Compilation
-from vlagents_ray.policies.compilation.cuda_graph import CAPTURES, CudaGraph
+from vlagents_ray.policies.compilation import CAPTURES, Compilation, CudaGraph
 from vlagents_ray.policies.loading import report_device
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.engine.engine import Engine

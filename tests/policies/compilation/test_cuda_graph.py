@@ -8,8 +8,7 @@ from typing import Any
 import pytest
 import torch
 
-from vlagents_ray.policies.compilation import Compilation
-from vlagents_ray.policies.compilation.cuda_graph import CudaGraph
+from vlagents_ray.policies.compilation import Compilation, CudaGraph
 from vlagents_ray.weights.trainable import named_values, set_values
 
 pytestmark = [pytest.mark.torch, pytest.mark.gpu]

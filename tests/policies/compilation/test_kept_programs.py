@@ -11,8 +11,7 @@ from typing import Any
 import pytest
 import torch
 
-from vlagents_ray.policies.compilation import Compilation
-from vlagents_ray.policies.compilation.kept_programs import keep_jax_programs, keep_torch_programs
+from vlagents_ray.policies.compilation import Compilation, keep_jax_programs, keep_torch_programs
 
 pytestmark = pytest.mark.torch
 

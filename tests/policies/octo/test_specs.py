@@ -12,9 +12,7 @@ import pytest
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.base.checkpoint import used_checkpoints
-from vlagents_ray.policies.octo import network
-from vlagents_ray.policies.octo.config import OctoConfig
-from vlagents_ray.policies.octo.specs import require_own_classes
+from vlagents_ray.policies.octo import OctoConfig, OctoNetwork, require_own_classes
 
 SOURCE = {
     "octo/model/components/tokenizers.py": """
@@ -115,16 +113,16 @@ def test_octo_loads_nothing_before_the_look(tmp_path: Path, monkeypatch: pytest.
             loaded.append(f"{folder}/{step}")
             raise KeyError("the stand-in has no model")
 
-    monkeypatch.setattr(network, "octo_model_class", lambda _source_dir: OctoModel)
-    monkeypatch.setattr(network, "jax_device", lambda name: name)
+    monkeypatch.setattr("vlagents_ray.policies.octo.octo_model_class", lambda _source_dir: OctoModel)
+    monkeypatch.setattr("vlagents_ray.policies.octo.jax_device", lambda name: name)
     folder = config(tmp_path, text=spec("os", "system")).parent
     for name in ("example_batch.msgpack", "dataset_statistics.json", "7/default"):
         (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).touch()
     with used_checkpoints() as used, pytest.raises(ConfigError, match="names 'system' of 'os'"):
-        network.OctoNetwork.load(OctoConfig(checkpoint=str(folder)))
+        OctoNetwork.load(OctoConfig(checkpoint=str(folder)))
     assert loaded == []
     assert [path.name for path in used] == ["config.json", "example_batch.msgpack", "dataset_statistics.json", "7"]
     with pytest.raises(ConfigError, match="the stand-in has no model"):
-        network.OctoNetwork.load(OctoConfig(checkpoint=str(folder), trust_remote_code=True))
+        OctoNetwork.load(OctoConfig(checkpoint=str(folder), trust_remote_code=True))
     assert loaded == [f"{folder}/7"]

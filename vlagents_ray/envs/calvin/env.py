@@ -1,26 +1,40 @@
-"""A scene of CALVIN as an environment for evaluations."""
+"""A scene of CALVIN as an environment for evaluations; its simulator in PyBullet is made from a checkout."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import contextlib
+import importlib
+import io
+import os
+import sys
+import warnings
+from collections.abc import Iterator, Mapping
 from importlib.metadata import version
-from typing import Any, ClassVar
+from pathlib import Path
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
-from vlagents_ray.envs.base import EvalEnv, one_row, require_known
-from vlagents_ray.envs.benchmark_protocol import BenchmarkProtocol
 from vlagents_ray.envs.calvin import chains
-from vlagents_ray.envs.calvin.simulation import Renderer, find_checkout, make_simulator, quietly, read_tasks
 from vlagents_ray.envs.rendering import egl
-from vlagents_ray.envs.rendering.graphics import Renderer as Device
-from vlagents_ray.envs.rendering.headless import prepare_rendering
-from vlagents_ray.envs.rendering.render_probe import EGL_CURE, failing, without
+from vlagents_ray.envs.rendering.graphics import EGL_DEVICE, Renderer
+from vlagents_ray.envs.rendering.render_probe import EGL_CURE, without
+from vlagents_ray.envs.simulator import BenchmarkProtocol, SimulatorEnv
 from vlagents_ray.errors import ConfigError, EnvFailed, NotReset
-from vlagents_ray.interface import Act, Obs
+from vlagents_ray.interface import Obs
 from vlagents_ray.ray_tools.git_state import code_in
+from vlagents_ray.registry import require
 
+VARIABLE = "CALVIN_SRC"
+_CURE = (
+    f"git clone --recurse-submodules https://github.com/mees/calvin, and name that folder in {VARIABLE} on every node, "
+    f"or as the env's option `source_dir`"
+)
+RendererName = Literal["egl", "tiny"]
+_PACKAGE, _CONF = Path("calvin_env"), Path("calvin_env/conf")
+_TASKS = Path("calvin_models/conf/callbacks/rollout/tasks/new_playtable_tasks.yaml")
+_WORDS = Path("calvin_models/conf/annotations/new_playtable_validation.yaml")
 SCENES = ("A", "B", "C", "D")
 TASKS, STEPS = 5, 360  # tasks of an episode, and the steps for each: evaluate_policy.py, EP_LEN
 PROTOCOL = BenchmarkProtocol(
@@ -51,7 +65,7 @@ CONTRACT = Contract(
 )
 
 
-class Calvin(EvalEnv):
+class Calvin(SimulatorEnv):
     """One scene of CALVIN, "A" to "D", in which an episode is a chain of five tasks.
 
     Observation: cameras `static`, 200x200, and `gripper`, 84x84; in `state`, in the world's frame, `tcp_pos` (3,) m and
@@ -66,6 +80,8 @@ class Calvin(EvalEnv):
     `info["tasks"]` are CALVIN's names of the chain, `info["solved"]` says how many are solved.
     """
 
+    suite = "calvin"
+    _contract = CONTRACT
     several_tasks = True
     init_states = chains.NUMBER
     _open: ClassVar[str | None] = None  # upstream's code takes the process's only simulation for its own
@@ -75,101 +91,44 @@ class Calvin(EvalEnv):
         task: str = "D",
         *,
         task_steps: int = STEPS,
-        renderer: Renderer = "egl",
+        renderer: RendererName = "egl",
         source_dir: str | None = None,
     ) -> None:
-        """Make the environment.
+        """Make the environment; raises the errors of `make_env`, `ConfigError` also if this process has one open.
 
         Args:
             task: The scene.
             task_steps: The steps that each task of a chain may take.
             renderer: "egl" draws as upstream does; "tiny" is PyBullet's own in software, with other light and shadows.
             source_dir: A checkout of CALVIN with its submodules; None is that of CALVIN_SRC.
-
-        Raises:
-            UnknownEnv: There is no such scene.
-            ConfigError: There is no checkout, an option has a wrong value, or this process has a CALVIN open already.
-            MissingDependency: PyBullet, hydra or another package is not installed.
-            EnvFailed: The simulator cannot be loaded.
         """
         self.require_task(task)
-        self._env: Any = None
-        self._name = f"calvin/{task}"
+        super().__init__(f"calvin/{task}", task_steps=task_steps)
         if renderer not in ("egl", "tiny"):
             raise ConfigError(f"{self._name}: renderer is {renderer!r}, want egl or tiny")
-        if task_steps < 1:
-            raise ConfigError(f"{self._name}: task_steps is {task_steps}, want at least 1")
         if Calvin._open is not None:
             raise ConfigError(f"{self._name}: {Calvin._open} is open in this process, want one at a time; close it")
         self._renderer, self._checkout = renderer, find_checkout(source_dir)
         self._task_steps, self.max_steps = task_steps, TASKS * task_steps
-        prepare_rendering()
-        with failing(self._name, "make"):
+        with self._making():
             self._env = make_simulator(self._checkout, task, renderer)
+            Calvin._open = self._name
+            self._resources.callback(self._free, self._env)
             self._judge, self._words = read_tasks(self._checkout)
             self._chains = chains.Chains(self._checkout)
-        Calvin._open = self._name
         self._chain: chains.Chain | None = None
-        self._solved = self._steps = 0  # of this task
-        self._begin: dict[str, Any] = {}  # CALVIN's information on the state in which this task began
+        self._done = 0  # tasks
+        self._task_step = 0  # steps of the present task
+        self._before: dict[str, Any] = {}  # CALVIN's information on the state in which the present task began
 
     @classmethod
     def known_contract(cls, arguments: Mapping[str, Any]) -> Contract:  # noqa: ARG003 - it is the same in each scene
         return CONTRACT
 
     @property
-    def contract(self) -> Contract:
-        return CONTRACT
-
-    @property
     def instruction(self) -> str:
         """The words of CALVIN's evaluation for the present task."""
-        return self._words[self._playing().tasks[min(self._solved, TASKS - 1)]]
-
-    def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
-        """Begin the chain with the number `options["init_state"]`, or else `seed` modulo 1000; no more is random."""
-        given = dict(options or {})
-        number = given.pop("init_state", seed % chains.NUMBER)
-        if given:
-            raise ConfigError(f"{self._name}: unknown reset options {sorted(given)}, want init_state or none")
-        if not isinstance(number, int) or not 0 <= number < chains.NUMBER:
-            raise ConfigError(f"{self._name}: init_state is {number!r}, want 0 to {chains.NUMBER - 1}")
-        env = self._alive()
-        with failing(self._name, "reset"), quietly():
-            chain = self._chains[number]
-            env.load()  # or contacts of the last episode would shift the next one
-            env.robot.gripper_action = 1
-            env.reset(robot_obs=chain.robot, scene_obs=chain.scene)
-            self._begin = env.get_info()
-        self._chain, self._solved, self._steps = chain, 0, 0
-        return self._observe(look=True), self._info()
-
-    def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
-        """Execute an action; the reward is 1 if it solves the present task, else 0.
-
-        A task that is not solved in time ends the chain: `terminated`, and not the step limit of the whole.
-        """
-        env, chain = self._alive(), self._playing()
-        if self._solved == TASKS or self._steps >= self._task_steps:
-            raise NotReset(f"{self._name}: step after the end of the chain; call reset(seed=...) first")
-        action = one_row(act, CONTRACT).astype(np.float64)
-        action[-1] = 1.0 if action[-1] > 0 else -1.0
-        with failing(self._name, "step"):
-            env.robot.apply_action(action)  # as upstream's `step`, which also renders
-            for _ in range(env.action_repeat):
-                env.p.stepSimulation(physicsClientId=env.cid)
-            env.scene.step()
-            now = env.get_info()
-            solved = bool(self._judge.get_task_info_for_set(self._begin, now, {chain.tasks[self._solved]}))
-        self._steps += 1
-        if solved:
-            self._solved, self._steps, self._begin = self._solved + 1, 0, now
-        obs = self._observe(look=self.looked_at or solved)
-        return obs, float(solved), self._solved == TASKS or self._steps >= self._task_steps, False, self._info()
-
-    @classmethod
-    def require_task(cls, task: str | None) -> None:
-        require_known("calvin", task or "D", SCENES)
+        return self._words[self._playing().tasks[min(self._done, TASKS - 1)]]
 
     @classmethod
     def tasks(cls) -> list[str]:
@@ -186,7 +145,7 @@ class Calvin(EvalEnv):
             return str(error)
         return None if egl.devices() else f"CALVIN finds no EGL device; {EGL_CURE}, or set the option renderer to tiny"
 
-    def renderer(self) -> Device | None:
+    def renderer(self) -> Renderer | None:
         return super().renderer() if self._renderer == "egl" else None
 
     def describe(self) -> dict[str, Any]:
@@ -203,13 +162,43 @@ class Calvin(EvalEnv):
             "protocol": protocol,
         }
 
-    def close(self) -> None:
-        env, self._env, self._chain = self._env, None, None
-        if env is not None:
-            Calvin._open = None
-            with quietly():
-                env.close()
-                env.ownsPhysicsClient = False  # it would be closed again by `__del__`
+    def _begin(self, seed: int, state: int) -> tuple[Obs, dict[str, Any]]:
+        env = self._env
+        with quietly():
+            chain = self._chains[state]
+            env.load()  # or contacts of the last episode would shift the next one
+            env.robot.gripper_action = 1
+            env.reset(robot_obs=chain.robot, scene_obs=chain.scene)
+            self._before = env.get_info()
+        self._chain, self._done, self._task_step = chain, 0, 0
+        return self._observe(look=True), self._info()
+
+    def _advance(self, action: np.ndarray) -> tuple[Obs, float, bool, dict[str, Any]]:
+        """The reward is 1 in the step that solves a task; a task that takes too long ends the chain."""
+        env, chain = self._env, self._playing()
+        if self._ended():
+            raise NotReset(f"{self._name}: step after the end of the chain; call reset(seed=...) first")
+        command = action.astype(np.float64)
+        command[-1] = 1.0 if command[-1] > 0 else -1.0
+        env.robot.apply_action(command)  # as upstream's `step`, which also renders
+        for _ in range(env.action_repeat):
+            env.p.stepSimulation(physicsClientId=env.cid)
+        env.scene.step()
+        now = env.get_info()
+        solved = bool(self._judge.get_task_info_for_set(self._before, now, {chain.tasks[self._done]}))
+        self._task_step += 1
+        if solved:
+            self._done, self._task_step, self._before = self._done + 1, 0, now
+        return self._observe(look=self.looked_at or solved), float(solved), self._ended(), self._info()
+
+    def _ended(self) -> bool:
+        return self._done == TASKS or self._task_step >= self._task_steps
+
+    def _free(self, env: Any) -> None:
+        Calvin._open, self._chain = None, None
+        with quietly():
+            env.close()
+            env.ownsPhysicsClient = False  # it would be closed again by `__del__`
 
     def _observe(self, *, look: bool) -> Obs:
         env = self._alive()
@@ -221,14 +210,89 @@ class Calvin(EvalEnv):
         return Obs(cameras, 1.0 if robot[14] > 0 else 0.0, dict(zip(_STATE, parts, strict=True)))
 
     def _info(self) -> dict[str, Any]:
-        return {"success": self._solved == TASKS, "solved": self._solved, "tasks": list(self._playing().tasks)}
+        return {
+            "success": self._done == TASKS,
+            "solved": self._done,
+            "tasks": list(self._playing().tasks),
+        }
 
     def _playing(self) -> chains.Chain:
         if self._chain is None:
             raise NotReset(f"{self._name}: step before reset; call reset(seed=...) first")
         return self._chain
 
-    def _alive(self) -> Any:
-        if self._env is None:
-            raise EnvFailed(f"{self._name} is closed; make a new one")
-        return self._env
+
+def find_checkout(chosen: str | None) -> Path:
+    """Return the checkout of CALVIN, `chosen` or that of CALVIN_SRC; raises `ConfigError` if it is none."""
+    named = chosen or os.environ.get(VARIABLE)
+    if not named:
+        raise ConfigError(f"calvin: {VARIABLE} is not set; {_CURE}")
+    checkout = Path(named).expanduser().resolve()
+    lacks = [str(part) for part in (_CONF, _TASKS, _WORDS) if not (checkout / part).exists()]
+    if lacks:
+        raise ConfigError(f"calvin: {checkout} lacks {lacks}, want a checkout of CALVIN with its submodules; {_CURE}")
+    return checkout
+
+
+def make_simulator(checkout: Path, scene: str, renderer: RendererName) -> Any:
+    """Make CALVIN's `PlayTableSimEnv` of a scene, with the cameras, arm and rates of its datasets.
+
+    Args:
+        checkout: The checkout.
+        scene: "A" to "D".
+        renderer: As upstream draws, through OpenGL ("egl"), or PyBullet's renderer in software ("tiny").
+
+    Raises:
+        EnvFailed: PyBullet cannot draw through EGL.
+    """
+    folder = str(checkout / _PACKAGE)
+    if folder not in sys.path:
+        sys.path.insert(0, folder)
+    if device := os.environ.get(EGL_DEVICE):
+        os.environ.setdefault("EGL_VISIBLE_DEVICES", device)
+    with quietly():
+        require("pybullet")
+        hydra, omegaconf = require("hydra"), require("omegaconf").OmegaConf
+        code: Any = importlib.import_module("calvin_env.envs.play_table_env")
+        code.get_git_commit_hash = lambda _: ""  # which wants a repository
+        parts = {
+            "env": "env/play_table_env",
+            "scene": f"scene/calvin_scene_{scene}",
+            "arm": "robot/panda",
+            "fingers": "robot/panda_longer_finger",
+            "static": "cameras/cameras/static",
+            "gripper": "cameras/cameras/gripper",
+        }
+        read = {name: omegaconf.load(checkout / _CONF / f"{path}.yaml") for name, path in parts.items()}
+        read["fingers"].pop("defaults")  # the arm, which hydra would merge
+        settings = omegaconf.create(
+            {
+                "data_path": "data",
+                "use_vr": False,
+                "env": read["env"],
+                "scene": read["scene"],
+                "robot": omegaconf.merge(read["arm"], read["fingers"]),
+                "cameras": {"static": read["static"], "gripper": read["gripper"]},
+            }
+        )
+        try:
+            return hydra.utils.instantiate(settings.env, use_scene_info=True, use_egl=renderer == "egl")
+        except SystemExit as error:  # PyBullet could not load its plug-in, which it has printed
+            raise EnvFailed(f"calvin: PyBullet cannot draw through EGL; {EGL_CURE}, or set renderer to tiny") from error
+
+
+def read_tasks(checkout: Path) -> tuple[Any, dict[str, str]]:
+    """Return CALVIN's judge of tasks, `Tasks`, and the words of each task in its evaluation."""
+    hydra, omegaconf = require("hydra"), require("omegaconf").OmegaConf
+    with quietly():
+        judge = hydra.utils.instantiate(omegaconf.load(checkout / _TASKS))
+    return judge, {task: texts[0] for task, texts in omegaconf.load(checkout / _WORDS).items()}
+
+
+@contextlib.contextmanager
+def quietly() -> Iterator[None]:
+    """Keep what upstream's code prints and warns of, such as gym's end, off the terminal; errors are raised."""
+    nowhere = io.StringIO()
+    with contextlib.redirect_stdout(nowhere), contextlib.redirect_stderr(nowhere), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield

@@ -7,14 +7,11 @@ from typing import Any
 
 from vlagents_ray.contract import Contract
 from vlagents_ray.envs.base import BatchEnv, EvalEnv
-from vlagents_ray.envs.gymnasium.known import known
-from vlagents_ray.envs.gymnasium.making import make, only_vectors
-from vlagents_ray.envs.gymnasium.vector_batch import GymnasiumBatch
-from vlagents_ray.envs.gymnasium.vector_rows import VectorRows
-from vlagents_ray.envs.gymnasium.view import SUCCESS_KEYS, Mapped, View
-from vlagents_ray.envs.mapping import plain
-from vlagents_ray.envs.recording import record_size_of
-from vlagents_ray.envs.rendering.headless import prepare_rendering
+from vlagents_ray.envs.gymnasium.making import known, make, only_vectors
+from vlagents_ray.envs.gymnasium.vector import GymnasiumBatch, VectorRows
+from vlagents_ray.envs.gymnasium.view import SUCCESS_KEYS, Mapped, View, plain
+from vlagents_ray.envs.rendering.graphics import prepare_rendering
+from vlagents_ray.envs.simulator import record_size_of
 from vlagents_ray.errors import ConfigError, EnvFailed, MissingDependency, NotReset, UnknownEnv, VLAgentsError
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.registry import require

@@ -16,7 +16,7 @@ from typing import Any
 
 from vlagents_ray.contract import Contract
 from vlagents_ray.envs.gymnasium.env import Gymnasium
-from vlagents_ray.envs.gymnasium.vector_rows import VectorRows
+from vlagents_ray.envs.gymnasium.vector import VectorRows
 from vlagents_ray.errors import ConfigError, EnvFailed, MissingDependency, UnknownEnv
 from vlagents_ray.registry import require
 

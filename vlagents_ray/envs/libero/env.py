@@ -2,27 +2,24 @@
 
 from __future__ import annotations
 
-import os
+import math
 from collections.abc import Mapping, Sequence
-from importlib.metadata import version
 from typing import Any
 
 import numpy as np
 
-from vlagents_ray.contract import Contract
-from vlagents_ray.envs.base import EvalEnv, one_row
-from vlagents_ray.envs.libero import assets as asset_files
-from vlagents_ray.envs.libero import robot, variants
+from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.envs.libero.benchmark_protocol import LiberoProtocol
+from vlagents_ray.envs.libero.package import assets_digest, find_assets
 from vlagents_ray.envs.libero.simulation import LiberoSimulation, SimulatorObs
-from vlagents_ray.envs.libero.tasks import find_task, read_states, require_suite, task_names
-from vlagents_ray.envs.recording import record_size_of
-from vlagents_ray.envs.rendering.render_probe import failing, without, without_egl
-from vlagents_ray.errors import ConfigError, EnvFailed, NotReset
-from vlagents_ray.interface import HIGH_RES, Act, Obs
+from vlagents_ray.envs.libero.tasks import files_digest, find_task, read_states, require_suite, task_names
+from vlagents_ray.envs.robosuite.base import gripper_opening
+from vlagents_ray.envs.simulator import SimulatorEnv
+from vlagents_ray.errors import ConfigError, EnvFailed
+from vlagents_ray.interface import HIGH_RES, Obs
 
 
-class Libero(EvalEnv):
+class Libero(SimulatorEnv):
     """One environment of one LIBERO task, e.g. "libero_spatial/0", or of one that varies it, "libero_goal_swap/0".
 
     Observation: cameras "front" (LIBERO's agentview) and "wrist" (its eye in hand), turned as policies
@@ -39,6 +36,10 @@ class Libero(EvalEnv):
     An episode is a pure function of its initial state, `options["init_state"]`; where that is not given,
     the seed chooses it, and otherwise the seed is the policy's alone.
     """
+
+    suite, title = "libero", "LIBERO"
+    packages, distributions = ("libero", "robosuite", "mujoco"), ("hf-libero", "robosuite", "mujoco")
+    cure = "pip install 'vlagents-ray[libero]'"
 
     def __init__(
         self,
@@ -57,7 +58,7 @@ class Libero(EvalEnv):
         assets: str | None = None,
         files: str | None = None,
     ) -> None:
-        """Make the environment.
+        """Make the environment; raises the errors of `make_env`.
 
         Args:
             task: "SUITE/NUMBER", or "SUITE/NAME" with LIBERO's name.
@@ -75,22 +76,14 @@ class Libero(EvalEnv):
             assets: The folder with LIBERO's meshes and textures; None is what LIBERO_ASSETS names.
             files: The folder with `bddl_files` and `init_files` of suites that vary LIBERO's, such as LIBERO-PRO's;
                 None is what LIBERO_FILES names.
-
-        Raises:
-            UnknownEnv: There is no such task.
-            ConfigError: An option has a wrong value.
-            MissingDependency: The simulator is not installed.
-            EnvFailed: The simulator or its assets cannot be loaded.
         """
-        for name, value in (("width", width), ("height", height), ("max_steps", max_steps)):
-            if value is not None and value < 1:
-                raise ConfigError(f"libero/{task}: {name} is {value}, want at least 1")
-        record = record_size_of(record_size, f"libero/{task}")
+        super().__init__(f"libero/{task}", record_size=record_size, width=width, height=height, max_steps=max_steps)
         if (settling_steps or 0) < 0:
             raise ConfigError(f"libero/{task}: settling_steps is {settling_steps}, want 0 or more")
         self._task = find_task(task, files)
-        self._assets = asset_files.find_assets(assets)
-        self._protocol = LiberoProtocol.of(
+        self._name = f"libero/{self._task.full_name}"
+        self._assets = find_assets(assets)
+        self._rules = LiberoProtocol.of(
             self._task.suite,
             image_size=(height, width),
             max_steps=max_steps,
@@ -100,52 +93,22 @@ class Libero(EvalEnv):
             gripper_open=gripper_open,
             gripper_closed=gripper_closed,
         )
-        if self._protocol.gripper_open == self._protocol.gripper_closed:
+        if self._rules.gripper_open == self._rules.gripper_closed:
             raise ConfigError(f"libero/{task}: the gripper opens and closes at {gripper_open}; want two numbers")
-        self.max_steps = self._protocol.max_steps
+        self.max_steps, self._ends_on_success = self._rules.max_steps, stop_at_success
         self._instruction = instruction or self._task.language
-        self._steps: int | None = None
-        self._world: LiberoSimulation | None = None
-        self._contract = robot.contract(self._protocol)
-        with failing(self._name, "make"):
+        self._contract = _contract_of(self._rules)
+        with self._making():
             self._states = read_states(self._task.states)
-            self._world = LiberoSimulation(self._task, self._protocol, self._assets, record)
+            self._env = LiberoSimulation(self._task, self._rules, self._assets, self._record_size)
+            self._resources.callback(self._env.close)
         self.init_states = len(self._states)
 
     @classmethod
     def known_contract(cls, arguments: Mapping[str, Any]) -> Contract:
         size = (arguments["height"], arguments["width"])
         grippers = {name: arguments[name] for name in ("gripper_open", "gripper_closed")}
-        return robot.contract(LiberoProtocol.of(arguments["task"].partition("/")[0], image_size=size, **grippers))
-
-    @property
-    def contract(self) -> Contract:
-        return self._contract
-
-    @property
-    def instruction(self) -> str:
-        return self._instruction
-
-    def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
-        """Begin an episode in the initial state `options["init_state"]`, or in one chosen by the seed."""
-        world, state = self._alive(), self._initial(seed, options or {})
-        with failing(self._name, "reset"):
-            seen = world.begin(self._states[state])
-        self._steps = 0
-        return self._observe(seen), {"success": seen.success, "init_state": state}
-
-    def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
-        world = self._alive()
-        if self._steps is None:
-            raise NotReset(f"{self._name}: step before reset; call reset(seed=...) first")
-        action = one_row(act, self._contract)
-        with failing(self._name, "step"):
-            seen = world.step(robot.to_simulator(action, self._protocol), look=self.looked_at)
-        self._steps += 1
-        ended = seen.success and self._protocol.stop_at_success
-        truncated = not ended and self._steps >= self.max_steps
-        obs = self._observe(seen, look=self.looked_at)
-        return obs, float(seen.success), ended, truncated, {"success": seen.success}
+        return _contract_of(LiberoProtocol.of(arguments["task"].partition("/")[0], image_size=size, **grippers))
 
     @classmethod
     def require_task(cls, task: str | None) -> None:
@@ -156,69 +119,104 @@ class Libero(EvalEnv):
         return task_names()
 
     @classmethod
-    def missing(cls) -> str | None:
-        """The first call in a process renders one frame in a child."""
-        if missing := without(("libero", "robosuite", "mujoco"), "pip install 'vlagents-ray[libero]'"):
-            return missing
+    def _missing_assets(cls) -> str | None:
         try:
-            asset_files.find_assets()
+            find_assets()
         except EnvFailed as error:
             return str(error)
-        return without_egl("LIBERO")
+        return None
 
     def describe(self) -> dict[str, Any]:
-        protocol = self._protocol.to_json(self._task.suite)
+        protocol = self._rules.to_json(self._task.suite)
         if self._task.passes_for_own:
             protocol["deviations"].append(f"files: those of {self._task.name}, the protocol says LIBERO's own")
-        return {
-            "simulator": "libero",
-            "task": self._task.full_name,
+        facts = super().describe() | {
             "name": self._task.name,
             "language": self._task.language,
             "init_states": self.init_states,
             "protocol": protocol,
-            "hf-libero": version("hf-libero"),
-            "robosuite": version("robosuite"),
-            "mujoco": version("mujoco"),
-            "assets": asset_files.digest(self._assets),
-            **({"files": variants.digest(self._task.problem, self._task.states)} if self._task.varied else {}),
-            "render_backend": os.environ.get("MUJOCO_GL", "glfw"),
+            "assets": assets_digest(self._assets),
         }
+        return facts | ({"files": files_digest(self._task.problem, self._task.states)} if self._task.varied else {})
 
-    def close(self) -> None:
-        world, self._world, self._steps = self._world, None, None
-        if world is not None:
-            world.close()
+    def _begin(self, seed: int, state: int) -> tuple[Obs, dict[str, Any]]:
+        seen = self._env.begin(self._states[state])
+        return self._observe(seen), {"success": seen.success}
 
-    def _initial(self, seed: int, options: Mapping[str, Any]) -> int:
-        """The number of the initial state."""
-        unknown = sorted(set(options) - {"init_state"})
-        if unknown:
-            raise ConfigError(f"{self._name}: unknown reset options {unknown}, want init_state or none")
-        count = len(self._states)
-        state = options.get("init_state", seed % count)
-        if not isinstance(state, int) or not 0 <= state < count:
-            raise ConfigError(f"{self._name}: init_state is {state!r}, want 0 to {count - 1}")
-        return state
+    def _advance(self, action: np.ndarray) -> tuple[Obs, float, bool, dict[str, Any]]:
+        seen = self._env.step(to_simulator(action, self._rules), look=self.looked_at)
+        return self._observe(seen, look=self.looked_at), float(seen.success), *self._solved(seen.success)
 
     def _observe(self, seen: SimulatorObs, *, look: bool = True) -> Obs:
-        world, cameras = self._alive(), self._protocol.cameras if look else {}
-        info: dict[str, Any] = {"sim_state": {"positions": world.positions(), "goal": world.goal}}
+        cameras = self._rules.cameras if look else {}
+        info: dict[str, Any] = {"sim_state": {"positions": self._env.positions(), "goal": self._env.goal}}
         if seen.views and look:
             info[HIGH_RES] = {name: _turned(seen.views[own]) for name, own in cameras.items()}
-        state, gripper = robot.read(seen.raw)
-        images = {name: _turned(seen.raw[f"{own}_image"]) for name, own in cameras.items()}
-        return Obs(cameras=images, gripper=gripper, state=state, info=info)
-
-    @property
-    def _name(self) -> str:
-        return f"libero/{self._task.full_name}"
-
-    def _alive(self) -> LiberoSimulation:
-        if self._world is None:
-            raise EnvFailed(f"{self._name} is closed; make a new one")
-        return self._world
+        raw = seen.raw
+        state = {
+            "xyz_axis_angle": np.concatenate([raw["robot0_eef_pos"], axis_angle(raw["robot0_eef_quat"])]),
+            "gripper_qpos": raw["robot0_gripper_qpos"],
+            "joints": raw["robot0_joint_pos"],
+        }
+        return Obs(
+            cameras={name: _turned(raw[f"{own}_image"]) for name, own in cameras.items()},
+            gripper=gripper_opening(raw),
+            state={name: part.astype(np.float32) for name, part in state.items()},
+            info=info,
+        )
 
 
 def _turned(image: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(image[::-1, ::-1])
+
+
+def _contract_of(protocol: LiberoProtocol) -> Contract:
+    """Return the contract of an env under a protocol; names and units are those of policies for LIBERO."""
+    return Contract(
+        cameras={name: CameraSpec(*protocol.image_size) for name in protocol.cameras},
+        state={
+            "xyz_axis_angle": StateSpec(6, "m+rad"),
+            "gripper_qpos": StateSpec(2, "m"),
+            "joints": StateSpec(7, "rad"),
+        },
+        gripper=True,
+        instruction=True,
+        action=ActionSpec(
+            dim=7,
+            space="ee_pose",
+            delta=True,
+            rotation="axis_angle",
+            frame="base",
+            gripper_open=protocol.gripper_open,
+            gripper_closed=protocol.gripper_closed,
+            low=-1.0,
+            high=1.0,
+        ),
+        control_hz=protocol.control_hz,
+    )
+
+
+def to_simulator(action: np.ndarray, protocol: LiberoProtocol) -> np.ndarray:
+    """An action under `protocol`, (7,), as robosuite takes it: the gripper -1 to open, 1 to close, 0 to stay.
+
+    Closer to `gripper_open` means open, as in openvla's evaluation, which binarises, and as robosuite's own
+    gripper does, of whose command only the sign counts.
+    """
+    middle = (protocol.gripper_open + protocol.gripper_closed) / 2
+    command = np.sign((action[6] - middle) * (protocol.gripper_closed - protocol.gripper_open))
+    return np.append(action[:6], command).astype(np.float64)
+
+
+def axis_angle(quaternion: np.ndarray) -> np.ndarray:
+    """A unit quaternion xyzw to axis times angle, (3,) rad, the angle in [0, 2 pi].
+
+    As robosuite's `quat2axisangle`, q and -q give different ones: policies were trained on states in which
+    no sign was normalised. For a gripper that points down w is near 0, and a state that chose the sign by it
+    would jump.
+    """
+    w = min(max(float(quaternion[3]), -1.0), 1.0)
+    sine = math.sqrt(1.0 - w * w)
+    if math.isclose(sine, 0.0):
+        return np.zeros(3)
+    turned: np.ndarray = np.asarray(quaternion[:3], np.float64) * 2.0 * math.acos(w) / sine
+    return turned

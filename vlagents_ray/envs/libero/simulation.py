@@ -11,7 +11,7 @@ import numpy as np
 
 from vlagents_ray.envs.libero.benchmark_protocol import LiberoProtocol
 from vlagents_ray.envs.libero.tasks import LiberoTask
-from vlagents_ray.envs.robosuite.simulation import CameraRenderer, seeded
+from vlagents_ray.envs.robosuite.base import CameraRenderer, seeded
 from vlagents_ray.errors import EnvFailed
 from vlagents_ray.registry import require
 

@@ -1,8 +1,17 @@
-"""LIBERO's tasks: their names, files and initial states."""
+"""LIBERO's tasks: their names, files and initial states; and those that vary them by other files alone.
+
+Of LIBERO-PRO and LIBERO-Plus hf-libero can play some suites and tasks.
+LIBERO-PRO (Zhou et al. 2025, arXiv 2510.03827) names its suites after LIBERO's: `libero_goal_swap` has other positions,
+`_lan` other instructions, `_task` other goals, `_object` other objects. LIBERO-Plus (Fei et al. 2025, arXiv 2510.13626)
+names its tasks after LIBERO's: `NAME_language_7` has another instruction, `NAME_level3_sample2` other positions.
+"""
 
 from __future__ import annotations
 
 import codecs
+import hashlib
+import os
+import re
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,12 +19,20 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.envs.libero import import_libero, variants
 from vlagents_ray.envs.libero.benchmark_protocol import SUITES, base_of
-from vlagents_ray.errors import UnknownEnv
+from vlagents_ray.envs.libero.package import import_libero
+from vlagents_ray.envs.rendering.render_probe import failing
+from vlagents_ray.errors import ConfigError, UnknownEnv
 from vlagents_ray.naming import did_you_mean
 from vlagents_ray.registry import require
 from vlagents_ray.wire.pickles import read_pickled_array
+
+VARIABLE = "LIBERO_FILES"
+_PROBLEMS, _STATES = "bddl_files", "init_files"
+_CURE = (
+    f"download LIBERO-PRO's, hf download zhouxueyang/LIBERO-Pro --repo-type dataset --local-dir libero-pro, and set "
+    f"{VARIABLE} to that folder on every node, or the env's option `files`"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +60,7 @@ class LiberoTask:
 
 def task_names() -> list[str]:
     """Every task, e.g. "libero_spatial/0", those of the suites in `LIBERO_FILES` included; needs no simulator."""
-    counts = {name: suite.tasks for name, suite in SUITES.items()} | variants.suites()
+    counts = {name: suite.tasks for name, suite in SUITES.items()} | _varied_suites()
     return [f"{suite}/{number}" for suite, count in counts.items() for number in range(count)]
 
 
@@ -74,11 +91,11 @@ def find_task(name: str, files: str | None = None) -> LiberoTask:
         ConfigError: The folder of variants is not given, or the task wants what hf-libero does not have.
     """
     suite, which = require_suite(name)
-    root = import_libero.load()
+    root = import_libero()
     known = require("libero.libero.benchmark").task_maps[base_of(suite)]
-    own = suite in SUITES and (which.isdecimal() or which in known or variants.folder(files) is None)
-    place = root if own else variants.require_folder(files)
-    names = list(known) if own else variants.names(place, suite, list(known))
+    own = suite in SUITES and (which.isdecimal() or which in known or _files_folder(files) is None)
+    place = root if own else _require_files_folder(files)
+    names = list(known) if own else _varied_names(place, suite, list(known))
     if which.isdecimal() and int(which) < len(names):
         number = int(which)
     elif which in names:
@@ -88,7 +105,7 @@ def find_task(name: str, files: str | None = None) -> LiberoTask:
             f"libero: {suite} has no task {which!r}: want 0 to {len(names) - 1}, or a name such as {names[0]!r}"
         )
     if not own:
-        return LiberoTask(suite, number, names[number], *variants.read(place, suite, names[number]), varied=True)
+        return LiberoTask(suite, number, names[number], *_read_variant(place, suite, names[number]), varied=True)
     found = known[names[number]]
     return LiberoTask(
         suite=suite,
@@ -121,3 +138,88 @@ def read_states(path: Path) -> np.ndarray:
     with torch.serialization.safe_globals(numpys):
         states: np.ndarray = torch.load(path, weights_only=True)
     return np.atleast_2d(states)  # LIBERO-Plus writes a single one
+
+
+def _files_folder(chosen: str | None = None) -> Path | None:
+    """The folder of variants, `chosen` or the one that `LIBERO_FILES` names; None if neither is given."""
+    named = chosen or os.environ.get(VARIABLE)
+    return Path(named) if named else None
+
+
+def _require_files_folder(chosen: str | None = None) -> Path:
+    """The folder of variants; raises `ConfigError` if none is given, or it lacks a part."""
+    found = _files_folder(chosen)
+    if found is None:
+        raise ConfigError(f"libero: suites that vary LIBERO's want their files; {_CURE}")
+    lacks = [part for part in (_PROBLEMS, _STATES) if not (found / part).is_dir()]
+    if lacks:
+        raise ConfigError(f"libero: the folder of variants {found} lacks {lacks}; {_CURE}")
+    return found
+
+
+def _varied_suites() -> dict[str, int]:
+    """The suites in the folder that `LIBERO_FILES` names, without LIBERO's own, and how many tasks each has."""
+    found = _files_folder()
+    here = sorted(found.glob(f"{_PROBLEMS}/*/")) if found else []
+    named = {one.name: len(list(one.glob("*.bddl"))) for one in here if base_of(one.name)}
+    return {suite: count for suite, count in named.items() if count and suite not in SUITES}
+
+
+def _varied_names(place: Path, suite: str, known: list[str]) -> list[str]:
+    """The names of a suite's tasks: in LIBERO's order where they are LIBERO's, and else by the alphabet.
+
+    Args:
+        place: The folder of variants.
+        suite: The suite.
+        known: The tasks of the suite that it varies, in LIBERO's order.
+
+    Raises:
+        UnknownEnv: The folder has no such suite.
+    """
+    here = {file.stem for file in place.glob(f"{_PROBLEMS}/{suite}/*.bddl")}
+    if not here:
+        have = sorted(one.name for one in place.glob(f"{_PROBLEMS}/*/"))
+        raise UnknownEnv(f"libero: {place} has no suite {suite!r}: want one of {have}{did_you_mean(suite, have)}")
+    return list(known) if here == set(known) else sorted(here)
+
+
+def _read_variant(place: Path, suite: str, name: str) -> tuple[str, Path, Path]:
+    """A task's instruction, as its BDDL file gives it, that file, and the one of its initial states; imports LIBERO.
+
+    Raises:
+        ConfigError: The task wants an object or a scene that hf-libero does not have, or has no initial states.
+        EnvFailed: hf-libero cannot read the BDDL file.
+    """
+    problem = place / _PROBLEMS / suite / f"{name}.bddl"
+    _require_playable(problem)
+    unspoken = re.sub(r"_language_\d+$", "", name)  # of the task whose instruction alone is another
+    looked = [
+        place / _STATES / part / f"{one}.pruned_init"
+        for part, one in ((suite, name), (f"libero_newobj/{suite}", name), (suite, unspoken))
+    ]
+    states = next((file for file in looked if file.is_file()), None)
+    if states is None:
+        raise ConfigError(f"libero: {problem} has no initial states: looked for {[str(file) for file in looked]}")
+    about = require("libero.libero.envs.bddl_utils").get_problem_info(str(problem))
+    return about["language_instruction"], problem, states
+
+
+def files_digest(problem: Path, states: Path) -> str:
+    """Stands for the contents of a task's two files in the results."""
+    return hashlib.sha256(problem.read_bytes() + states.read_bytes()).hexdigest()[:16]
+
+
+def _require_playable(problem: Path) -> None:
+    """Raise `ConfigError` unless hf-libero has the task's scene and all its objects."""
+    envs, objects = require("libero.libero.envs"), require("libero.libero.envs.objects").OBJECTS_DICT
+    with failing("libero", f"read {problem}"):
+        parsed = require("libero.libero.envs.bddl_utils").robosuite_parse_problem(str(problem))
+    placed = {one for one in parsed["fixtures"] if not one.endswith(("table", "floor"))}  # which belong to the scene
+    lacks = sorted({*placed, *parsed["objects"]} - set(objects))
+    if parsed["problem_name"] not in envs.TASK_MAPPING:
+        lacks = [parsed["problem_name"], *lacks]
+    if lacks:
+        raise ConfigError(
+            f"libero: {problem} wants {lacks}, which hf-libero does not have: such objects, tables and lights need the "
+            f"code of LIBERO-PRO or LIBERO-Plus; choose a variant of positions, instructions or goals"
+        )

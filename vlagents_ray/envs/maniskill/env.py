@@ -1,26 +1,42 @@
-"""A ManiSkill task as an environment for evaluations."""
+"""A ManiSkill task as an environment for evaluations, alone or many in one simulator on a GPU."""
 
 from __future__ import annotations
 
-import importlib.util
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
 from vlagents_ray.contract import Contract
-from vlagents_ray.envs.base import BatchEnv, EvalEnv, one_row
-from vlagents_ray.envs.maniskill import benchmark_protocol, factory
+from vlagents_ray.envs.base import BatchEnv, Options, Steps, one_row
+from vlagents_ray.envs.batch import episodes_of
+from vlagents_ray.envs.maniskill import factory
+from vlagents_ray.envs.maniskill.factory import INSTRUCTIONS
 from vlagents_ray.envs.maniskill.simulator import Simulator
-from vlagents_ray.envs.maniskill.tasks import INSTRUCTIONS
-from vlagents_ray.envs.recording import record_size_of
 from vlagents_ray.envs.rendering.graphics import Renderer
-from vlagents_ray.envs.rendering.render_probe import render_probe
-from vlagents_ray.errors import NotReset
+from vlagents_ray.envs.rendering.render_probe import render_probe, without
+from vlagents_ray.envs.simulator import SimulatorEnv
+from vlagents_ray.errors import ConfigError, NotReset
 from vlagents_ray.interface import Act, Obs
 
+ON_GPU = ("gpu", "cuda", "physx_cuda")
 
-class ManiSkill(EvalEnv):
+
+@dataclass(frozen=True, slots=True)
+class ManiSkillProtocol:
+    """The section "Evaluation" of ManiSkill 3's guide to its set-up for reinforcement learning."""
+
+    ignore_terminations: bool = True  # an episode continues to the step limit after success or failure
+    reconfiguration_freq: int = 1  # the scene is rebuilt for each episode, with other objects where a task draws them
+    metrics: tuple[str, ...] = ("success_once", "success_at_end")
+    seeds: str = "one an environment"  # each episode has its own seed, which determines all that is random in it
+
+
+PROTOCOL = ManiSkillProtocol()
+
+
+class ManiSkill(SimulatorEnv):
     """One environment of one ManiSkill task.
 
     Observation: the task's cameras; in `state` the arm's `joints` (without the fingers), `tquat` and
@@ -37,6 +53,8 @@ class ManiSkill(EvalEnv):
     The env continues after success, so that success once and success at the end can both be measured,
     and never reports `terminated`.
     """
+
+    suite = "maniskill"
 
     def __init__(
         self,
@@ -55,7 +73,7 @@ class ManiSkill(EvalEnv):
         reconfigure: bool = True,
         record_size: Sequence[int] | None = None,
     ) -> None:
-        """Make the environment.
+        """Make the environment; raises the errors of `make_env`.
 
         Args:
             task: ManiSkill's id.
@@ -72,31 +90,110 @@ class ManiSkill(EvalEnv):
             reconfigure: Rebuild the scene for each episode. Without it some tasks' dynamics
                 (PlugCharger, PushT) depend on the episode before; it saves about 15 ms a reset.
             record_size: Height and width of further views by the same cameras, for the record only.
-
-        Raises:
-            UnknownEnv: There is no such task.
-            ConfigError: An option has a wrong value.
-            MissingDependency: The simulator is not installed.
-            EnvFailed: The simulator or its assets cannot be loaded.
         """
+        super().__init__(f"maniskill/{task}", record_size=record_size)
         self._own_limit = factory.registered_limit(task)
-        self.max_steps = factory.step_limit(f"maniskill/{task}", max_steps, self._own_limit)
-        self._task = task
-        self._instruction = instruction
-        self._rebuild = {"reconfigure": True} if reconfigure else {}
-        self._steps: int | None = None
-        self._simulator = Simulator(
-            f"maniskill/{task}",
+        self.max_steps = factory.step_limit(self._name, max_steps, self._own_limit)
+        self._given_instruction = instruction
+        self._reconfigure = reconfigure
+        self._env = _simulator(
             task,
-            obs_mode="rgb+state",
+            width=width,
+            height=height,
+            shader=shader,
             cameras=cameras,
-            record_size=record_size_of(record_size, f"maniskill/{task}"),
+            record_size=self._record_size,
             sim_backend=sim_backend,
             render_backend=render_backend,
             control_mode=control_mode,
             reward_mode=reward_mode,
-            sensors=factory.sensor_settings(f"maniskill/{task}", width, height, shader),
         )
+        self._resources.callback(self._env.close)
+        self._contract = self._env.contract(self._env.action)
+
+    @property
+    def instruction(self) -> str:
+        return self._alive().instructions()[0] if self._given_instruction is None else self._given_instruction
+
+    def reset(self, *, seed: int, options: Options | None = None) -> tuple[Obs, dict[str, Any]]:
+        """Begin the episode of `seed`, taken modulo 2^32; `options` go to ManiSkill's own reset."""
+        self._options = options or {}
+        return super().reset(seed=seed)
+
+    @classmethod
+    def tasks(cls) -> list[str]:
+        return sorted(INSTRUCTIONS)
+
+    @classmethod
+    def require_task(cls, task: str | None) -> None:
+        """Do nothing: only ManiSkill knows which other ids are registered."""
+
+    @classmethod
+    def missing(cls) -> str | None:
+        """Say why ManiSkill cannot run here; the first call in a process renders one frame in a child."""
+        if missing := without(("mani_skill", "sapien", "gymnasium", "torch"), "pip install 'vlagents-ray[maniskill]'"):
+            return missing
+        probe = render_probe()
+        return None if probe.ok else f"ManiSkill finds no Vulkan device to render on ({probe.error}); {probe.cure}"
+
+    @classmethod
+    def batched(cls, num_envs: int, **options: Any) -> BatchEnv | None:
+        """Make all environments in one simulator, if it runs on a GPU."""
+        return ManiSkillBatch(num_envs=num_envs, **options) if options.get("sim_backend") in ON_GPU else None
+
+    def renderer(self) -> Renderer | None:
+        found: Renderer | None = self._alive().renderer()
+        return found
+
+    def describe(self) -> dict[str, Any]:
+        return _described(self._alive(), self._reconfigure, self.max_steps, self._own_limit)
+
+    def _begin(self, seed: int, state: int) -> tuple[Obs, dict[str, Any]]:
+        rebuild = {"reconfigure": True} if self._reconfigure else {}
+        now = self._env.reset([seed], {**self._options, **rebuild})
+        return now.obs[0], {"success": now.success[0]}
+
+    def _advance(self, action: np.ndarray) -> tuple[Obs, float, bool, dict[str, Any]]:
+        now = self._env.step(action[np.newaxis], look=self.looked_at)
+        return now.obs[0], now.rewards[0], False, {"success": now.success[0]}
+
+
+class ManiSkillBatch(BatchEnv):
+    """`num_envs` environments of one ManiSkill task; observations and actions are those of `ManiSkill`.
+
+    Physics on the GPU is not that on the CPU to the bit: results of the two do not mix.
+    """
+
+    def __init__(
+        self,
+        task: str = "PushCube-v1",
+        *,
+        num_envs: int,
+        instruction: str | None = None,
+        max_steps: int | None = None,
+        sim_backend: str = "physx_cuda",
+        reconfigure: bool = True,
+        record_size: Sequence[int] | None = None,
+        **options: Any,
+    ) -> None:
+        """Make the environments with the options of `ManiSkill`, whose errors this raises.
+
+        `sim_backend` "physx_cpu" simulates a single environment, and `record_size` must be None.
+        """
+        if record_size is not None:
+            raise ConfigError(f"maniskill/{task}: record_size is for single environments; leave it out")
+        if sim_backend not in ON_GPU and num_envs > 1:
+            raise ConfigError(
+                f"maniskill/{task}: {sim_backend} simulates one environment, not {num_envs}; want physx_cuda"
+            )
+        self._own_limit = factory.registered_limit(task)
+        self.num_envs = num_envs
+        self.max_steps = factory.step_limit(f"maniskill/{task}", max_steps, self._own_limit)
+        self._task = task
+        self._instruction = instruction
+        self._reconfigure = reconfigure
+        self._playing = self._steps = 0
+        self._simulator = _simulator(task, num_envs=num_envs, sim_backend=sim_backend, **options)
         self._contract = self._simulator.contract(self._simulator.action)
 
     @property
@@ -104,56 +201,59 @@ class ManiSkill(EvalEnv):
         return self._contract
 
     @property
-    def instruction(self) -> str:
-        return self._simulator.instructions()[0] if self._instruction is None else self._instruction
+    def instructions(self) -> list[str]:
+        own = self._simulator.instructions() if self._instruction is None else [self._instruction] * self.num_envs
+        return own[: self._playing]
 
-    def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
-        """Begin the episode of `seed`, taken modulo 2^32; `options` go to ManiSkill's own reset."""
-        now = self._simulator.reset([seed], {**(options or {}), **self._rebuild})
-        self._steps = 0
-        return now.obs[0], {"success": now.success[0]}
+    def reset(self, *, seeds: Sequence[int], options: Sequence[Options | None] | None = None) -> list[Obs]:
+        """Begin the episodes of `seeds`, taken modulo 2^32; the options go to ManiSkill's own reset."""
+        self._playing, self._steps = episodes_of(seeds, self.num_envs), 0
+        spare = self.num_envs - self._playing
+        every = [*seeds, *[seeds[-1]] * spare]
+        given: list[Options] = [*(option or {} for option in options or [{}] * self._playing), *[{}] * spare]
+        if self._reconfigure:
+            self._simulator.reset(every, {"reconfigure": True})
+        return self._simulator.reset_each(every, given).obs[: self._playing]
 
-    def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
-        if self._steps is None:
-            raise NotReset(f"maniskill/{self._task}: step before reset; call reset(seed=...) first")
-        action = one_row(act, self._contract)
-        now = self._simulator.step(action[np.newaxis], look=self.looked_at)
+    def step(self, acts: Sequence[Act | None]) -> Steps:
+        if not self._playing:
+            raise NotReset(f"maniskill/{self._task}: step before reset; call reset(seeds=...) first")
+        actions = np.zeros((self.num_envs, self._contract.action.dim or 0), np.float32)
+        for i, act in enumerate(acts):
+            if act is not None:
+                actions[i] = one_row(act, self._contract)
+        now = self._simulator.step(actions, look=self.looked_at)
         self._steps += 1
-        outcome = {"success": now.success[0]}
-        return now.obs[0], now.rewards[0], False, self._steps >= self.max_steps, outcome
-
-    @classmethod
-    def tasks(cls) -> list[str]:
-        return sorted(INSTRUCTIONS)
-
-    @classmethod
-    def missing(cls) -> str | None:
-        """The first call in a process renders one frame in a child, which takes some seconds."""
-        for module in ("mani_skill", "sapien", "gymnasium", "torch"):
-            if importlib.util.find_spec(module) is None:
-                return f"{module} is not installed; pip install 'vlagents-ray[maniskill]'"
-        probe = render_probe()
-        return None if probe.ok else f"ManiSkill finds no Vulkan device to render on ({probe.error}); {probe.cure}"
-
-    @classmethod
-    def batched(cls, num_envs: int, **options: Any) -> BatchEnv | None:
-        """Make all environments in one simulator, if it runs on a GPU."""
-        from vlagents_ray.envs.maniskill.batch import ON_GPU, ManiSkillBatch
-
-        if options.get("sim_backend") not in ON_GPU:
-            return None
-        return ManiSkillBatch(num_envs=num_envs, **options)
+        n = self._playing
+        over = self._steps >= self.max_steps
+        infos = [{"success": success} for success in now.success[:n]]
+        return now.obs[:n], now.rewards[:n], [False] * n, [over] * n, infos
 
     def renderer(self) -> Renderer | None:
         return self._simulator.renderer()
 
     def describe(self) -> dict[str, Any]:
-        reconfigure = bool(self._rebuild)
-        rules = benchmark_protocol.described(
-            reconfigure=reconfigure, max_steps=self.max_steps, own_limit=self._own_limit
-        )
-        return {**self._simulator.describe(), "reconfigure": reconfigure, "protocol": rules}
+        return _described(self._simulator, self._reconfigure, self.max_steps, self._own_limit)
 
     def close(self) -> None:
-        self._steps = None
+        self._playing = 0
         self._simulator.close()
+
+
+def _simulator(
+    task: str, *, width: int = 224, height: int = 224, shader: str | None = None, **options: Any
+) -> Simulator:
+    name = f"maniskill/{task}"
+    sensors = factory.sensor_settings(name, width, height, shader)
+    return Simulator(name, task, obs_mode="rgb+state", sensors=sensors, **options)
+
+
+def _described(simulator: Simulator, reconfigure: bool, max_steps: int, own_limit: int | None) -> dict[str, Any]:
+    """Return what `describe` states, with the deviations of the settings from the protocol."""
+    deviations = []
+    if not reconfigure:
+        deviations.append("reconfigure is False: scenes are kept from episode to episode")
+    if max_steps != own_limit:
+        deviations.append(f"max_steps is {max_steps}, the task's own is {own_limit}")
+    protocol = {**asdict(PROTOCOL), "metrics": list(PROTOCOL.metrics), "deviations": deviations}
+    return {**simulator.describe(), "reconfigure": reconfigure, "protocol": protocol}

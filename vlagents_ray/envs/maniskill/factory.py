@@ -1,4 +1,4 @@
-"""The construction of ManiSkill environments in processes without a terminal."""
+"""ManiSkill's tasks in words, and the construction of its environments in processes without a terminal."""
 
 from __future__ import annotations
 
@@ -13,13 +13,38 @@ import warnings
 from collections.abc import Iterator
 from typing import Any
 
-from vlagents_ray.envs.maniskill.tasks import INSTRUCTIONS
-from vlagents_ray.envs.rendering.headless import prepare_rendering
+from vlagents_ray.envs.rendering.graphics import prepare_rendering
 from vlagents_ray.envs.rendering.render_probe import vulkan_cure
 from vlagents_ray.errors import ConfigError, EnvFailed, UnknownEnv
 from vlagents_ray.registry import require
 
 DEFAULT_CONTROL_MODE = "pd_ee_delta_pose"
+
+# The tasks whose assets come with the package.
+INSTRUCTIONS: dict[str, str] = {
+    "LiftPegUpright-v1": "lift the peg and stand it upright on the table",
+    "PegInsertionSide-v1": "pick up the peg and insert its orange end into the hole in the box",
+    "PickCube-v1": "pick up the red cube and move it to the goal",
+    "PlugCharger-v1": "pick up the charger and plug it into the receptacle",
+    "PokeCube-v1": "poke the cube with the peg and push it onto the red and white target",
+    "PullCube-v1": "pull the cube onto the red and white target",
+    "PullCubeTool-v1": "pick up the L-shaped tool and pull the cube towards the robot with it",
+    "PushCube-v1": "push the cube onto the red and white target",
+    "PushT-v1": "push the T-shaped block onto the T-shaped target",
+    "RollBall-v1": "roll the ball onto the red and white target",
+    "StackCube-v1": "pick up the red cube and stack it on the green cube",
+}
+
+
+def instruction_for(task: str) -> str:
+    """The task's instruction; for a task not in `INSTRUCTIONS` its name in words.
+
+    "PickSingleYCB-v1" becomes "pick single ycb".
+    """
+    if task in INSTRUCTIONS:
+        return INSTRUCTIONS[task]
+    words = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", re.sub(r"-v\d+$", "", task))
+    return " ".join(words).lower()
 
 
 def registered_limit(task: str) -> int | None:

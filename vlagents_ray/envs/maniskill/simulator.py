@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Mapping, Sequence
+import dataclasses
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from typing import Any
@@ -12,12 +13,11 @@ import numpy as np
 
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract
 from vlagents_ray.envs.maniskill import factory
-from vlagents_ray.envs.maniskill.recording import RecordCameras
+from vlagents_ray.envs.maniskill.factory import instruction_for
 from vlagents_ray.envs.maniskill.robot import ManiSkillRobot, action_spec
-from vlagents_ray.envs.maniskill.tasks import instruction_for
-from vlagents_ray.envs.recording import Size
 from vlagents_ray.envs.rendering.graphics import Renderer, vulkan_renderer
-from vlagents_ray.envs.rendering.render_probe import vulkan_device
+from vlagents_ray.envs.rendering.render_probe import failing, vulkan_device
+from vlagents_ray.envs.simulator import Size, require_cameras
 from vlagents_ray.errors import ConfigError, EnvFailed
 from vlagents_ray.interface import HIGH_RES, Obs
 from vlagents_ray.registry import require
@@ -45,8 +45,8 @@ class Simulator:
         cameras: Sequence[str] | None = None,
         record_size: Size | None = None,
         sim_backend: str,
-        render_backend: str,
-        control_mode: str | None,
+        render_backend: str = "auto",
+        control_mode: str | None = None,
         reward_mode: str | None = None,
         sensors: Mapping[str, Any],
     ) -> None:
@@ -101,7 +101,7 @@ class Simulator:
     def reset(self, seeds: Sequence[int], options: Mapping[str, Any]) -> Moment:
         """Begin an episode in each environment; seeds are taken modulo 2^32."""
         env = self.alive()
-        with self._failing("reset"):
+        with failing(self.name, "reset"):
             raw, info = env.reset(seed=[seed % 2**32 for seed in seeds], options=dict(options))
             if env.num_envs == 1:  # rendering is most of a step's time, so only the requested cameras are rendered
                 for name in set(env.scene.sensors) - set(self.cameras):
@@ -115,7 +115,7 @@ class Simulator:
         draws by torch would then depend on the other environments.
         """
         env = self.alive()
-        with self._failing("reset"):
+        with failing(self.name, "reset"):
             with self._observing("none"):  # nothing is rendered before all episodes have begun
                 for i, (seed, option) in enumerate(zip(seeds, options, strict=True)):
                     only = require("torch").tensor([i], device=env.device)
@@ -126,7 +126,7 @@ class Simulator:
     def step(self, actions: np.ndarray, *, look: bool = True) -> Moment:
         """Execute one action in each environment, (N, D) float32; without `look` nothing is rendered."""
         env = self.alive()
-        with self._failing("step"), contextlib.nullcontext() if look else self._observing("state_dict"):
+        with failing(self.name, "step"), contextlib.nullcontext() if look else self._observing("state_dict"):
             # a copy: torch shares the memory, and warns of read-only arrays, such as those of Ray
             raw, rewards, _, _, info = env.step(actions.copy())
             return replace(self.moment(raw, info), rewards=rewards.cpu().numpy().astype(float).tolist())
@@ -192,9 +192,7 @@ class Simulator:
     def _choose(self, cameras: Sequence[str] | None) -> dict[str, CameraSpec]:
         seen = self.env.single_observation_space["sensor_data"]
         sizes = {name: textures["rgb"].shape[:2] for name, textures in seen.items() if "rgb" in textures.spaces}
-        unknown = sorted(set(cameras or ()) - set(sizes))
-        if unknown:
-            raise ConfigError(f"{self.name} has no camera {unknown}: want some of {sorted(sizes)}")
+        require_cameras(self.name, cameras or (), sizes)
         chosen = sizes if cameras is None else cameras
         return {name: CameraSpec(height=sizes[name][0], width=sizes[name][1]) for name in chosen}
 
@@ -208,9 +206,45 @@ class Simulator:
         finally:
             env._obs_mode = own
 
-    @contextlib.contextmanager
-    def _failing(self, doing: str) -> Iterator[None]:
-        try:
-            yield
-        except Exception as error:
-            raise EnvFailed(f"{self.name} failed in {doing}: {type(error).__name__}: {error}") from error
+
+class RecordCameras:
+    """Cameras at the places of the task's cameras, created again with each scene."""
+
+    def __init__(self, size: Size, names: Iterable[str]) -> None:
+        self._height, self._width = size
+        self._names = list(names)
+        self._scene: Any = None
+        self._cameras: dict[str, Any] = {}
+
+    def views(self, env: Any) -> dict[str, np.ndarray]:
+        """Return the current images of a single environment's cameras, (height, width, 3) uint8 RGB each."""
+        if env.scene is not self._scene:
+            self._cameras = {name: self._beside(env, name) for name in self._names}
+            self._scene = env.scene
+        env.scene.update_render(update_sensors=True, update_human_render_cameras=False)
+        return {name: self._view(env, name) for name in self._names}
+
+    def _beside(self, env: Any, name: str) -> Any:
+        own = env._sensor_configs[name]
+        intrinsic = None
+        if own.intrinsic is not None:  # in pixels; a field of view needs no scaling
+            scale = np.array([self._width / own.width, self._height / own.height, 1.0])
+            intrinsic = np.asarray(own.intrinsic) * scale[:, np.newaxis]
+        config = dataclasses.replace(
+            own, uid=f"{name}_record", width=self._width, height=self._height, intrinsic=intrinsic
+        )
+        robot = env.agent.robot if name in env._agent_sensor_configs else None
+        return require("mani_skill.sensors.camera").Camera(config, env.scene, articulation=robot)
+
+    def _view(self, env: Any, name: str) -> np.ndarray:
+        camera = self._cameras[name]
+        camera.capture()
+        overlay = (getattr(env, "_rgb_overlay_images", None) or {}).get(name)
+        seen = camera.get_obs(depth=False, position=False, segmentation=overlay is not None)
+        rgb = seen["rgb"]
+        if overlay is not None:  # a digital twin, whose background is a photograph
+            pil = require("PIL.Image")
+            photograph = pil.fromarray(overlay.cpu().numpy().astype(np.uint8)).resize((self._width, self._height))
+            background = require("torch").tensor(np.array(photograph), device=rgb.device)
+            rgb = env._green_sceen_rgb(rgb, seen["segmentation"], background)
+        return np.ascontiguousarray(rgb[0].cpu().numpy().astype(np.uint8))

@@ -2,27 +2,32 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from importlib.metadata import version
 from typing import Any, ClassVar
 
 import numpy as np
 
-from vlagents_ray.contract import CameraSpec, Contract
-from vlagents_ray.envs.base import EvalEnv, one_row, require_known
-from vlagents_ray.envs.mapping import plain
-from vlagents_ray.envs.rcs import factory
-from vlagents_ray.envs.rcs.arms import Arms
-from vlagents_ray.envs.rcs.tasks import DUOBENCH_TASKS, RCS_TASKS, ControlMode, RcsTask
-from vlagents_ray.envs.recording import record_size_of
-from vlagents_ray.errors import ConfigError, EnvFailed, NotReset
-from vlagents_ray.interface import HIGH_RES, Act, Obs
+from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, Rotation, StateSpec
+from vlagents_ray.envs.base import require_known
+from vlagents_ray.envs.gymnasium.view import plain
+from vlagents_ray.envs.rcs import scenes
+from vlagents_ray.envs.rcs.scenes import DUOBENCH_TASKS, RCS_TASKS, ControlMode, RcsTask
+from vlagents_ray.envs.simulator import SimulatorEnv
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.interface import HIGH_RES, Obs
 from vlagents_ray.registry import require
 
+# RCS's angles are roll, pitch, yaw about fixed axes, R = Rz Ry Rx; its quaternions end with w.
+_UNITS = {"joints": "rad", "tquat": "m+quat_xyzw", "xyzrpy": "m+rad"}
+_COMMANDS: dict[ControlMode, tuple[str, Rotation]] = {
+    "joints": ("joint", "none"),
+    "tquat": ("ee_pose", "quat_xyzw"),
+    "xyzrpy": ("ee_pose", "euler_xyz"),
+}
 
-class Rcs(EvalEnv):
+
+class Rcs(SimulatorEnv):
     """One environment of one task: "pick", or the id of any scene with a task that RCS has registered.
 
     Observation: the scene's cameras; of each arm `joints` rad, `tquat` and `xyzrpy`, the tool's pose
@@ -35,9 +40,10 @@ class Rcs(EvalEnv):
     Success is the simulator's, and ends the episode. The seed places the objects.
     """
 
-    suite: ClassVar[str] = "rcs"
+    suite = "rcs"
     known: ClassVar[Mapping[str, RcsTask]] = RCS_TASKS
     packages: ClassVar[tuple[str, ...]] = ("rcs",)
+    distributions: ClassVar[tuple[str, ...]] = ("rcs-core", "mujoco")
 
     def __init__(
         self,
@@ -55,7 +61,7 @@ class Rcs(EvalEnv):
         instruction: str | None = None,
         max_steps: int | None = None,
     ) -> None:
-        """Make the environment.
+        """Make the environment; raises the errors of `make_env`.
 
         Args:
             task: One of `tasks()`, or Gymnasium's id of a scene, "lab/shelf"; None is the first of `tasks()`.
@@ -70,48 +76,35 @@ class Rcs(EvalEnv):
             record_size: (height, width) in pixels of a second view of each camera, for the record alone.
             instruction: None is the task's.
             max_steps: None is the protocol's limit.
-
-        Raises:
-            UnknownEnv: There is no such task.
-            ConfigError: An option has a wrong value.
-            MissingDependency: The simulator is not installed.
-            EnvFailed: The simulator or its assets cannot be loaded.
         """
         task = self.tasks()[0] if task is None else task
-        self._name = f"{self.suite}/{task}"
         self._task = self._find(task, module)
         protocol = self._task.protocol
         limit = protocol.max_steps if max_steps is None and protocol is not None else max_steps
         if limit is None:
-            raise ConfigError(f"{self._name} has no step limit of its own; set max_steps")
-        sizes = {"width": width, "height": height, "max_steps": limit}
-        for name, value in sizes.items():
-            if value < 1:
-                raise ConfigError(f"{self._name}: {name} is {value}, want at least 1")
+            raise ConfigError(f"{self.suite}/{task} has no step limit of its own; set max_steps")
+        super().__init__(f"{self.suite}/{task}", record_size=record_size, width=width, height=height, max_steps=limit)
         self.max_steps = limit
         self._mode = control_mode or self._task.control_mode
         self._given_instruction = instruction
-        self._instruction = ""
-        record = record_size_of(record_size, self._name)
-        self._recording = record is not None
-        self._steps: int | None = None
-        self._env: Any = None
         hz = control_hz or self._task.control_hz
-        maker = factory.creator(self._task, self._name)
+        maker = scenes.creator(self._task, self._name)
         config = maker.config()
         self._task.prepare(config)
-        factory.configure(
+        scenes.configure(
             config,
+            env=self._name,
             control_mode=self._mode,
             delta=delta,
             control_hz=hz,
             binary_gripper=binary_gripper,
             size=(height, width),
             cameras=cameras,
-            record_size=record,
+            record_size=self._record_size,
         )
-        with self._failing("make"):
+        with self._making():
             self._env = maker.create_env(config)
+            self._resources.callback(self._env.close)
             self._sim = self._env.get_wrapper_attr("sim")
             self._loose = _loose_joints(self._sim.model)
             self._arms = Arms(self._env.action_space, self._env.observation_space, self._mode)
@@ -125,39 +118,8 @@ class Rcs(EvalEnv):
         )
 
     @property
-    def contract(self) -> Contract:
-        return self._contract
-
-    @property
     def instruction(self) -> str:
         return self._given_instruction or self._instruction or self._task.instruction
-
-    def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
-        """Begin the episode of `seed`, taken modulo 2^32; there are no options."""
-        if options:
-            raise ConfigError(f"{self._name}: unknown reset options {sorted(options)}, want none")
-        env = self._alive()
-        with self._failing("reset"):
-            raw, info = env.reset(seed=seed % 2**32)
-        self._steps = 0
-        self._instruction = str(info.get("instruction", ""))
-        if not self.instruction:
-            raise ConfigError(f"{self._name} states no instruction; set the option `instruction`")
-        return self._observe(raw), {"success": bool(info.get("success", False))}
-
-    def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
-        env = self._alive()
-        if self._steps is None:
-            raise NotReset(f"{self._name}: step before reset; call reset(seed=...) first")
-        action = one_row(act, self._contract)
-        with self._failing("step"):
-            raw, reward, terminated, _, info = env.step(self._arms.command(action))
-        if "success" not in info:
-            raise ConfigError(f"{self._name} does not say what success is: want a scene with a task")
-        self._steps += 1
-        task_info = {key: value for key, value in info.items() if key not in self._arms.names}  # without that of arms
-        outcome = {**plain(task_info), "success": bool(info["success"])}
-        return self._observe(raw), float(reward), bool(terminated), self._steps >= self.max_steps, outcome
 
     @classmethod
     def require_task(cls, task: str | None) -> None:
@@ -170,24 +132,34 @@ class Rcs(EvalEnv):
 
     @classmethod
     def missing(cls) -> str | None:
-        return factory.missing(*cls.packages)
+        return scenes.missing(*cls.packages)
 
     def describe(self) -> dict[str, Any]:
         control = f"{self._mode}, delta" if self._contract.action.delta else self._mode
         played = {"max_steps": self.max_steps, "control_hz": self._contract.control_hz, "control": control}
         protocol = self._task.protocol
-        return {
+        robots = self._alive().get_wrapper_attr("robot")
+        return super().describe() | {
             "simulator": "rcs",
             "task": self._task.id,
-            **{name: version(name) for name in ("rcs-core", *self.packages[1:], "mujoco")},
-            "robots": {name: robot.get_config().robot_type.id for name, robot in self._robots().items()},
+            "robots": {name: robot.get_config().robot_type.id for name, robot in robots.items()},
             "protocol": protocol.describe(**played) if protocol is not None else played,
         }
 
-    def close(self) -> None:
-        env, self._env, self._steps = self._env, None, None
-        if env is not None:
-            env.close()
+    def _begin(self, seed: int, state: int) -> tuple[Obs, dict[str, Any]]:
+        raw, info = self._env.reset(seed=seed)
+        self._instruction = str(info.get("instruction", ""))
+        if not self.instruction:
+            raise ConfigError(f"{self._name} states no instruction; set the option `instruction`")
+        return self._observe(raw), {"success": bool(info.get("success", False))}
+
+    def _advance(self, action: np.ndarray) -> tuple[Obs, float, bool, dict[str, Any]]:
+        raw, reward, terminated, _, info = self._env.step(self._arms.command(action))
+        if "success" not in info:
+            raise ConfigError(f"{self._name} does not say what success is: want a scene with a task")
+        task_info = {key: value for key, value in info.items() if key not in self._arms.names}  # without that of arms
+        outcome = {**plain(task_info), "success": bool(info["success"])}
+        return self._observe(raw), float(reward), bool(terminated), outcome
 
     def _find(self, task: str, module: str | None) -> RcsTask:
         if task in self.known:
@@ -200,9 +172,9 @@ class Rcs(EvalEnv):
         state, gripper = self._arms.read(raw)
         images = {name: frame["rgb"]["data"] for name, frame in raw.get("frames", {}).items()}
         info: dict[str, Any] = {"objects": {name: np.array(self._sim.data.joint(name).qpos) for name in self._loose}}
-        if self._recording:
+        if self._record_size is not None:
             info[HIGH_RES] = {
-                name.removeprefix(factory.RECORD): np.ascontiguousarray(image)
+                name.removeprefix(scenes.RECORD): np.ascontiguousarray(image)
                 for name, image in images.items()
                 if _for_the_record(name)
             }
@@ -213,22 +185,6 @@ class Rcs(EvalEnv):
             info=info,
         )
 
-    def _robots(self) -> dict[str, Any]:
-        robots: dict[str, Any] = self._alive().get_wrapper_attr("robot")
-        return robots
-
-    def _alive(self) -> Any:
-        if self._env is None:
-            raise EnvFailed(f"{self._name} is closed; make a new one")
-        return self._env
-
-    @contextlib.contextmanager
-    def _failing(self, doing: str) -> Iterator[None]:
-        try:
-            yield
-        except Exception as error:
-            raise EnvFailed(f"{self._name} failed in {doing}: {type(error).__name__}: {error}") from error
-
 
 class DuoBench(Rcs):
     """DuoBench's eleven tasks of two FR3 arms, "left" and "right", named without "duobench/".
@@ -237,9 +193,9 @@ class DuoBench(Rcs):
     reward is the share of the task's stages reached; a step's info has `stage` and `max_stage`.
     """
 
-    suite: ClassVar[str] = "duobench"
+    suite = "duobench"
     known: ClassVar[Mapping[str, RcsTask]] = DUOBENCH_TASKS
-    packages: ClassVar[tuple[str, ...]] = ("rcs", "duobench")
+    packages, distributions = ("rcs", "duobench"), ("rcs-core", "duobench", "mujoco")
 
 
 def _loose_joints(model: Any) -> list[str]:
@@ -248,4 +204,69 @@ def _loose_joints(model: Any) -> list[str]:
 
 
 def _for_the_record(camera: str) -> bool:
-    return camera.startswith(factory.RECORD)
+    return camera.startswith(scenes.RECORD)
+
+
+class Arms:
+    """Translates between RCS's dicts, keyed by robot, and what policies see.
+
+    The parts of a single arm's state have plain names, `joints`; those of several begin with the
+    arm's, `left/joints`, and so does the gripper, which then is a part of the state, (1,). In a row of
+    the action each arm has its command, then its gripper, 1 = open; the arms follow each other.
+    """
+
+    def __init__(self, actions: Mapping[str, Any], observations: Mapping[str, Any], mode: ControlMode) -> None:
+        """`actions` and `observations` are RCS's spaces: robot -> part -> Box (D,)."""
+        self.names = tuple(actions)
+        self.single = len(self.names) == 1
+        self._mode = mode
+        self._sizes = {name: int(actions[name][mode].shape[0]) for name in self.names}
+        self._grippers = {name for name in self.names if "gripper" in actions[name].spaces}
+        self.state = {
+            self._key(name, part): StateSpec(int(observations[name][part].shape[0]), unit)
+            for name in self.names
+            for part, unit in _UNITS.items()
+        }
+        if not self.single:
+            self.state |= {self._key(name, "gripper"): StateSpec(1) for name in self.names if name in self._grippers}
+        self.has_gripper = self.single and bool(self._grippers)  # that `Obs.gripper` can tell
+
+    def action_spec(self, *, delta: bool) -> ActionSpec:
+        """The contract of an action."""
+        space, rotation = _COMMANDS[self._mode]
+        return ActionSpec(
+            dim=sum(self._sizes.values()) + len(self._grippers),
+            space=space,
+            delta=delta,
+            rotation=rotation,
+            frame=None if self._mode == "joints" else "base",
+            gripper_open=1.0 if self._grippers else None,
+            gripper_closed=0.0 if self._grippers else None,
+            arms=None if self.single else self.names,
+        )
+
+    def command(self, row: np.ndarray) -> dict[str, dict[str, np.ndarray]]:
+        """A row, (D,), as RCS takes it."""
+        commands: dict[str, dict[str, np.ndarray]] = {}
+        rest = row.astype(np.float64)
+        for name in self.names:
+            pose, rest = np.split(rest, [self._sizes[name]])
+            commands[name] = {self._mode: pose}
+            if name in self._grippers:
+                commands[name]["gripper"], rest = np.split(rest, [1])
+        return commands
+
+    def read(self, observation: Mapping[str, Any]) -> tuple[dict[str, np.ndarray], float | None]:
+        """The state, each part (D,) float32, and a single arm's gripper in [0, 1], 1 = open."""
+        state = {
+            self._key(name, part): np.array(observation[name][part], dtype=np.float32)
+            for name in self.names
+            for part in _UNITS
+        }
+        openings = {name: np.clip(np.array(observation[name]["gripper"], np.float32), 0, 1) for name in self._grippers}
+        if self.single:
+            return state, float(openings[self.names[0]][0]) if openings else None
+        return state | {self._key(name, "gripper"): opening for name, opening in openings.items()}, None
+
+    def _key(self, name: str, part: str) -> str:
+        return part if self.single else f"{name}/{part}"

@@ -7,6 +7,7 @@ chosen in a process without CUDA_VISIBLE_DEVICES.
 
 from __future__ import annotations
 
+import ctypes
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -56,6 +57,18 @@ def fitting(devices: Sequence[egl.EglDevice], *, gpu: bool) -> egl.EglDevice | N
     return next((one for one in devices if one.software), None)
 
 
+def prepare_rendering() -> None:
+    """Set what drivers and simulators read when they are loaded, for rendering without a display on shared cores.
+
+    Variables set by the user are kept. Call it before any simulator is imported: ManiSkill also imports MuJoCo, which
+    chooses its OpenGL then and for good.
+    """
+    os.environ.setdefault("LP_NUM_THREADS", "1")  # Mesa's software drivers take all cores otherwise
+    if not os.environ.get("MUJOCO_GL") and not os.environ.get("DISPLAY") and _has_egl():
+        os.environ["MUJOCO_GL"] = "egl"
+    choose_devices()
+
+
 def choose_devices() -> None:
     """Set the variables that select the devices, before libraries are loaded; variables set by the user are kept."""
     gpu = has_gpu()
@@ -101,3 +114,11 @@ def require_own(renderer: Renderer) -> None:
 def _lavapipe() -> Path | None:
     """Return the file that describes Mesa's software driver to Vulkan."""
     return next((path for folder in _ICD_FOLDERS for path in sorted(Path(folder).glob("lvp_icd*.json"))), None)
+
+
+def _has_egl() -> bool:
+    try:
+        ctypes.CDLL("libEGL.so.1")  # without it `MUJOCO_GL=egl` makes `import mujoco` fail
+    except OSError:
+        return False
+    return True

@@ -1,27 +1,64 @@
-"""A task of robosuite as an environment for evaluations."""
+"""robosuite's tasks by name, and one of them as an environment for evaluations."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from importlib.metadata import version
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from vlagents_ray.contract import CameraSpec, Contract
-from vlagents_ray.envs.base import require_known
-from vlagents_ray.envs.rendering.render_probe import failing, without, without_egl
-from vlagents_ray.envs.robosuite.base import RobosuiteEnv
-from vlagents_ray.envs.robosuite.importing import importing_robosuite
-from vlagents_ray.envs.robosuite.simulation import seeded
-from vlagents_ray.envs.robosuite.tasks import CONTROL_HZ, TASKS, contract
+from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
+from vlagents_ray.envs.robosuite.base import RobosuiteEnv, importing_robosuite, seeded
+from vlagents_ray.envs.simulator import BenchmarkProtocol
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.registry import require
 
-_CURE = (
-    "run `vlagents-ray env make requirements/robosuite.txt` and give the evaluation's workers that environment's Python"
+CONTROL_HZ = 20.0
+_PROTOCOL = BenchmarkProtocol(
+    name="robomimic",
+    source="Mandlekar et al. 2021, arXiv 2108.03298; robomimic 0.3.0, dataset registry and base_config.py",
+    max_steps=400,
+    control_hz=CONTROL_HZ,
+    control="pose of the hand, delta, by OSC_POSE: 0.05 m and 0.5 rad a unit",
+    success="robosuite's own check of the task holds after a step",
+    begins="where the objects lie, and noise on the arm's joints: the seed's",
+    ends_on_success=True,
+    episodes=50,
 )
+
+
+@dataclass(frozen=True, slots=True)
+class RobosuiteTask:
+    """A task of robosuite, and what robomimic observes and allows in it."""
+
+    instruction: str
+    max_steps: int = 400  # robomimic's horizon for demonstrations of proficient humans
+    cameras: tuple[str, ...] = ("agentview", "robot0_eye_in_hand")
+    size: int = 84  # of each image, pixels
+    arms: tuple[str, ...] = ("robot0",)
+
+    @property
+    def protocol(self) -> BenchmarkProtocol:
+        """The protocol of the task."""
+        return replace(_PROTOCOL, max_steps=self.max_steps)
+
+
+TASKS: Mapping[str, RobosuiteTask] = {
+    "Lift": RobosuiteTask("lift the red cube"),
+    "PickPlaceCan": RobosuiteTask("pick up the can and place it in its bin"),
+    "NutAssemblySquare": RobosuiteTask("put the square nut onto the square peg"),
+    "ToolHang": RobosuiteTask(
+        "assemble the frame and hang the tool on it", 700, ("sideview", "robot0_eye_in_hand"), size=240
+    ),
+    "TwoArmTransport": RobosuiteTask(
+        "move the hammer from its bin into the other one, and the trash out of that",
+        700,
+        ("shouldercamera0", "shouldercamera1", "robot0_eye_in_hand", "robot1_eye_in_hand"),
+        arms=("robot0", "robot1"),
+    ),
+}
 
 
 class Robosuite(RobosuiteEnv):
@@ -36,6 +73,10 @@ class Robosuite(RobosuiteEnv):
     0.5 rad a unit about them, axis-angle; the last is the gripper, -1 opens, 1 closes, and only its sign counts.
     """
 
+    suite = title = "robosuite"
+    packages, distributions = ("robosuite", "mujoco"), ("robosuite", "mujoco")
+    cure = "run `vlagents-ray env make requirements/robosuite.txt` and give the evaluation's workers that Python"
+
     def __init__(
         self,
         task: str = "Lift",
@@ -48,7 +89,7 @@ class Robosuite(RobosuiteEnv):
         ends_on_success: bool = True,
         record_size: Sequence[int] | None = None,
     ) -> None:
-        """Make the environment.
+        """Make the environment; raises the errors of `make_env`.
 
         Args:
             task: robosuite's name, one of `tasks()`.
@@ -59,33 +100,21 @@ class Robosuite(RobosuiteEnv):
             max_steps: The step limit; None is the protocol's for the task.
             ends_on_success: As in robomimic; False: success at the end can be measured, too.
             record_size: Height and width of further views by the same cameras, for recordings only.
-
-        Raises:
-            UnknownEnv: There is no such task.
-            ConfigError: An option has a wrong value, or the installed robosuite has no such task.
-            MissingDependency: The simulator is not installed.
-            EnvFailed: The simulator cannot be loaded.
         """
         self.require_task(task)
+        super().__init__(f"robosuite/{task}", record_size=record_size, width=width, height=height, max_steps=max_steps)
         self._task = TASKS[task]
-        super().__init__(
-            f"robosuite/{task}",
-            protocol=self._task.protocol,
-            width=width,
-            height=height,
-            max_steps=max_steps,
-            ends_on_success=ends_on_success,
-            record_size=record_size,
-        )
+        self._protocol, self._ends_on_success = self._task.protocol, ends_on_success
+        self.max_steps = max_steps or self._task.protocol.max_steps
         self._contract = self.known_contract({"task": task, "width": width, "height": height, "cameras": cameras})
         self._instruction = instruction or self._task.instruction
         with importing_robosuite("robosuite"), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # warnings of upstream code
             simulator = require("robosuite")
         if task not in simulator.ALL_ENVIRONMENTS:
-            raise ConfigError(f"{self._name}: robosuite {simulator.__version__} has no such task, 1.5 has; {_CURE}")
+            raise ConfigError(f"{self._name}: robosuite {simulator.__version__} has no such task, 1.5 has; {self.cure}")
         images = self._contract.cameras or {}
-        with failing(self._name, "make"), seeded(0):
+        with self._making(), seeded(0):
             made = simulator.make(
                 task,
                 robots=["Panda"] * len(self._task.arms),
@@ -102,43 +131,47 @@ class Robosuite(RobosuiteEnv):
             )
             for arm in self._task.arms:  # which robosuite leaves out, and robomimic has
                 made.modify_observable(f"{arm}_joint_pos", "active", modifier=True)
-        self._use(made)
+            self._use(made)
 
     @classmethod
     def known_contract(cls, arguments: Mapping[str, Any]) -> Contract:
+        """Return the contract; names and units of the state are those of robomimic's data."""
         task = TASKS[arguments["task"]]
         chosen = task.cameras if arguments["cameras"] is None else arguments["cameras"]
         size = CameraSpec(arguments["height"] or task.size, arguments["width"] or task.size)
-        return contract(task, dict.fromkeys(chosen, size))
-
-    @property
-    def contract(self) -> Contract:
-        return self._contract
-
-    @property
-    def instruction(self) -> str:
-        return self._instruction
-
-    @classmethod
-    def require_task(cls, task: str | None) -> None:
-        require_known("robosuite", task or "Lift", cls.tasks())
+        parts = {
+            "eef_pos": StateSpec(3, "m"),
+            "eef_quat": StateSpec(4, "quat_xyzw"),
+            "gripper_qpos": StateSpec(2, "m"),
+            "joint_pos": StateSpec(7, "rad"),
+        }
+        return Contract(
+            cameras=dict.fromkeys(chosen, size),
+            state={f"{arm}_{part}": spec for arm in task.arms for part, spec in parts.items()},
+            gripper=len(task.arms) == 1,
+            instruction=True,
+            action=ActionSpec(
+                dim=7 * len(task.arms),
+                space="ee_pose",
+                delta=True,
+                rotation="axis_angle",
+                frame="base",
+                gripper_open=-1.0,
+                gripper_closed=1.0,
+                low=-1.0,
+                high=1.0,
+                arms=task.arms if len(task.arms) > 1 else None,
+            ),
+            control_hz=CONTROL_HZ,
+        )
 
     @classmethod
     def tasks(cls) -> list[str]:
         return list(TASKS)
 
-    @classmethod
-    def missing(cls) -> str | None:
-        """Say why robosuite cannot run here; the first call in a process renders one frame in a child."""
-        return without(("robosuite", "mujoco"), _CURE) or without_egl("robosuite")
-
-    def describe(self) -> dict[str, Any]:
-        played = self._protocol.describe(max_steps=self.max_steps, ends_on_success=self._ends_on_success)
-        return super().describe() | {"robosuite": version("robosuite"), "protocol": played}
-
     def _sim_state(self, raw: Mapping[str, Any]) -> dict[str, np.ndarray]:
         """The positions and orientations of objects, and the place where one belongs."""
-        env, found = self._alive(), super()._sim_state(raw)
+        env, found = self._env, super()._sim_state(raw)
         if hasattr(env, "target_bin_placements"):
             found["target_pos"] = np.array(env.target_bin_placements[env.object_id], np.float64)
         elif hasattr(env, "peg1_body_id"):

@@ -11,8 +11,7 @@ import numpy as np
 from PIL import Image
 from pydantic import BaseModel, Field
 
-from vlagents_ray.policies.arro.parts import Detection, Images
-from vlagents_ray.policies.arro.regions import box_of, flat, largest, overlap, split
+from vlagents_ray.policies.arro.parts import Detection, Images, box_of, flat, largest, overlap, split
 
 _HUES = {"red": 0.0, "orange": 28.0, "yellow": 48.0, "green": 132.0, "cyan": 180.0, "blue": 216.0, "purple": 275.0}
 
@@ -45,16 +44,14 @@ class ColourDetector:
     def _detections(self, image: np.ndarray, phrases: Sequence[str]) -> list[Detection]:
         hue, saturation, value = np.moveaxis(np.asarray(Image.fromarray(image).convert("HSV"), np.float32), -1, 0)
         coloured = (saturation >= self._config.saturation * 255) & (value >= self._config.value * 255)
+        smallest = max(1, round(self._config.smallest * hue.size))
         found = []
         for phrase in phrases:
             for word in sorted(set(re.findall(r"\w+", phrase.lower())) & set(self._config.hues)):
                 off = np.abs((hue * (360 / 256) - self._config.hues[word] + 180) % 360 - 180)
-                for mask in split(coloured & (off <= self._config.tolerance), self._smallest(image)):
+                for mask in split(coloured & (off <= self._config.tolerance), smallest):
                     found.append(Detection(phrase, box_of(mask), np.count_nonzero(mask) / mask.size, mask))
         return sorted(found, key=lambda one: -one.score)
-
-    def _smallest(self, image: np.ndarray) -> int:
-        return max(1, round(self._config.smallest * (image.size // 3)))
 
 
 class FlatConfig(BaseModel, extra="forbid"):

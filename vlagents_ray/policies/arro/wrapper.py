@@ -12,8 +12,7 @@ from vlagents_ray.contract import CameraSpec, Contract
 from vlagents_ray.errors import ConfigError, InvalidObservation, MissingCamera, NotReset, VLAgentsError
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.policies.arro.background import Background
-from vlagents_ray.policies.arro.config import ArroConfig
-from vlagents_ray.policies.arro.tracking import Track, Tracking
+from vlagents_ray.policies.arro.tracking import ArroConfig, Track, Tracking
 from vlagents_ray.policies.base.checkpoint import used_checkpoints
 from vlagents_ray.policies.base.checkpoint_files import weights_of, with_parts
 from vlagents_ray.policies.wrapper import Wrapper

@@ -15,7 +15,7 @@ from typing import Any
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.base import import_fixes
 from vlagents_ray.policies.base.config import DType
-from vlagents_ray.policies.compilation.kept_programs import keep_jax_programs
+from vlagents_ray.policies.compilation import keep_jax_programs
 from vlagents_ray.policies.loading import report_device
 from vlagents_ray.registry import require
 

@@ -9,7 +9,9 @@ from __future__ import annotations
 import importlib
 from typing import Protocol
 
-from vlagents_ray.errors import ContractMismatch
+import numpy as np
+
+from vlagents_ray.errors import ContractMismatch, InvalidObservation
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.registry import env_suite
 
@@ -23,8 +25,8 @@ EXPERTS: dict[str, str] = {
     "rcs/pick": "vlagents_ray.policies.experts.rcs:RcsPick",
     "gymnasium/FetchReach-v4": "vlagents_ray.policies.experts.fetch:FetchReach",
     "gymnasium/FetchReachDense-v4": "vlagents_ray.policies.experts.fetch:FetchReach",
-    "libero": "vlagents_ray.policies.experts.osc_pose.libero:LiberoExpert",
-    "robosuite": "vlagents_ray.policies.experts.osc_pose.robosuite:RobosuiteExpert",
+    "libero": "vlagents_ray.policies.experts.osc_pose:LiberoExpert",
+    "robosuite": "vlagents_ray.policies.experts.osc_pose:RobosuiteExpert",
     "simpler": "vlagents_ray.policies.experts.simpler:SimplerExpert",
 }
 
@@ -54,3 +56,19 @@ def expert_for(env_name: str) -> Expert:
     module, _, name = target.partition(":")
     expert: Expert = getattr(importlib.import_module(module), name)(env_name)
     return expert
+
+
+def sim_vector(obs: Obs, size: int, env_name: str) -> np.ndarray:
+    """Return `info["sim_state"]` of an observation, (`size`,), as the env gives it.
+
+    Raises:
+        InvalidObservation: The observation has no such vector.
+    """
+    state = obs.info.get("sim_state")
+    if not isinstance(state, np.ndarray) or state.shape != (size,):
+        got = f"shape {state.shape}" if isinstance(state, np.ndarray) else type(state).__name__
+        raise InvalidObservation(
+            f"info['sim_state']: got {got}, want ({size},), as the env {env_name} gives it; "
+            f"this expert cannot act on images"
+        )
+    return state

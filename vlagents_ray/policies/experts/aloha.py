@@ -10,8 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vlagents_ray.errors import ContractMismatch, InvalidObservation, MissingState, NotReset
+from vlagents_ray.errors import ContractMismatch, MissingState, NotReset
 from vlagents_ray.interface import Act, Obs
+from vlagents_ray.policies.experts import sim_vector
 from vlagents_ray.registry import env_task
 
 _SHOULDER = 0.12705  # height of the shoulder's axis over the table, m
@@ -72,14 +73,7 @@ class AlohaExpert:
             InvalidObservation: The observation lacks the objects' poses.
             MissingState: The observation lacks a part of the arms' state.
         """
-        objects = obs.info.get("sim_state")
-        want = (_OBJECTS[self._task],)
-        if not isinstance(objects, np.ndarray) or objects.shape != want:
-            got = f"shape {objects.shape}" if isinstance(objects, np.ndarray) else type(objects).__name__
-            raise InvalidObservation(
-                f"info['sim_state']: got {got}, want {want}, as the env aloha/{self._task} gives it; "
-                f"a script cannot act on images"
-            )
+        objects = sim_vector(obs, _OBJECTS[self._task], f"aloha/{self._task}")
         plan = (_transfer if self._task == "transfer_cube" else _insertion)(objects)
         self._way = {
             arm: [(0, _now(obs, arm)), *((step, np.array(joints(arm, pose))) for step, pose in plan[arm])]

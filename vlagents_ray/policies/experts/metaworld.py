@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.errors import ContractMismatch, InvalidObservation
+from vlagents_ray.errors import ContractMismatch
 from vlagents_ray.interface import Act, Obs
+from vlagents_ray.policies.experts import sim_vector
 from vlagents_ray.registry import env_task, require
 
 _SIZE = 39  # hand 3, gripper 1, objects 14, the same of the step before, goal 3
@@ -26,19 +27,9 @@ class MetaWorldExpert:
 
     def reset(self, obs: Obs, instruction: str) -> None:
         """Begin an episode; raises `InvalidObservation` without the simulator's observation."""
-        self._sim_state(obs)
+        sim_vector(obs, _SIZE, self._name)
 
     def act(self, obs: Obs) -> Act:
         """Compute the next action, (4,) float32 in [-1, 1]."""
-        action = np.asarray(self._oracle.get_action(self._sim_state(obs)), dtype=np.float32)
+        action = np.asarray(self._oracle.get_action(sim_vector(obs, _SIZE, self._name)), dtype=np.float32)
         return Act(action=np.clip(action, -1.0, 1.0))
-
-    def _sim_state(self, obs: Obs) -> np.ndarray:
-        state = obs.info.get("sim_state")
-        if not isinstance(state, np.ndarray) or state.shape != (_SIZE,):
-            got = f"shape {state.shape}" if isinstance(state, np.ndarray) else type(state).__name__
-            raise InvalidObservation(
-                f"info['sim_state']: got {got}, want ({_SIZE},), as the env {self._name} gives it; "
-                f"an oracle cannot act on images"
-            )
-        return state

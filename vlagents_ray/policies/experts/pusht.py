@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from vlagents_ray.errors import InvalidObservation
 from vlagents_ray.interface import Act, Obs
+from vlagents_ray.policies.experts import sim_vector
 from vlagents_ray.registry import require
 
 _SIZE = 7  # position and velocity of the agent, 2 each; position of the block, 2, and its angle
@@ -58,12 +58,12 @@ class PushTExpert:
 
     def reset(self, obs: Obs, instruction: str) -> None:
         """Begin an episode; raises `InvalidObservation` without the simulator's state."""
-        self._state(obs)
+        sim_vector(obs, _SIZE, self._name)
         self._plan.clear()
 
     def act(self, obs: Obs) -> Act:
         """Compute the next action, (2,) float32; it takes longer where a push has ended and another one is chosen."""
-        state = self._state(obs)
+        state = sim_vector(obs, _SIZE, self._name)
         if not self._plan or self._error(state, self._placed(self._expected[4:])) > _ASTRAY_PX:
             self._plan = deque(self._best_push(state))
         step = self._plan.popleft()
@@ -145,13 +145,3 @@ class PushTExpert:
     def _error(self, state: np.ndarray, corners: np.ndarray) -> float:
         """Return the root mean square distance of the block's corners from `corners`, px."""
         return float(np.sqrt(np.sum((self._placed(state[4:]) - corners) ** 2, axis=1).mean()))
-
-    def _state(self, obs: Obs) -> np.ndarray:
-        state = obs.info.get("sim_state")
-        if not isinstance(state, np.ndarray) or state.shape != (_SIZE,):
-            got = f"shape {state.shape}" if isinstance(state, np.ndarray) else type(state).__name__
-            raise InvalidObservation(
-                f"info['sim_state']: got {got}, want ({_SIZE},), as the env {self._name} gives it; "
-                f"this expert does not look at images"
-            )
-        return state

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vlagents_ray.errors import InvalidObservation
 from vlagents_ray.interface import Act, Obs
+from vlagents_ray.policies.experts import sim_vector
 
 _OPEN, _CLOSED = 1.0, 0.0
 _STEP_M = 0.04  # largest command along an axis
@@ -90,9 +90,5 @@ class SimplerExpert:
 
     def _state(self, obs: Obs) -> tuple[np.ndarray, float]:
         """Return the positions of object, target, gripper and its command, (4, 3) m, and the object's yaw, rad."""
-        state = obs.info.get("sim_state")
-        if not isinstance(state, np.ndarray) or state.shape != (13,):
-            got = f"shape {state.shape}" if isinstance(state, np.ndarray) else type(state).__name__
-            raise InvalidObservation(f"info['sim_state']: got {got}, want (13,) float32, as {self._name} gives it")
-        exact = state.astype(np.float64)
+        exact = sim_vector(obs, 13, self._name).astype(np.float64)
         return exact[:12].reshape(4, 3), float(exact[12])

@@ -8,26 +8,51 @@ import importlib.util
 import json
 import os
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
+from pydantic import Field
 
 from vlagents_ray.errors import ConfigError
+from vlagents_ray.policies.base import ModelConfig
 from vlagents_ray.policies.base.accelerator import ensure_torchvision, torch_device, torch_dtype
 from vlagents_ray.policies.base.checkpoint import SavedTensors, find_checkpoint, require_loaded
 from vlagents_ray.policies.base.model_code import remote_code, use_source
-from vlagents_ray.policies.gr00t.attention import (
-    built_without_flash_attention,
-    flash_attention_is_here,
-    use_torch_attention,
-)
-from vlagents_ray.policies.gr00t.config import Gr00tConfig
 from vlagents_ray.policies.gr00t.embodiment import CONFIG, Embodiment
 from vlagents_ray.registry import require
+
+
+class Gr00tConfig(ModelConfig):
+    """Settings of GR00T, beside those of all models."""
+
+    checkpoint: str = Field(
+        min_length=1,
+        description="folder of GR00T's training, such as outputs/checkpoint-{step}, or hub id: org/name, "
+        "org/name@COMMIT",
+    )
+    source_dir: str | None = Field(
+        default=None, description="a checkout of Isaac-GR00T; unset: the variable GR00T_SRC, or what is installed"
+    )
+    embodiment: str | None = Field(
+        default=None, description="the checkpoint's name of the robot, such as new_embodiment; unset: its only one"
+    )
+    backbone: str | None = Field(
+        default=None,
+        description="N1.7: folder of the vision-language model that the checkpoint names, nvidia/Cosmos-Reason2-2B, "
+        "whose path must contain that name; unset: from the hub or its cache",
+    )
+    steps: int | None = Field(default=None, ge=1, description="steps of the flow; unset: the checkpoint's, usually 4")
+    compile: Literal[False] = Field(default=False, description="not offered for GR00T")
+    trust_remote_code: bool = Field(
+        default=False,
+        description="run Python code that lies in the checkpoint or its backbone: whoever can write there can do on "
+        "this machine whatever this process can",
+    )
+
 
 SOURCE = "GR00T_SRC"
 _MODEL = "config.json"
@@ -198,3 +223,65 @@ def _require_version(folder: Path) -> None:
             else "name the checkout of its version"
         )
         raise ConfigError(f"checkpoint {folder}: got model_type {kind!r}, this checkout has {known}; {cure}")
+
+
+_FLASH, _PACKED = "flash_attention_2", "packed_sdpa"
+_CHECK = "_check_and_enable_flash_attn_2"  # of transformers' models, up to 4.5
+
+
+def flash_attention_is_here(device: Any, dtype: Any) -> bool:
+    """Whether flash-attention is installed, and computes on a device in a dtype: on CUDA, in 16 bits."""
+    computes = device.type == "cuda" and dtype.itemsize == 2
+    return computes and bool(require("transformers.utils").is_flash_attn_2_available())
+
+
+@contextlib.contextmanager
+def built_without_flash_attention() -> Iterator[None]:
+    """Let models be built in this context that insist on flash-attention, as N1.6's backbone does."""
+    base: Any = require("transformers").PreTrainedModel
+    check = vars(base).get(_CHECK)
+    if check is None:  # newer: N1.7's, which takes another attention by itself
+        yield
+        return
+    setattr(base, _CHECK, classmethod(lambda _, config, *__, **___: config))
+    try:
+        yield
+    finally:
+        setattr(base, _CHECK, check)
+
+
+def use_torch_attention(model: Any) -> None:
+    """Have the parts of a model that ask for flash-attention use torch's own.
+
+    N1.6's vision tower attends within each of several images that follow each other in one sequence.
+    """
+    transformers = require("transformers.modeling_utils")
+    for module in model.modules():
+        config: Any = getattr(module, "config", None)
+        if config is not None and getattr(config, "_attn_implementation", None) == _FLASH:
+            packed = config.model_type.startswith("siglip2")
+            config._attn_implementation = _PACKED if packed else "sdpa"
+    transformers.AttentionInterface.register(_PACKED, packed_attention)
+
+
+def packed_attention(
+    _: Any, query: Any, key: Any, value: Any, __: Any = None, *, scaling: float, seq_len_list: Sequence[int], **___: Any
+) -> tuple[Any, None]:
+    """Attend within each of several sequences that follow each other.
+
+    Args:
+        query: (1, heads, tokens, D).
+        key: As `query`.
+        value: As `query`.
+        scaling: The factor of the products of queries and keys.
+        seq_len_list: The number of tokens of each sequence.
+
+    Returns:
+        (1, tokens, heads, D), and None in place of the weights.
+    """
+    attention = require("torch.nn.functional").scaled_dot_product_attention
+    if len(set(seq_len_list)) == 1:  # in one call, each sequence a row
+        rows = [one[0].unflatten(1, (-1, seq_len_list[0])).transpose(0, 1) for one in (query, key, value)]
+        return attention(*rows, scale=scaling).transpose(1, 2).flatten(0, 1)[None], None
+    parts = zip(*(one.split(list(seq_len_list), dim=2) for one in (query, key, value)), strict=True)
+    return require("torch").cat([attention(*part, scale=scaling) for part in parts], dim=2).transpose(1, 2), None

@@ -22,9 +22,8 @@ from vlagents_ray.policies.base.model_inputs import (
     state_specs,
     state_vector,
 )
-from vlagents_ray.policies.gr00t.config import Gr00tConfig
 from vlagents_ray.policies.gr00t.embodiment import Embodiment
-from vlagents_ray.policies.gr00t.network import Gr00tNetwork
+from vlagents_ray.policies.gr00t.network import Gr00tConfig, Gr00tNetwork
 
 USUAL_CAMERAS = {"image": "front", "wrist_image": "wrist"}  # of LIBERO; others have the checkpoint's names
 GRIPPER_QPOS = "gripper_qpos"  # the part that a group `gripper` of several numbers is, as in LIBERO

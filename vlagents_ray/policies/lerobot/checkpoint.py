@@ -15,12 +15,11 @@ from typing import Any
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.base.accelerator import ensure_torchvision
 from vlagents_ray.policies.base.checkpoint import SavedTensors, find_checkpoint, require_loaded
-from vlagents_ray.policies.lerobot.config import LeRobotConfig
+from vlagents_ray.policies.lerobot.config import LeRobotConfig, is_new, other_version, refusal
 from vlagents_ray.policies.lerobot.kinds.diffusion import Diffusion
 from vlagents_ray.policies.lerobot.kinds.flow import Flow
 from vlagents_ray.policies.lerobot.policy_types import KINDS
 from vlagents_ray.policies.lerobot.processors import PIPELINES, require_known_steps
-from vlagents_ray.policies.lerobot.versions import is_new, other_version, refusal
 from vlagents_ray.registry import require
 
 WEIGHTS = "model.safetensors"
@@ -53,7 +52,7 @@ def load(folder: Path, config: LeRobotConfig, device: Any) -> Any:
     """Load LeRobot's policy to the device, in evaluation mode, with every parameter from the checkpoint."""
     ensure_torchvision()
     factory = require("lerobot.policies.factory")
-    require_served(_type(folder), folder)
+    require_served(str(_config(folder / "config.json").get("type", "")), folder)
     settings = _settings(folder, config)
     settings.pretrained_path = folder  # as LeRobot's factory does; without it EO-1 loads its backbone from the hub
     as_saved = _prepare(settings, config, device)
@@ -162,11 +161,6 @@ def _require_no_nvidia(file: Path) -> None:
             f"the policy gr00t (docs/policies/gr00t.md), or train it on with LeRobot 0.6 (lerobot-train "
             f"--policy.type=groot --policy.base_model_path={file.parent})"
         )
-
-
-def _type(folder: Path) -> str:
-    """Return the type of the policy in a checkpoint's config.json; empty if it states none."""
-    return str(_config(folder / "config.json").get("type", ""))
 
 
 def _config(file: Path) -> Mapping[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,11 +24,8 @@ from vlagents_ray.policies.base.model_inputs import (
 )
 from vlagents_ray.policies.base.realtime import Guide
 from vlagents_ray.policies.flow import OFFERED
-from vlagents_ray.policies.openpi.config import OpenPiConfig
-from vlagents_ray.policies.openpi.models import OpenPiModel, load_jax, load_torch
-from vlagents_ray.policies.openpi.robots import RobotConvention, choose_robot
-from vlagents_ray.policies.openpi.training import FOLDERS, SOURCE, train_config
-from vlagents_ray.policies.openpi.transforms import Transforms
+from vlagents_ray.policies.openpi.models import OpenPiConfig, OpenPiModel, load_jax, load_torch
+from vlagents_ray.policies.openpi.robots import RobotConvention, Transforms, choose_robot
 from vlagents_ray.registry import require
 
 _REMOTE = "://"
@@ -177,3 +175,25 @@ class OpenPi(ModelPolicy):
         if self.model is None:
             raise PolicyFailed("openpi: act before initialize; the checkpoint is not loaded")
         return self.model
+
+
+SOURCE = "OPENPI_SRC"  # the variable that names a checkout; PyPI's "openpi" is another project
+FOLDERS = ("src", "packages/openpi-client/src")
+
+
+def train_config(name: str) -> Any:
+    """Return openpi's `TrainConfig` of a name, or the one at "module:NAME"."""
+    configs = require("openpi.training.config")
+    module, colon, attribute = name.partition(":")
+    if not colon:
+        try:
+            return configs.get_config(name)
+        except ValueError as error:
+            raise ConfigError(f"config {name!r}: not one of openpi's {sorted(configs._CONFIGS_DICT)}") from error
+    try:
+        found = getattr(importlib.import_module(module), attribute, None)
+    except ModuleNotFoundError as error:
+        raise ConfigError(f"config {name!r}: no module {error.name!r}; add its folder to PYTHONPATH") from error
+    if not isinstance(found, configs.TrainConfig):
+        raise ConfigError(f"config {name!r}: got {type(found).__name__}, want an openpi TrainConfig")
+    return found

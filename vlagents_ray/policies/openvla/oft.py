@@ -21,10 +21,16 @@ from vlagents_ray.policies.base.model_inputs import (
     state_specs,
     state_vector,
 )
-from vlagents_ray.policies.openvla import preprocessing
-from vlagents_ray.policies.openvla.base import OFFERED, DecodedChunk, PreparedRow, PrismaticPolicy
-from vlagents_ray.policies.openvla.components import Film, Mlp, Projector, read_component, require_unused
-from vlagents_ray.policies.openvla.parallel import ModelInput, Parallel
+from vlagents_ray.policies.openvla.base import OFFERED, DecodedChunk, PreparedRow, PrismaticPolicy, middle, resized
+from vlagents_ray.policies.openvla.parallel import (
+    Film,
+    Mlp,
+    ModelInput,
+    Parallel,
+    Projector,
+    read_component,
+    require_unused,
+)
 from vlagents_ray.policies.openvla.prismatic import Prismatic, PrismaticConfig, load_prismatic
 from vlagents_ray.policies.openvla.statistics import Bounds, Statistics
 
@@ -127,9 +133,9 @@ class OpenVLAOFT(PrismaticPolicy):
 
     def perceive(self, obs: Obs) -> tuple[tuple[Any, ...], np.ndarray | None]:
         """Return the images as inputs of the backbones, (C, S, S) float32 each, and the state vector (P,)."""
-        seen = [preprocessing.resized(image) for image in camera_images(obs, self._cameras).values()]
+        seen = [resized(image) for image in camera_images(obs, self._cameras).values()]
         if self.config.center_crop:
-            seen = [preprocessing.middle(image) for image in seen]
+            seen = [middle(image) for image in seen]
         projector = self.model.proprio
         state = None if projector is None else state_vector(obs, self._state, projector.dim)
         return tuple(self.model.base.pixels(image) for image in seen), state

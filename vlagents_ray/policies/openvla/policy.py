@@ -20,8 +20,7 @@ from vlagents_ray.policies.adapters import Adapters
 from vlagents_ray.policies.base import Row, shared_frames
 from vlagents_ray.policies.base.model_inputs import camera_images, camera_specs, choose_cameras
 from vlagents_ray.policies.compilation import Compilation
-from vlagents_ray.policies.openvla import preprocessing
-from vlagents_ray.policies.openvla.base import OFFERED, DecodedChunk, PreparedRow, PrismaticPolicy
+from vlagents_ray.policies.openvla.base import OFFERED, DecodedChunk, PreparedRow, PrismaticPolicy, middle, resized
 from vlagents_ray.policies.openvla.prismatic import Prismatic, PrismaticConfig, load_prismatic
 from vlagents_ray.registry import require
 
@@ -75,7 +74,7 @@ class OpenVLA(PrismaticPolicy):
         """Return the image as the input of the backbones, (C, S, S) float32."""
         image = camera_images(obs, self._cameras)[_IMAGE]
         if self.config.center_crop:
-            image = preprocessing.middle(preprocessing.resized(image))
+            image = middle(resized(image))
         return self.model.base.pixels(image)
 
     @property
@@ -108,10 +107,10 @@ class TokenDecoder:
     adapters: Adapters = field(default_factory=Adapters)  # of the policy
 
     def compile_with(self, compilation: Compilation) -> None:
-        """Mark what of the model is compiled."""
-        self.look = compilation.core("look", self.look)  # type: ignore[method-assign]
-        self.read = compilation.core("read", self.read)  # type: ignore[method-assign]
-        self.continue_from = compilation.core("continue", self.continue_from)  # type: ignore[method-assign]
+        """Compile the vision encoder and the language model."""
+        self.encode_images = compilation.core("vision encoder", self.encode_images)  # type: ignore[method-assign]
+        self.prefill = compilation.core("language model", self.prefill)  # type: ignore[method-assign]
+        self.continue_from = compilation.core("next token", self.continue_from)  # type: ignore[method-assign]
 
     def decode(
         self,
@@ -132,7 +131,7 @@ class TokenDecoder:
         with torch.inference_mode(), self.adapters.rows(fingerprints):
             uniform = torch.tensor(draws, device=base.device)
             embeddings, mask = self._left_padded(prompts)
-            hidden, cache = self.read(embeddings, mask)
+            hidden, cache = self.prefill(embeddings, mask)
         with torch.inference_mode(), self.adapters.rows([fingerprints[i] for i in owners] if fingerprints else ()):
             index = torch.tensor(owners, device=base.device)
             length, position = mask.shape[1], mask.sum(1)[index]
@@ -152,27 +151,27 @@ class TokenDecoder:
                 chosen.append(base.bins.choose(logits[-1], uniform[:, step]))
             return torch.stack(chosen, 1), torch.stack(logits, 1)
 
-    def look(self, pixels: Any) -> Any:
+    def encode_images(self, pixels: Any) -> Any:
         """Return the embeddings (P, N, D) of images (P, C, S, S)."""
         network = self.base.network
         return network.projector(network.vision_backbone(pixels))
 
-    def read(self, embeddings: Any, mask: Any) -> tuple[Any, Any]:
-        """Return what follows prompts (P, L, D), of which `mask` (P, L) is not 0.
+    def prefill(self, embeddings: Any, mask: Any) -> tuple[Any, Any]:
+        """Run the language model on prompts (P, L, D), whose tokens are where `mask` (P, L) is not 0.
 
         Returns:
             The last hidden state (P, D), and keys and values (P, layers, 2, heads, L, E).
         """
-        read = self.base.network.language_model.model(
+        result = self.base.network.language_model.model(
             inputs_embeds=embeddings,
             attention_mask=mask,
             position_ids=(mask.cumsum(-1) - 1).clamp(min=0),
             use_cache=True,
         )
-        return read.last_hidden_state[:, -1], _stacked(read.past_key_values)
+        return result.last_hidden_state[:, -1], _stacked(result.past_key_values)
 
     def continue_from(self, tokens: Any, positions: Any, mask: Any, cache: Any) -> tuple[Any, Any]:
-        """Return what follows tokens (R,) at `positions` (R,).
+        """Run the language model on one more token (R,) of each row, at `positions` (R,).
 
         Args:
             tokens: The last token of each row.
@@ -183,20 +182,20 @@ class TokenDecoder:
         Returns:
             The hidden state (R, D), and the token's own keys and values (R, layers, 2, heads, E).
         """
-        read = self.base.network.language_model.model(
+        result = self.base.network.language_model.model(
             input_ids=tokens[:, None],
             attention_mask=mask,
             position_ids=positions[:, None],
             past_key_values=tuple((layer[:, 0], layer[:, 1]) for layer in cache.unbind(1)),
             use_cache=True,
         )
-        own = tuple((keys[:, :, -1:], values[:, :, -1:]) for keys, values in read.past_key_values)
-        return read.last_hidden_state[:, -1], _stacked(own)[..., 0, :]
+        own = tuple((keys[:, :, -1:], values[:, :, -1:]) for keys, values in result.past_key_values)
+        return result.last_hidden_state[:, -1], _stacked(own)[..., 0, :]
 
     def _left_padded(self, prompts: Sequence[tuple[Any, list[int]]]) -> tuple[Any, Any]:
         """Return embeddings (P, L, D) and their mask (P, L), with the patches after the first token, as in training."""
         torch, base = require("torch"), self.base
-        patches = self.look(base.to_device([pixels for pixels, _ in prompts]))
+        patches = self.encode_images(base.to_device([pixels for pixels, _ in prompts]))
         rows = []
         for seen, (_, tokens) in zip(patches, prompts, strict=True):
             words = base.embed(tokens)

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from vlagents_ray.policies.vjepa2_ac.config import VJepa2AcConfig
+from vlagents_ray.policies.vjepa2_ac.network import VJepa2AcConfig
 from vlagents_ray.registry import require
 
 Tensor = Any  # torch's

@@ -22,10 +22,17 @@ from vlagents_ray.policies.base.model_inputs import (
     state_vector,
 )
 from vlagents_ray.policies.compilation import Compilation
-from vlagents_ray.policies.vjepa2_ac.config import VJepa2AcConfig
-from vlagents_ray.policies.vjepa2_ac.encoder import Encoder, load_encoder, normalizer, to_pixels
+from vlagents_ray.policies.vjepa2_ac.network import (
+    Encoder,
+    VJepa2AcConfig,
+    load_encoder,
+    load_predictor,
+    normalizer,
+    read_checkpoint,
+    to_pixels,
+    usual_attention,
+)
 from vlagents_ray.policies.vjepa2_ac.planner import DRAWN, Tensor, plan
-from vlagents_ray.policies.vjepa2_ac.predictor import load_predictor, read_checkpoint, usual_attention
 from vlagents_ray.registry import require
 
 CAMERA = "front"  # the model has one camera, without a name

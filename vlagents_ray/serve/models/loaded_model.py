@@ -18,7 +18,7 @@ from vlagents_ray.interface import Agent, Obs
 from vlagents_ray.policies.base.checkpoint import used_checkpoints
 from vlagents_ray.policies.base.checkpoint_files import weights_of
 from vlagents_ray.policies.base.program import Program, digest_of, files_named, with_defaults
-from vlagents_ray.policies.compilation.cuda_graph import CAPTURES
+from vlagents_ray.policies.compilation import CAPTURES
 from vlagents_ray.policies.loading import LoadingReport, loading_report
 from vlagents_ray.policies.wrapper import Wrapper
 from vlagents_ray.protocol.messages import Request

@@ -17,7 +17,7 @@ from weakref import WeakValueDictionary
 
 from vlagents_ray.errors import MessageTooLarge, NotTrainable, Overloaded, UnknownSession, WeightsNotStaged
 from vlagents_ray.interface import POLICY, Agent
-from vlagents_ray.policies.compilation.cuda_graph import CAPTURES
+from vlagents_ray.policies.compilation import CAPTURES
 from vlagents_ray.weights.check import fingerprint, fitted, require_fit
 from vlagents_ray.weights.safetensors import ValueSpec, read_header
 from vlagents_ray.weights.shared_values import gpu_of

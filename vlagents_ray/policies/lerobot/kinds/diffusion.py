@@ -23,7 +23,10 @@ class Diffusion(Kind):
     def __init__(self, policy: Any, compilation: Compilation) -> None:
         super().__init__(policy, compilation)
         unet = policy.diffusion.unet
-        self._denoise, self._look = compilation.core("denoise", unet.forward), compilation.core("look", self._condition)
+        self._denoise, self._encode = (
+            compilation.core("denoise", unet.forward),
+            compilation.core("vision encoder", self._condition),
+        )
         unet.forward = self._forward
 
     @property
@@ -37,7 +40,7 @@ class Diffusion(Kind):
         noise = np.stack([row.noise(self.config.horizon, self.config.action_feature.shape[0]) for row in rows])
         actions = model.conditional_sample(
             len(rows),
-            global_cond=self._look(*stacked(batch, self.config, len(rows)).values()),
+            global_cond=self._encode(*stacked(batch, self.config, len(rows)).values()),
             generator=[generator_of(row.rng) for row in rows],
             noise=torch.from_numpy(noise).to(self.config.device),
         )

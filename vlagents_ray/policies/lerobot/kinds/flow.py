@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,10 +11,8 @@ import numpy as np
 from vlagents_ray.policies.base import Row, shared_frames
 from vlagents_ray.policies.compilation import Compilation
 from vlagents_ray.policies.flow import Change, RandomSteps
-from vlagents_ray.policies.flow_passes import FlowPasses, Pi0Passes
-from vlagents_ray.policies.lerobot.kinds.guidance import Guidance
+from vlagents_ray.policies.flow_passes import FlowPasses, Pi0Passes, cache_of, layers_of
 from vlagents_ray.policies.lerobot.kinds.kind import Kind
-from vlagents_ray.policies.lerobot.kinds.smolvla import SmolVLAPasses
 from vlagents_ray.registry import require
 
 
@@ -81,3 +80,121 @@ class Flow(Kind):
         if not getattr(self.config, "adapt_to_pi_aloha", False):
             return left
         return self.policy._pi_aloha_encode_actions_inv(left[None].clone())[0]
+
+
+class Guidance:
+    """Guides chunks as the `RTCProcessor` of a flow-matching policy of LeRobot does, whose settings it has."""
+
+    def __init__(self, processor: Any) -> None:
+        self._processor = processor  # its settings and schedule are used
+
+    def towards(self, plans: Sequence[Any], delays: Sequence[int], shape: tuple[int, int], device: Any) -> Change:
+        """Return the change of velocities that leads chunks to the leftovers of their sessions.
+
+        Args:
+            plans: The leftover of each of the B rows in the policy's units, (H', D'), or None.
+            delays: The number of rows of each that will have been executed.
+            shape: Rows and numbers of a chunk, (H, D).
+            device: The policy's device.
+        """
+        torch = require("torch")
+        target, weights = torch.zeros(len(plans), *shape), torch.zeros(len(plans), shape[0], 1)
+        for i, (plan, delay) in enumerate(zip(plans, delays, strict=True)):
+            if plan is not None:
+                part = plan[: shape[0]]
+                target[i, : len(part), : part.shape[1]] = part
+                weights[i, :, 0] = self._weights(delay, len(part), shape[0])
+        target, weights = target.to(device), weights.to(device)
+
+        def change(velocity: Any, actions: Any, time: float) -> Any:
+            end = actions - time * velocity
+            return velocity - self._strength(time) * weights * (target - end)
+
+        return change
+
+    def _weights(self, delay: int, leftover: int, chunk: int) -> Any:
+        """Return the weight of the leftover in each row of a chunk, (chunk,) float32 in [0, 1]."""
+        horizon = min(self._processor.rtc_config.execution_horizon, leftover)
+        return self._processor.get_prefix_weights(max(delay, 0), horizon, chunk)
+
+    def _strength(self, time: float) -> float:
+        """Return g for LeRobot's time, which runs from 1 (noise) to 0."""
+        most = float(self._processor.rtc_config.max_guidance_weight)
+        done = 1 - time
+        return most if done == 0 else min(most, time / done * (time**2 + done**2) / time**2)
+
+
+class SmolVLAPasses(FlowPasses):
+    """The passes of SmolVLA, whose images are encoded from their patches."""
+
+    def __init__(self, model: Any, compilation: Compilation) -> None:
+        """Use the passes of a `VLAFlowMatching`, which takes patches in place of images from here on, too."""
+        super().__init__(model, compilation)
+        self._vlm = model.vlm_with_expert.get_vlm_model()
+        # LeRobot 0.4 keeps keys and values by name, (B, L, heads, D), later ones in a cache of transformers.
+        self._by_name = "fill_kv_cache" in inspect.signature(model.vlm_with_expert.forward).parameters
+        self._positions: dict[tuple[int, int], Any] = {}  # of the patches of an image, (L,), by its height and width
+        self._embed_image = model.vlm_with_expert.embed_image
+        model.vlm_with_expert.embed_image = self._embed
+
+    def encode_images(self, images: Sequence[Any]) -> list[Any]:
+        """Return the patches of images (P, 3, H, W) in the vision model's terms, (P, L, E).
+
+        The vision model itself looks for the patches of each image of a batch, which could not be compiled.
+        """
+        vision = self._vlm.vision_model
+        places = vision.embeddings.position_embedding
+        found = []
+        for image in images:
+            patches = vision.embeddings.patch_embedding(image.to(vision.dtype)).flatten(2).transpose(1, 2)
+            found.append(patches + places(self._positions_of(image)))
+        return found
+
+    def encode(self, tokens: Any, mask: Any, cameras: Any, state: Any, *patches: Any) -> tuple[Any, Any]:
+        """Return keys and values, and which tokens are there."""
+        import torch  # the compiler follows a statement, and not `require`
+
+        embedded, seen, causal = self.model.embed_prefix(patches, cameras.unbind(1), tokens, mask, state=state)
+        _, cache = self.model.vlm_with_expert.forward(
+            attention_mask=self.attention_mask(seen, causal),
+            position_ids=seen.cumsum(1) - 1,
+            inputs_embeds=[embedded, None],
+            use_cache=True,
+            **({"fill_kv_cache": True} if self._by_name else {}),
+        )
+        if self._by_name:
+            layers = [(layer["key_states"], layer["value_states"]) for layer in cache.values()]
+        else:
+            layers = layers_of(cache)
+        return torch.stack([torch.stack(layer, 1) for layer in layers], 1), seen.long()
+
+    def velocity(self, encoded: Any, seen: Any, state: Any, actions: Any, times: Any) -> Any:
+        """Return the velocity (B, H, D)."""
+        layers = encoded.unbind(1)
+        if self._by_name:
+            cache = {i: {"key_states": layer[:, 0], "value_states": layer[:, 1]} for i, layer in enumerate(layers)}
+        else:
+            cache = cache_of(layers)
+        return self.model.denoise_step(prefix_pad_masks=seen.bool(), past_key_values=cache, x_t=actions, timestep=times)
+
+    def _embed(self, patches: Any) -> Any:
+        if patches.ndim == 4:  # an image, of LeRobot's own training pass
+            return self._embed_image(patches)
+        vision = self._vlm.vision_model
+        hidden = vision.encoder(inputs_embeds=patches, attention_mask=None).last_hidden_state
+        return self._vlm.connector(vision.post_layernorm(hidden))
+
+    def _positions_of(self, image: Any) -> Any:
+        """Return the positions that the vision model gives to the patches of an image of this size."""
+        size = (image.shape[-2], image.shape[-1])
+        if size not in self._positions:
+            torch, vision = require("torch"), self._vlm.vision_model
+            found: list[Any] = []
+            hook = vision.embeddings.position_embedding.register_forward_pre_hook(lambda _, given: found.extend(given))
+            with hook, self.adapters.rows(()):  # this image is of no row
+                patches = [length // vision.patch_size for length in size]
+                vision.embeddings(
+                    image[:1].to(vision.dtype), torch.ones(1, *patches, dtype=torch.bool, device=image.device)
+                )
+            self._positions[size] = found[0][0].clone()
+        return self._positions[size]

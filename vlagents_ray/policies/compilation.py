@@ -10,17 +10,194 @@ another shape, or as it is too large, runs eagerly.
 from __future__ import annotations
 
 import logging
+import os
+import threading
 import time
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from operator import attrgetter
+from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-from vlagents_ray.errors import ConfigError
-from vlagents_ray.policies.compilation.cuda_graph import CudaGraph
-from vlagents_ray.policies.compilation.kept_programs import keep_torch_programs
+from vlagents_ray.errors import ConfigError, NotTrainable
 from vlagents_ray.policies.loading import report_uncompiled
 from vlagents_ray.registry import require
 
 logger = logging.getLogger(__name__)
+
+_TORCH = "TORCHINDUCTOR_CACHE_DIR"
+
+
+def keep_torch_programs() -> None:
+    """Let torch keep its programs in the user's cache, unless `TORCHINDUCTOR_CACHE_DIR` names another folder.
+
+    Torch writes its own choice, /tmp/torchinductor_USER, into that variable when it first needs it.
+    """
+    chosen = Path(os.environ.get(_TORCH, "")).name
+    if (not chosen or chosen.startswith("torchinductor_")) and (folder := _folder("torch")) is not None:
+        os.environ[_TORCH] = str(folder)
+
+
+def keep_jax_programs(jax: Any, platform: str) -> None:
+    """Let JAX keep its programs in the user's cache, unless `JAX_COMPILATION_CACHE_DIR` names another folder.
+
+    Args:
+        jax: The module.
+        platform: Of the device for which it compiles, such as "gpu"; nothing is kept for "cpu".
+    """
+    if platform == "cpu":
+        return
+    chosen = getattr(jax.config, "jax_compilation_cache_dir", "an older JAX, without this setting")
+    if chosen is None and (folder := _folder("jax")) is not None:
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+
+
+def _folder(library: str) -> Path | None:
+    """Return the folder of a library's programs; None, with a warning, if it cannot be made."""
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    folder = cache / "vlagents_ray" / "programs" / library
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError as error:
+        logger.warning("compiled programs are not kept for the next start: %s", error)
+        return None
+    return folder
+
+
+Quantization = Literal["int8", "float8"]
+
+_CONFIGS: dict[Quantization, str] = {"int8": "Int8WeightOnlyConfig", "float8": "Float8WeightOnlyConfig"}
+
+
+def quantize(policy: Any, kind: Quantization) -> None:
+    """Replace the weights of all linear layers of a loaded policy's network, in place.
+
+    Args:
+        policy: The policy; its `network` names the attribute that is a torch module, on the device of its forward pass.
+        kind: "int8", with a scale for each output of a layer, or "float8", of four bits of exponent and three of
+            mantissa.
+
+    Raises:
+        ConfigError: The policy names no network, or torchao cannot quantize it here.
+        MissingDependency: torchao is not installed.
+    """
+    if policy.network is None:
+        raise ConfigError(f"quantization: {type(policy).__name__} does not offer it; leave it out")
+    torchao = require("torchao.quantization")
+    try:
+        torchao.quantize_(attrgetter(policy.network)(policy), getattr(torchao, _CONFIGS[kind])())
+    except (RuntimeError, AttributeError, NotImplementedError, AssertionError) as error:
+        raise ConfigError(
+            f"quantization {kind!r}: torchao cannot use it here ({type(error).__name__}: {error}); try the other one, "
+            f"or dtype: bfloat16"
+        ) from error
+
+
+def require_whole(kind: Quantization | None) -> None:
+    """Raise `NotTrainable` if weights are quantized, since a learner's weights are not."""
+    if kind is not None:
+        raise NotTrainable(f"quantization {kind!r}: weights of 8 bits cannot be replaced by a learner's; leave it out")
+
+
+_WARM_UP = 3  # calls before the capture, in which libraries allocate their own memory
+_EMPTY = "CUDA Graph is empty"  # in torch's warning
+
+
+class CaptureLock:
+    """Keeps acts, of which it is the context, and pushes of weights out of the captures of this process.
+
+    A call that waits for a whole device ends any capture on it, with an error on both threads, whatever the mode of the
+    capture. A waiting capture goes before the next act, but waits for a push without delaying acts.
+    """
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._acting: set[int] = set()  # threads
+        self._capturing = False  # or about to
+        self.pushes = threading.RLock()  # the context of a push, within which its thread may also act
+
+    def __enter__(self) -> None:
+        """Begin an act: wait for the end of a capture. None begins until its end; a thread enters once at a time."""
+        with self._changed:
+            self._changed.wait_for(lambda: not self._capturing)
+            self._acting.add(threading.get_ident())
+
+    def __exit__(self, *_: object) -> None:
+        """End an act."""
+        with self._changed:
+            self._acting.discard(threading.get_ident())
+            self._changed.notify_all()
+
+    @contextmanager
+    def capture(self) -> Iterator[None]:
+        """Wait for running acts and pushes; none begins within this context.
+
+        Raises:
+            RuntimeError: This thread acts itself.
+        """
+        if threading.get_ident() in self._acting:
+            raise RuntimeError("a CUDA graph cannot be captured within an act; capture it in Agent.initialize")
+        with self.pushes:
+            try:
+                with self._changed:
+                    self._capturing = True
+                    self._changed.wait_for(lambda: not self._acting)
+                yield
+            finally:
+                with self._changed:
+                    self._capturing = False
+                    self._changed.notify_all()
+
+
+CAPTURES = CaptureLock()
+
+
+class CudaGraph:
+    """A function, captured once with inputs of one shape; calls copy their inputs to where the graph reads them.
+
+    It is captured here, and not by `torch.compile`, whose graphs belong to the thread that captured them: a checkpoint
+    is loaded on another thread than the one that acts with it.
+    """
+
+    def __init__(self, function: Callable[..., Any], tensors: Sequence[Any]) -> None:
+        """Capture a function, which must return a tensor, or a tuple of them, and have no other effect.
+
+        Args:
+            function: The function.
+            tensors: Its arguments, on one GPU, whose values do not matter.
+
+        Raises:
+            RuntimeError: The function cannot be captured, or none of its work was.
+        """
+        torch = require("torch")
+        self._inputs, device = [tensor.clone() for tensor in tensors], tensors[0].device
+        # The stream is named, since torch's own one is on the device of the first capture of the process. The current
+        # one is entered again, since `torch.cuda.graph` leaves its own if the capture fails.
+        own, current = torch.cuda.Stream(device), torch.cuda.current_stream(device)
+        with torch.cuda.device(device), torch.cuda.stream(current):
+            own.wait_stream(current)
+            with torch.cuda.stream(own):
+                for _ in range(_WARM_UP):
+                    function(*self._inputs)
+            current.wait_stream(own)
+            self._graph = torch.cuda.CUDAGraph()
+            with CAPTURES.capture(), warnings.catch_warnings(record=True) as said:
+                warnings.simplefilter("always")
+                # Preparations of acts go on meanwhile, on other threads, whose calls must not end the capture.
+                with torch.cuda.graph(self._graph, stream=own, capture_error_mode="thread_local"):
+                    self._result = function(*self._inputs)
+        if any(_EMPTY in str(warning.message) for warning in said):
+            raise RuntimeError("the CUDA graph is empty: all work ran on another stream, or on another device")
+
+    def __call__(self, *tensors: Any) -> Any:
+        """Return the function's result for tensors of the captured shapes, in memory of its own."""
+        for held, tensor in zip(self._inputs, tensors, strict=True):
+            held.copy_(tensor, non_blocking=True)
+        self._graph.replay()
+        result = self._result
+        return tuple(one.clone() for one in result) if isinstance(result, tuple) else result.clone()
+
 
 CompileMode = bool | Literal["require"]
 
@@ -152,7 +329,7 @@ class Core:
             return function(*tensors)
 
         # torch counts the programs of each code object, and gives up after eight of them
-        core.__code__ = core.__code__.replace(co_name=f"{self._name}_{len(tensors[0])}")
+        core.__code__ = core.__code__.replace(co_name=f"{self._name}_{len(tensors[0])}".replace(" ", "_"))
         program: Callable[..., Any] = torch.compile(core, fullgraph=True, dynamic=False, backend=self._owner.backend)
         program(*tensors)
         return CudaGraph(program, tensors) if tensors[0].device.type == "cuda" else program

@@ -1,0 +1,284 @@
+"""The base of the environments of simulators, MuJoCo's cameras, and the protocol of a benchmark."""
+
+from __future__ import annotations
+
+import os
+from abc import abstractmethod
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from typing import Any, ClassVar
+
+import numpy as np
+
+from vlagents_ray.contract import Contract
+from vlagents_ray.envs.base import EvalEnv, Options, one_row, require_known
+from vlagents_ray.envs.rendering.graphics import prepare_rendering
+from vlagents_ray.envs.rendering.render_probe import failing, without, without_egl
+from vlagents_ray.errors import ConfigError, EnvFailed, NotReset
+from vlagents_ray.interface import HIGH_RES, Act, Obs
+from vlagents_ray.registry import require
+
+Size = tuple[int, int]  # height, width in pixels
+
+
+@dataclass(frozen=True, slots=True)
+class BenchmarkProtocol:
+    """The settings that published numbers of a benchmark share, and their source; `describe()["protocol"]` has it."""
+
+    name: str
+    source: str  # the publication or code with these settings
+    max_steps: int
+    control_hz: float
+    control: str  # the quantity that an action commands
+    success: str  # the condition under which an episode counts as solved
+    begins: str  # the effect of an episode's seed and initial state
+    ends_on_success: bool
+    episodes: int | None = None  # episodes of a task in published tables; None if they differ
+
+    def describe(self, **played: Any) -> dict[str, Any]:
+        """Return the protocol as plain values; `deviations` lists the fields of `played` that differ from it."""
+        deviations = [
+            f"{name}: {value}, the protocol says {getattr(self, name)}"
+            for name, value in played.items()
+            if value != getattr(self, name)
+        ]
+        return asdict(self) | {"deviations": deviations}
+
+
+class SimulatorEnv(EvalEnv):
+    """One environment of a simulator in this process.
+
+    A subclass states the names below, makes its simulator in the constructor within `_making`, and registers with
+    `_resources` what `close` calls. `_begin` begins an episode and `_advance` executes a step; both are called with a
+    simulator that is open, and their errors become `EnvFailed`.
+    """
+
+    suite: ClassVar[str]
+    title: ClassVar[str]  # the name in sentences
+    packages: ClassVar[tuple[str, ...]]  # the modules that it imports
+    distributions: ClassVar[tuple[str, ...]] = ("mujoco",)  # the packages whose versions results state
+    cure: ClassVar[str]  # the command that installs the packages
+
+    _contract: Contract
+    _instruction: str = ""
+    _protocol: BenchmarkProtocol | None = None
+    _ends_on_success: bool = True
+    _env: Any = None  # the simulator; None before it is made and after `close`
+    _steps: int | None = None  # of the episode; None before the first reset
+
+    def __init__(self, name: str, *, record_size: Sequence[int] | None = None, **sizes: int | None) -> None:
+        """Check the options, and set what drivers read when a simulator is imported.
+
+        Args:
+            name: The env's name, for messages.
+            record_size: Height and width of further views by the same cameras, for recordings only.
+            sizes: Options that are at least 1, or None for their default, such as `width`.
+
+        Raises:
+            ConfigError: A size is less than 1.
+        """
+        self._name = name
+        for option, value in sizes.items():
+            if value is not None and value < 1:
+                raise ConfigError(f"{name}: {option} is {value}, want at least 1")
+        self._record_size = record_size_of(record_size, name)
+        self._resources = ExitStack()  # what `close` calls, the last first
+        prepare_rendering()
+
+    @property
+    def contract(self) -> Contract:
+        return self._contract
+
+    @property
+    def instruction(self) -> str:
+        return self._instruction
+
+    @classmethod
+    def require_task(cls, task: str | None) -> None:
+        if task is not None:  # the constructor has a default
+            require_known(cls.suite, task, cls.tasks())
+
+    @classmethod
+    def missing(cls) -> str | None:
+        """Say why the simulator cannot run here; the first call in a process renders one frame in a child."""
+        return without(cls.packages, cls.cure) or cls._missing_assets() or without_egl(cls.title)
+
+    def reset(self, *, seed: int, options: Options | None = None) -> tuple[Obs, dict[str, Any]]:
+        """Begin the episode of `seed`, taken modulo 2^32.
+
+        Where the task has fixed initial states, it begins in `options["init_state"]`, or in the one that the seed
+        chooses. There are no other options.
+        """
+        self._alive()
+        state = self._initial_state(seed, options or {})
+        with failing(self._name, "reset"):
+            obs, info = self._begin(seed % 2**32, state)
+        self._steps = 0
+        return obs, {"success": False} | ({} if self.init_states is None else {"init_state": state}) | info
+
+    def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
+        self._alive()
+        if self._steps is None:
+            raise NotReset(f"{self._name}: step before reset; call reset(seed=...) first")
+        action = one_row(act, self._contract)
+        with failing(self._name, "step"):
+            obs, reward, ended, info = self._advance(action)
+        self._steps += 1
+        return obs, reward, ended, self._steps >= self.max_steps, info
+
+    def describe(self) -> dict[str, Any]:
+        facts: dict[str, Any] = {
+            "simulator": self.suite,
+            "task": self._name.partition("/")[2],
+            **{name: version(name) for name in self.distributions},
+            "render_backend": os.environ.get("MUJOCO_GL", "glfw"),
+        }
+        if self._protocol is not None:
+            facts["protocol"] = self._protocol.describe(max_steps=self.max_steps, ends_on_success=self._ends_on_success)
+        return facts
+
+    def close(self) -> None:
+        self._env, self._steps = None, None
+        self._resources.close()
+
+    @abstractmethod
+    def _begin(self, seed: int, state: int) -> tuple[Obs, dict[str, Any]]:
+        """Begin an episode.
+
+        Args:
+            seed: The seed, 0 to 2^32 - 1.
+            state: The number of the initial state; 0 if the task has none that are fixed.
+
+        Returns:
+            The first observation, and what `info` has beside `init_state` and `success`, which is False by default.
+        """
+
+    @abstractmethod
+    def _advance(self, action: np.ndarray) -> tuple[Obs, float, bool, dict[str, Any]]:
+        """Execute an action, (D,) float32; return `(obs, reward, terminated, info)` as for `EvalEnv.step`."""
+
+    @classmethod
+    def _missing_assets(cls) -> str | None:
+        """Say which files of the simulator are not there, with the cure."""
+        return None
+
+    def _solved(self, success: bool) -> tuple[bool, dict[str, Any]]:
+        """Return `terminated` and `info` of a step after which the task is solved, or is not."""
+        return success and self._ends_on_success, {"success": success}
+
+    def _initial_state(self, seed: int, options: Options) -> int:
+        count = self.init_states
+        unknown = sorted(set(options) - ({"init_state"} if count is not None else set()))
+        if unknown:
+            want = "none" if count is None else "init_state or none"
+            raise ConfigError(f"{self._name}: unknown reset options {unknown}, want {want}")
+        state = options.get("init_state", seed % (count or 1))
+        if type(state) is not int or not 0 <= state < (count or 1):
+            raise ConfigError(f"{self._name}: init_state is {state!r}, want 0 to {(count or 1) - 1}")
+        return state
+
+    def _alive(self) -> Any:
+        if self._env is None:
+            raise EnvFailed(f"{self._name} is closed; make a new one")
+        return self._env
+
+    @contextmanager
+    def _making(self) -> Iterator[None]:
+        """Make the simulator within this: an error becomes `EnvFailed`, and frees what was made."""
+        try:
+            with failing(self._name, "make"):
+                yield
+        except BaseException:
+            self.close()
+            raise
+
+
+class MujocoCameras:
+    """Cameras of a MuJoCo model, each rendered in the size of the policy and in that of recordings."""
+
+    def __init__(
+        self,
+        env: str,
+        model: Any,
+        cameras: Sequence[str],
+        size: Size,
+        record_size: Size | None,
+        *,
+        upside_down: Collection[str] = (),
+    ) -> None:
+        """Make the renderers.
+
+        Args:
+            env: The env's name, for messages.
+            model: The `mujoco.MjModel`, whose frame buffer grows to the sizes.
+            cameras: The names of the cameras.
+            size: Height and width of the policy's images.
+            record_size: Height and width of the images for recordings; None for no such images.
+            upside_down: The cameras that are mounted upside down, whose images are turned.
+
+        Raises:
+            ConfigError: The model has no such camera.
+        """
+        require_cameras(env, cameras, camera_names(model))
+        self._cameras, self._upside_down = list(cameras), upside_down
+        buffer = model.vis.global_
+        self._renderers: dict[str, Any] = {}
+        for use, wanted in (("", size), (HIGH_RES, record_size)):
+            if wanted is not None:
+                buffer.offheight, buffer.offwidth = max(buffer.offheight, wanted[0]), max(buffer.offwidth, wanted[1])
+                self._renderers[use] = require("mujoco").Renderer(model, *wanted)
+
+    def render(self, data: Any) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Render the state of a `mujoco.MjData`.
+
+        Returns:
+            The images by camera, (H, W, 3) uint8 RGB, and the part of `Obs.info` with those for recordings.
+        """
+        views = {
+            use: {name: self._image(one, data, name) for name in self._cameras} for use, one in self._renderers.items()
+        }
+        return views.pop(""), views
+
+    def close(self) -> None:
+        """Free the renderers."""
+        for renderer in self._renderers.values():
+            renderer.close()
+
+    def _image(self, renderer: Any, data: Any, camera: str) -> np.ndarray:
+        renderer.update_scene(data, camera=camera)
+        image: np.ndarray = renderer.render()
+        return np.ascontiguousarray(image[::-1, ::-1]) if camera in self._upside_down else image
+
+
+def camera_names(model: Any) -> list[str]:
+    """Return the names of the cameras of a `mujoco.MjModel`."""
+    return [model.camera(i).name for i in range(model.ncam)]
+
+
+def require_cameras(env: str, names: Collection[str], have: Collection[str]) -> None:
+    """Raise `ConfigError` unless an env has the cameras of these names."""
+    unknown = sorted(set(names) - set(have))
+    if unknown:
+        raise ConfigError(f"{env} has no camera {unknown}: want some of {sorted(have)}")
+
+
+def record_size_of(size: Sequence[int] | None, env: str) -> Size | None:
+    """Check the option `record_size`: views for recordings, `info[HIGH_RES]`, which the policy does not get.
+
+    Args:
+        size: (height, width) in pixels, a list in settings files; None if there are no such views.
+        env: The env's name, for the message.
+
+    Returns:
+        The size; None if there are no such views.
+
+    Raises:
+        ConfigError: There can be no image of this size.
+    """
+    if size is None:
+        return None
+    if len(size) != 2 or min(size) < 1:
+        raise ConfigError(f"{env}: record_size is {size}, want (height, width), each at least 1")
+    return size[0], size[1]

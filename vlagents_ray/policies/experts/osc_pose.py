@@ -1,0 +1,306 @@
+"""Experts for robosuite's OSC_POSE, which pick an object from above: for LIBERO's and robosuite's tasks.
+
+They know where the objects are from the simulator's state. An action is (7,) for one arm: 0.05 m and 0.5 rad a unit,
+gripper -1 open, 1 closed.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from vlagents_ray.errors import ContractMismatch, InvalidObservation, MissingState, NotReset
+from vlagents_ray.interface import Act, Obs
+from vlagents_ray.registry import env_task
+
+_OPEN, _CLOSED = -1.0, 1.0
+_ARRIVED_M = 0.008
+_OVER_M = 0.12  # height of the hand above the grasp when approaching it
+_UP = np.array([0.0, 0.0, 1.0])
+_PER_RAD = 2.0  # units of the action: all of the remaining rotation
+_MOST_TURN = 0.3
+
+
+@dataclass(frozen=True, slots=True)
+class PickPhase:
+    """A phase of the motion, which ends when the hand arrives, or after `steps`."""
+
+    name: str
+    gripper: float
+    steps: int
+    waits: bool = False  # waits `steps` for the fingers, independent of the hand
+
+
+class PickExpert(ABC):
+    """Moves the hand to one pose after another, each of which is aimed at when its phase begins."""
+
+    per_m: ClassVar[float] = 10.0
+    """Units of the action for a metre of the remaining distance; 20 command all of it."""
+
+    def __init__(self, name: str, phases: Sequence[PickPhase]) -> None:
+        self._name, self._phases = name, phases
+        self._first: np.ndarray | None = None  # (3, 3), of the hand: its fingers close along y
+        self._phase, self._spent = 0, 0
+        self._target, self._turned = np.zeros(3), np.eye(3)  # of the hand in this phase: (3,) m, (3, 3)
+
+    def reset(self, obs: Obs, instruction: str) -> None:
+        """Begin an episode.
+
+        Raises:
+            InvalidObservation: The observation has no simulator state of this env.
+            MissingState: The observation lacks a part of the hand's state.
+            ContractMismatch: The goal is not of picking and placing an object.
+        """
+        hand, self._first = self._hand(obs)
+        self._phase, self._spent, self._turned = 0, 0, self._first
+        self._aim(hand, obs)
+
+    def act(self, obs: Obs) -> Act:
+        """Compute the next action, (7,) float32."""
+        if self._first is None:
+            raise NotReset(f"{self._name}: act before reset; call reset(obs, instruction) first")
+        hand, orientation = self._hand(obs)
+        phase = self._phases[self._phase]
+        arrived = not phase.waits and float(np.linalg.norm(hand - self._target)) < _ARRIVED_M
+        if (arrived or self._spent >= phase.steps) and self._phase < len(self._phases) - 1:
+            self._phase, self._spent = self._phase + 1, 0
+            self._aim(hand, obs)
+            phase = self._phases[self._phase]
+        self._spent += 1
+        return _towards(hand, orientation, self._target, self._turned, phase.gripper, per_m=self.per_m)
+
+    @abstractmethod
+    def _hand(self, obs: Obs) -> tuple[np.ndarray, np.ndarray]:
+        """Return the position (3,) m and orientation (3, 3) of the hand in the world's frame."""
+
+    @abstractmethod
+    def _aim(self, hand: np.ndarray, obs: Obs) -> None:
+        """Set the target of the hand in the phase that begins."""
+
+
+_SUITES = ("libero_spatial", "libero_object")
+_LIFT_M = 0.2
+_LEAVE_M = 0.15
+
+
+@dataclass(frozen=True, slots=True)
+class Grip:
+    """The grasp and release of a kind of object."""
+
+    offset: tuple[float, float, float]  # from the object's origin to the hand when it closes, m
+    release_m: float  # height of the object above its target when the hand opens
+
+
+_RIM = Grip((0.0, 0.048, 0.035), 0.02)  # bowls are wider than the hand: a finger goes inside
+_MIDDLE = Grip((0.0, 0.0, 0.0), 0.1)
+
+_PICK_AND_PLACE = (
+    PickPhase("over", _OPEN, 80),
+    PickPhase("down", _OPEN, 60),
+    PickPhase("grasp", _CLOSED, 15, waits=True),
+    PickPhase("lift", _CLOSED, 60),
+    PickPhase("carry", _CLOSED, 120),
+    PickPhase("lower", _CLOSED, 60),
+    PickPhase("release", _OPEN, 12, waits=True),
+    PickPhase("leave", _OPEN, 25),
+)
+
+
+class LiberoExpert(PickExpert):
+    """Grasps the object of the goal from above, and places it at the goal's target, in two of LIBERO's suites.
+
+    The hand keeps its initial orientation. Bowls in or on the cabinet (libero_spatial/4 and /9) are then out of reach:
+    it acts there, and fails.
+    """
+
+    def __init__(self, env_name: str) -> None:
+        suite = (env_task(env_name) or _SUITES[0]).partition("/")[0]
+        if not suite.startswith(_SUITES):  # those that vary them included
+            raise ContractMismatch(f"no scripted expert for env {env_name!r}: in LIBERO there are those for {_SUITES}")
+        super().__init__(env_name, _PICK_AND_PLACE)
+
+    def reset(self, obs: Obs, instruction: str) -> None:
+        self._goal(obs)
+        super().reset(obs, instruction)
+
+    def _hand(self, obs: Obs) -> tuple[np.ndarray, np.ndarray]:
+        pose = obs.state.get("xyz_axis_angle")
+        if pose is None or pose.shape != (6,):
+            raise InvalidObservation("state 'xyz_axis_angle': want (6,), m and rad, as LIBERO's env gives it")
+        return pose[:3].astype(np.float64), _matrix(pose[3:].astype(np.float64))
+
+    def _aim(self, hand: np.ndarray, obs: Obs) -> None:
+        name, place, positions = self._goal(obs)
+        grip = _RIM if "bowl" in name else _MIDDLE
+        thing = positions[name]
+        grasp = thing + np.array(grip.offset)
+        above = positions[place] + hand - thing  # of the hand, with the object above its target
+        targets: dict[str, np.ndarray] = {
+            "over": grasp + _OVER_M * _UP,
+            "down": grasp,
+            "lift": hand + _LIFT_M * _UP,
+            "carry": np.array([above[0], above[1], hand[2]]),
+            "lower": above + grip.release_m * _UP,
+            "leave": hand + _LEAVE_M * _UP,
+        }
+        # in other phases only the fingers move
+        self._target = targets.get(self._phases[self._phase].name, self._target)
+
+    def _goal(self, obs: Obs) -> tuple[str, str, dict[str, np.ndarray]]:
+        """Return the names of the object and of its place, and the positions of objects, (3,) m."""
+        state = obs.info.get("sim_state")
+        if not isinstance(state, dict) or not {"goal", "positions"} <= set(state):
+            got: Any = sorted(state) if isinstance(state, dict) else type(state).__name__
+            raise InvalidObservation(
+                f"info['sim_state']: got {got}, want the goal and the positions, as the env {self._name} gives "
+                f"them; this expert cannot act on images"
+            )
+        goal, positions = state["goal"], state["positions"]
+        if len(goal) != 1 or len(goal[0]) != 3 or goal[0][0] not in ("on", "in"):
+            raise ContractMismatch(f"{self._name}: the expert brings one thing to one place, the goal is {goal}")
+        _, name, place = goal[0]
+        if missing := {name, place} - set(positions):
+            raise InvalidObservation(f"info['sim_state']: no position of {sorted(missing)}, got {sorted(positions)}")
+        return name, place, positions
+
+
+@dataclass(frozen=True, slots=True)
+class Handling:
+    """How an object is grasped and placed."""
+
+    name: str  # robosuite's
+    handle_m: float = 0.0  # from the object's origin to the grasp, along its own x axis
+    aligned: bool = False  # the fingers close across that axis, and the object is turned by its nearest right angle
+    lift_m: float = 0.12  # so that it passes over what stands between
+    release_m: float | None = None  # height of its origin above the place when the hand opens; None: only lifted
+
+
+_HANDLED = {
+    "Lift": Handling("cube"),
+    "PickPlaceCan": Handling("Can", lift_m=0.25, release_m=0.07),
+    "NutAssemblySquare": Handling("SquareNut", handle_m=0.054, aligned=True, release_m=0.02),
+}
+_PICK = (
+    PickPhase("over", _OPEN, 80),
+    PickPhase("down", _OPEN, 60),
+    PickPhase("grasp", _CLOSED, 12, waits=True),
+    PickPhase("lift", _CLOSED, 60),
+)
+_PLACE = (
+    PickPhase("carry", _CLOSED, 100),
+    PickPhase("lower", _CLOSED, 50),
+    PickPhase("release", _OPEN, 8, waits=True),
+    PickPhase("leave", _OPEN, 25),
+)
+
+
+class RobosuiteExpert(PickExpert):
+    """Grasps the task's object from above, lifts it and, unless that is all, brings it to its place."""
+
+    per_m = 20.0
+
+    def __init__(self, env_name: str) -> None:
+        task = env_task(env_name) or "Lift"
+        if task not in _HANDLED:
+            known = [f"robosuite/{one}" for one in _HANDLED]
+            raise ContractMismatch(f"no scripted expert for env {env_name!r}: want one of {known}")
+        self._handled = _HANDLED[task]
+        phases = _PICK if self._handled.release_m is None else (*_PICK, *_PLACE)
+        super().__init__(f"robosuite/{task}", phases)
+
+    def _hand(self, obs: Obs) -> tuple[np.ndarray, np.ndarray]:
+        for part in ("robot0_eef_pos", "robot0_eef_quat"):
+            if part not in obs.state:
+                raise MissingState(part, have=obs.state)
+        x, y, z, w = (float(value) for value in obs.state["robot0_eef_quat"])
+        sine = math.sqrt(x * x + y * y + z * z)
+        angle = 2.0 * math.atan2(sine, w)
+        axis = np.array([x, y, z]) / sine if sine else np.zeros(3)
+        return obs.state["robot0_eef_pos"].astype(np.float64), _matrix(angle * axis)
+
+    def _aim(self, hand: np.ndarray, obs: Obs) -> None:
+        handled, phase = self._handled, self._phases[self._phase].name
+        thing, yaw = self._object(obs)
+        grasp = thing + handled.handle_m * np.array([math.cos(yaw), math.sin(yaw), 0.0])
+        if phase == "over":
+            self._target = grasp + _OVER_M * _UP
+            if handled.aligned:
+                self._turn(yaw)
+        elif phase == "down":
+            self._target = grasp
+        elif phase in ("lift", "leave"):
+            self._target = hand + handled.lift_m * _UP
+        elif phase in ("carry", "lower"):
+            right = round(yaw / (math.pi / 2)) * math.pi / 2 if handled.aligned else yaw
+            held = _matrix(np.array([0.0, 0.0, right - yaw])) @ (hand - thing)
+            height = handled.lift_m if phase == "carry" else handled.release_m or 0.0
+            self._target = self._read(obs, "target_pos", 3) + held + height * _UP
+            if handled.aligned and phase == "carry":
+                self._turn(right)
+
+    def _turn(self, yaw: float) -> None:
+        """Hold the hand so that its fingers close across the direction `yaw`, rad, of two ways by the shorter."""
+        near = (yaw + math.pi / 2) % math.pi - math.pi / 2
+        if self._first is not None:
+            self._turned = _matrix(np.array([0.0, 0.0, near])) @ self._first
+
+    def _object(self, obs: Obs) -> tuple[np.ndarray, float]:
+        """Return the position of the object, (3,) m, and its angle about the vertical, rad."""
+        x, y, z, w = self._read(obs, f"{self._handled.name}_quat", 4)
+        yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+        return self._read(obs, f"{self._handled.name}_pos", 3), yaw
+
+    def _read(self, obs: Obs, name: str, size: int) -> np.ndarray:
+        state = obs.info.get("sim_state")
+        value = state.get(name) if isinstance(state, dict) else None
+        if not isinstance(value, np.ndarray) or value.shape != (size,):
+            raise InvalidObservation(
+                f"info['sim_state']: want {name!r}, ({size},), as the env {self._name} gives it; "
+                f"this expert cannot act on images"
+            )
+        return value
+
+
+def _towards(
+    hand: np.ndarray,
+    orientation: np.ndarray,
+    target: np.ndarray,
+    upright: np.ndarray,
+    gripper: float,
+    *,
+    per_m: float,
+) -> Act:
+    """Compute the action that moves the hand towards a pose.
+
+    Args:
+        hand: Where the hand is, (3,) m.
+        orientation: How it is held, (3, 3).
+        target: Where it shall be, (3,) m.
+        upright: How it shall be held, (3, 3).
+        gripper: -1 open, 1 closed.
+        per_m: Units of the action for a metre of the remaining distance; 20 command all of it.
+    """
+    move = np.clip((target - hand) * per_m, -1.0, 1.0)
+    turn = np.clip(_rotation_vector(upright @ orientation.T) * _PER_RAD, -_MOST_TURN, _MOST_TURN)
+    return Act(np.concatenate([move, turn, [gripper]]).astype(np.float32))
+
+
+def _matrix(rotation_vector: np.ndarray) -> np.ndarray:
+    """Convert a rotation vector (3,) rad to a matrix (3, 3) by Rodrigues' formula."""
+    angle = float(np.linalg.norm(rotation_vector))
+    if angle == 0.0:
+        return np.eye(3)
+    x, y, z = rotation_vector / angle
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    turned: np.ndarray = np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * (cross @ cross)
+    return turned
+
+
+def _rotation_vector(turned: np.ndarray) -> np.ndarray:
+    """Convert a matrix (3, 3) to a rotation vector (3,) rad, with sines for the small angles."""
+    return np.array([turned[2, 1] - turned[1, 2], turned[0, 2] - turned[2, 0], turned[1, 0] - turned[0, 1]]) / 2

@@ -1,1 +1,0 @@
-"""Experts that move a hand by robosuite's OSC_POSE, in LIBERO and in robosuite."""
