@@ -80,7 +80,7 @@ class HttpTransport:
                 if isinstance(error, ConnectionLost):
                     require_plain(self._url, attempt_s)
                 if pause_s > left_s:
-                    raise PolicyUnavailable(f"{url}: not ready within {timeout_s:g} s ({error})") from error
+                    raise PolicyUnavailable(f"{url}: not ready within {round(timeout_s, 1):g} s ({error})") from error
                 unknown_since = None
                 report.failed(error)
             except UnknownApp as error:
