@@ -3,7 +3,7 @@
 import assert from "node:assert/strict";
 import { execFileSync } from "node:child_process";
 import { once } from "node:events";
-import { mkdtempSync, readFileSync } from "node:fs";
+import { mkdtempSync, readFileSync, rmSync } from "node:fs";
 import { createServer } from "node:https";
 import { tmpdir } from "node:os";
 import { test } from "node:test";
@@ -38,6 +38,7 @@ test("a port that speaks TLS, and a certificate of an unknown authority, are nam
   await assert.rejects(at("http"), /One with TLS needs https/);
   await assert.rejects(at("https"), /name its file in NODE_EXTRA_CA_CERTS/);
   server.close();
+  rmSync(files, { recursive: true });
 });
 
 test("a server that is not ready is waited for", async () => {
