@@ -536,23 +536,3 @@ def test_a_stop_that_is_over_before_the_loop_looks_still_drops_the_plan() -> Non
     assert control.restart()
     assert control.hold() is not None
     assert control.hold() is None
-
-
-@pytest.mark.parametrize("held", ["pause", "stop", "human"])
-def test_a_new_instruction_ends_the_episode_only_when_the_policy_moves_the_robot(held: str) -> None:
-    leader = ScriptedLeader(ahead)
-    control = Control(leader)
-    if held == "human":
-        leader.held = True
-    else:
-        getattr(control, held)("by the operator")
-    control.update()
-    control.instruct("fold")
-    assert not control.over
-    leader.held = False
-    control.resume()
-    assert control.restart()
-    control.update()
-    control.hold()
-    assert control.over
-    assert control.end() == ("", "fold")

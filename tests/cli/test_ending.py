@@ -11,7 +11,7 @@ from contextlib import suppress
 
 import pytest
 
-from vlagents_ray.ray_tools.signals import interrupts, stop_signals
+from vlagents_ray.ray_tools.signals import interrupts, own_sigterm, stop_signals
 
 # A Ray whose head is lost as soon as somebody looks; `{body}` is what the command does meanwhile.
 COMMAND = """
@@ -111,6 +111,15 @@ def test_an_evaluation_does_not_begin_after_an_interrupt_that_was_dropped() -> N
             pytest.fail("it began")
     with stop_signals() as stop:
         assert not stop.is_set()
+
+
+def test_sigterm_while_ray_starts_interrupts_the_command() -> None:
+    with interrupts():
+        with pytest.raises(KeyboardInterrupt), own_sigterm():
+            signal.signal(signal.SIGTERM, lambda number, _: sys.exit(number))  # as `ray.init` does
+            signal.raise_signal(signal.SIGTERM)
+        with pytest.raises(KeyboardInterrupt):  # the command's own handler is back
+            signal.raise_signal(signal.SIGTERM)
 
 
 def test_ctrl_c_while_modules_are_imported_ends_the_command_without_a_traceback() -> None:

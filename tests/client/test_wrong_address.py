@@ -8,20 +8,23 @@ import ssl
 import threading
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
+import numpy as np
 import pytest
 from certificates import authority
 
 from vlagents_ray import RemoteAgent
 from vlagents_ray.errors import ConfigError, PolicyUnavailable, VLAgentsError
+from vlagents_ray.learn import Publisher
 from vlagents_ray.serve.ports import free_port
 
 TIMEOUT_S = 1.0
 
 
 @contextlib.contextmanager
-def http_server(context: ssl.SSLContext | None = None) -> Iterator[int]:
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), http.server.BaseHTTPRequestHandler) as server:
+def http_server(context: ssl.SSLContext | None = None, host: str = "127.0.0.1") -> Iterator[int]:
+    with http.server.ThreadingHTTPServer((host, 0), http.server.BaseHTTPRequestHandler) as server:
         server.handle_error = lambda *_: None  # type: ignore[method-assign]
         if context is not None:
             server.socket = context.wrap_socket(server.socket, server_side=True)
@@ -64,3 +67,19 @@ def test_a_wrong_address_is_named_within_the_time_of_a_call(
         RemoteAgent(url, transport=transport, timeout_s=TIMEOUT_S).initialize()  # type: ignore[arg-type]
     assert said in str(caught.value)
     assert time.monotonic() - begun < TIMEOUT_S + 5
+
+
+@pytest.mark.parametrize("host", ["127.0.0.2", "localhost"])
+def test_a_name_that_the_certificate_does_not_have_is_named_with_the_cure(tmp_path: Path, host: str) -> None:
+    ours = authority(tmp_path, "ours")
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(*ours.sign("server"))
+    with http_server(context, "0.0.0.0") as port:  # noqa: S104 - for 127.0.0.2
+        agent = RemoteAgent(f"https://{host}:{port}", ca=ours.file, timeout_s=TIMEOUT_S)
+        with pytest.raises(ConfigError, match="write the URL with a name that the certificate has"):
+            agent.initialize()
+
+
+def test_weights_for_a_port_that_speaks_tls_are_told_the_url(ports: dict[str, int]) -> None:
+    with pytest.raises(ConfigError, match=f"write https://127.0.0.1:{ports['TLS']}"):
+        Publisher(f"http://127.0.0.1:{ports['TLS']}").push({"w": np.zeros(1, np.float32)})

@@ -289,10 +289,6 @@ class Machine(RuleBasedStateMachine):
     def mark(self) -> None:
         self.control.mark("success")
 
-    @event()
-    def instruct_by_a_topic(self) -> None:
-        self.control.instruct("fold")
-
     @event(held=st.booleans())
     def take_over_or_release(self, *, held: bool) -> None:
         self.held = held

@@ -5,17 +5,22 @@ from __future__ import annotations
 import asyncio
 import threading
 import traceback
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from ray import serve
 from ray._common.utils import import_attr
 from ray.serve._private.api import call_user_app_builder_with_args_if_necessary
 from ray.serve.exceptions import RayServeException
 
 from vlagents_ray.errors import MissingDependency, PolicyFailed
+from vlagents_ray.serve.access.key_store import new_key
 from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.launch.deployment_file import IMPORT_PATH
+from vlagents_ray.serve.ports import HOST
+from vlagents_ray.serve.replica import replica as module
 from vlagents_ray.serve.replica.app import build
 from vlagents_ray.serve.replica.replica import PolicyReplica
 
@@ -116,3 +121,24 @@ def test_serve_leaves_a_replica_that_does_not_answer_as_much_time_as_a_call_may_
     policy = build(ServerArgs(policy="noop", limits={"act_s": act_s}))._bound_deployment
     silent_s = 3 * policy._deployment_config.health_check_timeout_s
     assert act_s <= silent_s <= max(15.0, act_s)
+
+
+@pytest.mark.parametrize("plain", [False, True])
+def test_a_replica_warns_of_keys_that_come_unencrypted_unless_tls_ends_elsewhere(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, plain: bool
+) -> None:
+    new_key(tmp_path / "keys", "arm")
+    everywhere = SimpleNamespace(host="0.0.0.0", ssl_certfile=None)  # noqa: S104 - what is warned of
+    monkeypatch.delenv(HOST, raising=False)
+    monkeypatch.setattr(module, "http_options", lambda: everywhere)
+    monkeypatch.setattr(module, "write_audit", lambda: None)
+    monkeypatch.setattr(serve, "get_replica_context", lambda: SimpleNamespace(app_name="noop"))
+
+    def ended() -> None:
+        raise RayServeException("this test starts no engine")
+
+    monkeypatch.setattr(module, "SiblingReplicas", ended)
+    access = {"keys_file": str(tmp_path / "keys"), "plain_http": plain}
+    with pytest.raises(RayServeException, match="no engine"):
+        asyncio.run(Bare.__init__(object.__new__(Bare), {"policy": "noop", "access": access}))
+    assert ("host 0.0.0.0: API keys come unencrypted" in caplog.text) == (not plain)

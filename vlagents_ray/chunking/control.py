@@ -50,9 +50,9 @@ class Control:
     | "stopped" | nothing | `restart` |
 
     The state is decided once a tick, by `update`. All methods may be called from any thread: a pause counts from the
-    next action on, a stop at once. Stops, pauses and a new instruction last from one run of the control loop into the
-    next. Over a network only `pause`, `stop` and `mark` are called (see `vlagents_ray.client.commands`): `resume` and
-    `restart` are for the operator at the robot, and for its own program.
+    next action on, a stop at once. Stops and pauses last from one run of the control loop into the next. Over a network
+    only `pause`, `stop` and `mark` are called (see `vlagents_ray.client.commands`): `resume` and `restart` are for the
+    operator at the robot, and for its own program.
 
     Args:
         leader: What a human moves the robot with; None if there is nothing.
@@ -75,7 +75,6 @@ class Control:
         self._pauses = 0
         self._engaged = False  # at the last update
         self._outcome: Outcome | None = None
-        self._instruction: str | None = None
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Control:
         return Control(copy.deepcopy(self.leader, memo))  # that of another robot
@@ -151,20 +150,14 @@ class Control:
         with self._lock:
             self._outcome = "success" if label == "success" else "failure"
 
-    def instruct(self, text: str) -> None:
-        """Begin another episode with this instruction: at once if the policy moves the robot, else when it does."""
-        with self._lock:
-            self._instruction = text
-
     def adopt(self, other: Control) -> None:
-        """Take over the stop, the pause and the instruction of another control, which is not used any more."""
+        """Take over the stop and the pause of another control, which is not used any more."""
         with other._lock, self._lock:
             self._stop, self._barked = self._stop or other._stop, self._barked or other._barked
             self._silent |= other._silent
             self._unseen |= other._unseen
             self.stops += other.stops
             self._pause = self._pause or other._pause
-            self._instruction = self._instruction or other._instruction
 
     def begin(self, *, auto: bool) -> None:
         """Begin a run of the control loop.
@@ -175,12 +168,11 @@ class Control:
         with self._lock:
             self._auto, self._outcome, self.running = auto, None, True
 
-    def end(self) -> tuple[str, str | None]:
-        """End a run; return its outcome, "" without one, and the instruction of the next one, if there is one."""
+    def end(self) -> str:
+        """End a run; return its outcome, "" without one."""
         with self._lock:
-            ended = self._outcome or "", self._instruction
-            self._instruction, self.running = None, False
-            return ended
+            self.running = False
+            return self._outcome or ""
 
     def update(self) -> bool:
         """Decide at the beginning of a tick who moves the robot.
@@ -232,10 +224,8 @@ class Control:
 
     @property
     def over(self) -> bool:
-        """Whether the episode ends: it was marked, or a new instruction came and the policy moves the robot."""
-        with self._lock:
-            changed = self._instruction is not None and self._state == "autonomous" and self.held is None
-            return self._outcome is not None or changed
+        """Whether the episode ends, since it was marked."""
+        return self._outcome is not None
 
     def _silence(self) -> str:
         silent = f"no signal from the {' and the '.join(sorted(self._silent))}"

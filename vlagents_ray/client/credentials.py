@@ -22,6 +22,7 @@ WEBSOCKET_LOG = logging.getLogger("vlagents_ray.client.transports.websocket.prot
 """For websockets, which at DEBUG logs the headers that it sends: all but the key."""
 WEBSOCKET_LOG.addFilter(lambda record: "authorization" not in str(record.args).lower())
 _Path = str | os.PathLike[str]
+_OTHER_NAMES = (62, 64)  # X509_V_ERR_HOSTNAME_MISMATCH, X509_V_ERR_IP_ADDRESS_MISMATCH
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,6 +112,8 @@ def tls_failure(url: str, error: ssl.SSLError) -> VLAgentsError:
         return ConnectionLost(f"{url}: the connection ended ({error}); does the server speak TLS at this port?")
     if isinstance(error, ssl.SSLCertVerificationError):
         cure = "if the server's certificate is signed by a CA of your own, give its file as ca=, or in SSL_CERT_FILE"
+        if error.verify_code in _OTHER_NAMES:
+            cure = "write the URL with a name that the certificate has, or make a certificate with this name"
         return ConfigError(f"{url}: the server's certificate is not to be trusted: {error.verify_message}; {cure}")
     if "CERTIFICATE" in (error.reason or "") or "UNKNOWN_CA" in (error.reason or ""):
         return ConfigError(
@@ -123,8 +126,14 @@ def tls_failure(url: str, error: ssl.SSLError) -> VLAgentsError:
     return ConfigError(f"{url}: TLS failed ({error}); does the server speak TLS at this port?")
 
 
-def speaks_tls(url: SplitResult, timeout_s: float) -> bool:
-    """Whether the port of a server's URL answers to TLS, whatever its certificate and those it asks for."""
+def require_plain(url: SplitResult, timeout_s: float) -> None:
+    """Raise `ConfigError` if the URL is one without TLS and its port speaks TLS, whatever its certificate."""
+    if url.scheme in ("http", "ws") and _speaks_tls(url, timeout_s):
+        port = url.netloc.rpartition("@")[2]
+        raise ConfigError(f"http://{port}: this port speaks TLS; write https://{port}")
+
+
+def _speaks_tls(url: SplitResult, timeout_s: float) -> bool:
     context = ssl.create_default_context()
     context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
     try:

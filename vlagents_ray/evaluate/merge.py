@@ -287,7 +287,8 @@ def _require_apart(folders: Sequence[Results]) -> None:
             if (first := seen.setdefault(cell.cell, each.out)) is not each.out:
                 raise ConfigError(
                     f"report: {first} and {each.out} both have {cell.contender!r} in {cell.env!r} with the same "
-                    f"settings: parts of one evaluation; merge them into a folder first"
+                    f"settings; put parts of one evaluation into one folder first: `vlagents-ray merge OUT {first} "
+                    f"{each.out}`, with --accept-changes if code or weights changed between them"
                 )
 
 

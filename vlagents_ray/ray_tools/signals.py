@@ -49,8 +49,14 @@ def own_sigterm() -> Iterator[None]:
     process had no handler, Ray's remains.
     """
     before = signal.getsignal(signal.SIGTERM)
-    yield
-    if callable(before) and threading.current_thread() is threading.main_thread():
+    if not callable(before) or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    try:
+        yield
+    except SystemExit as ended:  # raised by Ray's handler
+        raise KeyboardInterrupt from ended
+    finally:
         signal.signal(signal.SIGTERM, before)
 
 

@@ -12,7 +12,6 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
 from typing import get_args
 
 from vlagents_ray.chunking.buffer import ENSEMBLE, MERGES
@@ -121,16 +120,16 @@ def _run(options: argparse.Namespace) -> LoopReport:
         if topics is not None:
             require_match(contract, topics.contract)
             options.instruction = options.instruction or topics.first_instruction(say)
-            topics.watchdog, topics.control = watchdog, player.control
+            topics.watchdog = watchdog
         stack.enter_context(_restarting(watchdog, say))
         if options.baseline > 0:
             say(_line(_HEADER))
             say(_row("empty loop", empty_loop(options.hz, options.baseline, real_time=options.real_time)))
-        play = partial(
-            run_loop,
+        report = run_loop(
             robot,
             player,
             hz=options.hz,
+            instruction=options.instruction,
             seconds=options.seconds,
             watchdog=watchdog,
             restart=options.restart,
@@ -139,7 +138,8 @@ def _run(options: argparse.Namespace) -> LoopReport:
             real_time=options.real_time,
             commands=commands,
         )
-        report = _played(play, options.instruction, say)
+        if report.outcome:
+            say(f"marked as a {report.outcome} on the live page")
         if options.baseline <= 0:
             say(_line(_HEADER))
         say(_row(f"{options.mode}, {agent.transport}", report.jitter))
@@ -194,18 +194,6 @@ def _topics(options: argparse.Namespace, stack: contextlib.ExitStack) -> RosRobo
     if options.robot is not None:
         raise ConfigError("--robot: got one besides --ros, want one of them")
     return stack.enter_context(RosRobot(read_settings(options.ros)))
-
-
-def _played(play: Callable[..., LoopReport], instruction: str | None, say: Callable[[str], None]) -> LoopReport:
-    """Play an episode, and a further one for each new instruction; return the last report."""
-    while True:
-        report = play(instruction=instruction)
-        if report.outcome:
-            say(f"marked as a {report.outcome} on the live page")
-        if report.next_instruction is None:
-            return report
-        instruction = report.next_instruction
-        say(f"another episode begins: {instruction!r}")
 
 
 @contextlib.contextmanager

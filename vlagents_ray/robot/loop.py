@@ -96,7 +96,6 @@ class LoopReport:
     done: bool = False  # the policy considered its task finished
     means: list[str] = field(default_factory=list)  # the measures taken against jitter
     outcome: str = ""  # "success" or "failure", if it was marked on the live page
-    next_instruction: str | None = None  # that of the next episode, by `Control.instruct` or a topic of ROS
 
     @property
     def safe_ticks(self) -> int:
@@ -216,7 +215,7 @@ def run_loop(
                 stack.enter_context(watchdog)
             pacer = Pacer(hz, spin_s)
             _drive(robot, agent, guard, watchdog, recorder, shown, report, pacer, seconds, until, control, commands)
-            report.outcome, report.next_instruction = control.end()
+            report.outcome = control.end()
             if report.outcome and recorder is not None and recorder.interventions:
                 recorder.label("success" if report.outcome == "success" else "failure")
         finally:

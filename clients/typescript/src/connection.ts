@@ -90,7 +90,10 @@ async function ask(
   } catch (error) {
     if (signal.aborted && sent) throw late(url, timeoutMs);
     const cause = error instanceof Error && error.cause !== undefined ? error.cause : error;
-    const detail = `${url}: ${String(cause)}; is the server running?`;
+    const cure = String(cause).includes("certificate")
+      ? "if a CA of your own has signed the server's, name its file in NODE_EXTRA_CA_CERTS"
+      : "is the server running? One with TLS needs https://";
+    const detail = `${url}: ${String(cause)}; ${cure}`;
     throw sent ? new ConnectionLost(detail, "connection_lost") : new Unreachable(detail, "unavailable");
   }
   const type = response.headers.get("content-type") ?? "";

@@ -1,7 +1,11 @@
 // What a client does about a server that is gone, busy, or answers wrongly.
 
 import assert from "node:assert/strict";
-import { readFileSync } from "node:fs";
+import { execFileSync } from "node:child_process";
+import { once } from "node:events";
+import { mkdtempSync, readFileSync, rmSync } from "node:fs";
+import { createServer } from "node:https";
+import { tmpdir } from "node:os";
 import { test } from "node:test";
 
 import {
@@ -22,6 +26,19 @@ test("a server that is not there is said so at once", async () => {
   const begun = Date.now();
   await thrown(new RemoteAgent("http://127.0.0.1:9", { timeoutMs: LONG_MS }).reset({}), PolicyUnavailable, "unavailable");
   assert.ok(Date.now() - begun < LONG_MS / 2);
+});
+
+test("a port that speaks TLS, and a certificate of an unknown authority, are named with their cure", async () => {
+  const files = mkdtempSync(`${tmpdir()}/`);
+  const [key, cert] = [`${files}/key`, `${files}/cert`];
+  execFileSync("openssl", ["req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes", "-subj", "/CN=here", "-keyout", key, "-out", cert], { stdio: "ignore" });
+  const server = createServer({ key: readFileSync(key), cert: readFileSync(cert) }).listen(0, "127.0.0.1");
+  await once(server, "listening");
+  const at = (scheme) => new RemoteAgent(`${scheme}://127.0.0.1:${server.address().port}`, { timeoutMs: LONG_MS }).reset({});
+  await assert.rejects(at("http"), /One with TLS needs https/);
+  await assert.rejects(at("https"), /name its file in NODE_EXTRA_CA_CERTS/);
+  server.close();
+  rmSync(files, { recursive: true });
 });
 
 test("a server that is not ready is waited for", async () => {

@@ -333,7 +333,9 @@ def test_a_killed_server_stops_the_arm(tmp_path: Path, capsys: pytest.CaptureFix
     assert status in ([1], [3])
 
 
-def test_the_first_instruction_is_waited_for_and_a_new_one_begins_another_episode() -> None:
+def test_the_first_instruction_is_waited_for_and_a_later_one_neither_ends_nor_begins_an_episode(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     with rosbridge_double() as double, RosArm(double.publish, lambda: double.on(COMMANDS)) as arm:
         settings = settings_from(ros_arm.settings(double.url, instruction={"topic": TOLD}), "arm.yaml")
         agent, said = Ahead(), []
@@ -345,15 +347,21 @@ def test_the_first_instruction_is_waited_for_and_a_new_one_begins_another_episod
         with RosRobot(settings) as robot, ChunkPlayer(agent, check=Guard(agent.contract)) as player:
             assert robot.first_instruction(say) == "fold"
             assert said == [f"waiting for an instruction on {TOLD}"]
-            robot.control = player.control
-            teller = threading.Thread(
-                target=lambda: (wait_for(lambda: agent.acts > 10), setattr(arm, "told", "unfold"))
-            )
-            teller.start()
-            report = run_loop(robot, player, hz=50, instruction=robot.instruction)
-            teller.join()
-    assert agent.acts > 10  # the same instruction again begins no other episode
-    assert report.next_instruction == "unfold"
+            heard_at = []
+
+            def over() -> bool:
+                if agent.acts > 10:
+                    arm.told = "unfold"
+                if robot.instruction == "unfold":
+                    heard_at.append(agent.acts)
+                return len(heard_at) > 20
+
+            report = run_loop(robot, player, hz=50, instruction=robot.instruction, until=over)
+            assert robot.instruction == "unfold"  # for the next call of `run_loop`
+    assert agent.acts > heard_at[0] + 5, "the policy goes on under the first instruction"
+    assert list(agent.instructions) == ["fold"]
+    assert report.safe_ticks == 0
+    assert "instruction: got 'unfold', which counts from the next episode on" in caplog.messages
 
 
 @pytest.mark.parametrize("held", ["pause", "stop"])
@@ -361,7 +369,6 @@ def test_a_new_instruction_moves_no_arm_that_stands(held: str) -> None:
     wire, agent = Wire(), Ahead()
     settings = settings_from(ros_arm.settings("ws://arm", instruction={"topic": TOLD}), "arm.yaml")
     with RosRobot(settings, wire) as robot, ChunkPlayer(agent, check=Guard(agent.contract)) as player:
-        robot.control = player.control
         getattr(player.control, held)("by the operator")
         wire.takes[TOLD]({"data": "unfold"})
         for _ in range(2):  # the second one is the episode of the new instruction

@@ -132,7 +132,8 @@ def test_an_error_of_a_preparation_is_that_of_its_request_alone(
     one.agent.gates["act"].set()
     error = answer.get(timeout=30).error
     assert isinstance(error, PolicyFailed)
-    assert "the policy raised ValueError" in str(error)
+    assert "the policy raised ValueError (test_preparation.py:" in str(error)
+    assert "not an observation" not in str(error)  # only logged
     assert "not an observation" in caplog.text
     assert [prepared(other).partition(":")[0] for other in others] == one.names[1:-1]
     prepared(one.submit(one.names[-1], "act"))  # its session goes on

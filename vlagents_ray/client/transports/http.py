@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from typing import Any
 from urllib.parse import SplitResult, urlsplit
 
-from vlagents_ray.client.credentials import ANONYMOUS, KEY_VARIABLE, Credentials, speaks_tls, tls_failure
+from vlagents_ray.client.credentials import ANONYMOUS, KEY_VARIABLE, Credentials, require_plain, tls_failure
 from vlagents_ray.client.transports.base import ConnectReport, first_timeout_s
 from vlagents_ray.client.transports.codec_selection import CodecChoice
 from vlagents_ray.errors import (
@@ -77,16 +77,10 @@ class HttpTransport:
                 if isinstance(error, DeadlineExceeded):  # a hung replica: another session id selects another one
                     self._session, attempt_s = uuid.uuid4().hex, 2 * attempt_s
                 url = self._url.geturl()
-                if (
-                    isinstance(error, ConnectionLost)
-                    and self._url.scheme == "http"
-                    and speaks_tls(self._url, attempt_s)
-                ):
-                    raise ConfigError(
-                        f"{url}: this port speaks TLS; write {url.replace('http', 'https', 1)}"
-                    ) from error
+                if isinstance(error, ConnectionLost):
+                    require_plain(self._url, attempt_s)
                 if pause_s > left_s:
-                    raise PolicyUnavailable(f"{url}: not ready within {timeout_s:g} s ({error})") from error
+                    raise PolicyUnavailable(f"{url}: not ready within {round(timeout_s, 1):g} s ({error})") from error
                 unknown_since = None
                 report.failed(error)
             except UnknownApp as error:

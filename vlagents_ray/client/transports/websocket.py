@@ -15,11 +15,12 @@ import struct
 import time
 from collections.abc import Sequence
 from typing import Any, Protocol
+from urllib.parse import urlsplit
 
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
 from websockets.sync.client import connect
 
-from vlagents_ray.client.credentials import ANONYMOUS, WEBSOCKET_LOG, Credentials, tls_failure
+from vlagents_ray.client.credentials import ANONYMOUS, WEBSOCKET_LOG, Credentials, require_plain, tls_failure
 from vlagents_ray.client.transports.base import first_timeout_s, is_answer, left_s
 from vlagents_ray.client.transports.codec_selection import CodecChoice
 from vlagents_ray.client.transports.direct_websocket import Stream
@@ -117,6 +118,8 @@ def open_websocket(url: str, credentials: Credentials, timeout_s: float) -> Prox
             raise refusal(error.response.status_code, kind, bytes(error.response.body or b"")) from error
         raise PolicyUnavailable(f"{url}: refused with HTTP {error.response.status_code}") from error
     except (OSError, InvalidHandshake, TimeoutError) as error:
+        if isinstance(error, InvalidHandshake):
+            require_plain(urlsplit(url), timeout_s)
         raise NoReplica(f"{url}: cannot connect ({error}); is it running?") from error
 
 

@@ -11,7 +11,6 @@ from typing import Any, Protocol
 import numpy as np
 
 from vlagents_ray.chunking.capture_clock import SKEW_S
-from vlagents_ray.chunking.control import Control
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.errors import ConfigError, InvalidAction, VLAgentsError
 from vlagents_ray.interface import CAPTURED, Obs
@@ -78,9 +77,8 @@ class RosRobot:
         self.holds: str | None = None
         self.watchdog: Watchdog | None = None
         """The watchdog of the control loop, with `silent_s` among its sources."""
-        self.instruction: str | None = None  # the newest on its topic
-        self.control: Control | None = None
-        """The state of the control loop, which a new instruction on its topic is given to."""
+        self.instruction: str | None = None
+        """The newest instruction on its topic, for the next episode: a message neither ends nor begins one."""
         self._link: Link = link or (Ros2() if settings.link == ROS2 else Rosbridge(settings.link, settings.compression))
         by_stamp = settings.clock == "stamp"
         self._readers = {id(reading): TopicReader(reading, by_stamp) for reading in settings.sensors}
@@ -250,10 +248,9 @@ class RosRobot:
         except VLAgentsError as error:
             logger.warning("instruction: left out: %s", error)
             return
-        if text != self.instruction:  # which may be published again and again
-            self.instruction = text
-            if self.control is not None:
-                self.control.instruct(text)
+        if self.instruction not in (None, text):  # the same one may be published again and again
+            logger.warning("instruction: got %r, which counts from the next episode on", text)
+        self.instruction = text
 
     def _wait_for_messages(self) -> None:
         deadline = time.monotonic() + self.settings.ready_s

@@ -7,11 +7,8 @@ a callback on a thread of the batch queue receives the reply.
 from __future__ import annotations
 
 import logging
-import sysconfig
 import time
-import traceback
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import (
@@ -28,7 +25,7 @@ from vlagents_ray.serve.engine.admission import Admission
 from vlagents_ray.serve.engine.arrival import PauseDetector
 from vlagents_ray.serve.engine.metrics_buffer import MetricsBuffer
 from vlagents_ray.serve.engine.resets import Resets
-from vlagents_ray.serve.engine.responses import Watchers, build_reply, public_error, timing
+from vlagents_ray.serve.engine.responses import Watchers, build_reply, public_error, raised_at, timing
 from vlagents_ray.serve.engine.session_transfer import DrainList, SessionTransfer
 from vlagents_ray.serve.models.checkpoints import Checkpoints
 from vlagents_ray.serve.models.loaded_model import LoadedModel, Loader
@@ -44,8 +41,6 @@ from vlagents_ray.serve.weights.versions import WeightsVersion
 logger = logging.getLogger(__name__)
 
 Acting = tuple[PendingRequest, Session[LoadedModel]]
-
-_LIBRARIES = (str(Path(__file__).parents[2]), sysconfig.get_path("stdlib"))  # this package's own, and Python's
 
 
 class Engine:
@@ -122,7 +117,7 @@ class Engine:
         except Exception as error:
             failed = f"the policy did not load: {type(error).__name__}"
             self._unready = PolicyFailed(f"{failed}; the server's log says why")
-            self._failure = PolicyFailed(f"{failed}: {error}{_place(error)}")
+            self._failure = PolicyFailed(f"{failed}: {error}{raised_at(error)}")
             raise self._failure from error
         if threaded:
             self._preparations = Preparations()
@@ -372,11 +367,3 @@ class Engine:
         if unsent:
             self.queue.answer_later(unsent)
         self.stats.batch(len(acting), rows)
-
-
-def _place(error: Exception) -> str:
-    """Return the line of the user's own code that raised an error, " (my_policy.py:12)"; "" if none did."""
-    for frame in reversed(traceback.extract_tb(error.__traceback__)):
-        if not frame.filename.startswith(_LIBRARIES) and "site-packages" not in frame.filename:
-            return f" ({Path(frame.filename).name}:{frame.lineno})"
-    return ""

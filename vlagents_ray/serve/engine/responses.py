@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import logging
+import sysconfig
 import threading
+import traceback
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Protocol
 
@@ -31,6 +34,7 @@ from vlagents_ray.validation import check_action
 logger = logging.getLogger(__name__)
 
 Done = Callable[[list[Reply]], None]
+_LIBRARIES = (str(Path(__file__).parents[2]), sysconfig.get_path("stdlib"))  # this package's own, and Python's
 
 
 class Watcher(Protocol):
@@ -127,9 +131,17 @@ def public_error(error: Exception, ticket: PendingRequest) -> VLAgentsError:
         "%s failed (session %s, request %s)", request.op, ticket.session_id, request.request_id, exc_info=error
     )
     return PolicyFailed(
-        f"{request.op}: the policy raised {type(error).__name__}; "
+        f"{request.op}: the policy raised {type(error).__name__}{raised_at(error)}; "
         f"the server's log has the details under request id {request.request_id or '(none)'}"
     )
+
+
+def raised_at(error: Exception) -> str:
+    """Return the line of the user's own code that raised an error, " (my_policy.py:12)"; "" if none did."""
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        if not frame.filename.startswith(_LIBRARIES) and "site-packages" not in frame.filename:
+            return f" ({Path(frame.filename).name}:{frame.lineno})"
+    return ""
 
 
 def timing(arrived: float, began: float, ended: float) -> dict[str, Any]:
