@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import select
 import socket
 import struct
 import threading
@@ -226,8 +227,18 @@ class UnixConnection:
         if self._ended or self._sender is None or (wait_s := self._sender.throttled_s()) <= 0:
             return False
         self._pause()
-        self._engine.queue.call_later(wait_s, self._resume)
+        self._engine.queue.call_later(wait_s, self._unthrottle)
         return True
+
+    def _unthrottle(self) -> None:
+        """Read the connection again, unless the client is gone or another one with its key was over the rate since."""
+        if self._ended:
+            return
+        if _has_hung_up(self._connection):  # to decode the messages that it left would delay others
+            self._disconnect()
+            return
+        self._is_throttled()
+        self._resume()
 
     def _decode(self, sender: Dispatcher, trace: RequestTrace, waited_s: float, frame: np.ndarray) -> None:
         """Decode the requests of a frame, in another thread if that is slow, and send them to the engine."""
@@ -348,6 +359,13 @@ class UnixConnection:
                 logger.info("local client: %s", error)
                 with contextlib.suppress(OSError):  # the connection is closed already
                     self._connection.shutdown(socket.SHUT_RDWR)
+
+
+def _has_hung_up(connection: socket.socket) -> bool:
+    """Return whether the peer has closed its end; messages may be unread."""
+    poller = select.poll()
+    poller.register(connection, 0)  # reports a hang-up in any case
+    return bool(poller.poll(0))
 
 
 class _Buffers(threading.local):

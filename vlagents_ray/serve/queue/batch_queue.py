@@ -165,10 +165,8 @@ class BatchQueue:
         self._poller.call_soon(call)
 
     def call_later(self, seconds: float, call: Callable[[], None]) -> None:
-        """Schedule `call` as `call_soon` does, after `seconds`. May be called on any thread."""
-        timer = threading.Timer(seconds, self._poller.call_soon, (call,))
-        timer.daemon = True
-        timer.start()
+        """Schedule `call` as `call_soon` does, after `seconds`. May only be called in a callback."""
+        self._poller.call_later(seconds, call)
 
     def full_batch_waits(self) -> bool:
         """Return whether a full batch waits, so that replies to simulations can be sent while that one runs."""

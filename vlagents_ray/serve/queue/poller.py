@@ -8,10 +8,14 @@ and decodes the next batch. Callbacks run on either thread, never on both at onc
 from __future__ import annotations
 
 import contextlib
+import heapq
+import itertools
 import logging
+import math
 import os
 import select
 import threading
+import time
 from collections import deque
 from collections.abc import Callable
 from typing import Protocol
@@ -42,6 +46,8 @@ class Poller:
         self._callback_lock = threading.Lock()  # held while the reader runs callbacks
         self._closed = False
         self._scheduled: deque[Callable[[], None]] = deque()
+        self._timers: list[tuple[float, int, Callable[[], None]]] = []  # a heap of times (s), numbers and callbacks
+        self._timer_numbers = itertools.count()  # so that no two callbacks are compared
 
     def watch(self, file: HasFileno, ready: Callable[[], None]) -> None:
         """Call `ready` whenever `file` can be read. Called before the owner's first `poll`, or in a callback."""
@@ -58,21 +64,28 @@ class Poller:
             self._scheduled.append(call)
             self.wake()
 
+    def call_later(self, seconds: float, call: Callable[[], None]) -> None:
+        """Schedule `call` to run as a callback after `seconds`. Called in a callback.
+
+        No thread is started, since a flood makes many connections wait at once.
+        """
+        heapq.heappush(self._timers, (time.monotonic() + seconds, next(self._timer_numbers), call))
+
     def wake(self) -> None:
         """End the current `poll`, or the next one. May be called on any thread."""
         with contextlib.suppress(BlockingIOError):  # the pipe is full, so that a wake-up is pending already
             os.write(self._wake_write, b"x")
 
     def poll(self, timeout_s: float) -> bool:
-        """Wait at most `timeout_s` for watched files or a wake-up call, and run the callbacks of all that are ready.
+        """Wait at most `timeout_s` for watched files, timers or a wake-up call, and run the callbacks that are due.
 
         Returns:
             False if there was no event.
         """
-        events = self._poll.poll(timeout_s)
+        events = self._poll.poll(min(timeout_s, self._timer_s()) if self._timers else timeout_s)
         if events:
             self._call(events)
-        return bool(events)
+        return (bool(self._timers) and self._run_timers()) or bool(events)
 
     def hand_to_reader(self) -> None:
         """Let the reader thread poll until `reclaim`; the owner must not poll meanwhile."""
@@ -80,6 +93,8 @@ class Poller:
             self._reader = threading.Thread(target=self._read, name="policy-reader", daemon=True)
             self._reader.start()
         self._lent.set()
+        if self._timers:
+            self.wake()  # the reader may have begun to wait before they were set
 
     def reclaim(self) -> None:
         """Take the poller back from the reader thread, after the callback that it is running."""
@@ -108,10 +123,12 @@ class Poller:
             self._lent.wait()
             if self._closed:
                 return
-            outside.poll()
+            wait_s = self._timer_s()
+            outside.poll(None if wait_s == math.inf else math.ceil(wait_s * 1e3))
             with self._callback_lock:
                 if self._lent.is_set() and not self._closed:
                     self._call(self._poll.poll(0), lent=True)
+                    self._run_timers()
 
     def _watch(self, descriptor: int, ready: Callable[[], None]) -> None:
         self._poll.register(descriptor, select.EPOLLIN)
@@ -136,7 +153,25 @@ class Poller:
         with contextlib.suppress(BlockingIOError):
             os.read(self._wake_read, 4096)
         while self._scheduled:
-            try:
-                self._scheduled.popleft()()
-            except Exception:
-                logger.exception("a scheduled callback failed")
+            _run(self._scheduled.popleft())
+
+    def _timer_s(self) -> float:
+        """Return the time until the next timer, s."""
+        first = self._timers[:1]  # a copy, since the owner may take the poller back from the reader meanwhile
+        return max(0.0, first[0][0] - time.monotonic()) if first else math.inf
+
+    def _run_timers(self) -> bool:
+        """Run the timers that are due; return whether there were any."""
+        if self._timer_s() > 0:
+            return False
+        now = time.monotonic()
+        while self._timers and self._timers[0][0] <= now:
+            _run(heapq.heappop(self._timers)[2])
+        return True
+
+
+def _run(call: Callable[[], None]) -> None:
+    try:
+        call()
+    except Exception:
+        logger.exception("a scheduled callback failed")
