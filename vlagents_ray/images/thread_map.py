@@ -6,6 +6,7 @@ JPEG and PNG coding release Python's global lock, so threads help.
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
 import threading
 from collections.abc import Callable, Sequence
@@ -13,7 +14,25 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache
 from typing import TypeVar
 
-from vlagents_ray.images import cpu_affinity
+# The CPU cores on which a thread runs, and may run.
+
+
+def _getcpu() -> Callable[[], int]:
+    """Return the C library's `sched_getcpu`, or a function that returns -1 where there is none."""
+    if not hasattr(os, "sched_setaffinity"):
+        return lambda: -1
+    found: Callable[[], int] = getattr(ctypes.CDLL(None), "sched_getcpu", lambda: -1)
+    return found
+
+
+here: Callable[[], int] = _getcpu()
+"""Return the core on which the calling thread runs; -1 if it is not known."""
+
+
+def allowed() -> int:
+    """Return the number of cores that this thread may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -33,7 +52,7 @@ def thread_map(function: Callable[[Item], Result], items: Sequence[Item], work_s
     Returns:
         The results in the order of the items; an exception is that of the first item that raised one.
     """
-    threads = min(len(items), cpu_affinity.allowed(), 1 + _MOST_HELPERS)
+    threads = min(len(items), allowed(), 1 + _MOST_HELPERS)
     if threads < 2 or work_s < _LEAST_WORK_S:
         return [function(item) for item in items]
     todo = iter(range(len(items)))  # shared by all threads, so that a late helper delays nothing
@@ -48,7 +67,7 @@ def thread_map(function: Callable[[Item], Result], items: Sequence[Item], work_s
                 errors[index] = error
 
     helpers = _helpers(os.getpid())
-    helpers.keep_off(cpu_affinity.here())
+    helpers.keep_off(here())
     helping: list[Future[None]] = []
     with contextlib.suppress(RuntimeError):  # while the interpreter exits, the caller works alone
         for _ in range(threads - 1):
