@@ -14,7 +14,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache
 from typing import TypeVar
 
-# The CPU core on which a thread runs, and its affinity.
+# The CPU cores on which a thread runs, and may run.
 
 
 def _getcpu() -> Callable[[], int]:
@@ -32,21 +32,6 @@ here: Callable[[], int] = _getcpu()
 def allowed() -> int:
     """Return the number of cores that this thread may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def leave(core: int) -> None:
-    """Move the calling thread off `core` if it runs there and may run elsewhere; it may return later.
-
-    Wake-affine scheduling, especially in virtual machines, can put two threads that wake each other on one core, and
-    keeps them there as long as both run briefly.
-    """
-    if core < 0 or here() != core:
-        return
-    affinity = os.sched_getaffinity(0)
-    if others := affinity - {core}:
-        with contextlib.suppress(OSError):  # not permitted
-            os.sched_setaffinity(0, others)
-            os.sched_setaffinity(0, affinity)
 
 
 Item = TypeVar("Item")

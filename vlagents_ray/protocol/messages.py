@@ -118,7 +118,7 @@ class LocalAddress:
     # with COMPACT, the arrays of the acts that follow the message's header (see `vlagents_ray.protocol.shm_layout`). A
     # reply follows its header, or lies in a memory file that is sent with it.
     REQUEST: ClassVar[struct.Struct] = struct.Struct("<IIQ")  # number of the memory file, flags, bytes in it
-    REPLY: ClassVar[struct.Struct] = struct.Struct("<QHh")  # bit n: memory file n is free again; flags; core or -1
+    REPLY: ClassVar[struct.Struct] = struct.Struct("<QHxx")  # bit n: memory file n is free again; flags
     IN_FILE: ClassVar[int] = 1  # flag: the frame of the reply lies in the memory file that comes with it
     COMPACT: ClassVar[int] = 2  # flag: no frame
     # most memory files of a client, which needs more than one if the policy keeps observations

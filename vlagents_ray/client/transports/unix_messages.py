@@ -18,7 +18,6 @@ from typing import ClassVar
 
 from vlagents_ray.client.transports.base import is_answer
 from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, PolicyUnavailable
-from vlagents_ray.images import thread_map
 from vlagents_ray.protocol import shm_layout
 from vlagents_ray.protocol.frames import decode_replies
 from vlagents_ray.protocol.messages import LocalAddress, Reply, Request
@@ -43,7 +42,6 @@ class UnixTransport(ABC):
         self._buffer = bytearray(_MESSAGE_BYTES)
         self._writer = shm_layout.ShmWriter()
         self._answers_fast = True  # whether the last answer came at once
-        self._core = -1  # the core on which the last answer was written
 
     @abstractmethod
     def _is_free(self) -> bool:
@@ -128,8 +126,6 @@ class UnixTransport(ABC):
                 if not replies[0].request_id:  # refused before it was parsed
                     self._writer = shm_layout.ShmWriter()
                 self._answers_fast = time.perf_counter() - begun < _FAST_S
-                if self._answers_fast:
-                    thread_map.leave(self._core)
                 return replies
 
     def _open(self, timeout_s: float) -> socket.socket:
@@ -158,7 +154,7 @@ class UnixTransport(ABC):
         size, control, _, _ = connection.recvmsg_into([self._buffer], _CONTROL)
         if size == 0:
             raise ConnectionResetError("the server closed the connection")
-        freed, flags, self._core = LocalAddress.REPLY.unpack_from(self._buffer)
+        freed, flags = LocalAddress.REPLY.unpack_from(self._buffer)
         if flags & LocalAddress.IN_FILE:
             descriptor = int.from_bytes(control[0][2][:4], sys.byteorder)
             with os.fdopen(descriptor, "rb") as file:

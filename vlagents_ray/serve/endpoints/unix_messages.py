@@ -26,7 +26,6 @@ import numpy as np
 
 from vlagents_ray.client.transports.unix_messages import peer_uid
 from vlagents_ray.errors import PolicyUnavailable, VLAgentsError
-from vlagents_ray.images import thread_map
 from vlagents_ray.protocol import shm_layout
 from vlagents_ray.protocol.frames import decode_requests, encode_replies
 from vlagents_ray.protocol.messages import OPS, Limits, LocalAddress, Op, Reply, Request
@@ -123,7 +122,7 @@ class UnixServer(ABC):
         if len(self._clients) >= self.engine.sessions.limit:
             full = PolicyUnavailable(f"this replica has {len(self._clients)} local clients, its limit of sessions")
             with contextlib.suppress(OSError):  # the client is gone already
-                connection.send(LocalAddress.REPLY.pack(0, 0, -1) + encode_replies([Reply(error=full)]))
+                connection.send(LocalAddress.REPLY.pack(0, 0) + encode_replies([Reply(error=full)]))
             connection.close()
             return
         client = UnixConnection(self, connection)
@@ -346,12 +345,12 @@ class UnixConnection:
             freed = self._payload.freed()
             try:
                 if len(frame) <= _INLINE:
-                    self._connection.send(LocalAddress.REPLY.pack(freed, flags, thread_map.here()) + frame)
+                    self._connection.send(LocalAddress.REPLY.pack(freed, flags) + frame)
                     return
                 descriptor = os.memfd_create("vlagents-ray-reply")
                 try:
                     os.write(descriptor, frame)
-                    header = LocalAddress.REPLY.pack(freed, flags | LocalAddress.IN_FILE, -1)
+                    header = LocalAddress.REPLY.pack(freed, flags | LocalAddress.IN_FILE)
                     socket.send_fds(self._connection, [header], [descriptor])
                 finally:
                     os.close(descriptor)

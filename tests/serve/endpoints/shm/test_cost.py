@@ -1,8 +1,9 @@
-"""What a lone act costs, in what does not depend on the machine: calls of Python, and looks at the socket."""
+"""What a lone act costs, in what does not depend on the machine: calls of Python, looks at the socket, no move."""
 
 from __future__ import annotations
 
 import contextlib
+import os
 import socket
 import statistics
 import sys
@@ -103,3 +104,18 @@ def test_a_client_that_waits_for_its_answer_reads_it_once(monkeypatch: pytest.Mo
             transport._answers_fast = True  # it looks before it sleeps
             transport.call([Request("act", OBS, request_id=str(number))], 5)
     assert len(reads) == ACTS + 1  # and the reset's
+
+
+def test_an_act_waits_for_no_certain_core(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`os.sched_setaffinity` returns when the thread runs on such a core, and keeps the interpreter's lock until then.
+
+    A client once moved off the core of the policy's thread in this way. When other programs kept the other core busy,
+    all eight sessions of that process stood still for 3 s.
+    """
+    moves: list[tuple[int, set[int]]] = []
+    monkeypatch.setattr(os, "sched_setaffinity", lambda *move: moves.append(move))
+    with serving(Counted()) as transport:
+        for number in range(10 * ACTS):
+            [reply] = transport.call([Request("act", OBS, request_id=str(number))], 5)
+            assert reply.error is None
+    assert not moves
