@@ -331,7 +331,7 @@ def test_a_killed_replica_is_noticed_and_the_next_one_serves() -> None:
     wait_for(again)
     assert agent.act(frame()).info["instruction"] == "after"
     left = set(folder.glob("vla*"))
-    assert (len(names), len(left)) == (2, 2)  # one of each application
+    assert (len(names), len(left)) == (1, 1)
     assert len(names - left) == 1  # that of the killed replica
     wait_for(lambda: channel not in memory_summary(ray.get_runtime_context().gcs_address))
     gc.enable()
