@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import threading
-import time
 from collections import deque
 from functools import partial
 from pathlib import Path
@@ -149,13 +148,12 @@ class Server:
         return HttpLine(port) if endpoint == "http" else WebSocketLine(port, endpoint)
 
     def do(self, what: str) -> None:
-        """Something that happens to the server, or time that passes."""
+        """Something that happens to the server."""
         happens = {
             "drains": self.engines[0].drain,
             "is acting": lambda: self._gate.acting.wait(20) or pytest.fail("the policy was not asked"),
             "acts on": self._gate.opened.set,
             "has no session": lambda: wait_for(lambda: not len(self.engines[0].sessions)),
-            "waits": lambda: time.sleep(0.02),  # longer than a deadline, which is counted from what the kernel notes
         }
         happens[what]()
 
