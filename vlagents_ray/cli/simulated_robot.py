@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import argparse
+import contextlib
 import shutil
 import time
-from collections.abc import Callable, Mapping
-import numpy as np
-import contextlib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+import typer
+
 from vlagents_ray.chunking.buffer import Mode
 from vlagents_ray.chunking.control import Control, Leader
 from vlagents_ray.chunking.player import ChunkPlayer
-from vlagents_ray.cli.console import out
+from vlagents_ray.cli.console import errors, out
+from vlagents_ray.cli.options import parse_settings
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.contract import Contract, require_match
 from vlagents_ray.envs.base import EvalEnv, make_env
@@ -27,7 +31,6 @@ from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.teleoperation import AxesDevice, AxesLeader, Keyboard, SpaceMouse, TeleoperatedAgent
 from vlagents_ray.robot.teleoperation.environment import EnvRobot
 from vlagents_ray.robot.teleoperation.keyboard import HELP
-
 
 _PERIOD_S = 0.2
 _LARGEST = 64  # px of the side of a picture; a terminal over SSH is slow
@@ -72,7 +75,6 @@ class TerminalView:
         self._lines = 0
 
 
-
 def blocks(images: list[np.ndarray], side: int) -> list[str]:
     """Draw images side by side, two pixels a character.
 
@@ -94,10 +96,8 @@ def blocks(images: list[np.ndarray], side: int) -> list[str]:
     return ["".join(map(_cell, *pair)) for pair in zip(pixels[::2].tolist(), pixels[1::2].tolist(), strict=True)]
 
 
-
 def _cell(above: list[int], below: list[int]) -> str:
     return "\x1b[38;2;{};{};{};48;2;{};{};{}m▀".format(*above, *below)
-
 
 
 class EnvPolicy(Wrapper):
@@ -127,16 +127,46 @@ class EnvPolicy(Wrapper):
         return list(obs)
 
 
+def drive(options: argparse.Namespace) -> int:
+    """Play what the options of `vlagents-ray robot --env` say, and return the command's exit status."""
+    try:
+        with errors():
+            if options.ask_for_help is not None and options.leader != "keyboard":
+                raise ConfigError("--ask-for-help: got it without a way to answer, want --leader keyboard")
+            run = RobotRun(
+                env=options.env,
+                env_options=parse_settings(options.env_set, "--env-set"),
+                policy=options.policy,
+                settings=parse_settings(options.set, "--set"),
+                leader=options.leader,
+                record=None if options.record is None else Path(options.record),
+                hz=options.hz,
+                mode=options.mode,
+                execute=options.execute,
+                max_step=options.max_step,
+                step=options.step,
+                ask_for_help=options.ask_for_help,
+                samples=options.samples,
+            )
+            try:
+                run.play(range(options.seed, options.seed + options.episodes))
+            except KeyboardInterrupt:
+                kept = "" if run.recorder is None else f"; {run.recorder.episodes} episodes are in {run.record}"
+                raise KeyboardInterrupt(f"interrupted{kept}") from None
+    except typer.Exit as ended:
+        return ended.exit_code
+    return 0
+
 
 @dataclass
 class RobotRun:
-    """What `vlagents-ray robot` plays, and how; the fields are its options."""
+    """What `vlagents-ray robot --env` plays, and how; the fields are its options."""
 
     env: str
     env_options: dict[str, Any]
     policy: str | None
     settings: dict[str, Any]
-    teleop: str | None
+    leader: str | None
     record: Path | None
     hz: float | None
     mode: Mode
@@ -150,7 +180,7 @@ class RobotRun:
     recorder: Recorder | None = field(default=None, init=False)
     _control: Control | None = field(default=None, init=False)
     _view: TerminalView | None = field(default=None, init=False)
-    _said: str | None = field(default=None, init=False)  # who moves the robot, or why nobody does, as printed
+    _said: str | None = field(default=None, init=False)  # what moves the robot, as printed
 
     def play(self, seeds: Iterable[int]) -> None:
         """Play an episode for each seed, and print what became of it.
@@ -169,9 +199,9 @@ class RobotRun:
             if self.record is not None:
                 recorder = stack.enter_context(Recorder(self.record, hz, interventions=leader is not None))
                 self.recorder = recorder
-            if self.teleop == "keyboard":
+            if self.leader == "keyboard":
                 out.print(f"{HELP}\n{KEYS}")
-            if self.teleop is not None and out.is_terminal:
+            if self.leader is not None and out.is_terminal:
                 self._view = TerminalView(_write)
             for seed in seeds:
                 if self.over:
@@ -182,7 +212,7 @@ class RobotRun:
 
     def _play(self, env: EvalEnv, agent: Agent, seed: int, hz: float, recorder: Recorder | None) -> None:
         self.verdict = None
-        robot = EnvRobot(env, seed, endless=self.teleop is not None)
+        robot = EnvRobot(env, seed, endless=self.leader is not None)
         self._say(f"seed {seed}: {env.instruction}")
 
         def label() -> Label:
@@ -213,12 +243,12 @@ class RobotRun:
         )
 
     def _leader(self, contract: Contract, stack: contextlib.ExitStack) -> Leader | None:
-        if self.teleop is None:
+        if self.leader is None:
             return None
-        if self.teleop not in DEVICES:
-            raise ConfigError(f"--teleop: got {self.teleop!r}, want one of {list(DEVICES)}")
+        if self.leader not in DEVICES:
+            raise ConfigError(f"--leader: got {self.leader!r}, want one of {list(DEVICES)}")
         device: AxesDevice
-        if self.teleop == "keyboard":
+        if self.leader == "keyboard":
             verdicts = {"y": "success", "n": "failure", "x": "discard"}
             keys = {key: lambda label=label: setattr(self, "verdict", label) for key, label in verdicts.items()}
             device = stack.enter_context(Keyboard({**keys, "p": self._pause, "q": self._quit}))
@@ -229,7 +259,7 @@ class RobotRun:
     def _agent(self, contract: Contract, leader: Leader | None) -> Agent:
         if self.policy is None:
             if leader is None:
-                raise ConfigError("robot: got neither a policy nor --teleop, want one of them, or both")
+                raise ConfigError("robot: got neither a policy nor --leader, want one of them, or both")
             return TeleoperatedAgent(leader, contract)
         remote = "://" in self.policy
         if remote and self.settings:
@@ -278,8 +308,6 @@ class RobotRun:
         self.verdict, self.over = "discard", True
 
 
-
 def _write(text: str) -> None:
     out.file.write(text)
     out.file.flush()
-
