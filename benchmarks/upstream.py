@@ -28,7 +28,7 @@ from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.serve.launch.server import running_server
 from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.serve.ports import free_port
-from vlagents_ray.wire.openpi import codec
+from vlagents_ray.wire import openpi
 
 DIRECT, QUEUE, SERVER = "directly", "policy upstream", "server of ours"
 _WARM_UP = 50
@@ -95,8 +95,8 @@ class _Direct(_Driver, contextlib.ExitStack):
         }
 
         def call() -> Any:
-            connection.send(codec.encode(theirs))
-            return codec.decode(connection.recv(decode=False))
+            connection.send(openpi.encode(theirs))
+            return openpi.decode(connection.recv(decode=False))
 
         self.call = call
 
@@ -155,11 +155,11 @@ def _serving() -> Iterator[str]:
 
 def _serve(port: int) -> None:
     def answer(connection: Any) -> None:
-        connection.send(codec.encode({}))
+        connection.send(openpi.encode({}))
         with contextlib.suppress(ConnectionClosed):
             for message in connection:
-                codec.decode(message)
-                connection.send(codec.encode({"actions": _ACTIONS}))
+                openpi.decode(message)
+                connection.send(openpi.encode({"actions": _ACTIONS}))
 
     with serve(answer, "127.0.0.1", port, **_UNBOUNDED) as server:
         server.serve_forever()

@@ -24,7 +24,7 @@ from vlagents_ray.evaluate import EvalConfig
 from vlagents_ray.interface import Act
 from vlagents_ray.protocol import frame_layout, frames, json_messages, messages, observations
 from vlagents_ray.protocol.messages import Limits, Reply
-from vlagents_ray.serve.config.python_env import EnvironmentArgs
+from vlagents_ray.serve.config.deployment import EnvironmentArgs
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"

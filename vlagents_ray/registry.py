@@ -59,14 +59,14 @@ ENVS: dict[str, str] = {
 # Other systems' protocols: the names under `dialects` in a deployment file. Of several that clients find at the
 # server's root, the first one that is on has it.
 DIALECTS: dict[str, str] = {
-    "openpi": "vlagents_ray.serve.dialects.openpi.handler:OpenPiDialect",
-    "roboarena": "vlagents_ray.serve.dialects.roboarena.handler:RoboArenaDialect",
-    "vllm_omni": "vlagents_ray.serve.dialects.vllm_omni.handler:VllmOmniDialect",
-    "openvla": "vlagents_ray.serve.dialects.openvla.handler:OpenVLADialect",
-    "vla_eval": "vlagents_ray.serve.dialects.vla_eval.handler:VlaEvalDialect",
-    "gr00t": "vlagents_ray.serve.dialects.gr00t.handler:GR00TDialect",
-    "vlagents": "vlagents_ray.serve.dialects.vlagents.handler:VlagentsDialect",
-    "lerobot": "vlagents_ray.serve.dialects.lerobot.handler:LeRobotDialect",
+    "openpi": "vlagents_ray.serve.dialects.openpi:OpenPiDialect",
+    "roboarena": "vlagents_ray.serve.dialects.roboarena:RoboArenaDialect",
+    "vllm_omni": "vlagents_ray.serve.dialects.vllm_omni:VllmOmniDialect",
+    "openvla": "vlagents_ray.serve.dialects.openvla:OpenVLADialect",
+    "vla_eval": "vlagents_ray.serve.dialects.vla_eval:VlaEvalDialect",
+    "gr00t": "vlagents_ray.serve.dialects.gr00t:GR00TDialect",
+    "vlagents": "vlagents_ray.serve.dialects.vlagents:VlagentsDialect",
+    "lerobot": "vlagents_ray.serve.dialects.lerobot:LeRobotDialect",
 }
 
 # import name -> extra of this package that installs it

@@ -28,9 +28,8 @@ from scripted_server import Visit, answer, document, scripted_server
 from vlagents_ray import Act, ActionSpec, Agent, Contract, Obs
 from vlagents_ray.errors import Overloaded
 from vlagents_ray.images.jpeg_png import encode_jpeg
-from vlagents_ray.protocol.budget import Budget
 from vlagents_ray.protocol.frames import decode_requests
-from vlagents_ray.protocol.messages import PROTOCOL_VERSION, Limits, Request
+from vlagents_ray.protocol.messages import PROTOCOL_VERSION, Budget, Limits, Request
 from vlagents_ray.serve import periodic
 from vlagents_ray.serve.access import api_keys
 from vlagents_ray.serve.access.api_keys import NoKey

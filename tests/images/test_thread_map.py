@@ -11,10 +11,9 @@ import time
 import numpy as np
 import pytest
 
-from vlagents_ray.images import cpu_affinity, thread_map
+from vlagents_ray.images import thread_map
 from vlagents_ray.images.codecs import JPEG, LOSSLESS, ImageCodec, decode_files, encode_files
-from vlagents_ray.protocol.budget import Budget
-from vlagents_ray.protocol.messages import DEFAULT_LIMITS
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Budget
 
 LITTLE, MUCH = 0.0, 1.0  # s of work
 WAIT_S = 30
@@ -22,7 +21,7 @@ WAIT_S = 30
 
 @pytest.fixture(autouse=True)
 def four_cores(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cpu_affinity, "allowed", lambda: 4)
+    monkeypatch.setattr(thread_map, "allowed", lambda: 4)
 
 
 @pytest.fixture
@@ -58,7 +57,7 @@ def test_little_work_and_one_item_need_no_helper() -> None:
 
 @pytest.mark.usefixtures("no_helpers")
 def test_one_core_needs_no_helper(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cpu_affinity, "allowed", lambda: 1)
+    monkeypatch.setattr(thread_map, "allowed", lambda: 1)
     assert thread_map.thread_map(abs, [-1, -2], MUCH) == [1, 2]
 
 
@@ -151,7 +150,7 @@ def test_helpers_keep_off_the_callers_core_but_not_off_all_others(monkeypatch: p
     thread_map.thread_map(lambda _: together.wait(WAIT_S), [0] * together.parties, MUCH)  # starts all
     may = os.sched_getaffinity(0)
     for core in may:
-        monkeypatch.setattr(cpu_affinity, "here", lambda core=core: core)
+        monkeypatch.setattr(thread_map, "here", lambda core=core: core)
         thread_map.thread_map(abs, [1, 2], MUCH)
         affinities = [os.sched_getaffinity(helper.native_id or 0) for helper in helpers()]
         assert affinities == [may - {core}] * thread_map._MOST_HELPERS
@@ -160,9 +159,9 @@ def test_helpers_keep_off_the_callers_core_but_not_off_all_others(monkeypatch: p
 def test_a_fork_and_the_end_of_the_process_are_no_trouble() -> None:
     code = """if True:
         import atexit, os, threading
-        from vlagents_ray.images import cpu_affinity
+        from vlagents_ray.images import thread_map
         from vlagents_ray.images.thread_map import thread_map
-        cpu_affinity.allowed = lambda: 2
+        thread_map.allowed = lambda: 2
         together = threading.Barrier(2)
         assert sorted(thread_map(lambda _: together.wait(20), [0, 0], 1)) == [0, 1]
         child = os.fork()

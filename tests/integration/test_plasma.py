@@ -28,8 +28,8 @@ from readme_blocks import ENV, ROOT
 from streaming_agents import ROWS
 
 from vlagents_ray import ConnectionLost, Obs, PolicyUnavailable, RemoteAgent
-from vlagents_ray.client.transports.local import unix_messages
-from vlagents_ray.client.transports.local.plasma import PlasmaTransport
+from vlagents_ray.client.transports import unix_messages
+from vlagents_ray.client.transports.plasma import PlasmaTransport
 from vlagents_ray.errors import DeadlineExceeded, MalformedMessage, MessageTooLarge
 from vlagents_ray.protocol.messages import PlasmaAddress, Request
 from vlagents_ray.ray_tools.reaper import MARK

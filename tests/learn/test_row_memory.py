@@ -3,8 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pyarrow as pa
 
-from vlagents_ray.learn.columns import arrays, tensors
-from vlagents_ray.learn.row_memory import RowMemory
+from vlagents_ray.learn.columns import RowMemory, arrays, tensors
 
 IMAGE = (224, 224, 3)
 

@@ -18,8 +18,7 @@ from vlagents_ray.errors import ConfigError, EnvFailed, InvalidAction, InvalidIn
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.learn import as_vector_env
-from vlagents_ray.learn.spaces import observation_space
-from vlagents_ray.learn.vector_env import BatchVectorEnv
+from vlagents_ray.learn.vector_env import BatchVectorEnv, observation_space
 
 TABLETOP: dict[str, Any] = {"env_options": {"width": 32, "height": 32, "max_steps": 6}}
 

@@ -25,7 +25,6 @@ from vlagents_ray.images.codecs import JPEG, RAW, ImageCodec
 from vlagents_ray.images.jpeg_png import encode_jpeg
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.protocol.arrays import Buffer
-from vlagents_ray.protocol.budget import Budget
 from vlagents_ray.protocol.frame_layout import pack
 from vlagents_ray.protocol.frames import (
     decode_replies,
@@ -38,6 +37,7 @@ from vlagents_ray.protocol.frames import (
 from vlagents_ray.protocol.json_messages import request_from_parts
 from vlagents_ray.protocol.messages import (
     DEFAULT_LIMITS,
+    Budget,
     Limits,
     Reply,
     Request,

@@ -17,7 +17,6 @@ from vlagents_ray.contract import Contract
 from vlagents_ray.errors import MalformedMessage
 from vlagents_ray.images.jpeg_png import decode
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.protocol.budget import Budget
 from vlagents_ray.protocol.frame_layout import pack, unpack
 from vlagents_ray.protocol.frames import (
     CONTENT_TYPE,
@@ -27,7 +26,7 @@ from vlagents_ray.protocol.frames import (
     encode_request,
     encode_requests,
 )
-from vlagents_ray.protocol.messages import DEFAULT_LIMITS, PROTOCOL_VERSION, Reply, Request
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, PROTOCOL_VERSION, Budget, Reply, Request
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.engine.engine import Engine

@@ -10,9 +10,8 @@ import pytest
 from vlagents_ray.errors import InvalidObservation, MalformedMessage, MessageTooLarge, NotReset
 from vlagents_ray.images.jpeg_png import encode_jpeg
 from vlagents_ray.interface import Act
-from vlagents_ray.protocol.budget import Budget
 from vlagents_ray.protocol.json_messages import problem, reply_to_json, request_from_parts
-from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits, Reply
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Budget, Limits, Reply
 
 IMAGE = np.full((16, 16, 3), 200, np.uint8)
 

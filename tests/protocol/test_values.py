@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from vlagents_ray.errors import InvalidInput, MalformedMessage
-from vlagents_ray.protocol.budget import Budget
-from vlagents_ray.protocol.messages import DEFAULT_LIMITS
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Budget
 from vlagents_ray.protocol.values import from_text, to_text
 
 

@@ -25,8 +25,8 @@ from websockets.sync.client import connect
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.credentials import Credentials
 from vlagents_ray.client.transports.direct_websocket import Stream
-from vlagents_ray.client.transports.local.shm import ShmTransport
 from vlagents_ray.client.transports.probe import bytes_probe
+from vlagents_ray.client.transports.shm import ShmTransport
 from vlagents_ray.errors import PolicyUnavailable, TooManyRequests, Unauthorized
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.frames import decode_reply, encode_request
@@ -34,11 +34,11 @@ from vlagents_ray.protocol.messages import PROTOCOL_VERSION, Limits, Request
 from vlagents_ray.serve import periodic
 from vlagents_ray.serve.access import api_keys
 from vlagents_ray.serve.access.api_keys import NoKey
+from vlagents_ray.serve.endpoints import unix_messages as local
 from vlagents_ray.serve.endpoints import websocket_connection
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
-from vlagents_ray.serve.endpoints.local import unix_messages as local
-from vlagents_ray.serve.endpoints.local.shm import ShmServer
+from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.dispatch import Dispatcher
 from vlagents_ray.serve.engine.engine import Engine

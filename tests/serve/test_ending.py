@@ -9,7 +9,7 @@ import ray
 from ray.serve._private.router import SharedRouterLongPollClient
 
 from vlagents_ray.ray_tools import head_monitor
-from vlagents_ray.serve.launch import serve_client
+from vlagents_ray.serve.launch import server
 
 
 @pytest.mark.parametrize(("ends", "head", "said"), [(True, True, False), (False, True, True), (False, False, False)])
@@ -23,8 +23,8 @@ def test_a_controller_that_ends_or_that_does_not_answer_is_no_error(
     )
     monkeypatch.setattr(ray, "wait", lambda refs, **_: (refs, []) if ends else ([], refs))
     monkeypatch.setattr(head_monitor, "head_is_gone", lambda: not head)
-    monkeypatch.setattr(serve_client, "_SHUTDOWN_S", 0.0)
-    serve_client.shut_down(client)
+    monkeypatch.setattr(server, "_SHUTDOWN_S", 0.0)
+    server.shut_down(client)
     assert client._shutdown
     assert ("has not ended within" in caplog.text) is said
 
@@ -39,5 +39,5 @@ def test_a_controller_that_is_about_to_end_is_asked_for_no_more_news(monkeypatch
         _router=SimpleNamespace(_asyncio_router=SimpleNamespace(long_poll_client=own, _event_loop=1))
     )
     unused = SimpleNamespace(_router=None)
-    serve_client._stop_long_polls(SimpleNamespace(_controller=None, handle_cache={"used": used, "unused": unused}))
+    server._stop_long_polls(SimpleNamespace(_controller=None, handle_cache={"used": used, "unused": unused}))
     assert stopped == ["own", "shared"]

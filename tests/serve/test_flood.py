@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import flood
 import pytest
 
-from vlagents_ray.client.transports.local.shm import ShmTransport
+from vlagents_ray.client.transports.shm import ShmTransport
 
 pytestmark = [pytest.mark.alone, pytest.mark.slow]
 

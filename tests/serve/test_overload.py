@@ -39,14 +39,13 @@ from eval_fakes import wait_for
 import vlagents_ray
 from vlagents_ray.client.credentials import Credentials
 from vlagents_ray.client.transports.direct_websocket import Stream
-from vlagents_ray.client.transports.local.shm import ShmTransport
 from vlagents_ray.client.transports.probe import bytes_probe, is_answer
+from vlagents_ray.client.transports.shm import ShmTransport
 from vlagents_ray.errors import DeadlineExceeded, MessageTooLarge, Overloaded, TooManyRequests, VLAgentsError
 from vlagents_ray.images import codecs, jpeg_png
 from vlagents_ray.images.codecs import decode_files
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol import frame_layout, json_messages
-from vlagents_ray.protocol.budget import Budget
 from vlagents_ray.protocol.frames import (
     CONTENT_TYPE,
     decode_replies,
@@ -56,22 +55,23 @@ from vlagents_ray.protocol.frames import (
 )
 from vlagents_ray.protocol.messages import (
     DEFAULT_LIMITS,
+    Budget,
     Limits,
     PlasmaAddress,
     Reply,
     Request,
 )
 from vlagents_ray.serve.access.api_keys import NoKey
-from vlagents_ray.serve.endpoints.local.shm import ShmServer
+from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.admission import Admission, MessageAdmission, NeedsDecodingThread
 from vlagents_ray.serve.engine.dispatch import Dispatcher
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.wire import gr00t as gr00t_codec
 from vlagents_ray.wire import json_numpy, msgpack
-from vlagents_ray.wire.gr00t import codec as gr00t_codec
-from vlagents_ray.wire.openpi import codec as openpi_codec
-from vlagents_ray.wire.openvla import codec as openvla_codec
-from vlagents_ray.wire.vla_eval import codec as vla_eval_codec
+from vlagents_ray.wire import openpi as openpi_codec
+from vlagents_ray.wire import openvla as openvla_codec
+from vlagents_ray.wire import vla_eval as vla_eval_codec
 
 JPEG = jpeg_png.encode_jpeg(np.full((32, 32, 3), 9, np.uint8))
 PNG = jpeg_png.encode_png(np.full((32, 32, 3), 9, np.uint8))
@@ -158,9 +158,7 @@ def _over_shm(visitor: Visitor, _when: str) -> str:
     transport.connect(10)
     visitor.become()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            "vlagents_ray.client.transports.local.shm.request_parts", lambda *_: frame_layout.pack(reset(), [JPEG])
-        )
+        patch.setattr("vlagents_ray.client.transports.shm.request_parts", lambda *_: frame_layout.pack(reset(), [JPEG]))
         [reply] = transport.call([Request("reset", Obs())], 10)
     transport.close()
     return "done" if reply.error is None else str(reply.error.status)
@@ -513,7 +511,7 @@ def test_a_frame_in_shared_memory_is_decoded_beside_the_policy_too(
     local = ShmTransport(asdict(near.address), Credentials(""))
     local.connect(10)
     large = frame_layout.pack(reset(), [LARGE])
-    monkeypatch.setattr("vlagents_ray.client.transports.local.shm.request_parts", lambda *_: large)
+    monkeypatch.setattr("vlagents_ray.client.transports.shm.request_parts", lambda *_: large)
     answers: list[Reply] = []
     asking = threading.Thread(target=lambda: answers.extend(local.call([Request("reset", Obs())], 30)))
     asking.start()
@@ -606,12 +604,9 @@ def test_a_connection_over_its_rate_is_not_read_meanwhile(replica: KeyedReplica)
     replica.known.keys.check(visitor.token, "app").admit()
     [held] = [one for one in list(own._clients) if getattr(one.caller, "name", "") == visitor.name]
 
-    def is_left_alone() -> bool:  # for a second, in which this process may have stood still
-        client.send(frame(reset()), 10)
-        assert isinstance(decode_replies(client.recv(10))[0].error, TooManyRequests)
-        return not held._polled
-
-    wait_for(is_left_alone)
+    client.send(frame(reset()), 10)
+    assert isinstance(decode_replies(client.recv(10))[0].error, TooManyRequests)
+    wait_for(lambda: not held._polled, every_s=0.001)  # for a second, and again after each message
     client.send(frame(reset()), 10)
     assert isinstance(decode_replies(client.recv(10))[0].error, TooManyRequests)  # after a second, at most
     client.close()

@@ -12,11 +12,10 @@ from client_observations import SENT, TASK, Sent
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import InvalidObservation
 from vlagents_ray.interface import Obs
-from vlagents_ray.serve.dialects.gr00t.connection import nested_mapping
-from vlagents_ray.serve.presets import presets
-from vlagents_ray.wire.gr00t import codec as gr00t_codec
-from vlagents_ray.wire.mapping.key_paths import lookup, matches
-from vlagents_ray.wire.mapping.mapping import KeyMapping
+from vlagents_ray.serve.config.dialects import presets
+from vlagents_ray.serve.dialects.gr00t import nested_mapping
+from vlagents_ray.wire import gr00t as gr00t_codec
+from vlagents_ray.wire.mapping import KeyMapping, lookup, matches
 
 each = pytest.mark.parametrize("sent", SENT, ids=lambda sent: f"{sent.preset}: {sent.source}")
 

@@ -22,19 +22,19 @@ from websockets.exceptions import InvalidStatus
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.credentials import Credentials
 from vlagents_ray.client.transports.direct_websocket import Stream
-from vlagents_ray.client.transports.local.shm import ShmTransport
+from vlagents_ray.client.transports.shm import ShmTransport
 from vlagents_ray.errors import MessageTooLarge, Overloaded, PolicyUnavailable, TooManyRequests, VLAgentsError
 from vlagents_ray.interface import Obs
 from vlagents_ray.protocol.frames import decode_replies, encode_request
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, STREAM_BYTES, Limits, Request
 from vlagents_ray.serve.access import api_keys
 from vlagents_ray.serve.access.api_keys import NoKey
+from vlagents_ray.serve.dialects import gr00t
 from vlagents_ray.serve.dialects.base import GatewayContext
-from vlagents_ray.serve.dialects.gr00t import handler as gr00t
 from vlagents_ray.serve.engine.admission import Admission
 from vlagents_ray.serve.engine.dispatch import REFUSALS
-from vlagents_ray.wire.lerobot.upstream import read_chunk
-from vlagents_ray.wire.pickles.tensors import _CONSTANT
+from vlagents_ray.wire.lerobot import read_chunk
+from vlagents_ray.wire.pickles import _CONSTANT
 
 SLACK = 48 * 2**20  # bytes of buffers in the kernel's and the interpreter's own care
 SEEN = Obs({"front": np.zeros((8, 8, 3), np.uint8)})

@@ -38,8 +38,8 @@ from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.connection import Connection
 from vlagents_ray.client.credentials import Credentials
 from vlagents_ray.client.transports.codec_selection import CodecChoice
-from vlagents_ray.client.transports.local.shm import ShmTransport
 from vlagents_ray.client.transports.probe import bytes_probe
+from vlagents_ray.client.transports.shm import ShmTransport
 from vlagents_ray.errors import BY_CODE, VLAgentsError
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.frames import decode_replies, decode_reply, encode_request
@@ -60,7 +60,7 @@ from vlagents_ray.serve.dialects.routes import dialect_routes
 from vlagents_ray.serve.endpoints import access_middleware, websocket_connection
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
-from vlagents_ray.serve.endpoints.local.shm import ShmServer
+from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.endpoints.weights import weights_routes
 from vlagents_ray.serve.engine.engine import Engine
@@ -70,7 +70,7 @@ from vlagents_ray.serve.live.snapshot import ReplicaView
 from vlagents_ray.serve.ports import free_port, reserve
 from vlagents_ray.serve.weights.updates import PushResult
 from vlagents_ray.weights.safetensors import ValueSpec, header_of, read_header
-from vlagents_ray.wire.vla_eval import codec as vla_eval_codec
+from vlagents_ray.wire import vla_eval as vla_eval_codec
 
 ANSWER_S = 10.0
 LIMITS = Limits(body_bytes=2**20)
@@ -156,7 +156,7 @@ class KeyedReplica:
         patch.setattr(api_keys, "_CHECK_S", 0.0)
         patch.setattr(access_middleware, "_TICK_S", 0.02)
         patch.setattr(periodic.each_half_second, "_period_s", 0.02)
-        patch.setattr("vlagents_ray.serve.dialects.gr00t.handler._TICK_MS", 20)
+        patch.setattr("vlagents_ray.serve.dialects.gr00t._TICK_MS", 20)
         self.known = ChangingKeys()
         self.at_gateway = self.known.another()  # of another process
         self.policy = Recorder()
@@ -233,7 +233,7 @@ def _plasma_server(engine: Engine, patch: pytest.MonkeyPatch, folder: Path) -> A
     """The plasma endpoint, with channels that hold a frame as it is."""
     import ray
 
-    from vlagents_ray.serve.endpoints.local.plasma import PlasmaServer
+    from vlagents_ray.serve.endpoints.plasma import PlasmaServer
 
     node = SimpleNamespace(plasma_store_socket_name=str(folder / "plasma_store"))
     with pytest.MonkeyPatch.context() as for_now:

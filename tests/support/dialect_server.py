@@ -18,9 +18,9 @@ from vlagents_ray.serve.dialects.routes import dialect_routes
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.wire.openpi import codec as openpi_codec
-from vlagents_ray.wire.openvla import codec as openvla_codec
-from vlagents_ray.wire.vla_eval import codec as vla_eval_codec
+from vlagents_ray.wire import openpi as openpi_codec
+from vlagents_ray.wire import openvla as openvla_codec
+from vlagents_ray.wire import vla_eval as vla_eval_codec
 
 LIMITS = Limits(body_bytes=300_000, pixels=64 * 64)
 METADATA = {"policy": "mirror", "version": "0", "protocol": 1, "checkpoint": None}

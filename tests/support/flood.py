@@ -31,7 +31,7 @@ from websockets.protocol import State
 from websockets.uri import parse_uri
 
 from vlagents_ray.client.credentials import Credentials
-from vlagents_ray.client.transports.local.shm import ShmTransport
+from vlagents_ray.client.transports.shm import ShmTransport
 from vlagents_ray.images import jpeg_png
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol import frame_layout
@@ -43,12 +43,12 @@ from vlagents_ray.serve.dialects.base import ReplicaContext
 from vlagents_ray.serve.dialects.routes import dialect_routes
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
-from vlagents_ray.serve.endpoints.local.shm import ShmServer
+from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.wire import json_numpy
-from vlagents_ray.wire.openpi import codec as openpi_codec
-from vlagents_ray.wire.vla_eval import codec as vla_eval_codec
+from vlagents_ray.wire import openpi as openpi_codec
+from vlagents_ray.wire import vla_eval as vla_eval_codec
 
 HEIGHT, WIDTH = 2304, 4096  # of the largest image
 IMAGES = 4  # of these in the largest request

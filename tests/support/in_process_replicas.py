@@ -15,7 +15,6 @@ from vlagents_ray.client.connection import Connection
 from vlagents_ray.client.transports.codec_selection import CodecChoice
 from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, PolicyUnavailable, UnknownApp
 from vlagents_ray.interface import Agent
-from vlagents_ray.protocol.budget import Budget
 from vlagents_ray.protocol.frames import (
     decode_replies,
     decode_requests,
@@ -25,6 +24,7 @@ from vlagents_ray.protocol.frames import (
 from vlagents_ray.protocol.messages import (
     DEFAULT_LIMITS,
     PROTOCOL_VERSION,
+    Budget,
     Reply,
     Request,
 )

@@ -9,9 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.wire import json_numpy
-from vlagents_ray.wire.vlagents import brine, rpyc
-from vlagents_ray.wire.vlagents.rpyc import Handler
+from vlagents_ray.wire import json_numpy, rpyc
+from vlagents_ray.wire.rpyc import Handler
 
 ROOT = ("vlagents_ray.Policy", 1, 1)
 VALUE, TUPLE, LOCAL, REMOTE = 1, 2, 3, 4
@@ -58,7 +57,7 @@ class Client:
         length, compressed = rpyc.HEADER.unpack(header)
         body = self.file.read(length + 1)[:-1]
         message = zlib.decompress(body) if compressed else body
-        sequence, content = brine.read(memoryview(message)[1:])
+        sequence, content = rpyc.read_brine(memoryview(message)[1:])
         return message[0], sequence, content
 
     def act(self, text: str) -> list:

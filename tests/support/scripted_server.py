@@ -18,9 +18,8 @@ from websockets.http11 import Response
 from websockets.sync.server import ServerConnection, serve
 
 from vlagents_ray.interface import Act
-from vlagents_ray.protocol.budget import Budget
 from vlagents_ray.protocol.frames import decode_requests, encode_replies
-from vlagents_ray.protocol.messages import DEFAULT_LIMITS, PROTOCOL_VERSION, Reply, Request
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, PROTOCOL_VERSION, Budget, Reply, Request
 
 Script = Callable[["Visit"], None]
 

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.client.transports.local.shm import ShmTransport
+from vlagents_ray.client.transports.shm import ShmTransport
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.messages import Limits, Reply, Request
-from vlagents_ray.serve.endpoints.local.shm import ShmServer
+from vlagents_ray.serve.endpoints.shm import ShmServer
 
 LIMITS = Limits(body_bytes=4 * 2**20)
 

@@ -20,8 +20,8 @@ from vlagents_ray.errors import (
     VLAgentsError,
 )
 from vlagents_ray.protocol.messages import Limits
-from vlagents_ray.serve.presets import presets, read_mapping
-from vlagents_ray.wire.mapping.mapping import KeyMapping
+from vlagents_ray.serve.config.dialects import presets, read_mapping
+from vlagents_ray.wire.mapping import KeyMapping
 
 IMAGE = np.random.default_rng(0).integers(0, 256, (6, 8, 3), np.uint8)
 LIBERO = {

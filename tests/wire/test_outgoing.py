@@ -9,8 +9,8 @@ import pytest
 
 from vlagents_ray.errors import ConfigError, InvalidAction, InvalidObservation, MissingCamera, MissingState
 from vlagents_ray.interface import Obs
-from vlagents_ray.wire.mapping.mapping import KeyMapping
-from vlagents_ray.wire.mapping.outgoing import Outgoing
+from vlagents_ray.wire.mapping import KeyMapping
+from vlagents_ray.wire.outgoing import Outgoing
 from vlagents_ray.wire.presets import PRESETS, read_mapping
 
 IMAGE = np.arange(4 * 5 * 3, dtype=np.uint8).reshape(4, 5, 3)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from vlagents_ray.errors import MalformedMessage
-from vlagents_ray.wire.pickles.arrays import read_pickled_array
+from vlagents_ray.wire.pickles import read_pickled_array
 
 
 @pytest.mark.parametrize("protocol", [4, 5])

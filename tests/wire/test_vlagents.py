@@ -13,13 +13,12 @@ from hypothesis import strategies as st
 from many import many
 
 from vlagents_ray.errors import InvalidInput
-from vlagents_ray.wire import json_numpy
-from vlagents_ray.wire.vlagents import brine, rpyc, upstream
+from vlagents_ray.wire import json_numpy, rpyc, vlagents
 
 
 def test_the_gripper_is_the_last_column_and_each_robot_has_its_own_rows() -> None:
     step = {"left": {"action": np.ones(2), "gripper": 0.5, "done": False, "info": {}}, "right": {"action": [3.0]}}
-    found = upstream.read_act(json_numpy.dumps({"acts": [step, step]}))
+    found = vlagents.read_actions(json_numpy.dumps({"acts": [step, step]}))
     assert found["left"].tolist() == [[1, 1, 0.5]] * 2
     assert found["right"].tolist() == [[3]] * 2
 
@@ -41,14 +40,14 @@ def test_the_gripper_is_the_last_column_and_each_robot_has_its_own_rows() -> Non
 )
 def test_what_is_no_action_is_refused(acts: Any) -> None:
     with pytest.raises(InvalidInput):
-        upstream.read_act(json.dumps({"acts": acts}))
+        vlagents.read_actions(json.dumps({"acts": acts}))
 
 
 @given(st.binary(max_size=80), st.booleans())
 @settings(max_examples=many(500))
 def test_any_bytes_are_a_reply_or_an_error_of_ours(data: bytes, compressed: bool) -> None:
     with contextlib.suppress(InvalidInput):
-        upstream.read(data + rpyc.END, compressed, 1000)
+        vlagents.read_result(data + rpyc.END, compressed, 1000)
 
 
 @given(st.recursive(st.none() | st.integers(-(2**60), 2**60) | st.text(max_size=5), lambda one: st.tuples(one, one)))
@@ -56,4 +55,4 @@ def test_any_bytes_are_a_reply_or_an_error_of_ours(data: bytes, compressed: bool
 def test_any_content_is_a_value_or_an_error_of_ours(content: Any) -> None:
     for kind in (2, 3):
         with contextlib.suppress(InvalidInput):
-            upstream.read(bytes([kind]) + brine.write((1, content)) + rpyc.END, False, 10_000)
+            vlagents.read_result(bytes([kind]) + rpyc.write_brine((1, content)) + rpyc.END, False, 10_000)

@@ -66,7 +66,7 @@ DecodedFiles = dict[int, tuple[np.ndarray, "bytes | memoryview"]]
 
 
 class PixelBudget(Protocol):
-    """The limits of a message; see `vlagents_ray.protocol.budget`."""
+    """The limits of a message; see `vlagents_ray.protocol.messages`."""
 
     serial: bool
     files: DecodedFiles | None  # gets the files of the images that are decoded; None if nobody needs them

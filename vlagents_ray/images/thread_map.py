@@ -6,6 +6,7 @@ JPEG and PNG coding release Python's global lock, so threads help.
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
 import threading
 from collections.abc import Callable, Sequence
@@ -13,7 +14,40 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache
 from typing import TypeVar
 
-from vlagents_ray.images import cpu_affinity
+# The CPU core on which a thread runs, and its affinity.
+
+
+def _getcpu() -> Callable[[], int]:
+    """Return the C library's `sched_getcpu`, or a function that returns -1 where there is none."""
+    if not hasattr(os, "sched_setaffinity"):
+        return lambda: -1
+    found: Callable[[], int] = getattr(ctypes.CDLL(None), "sched_getcpu", lambda: -1)
+    return found
+
+
+here: Callable[[], int] = _getcpu()
+"""Return the core on which the calling thread runs; -1 if it is not known."""
+
+
+def allowed() -> int:
+    """Return the number of cores that this thread may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def leave(core: int) -> None:
+    """Move the calling thread off `core` if it runs there and may run elsewhere; it may return later.
+
+    Wake-affine scheduling, especially in virtual machines, can put two threads that wake each other on one core, and
+    keeps them there as long as both run briefly.
+    """
+    if core < 0 or here() != core:
+        return
+    affinity = os.sched_getaffinity(0)
+    if others := affinity - {core}:
+        with contextlib.suppress(OSError):  # not permitted
+            os.sched_setaffinity(0, others)
+            os.sched_setaffinity(0, affinity)
+
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -33,7 +67,7 @@ def thread_map(function: Callable[[Item], Result], items: Sequence[Item], work_s
     Returns:
         The results in the order of the items; an exception is that of the first item that raised one.
     """
-    threads = min(len(items), cpu_affinity.allowed(), 1 + _MOST_HELPERS)
+    threads = min(len(items), allowed(), 1 + _MOST_HELPERS)
     if threads < 2 or work_s < _LEAST_WORK_S:
         return [function(item) for item in items]
     todo = iter(range(len(items)))  # shared by all threads, so that a late helper delays nothing
@@ -48,7 +82,7 @@ def thread_map(function: Callable[[Item], Result], items: Sequence[Item], work_s
                 errors[index] = error
 
     helpers = _helpers(os.getpid())
-    helpers.keep_off(cpu_affinity.here())
+    helpers.keep_off(here())
     helping: list[Future[None]] = []
     with contextlib.suppress(RuntimeError):  # while the interpreter exits, the caller works alone
         for _ in range(threads - 1):

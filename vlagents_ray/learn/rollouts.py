@@ -23,8 +23,7 @@ from vlagents_ray.evaluate.workers.pool import WorkerPool
 from vlagents_ray.evaluate.workers.rollout import Report
 from vlagents_ray.evaluate.workers.worker import FailedAttempts, dispatch
 from vlagents_ray.interface import Agent
-from vlagents_ray.learn.columns import EXTRA
-from vlagents_ray.learn.row_memory import RowMemory
+from vlagents_ray.learn.columns import EXTRA, RowMemory
 from vlagents_ray.learn.transitions import WANTED, TransitionRecorder
 from vlagents_ray.registry import require
 

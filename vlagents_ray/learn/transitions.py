@@ -14,8 +14,7 @@ from vlagents_ray.evaluate.episode.second_pass import SecondPass
 from vlagents_ray.evaluate.episode.stats import version_of
 from vlagents_ray.evaluate.plan.config import EpisodeChoice, EvalConfig
 from vlagents_ray.interface import BEHAVIOUR, WANT, Act, Obs
-from vlagents_ray.learn.columns import EXTRA, FINAL, REPLAY, at_rows, constant, tensors, words
-from vlagents_ray.learn.row_memory import RowMemory
+from vlagents_ray.learn.columns import EXTRA, FINAL, REPLAY, RowMemory, at_rows, constant, tensors, words
 from vlagents_ray.registry import require
 
 WANTED = ("logprob", "value", "entropy", REPLAY)  # columns that a policy fills

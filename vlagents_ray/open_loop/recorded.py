@@ -16,8 +16,7 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.images import jpeg_png
 from vlagents_ray.interface import CAPTURED, Obs
 from vlagents_ray.naming import did_you_mean
-from vlagents_ray.protocol.budget import Budget
-from vlagents_ray.protocol.messages import DEFAULT_LIMITS
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Budget
 from vlagents_ray.protocol.values import from_text
 from vlagents_ray.registry import require
 from vlagents_ray.robot.episode import ACTION, ENVIRONMENT, IMAGES, STATE

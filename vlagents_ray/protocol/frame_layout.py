@@ -15,8 +15,7 @@ from typing import Any
 
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge
 from vlagents_ray.protocol.arrays import Buffer
-from vlagents_ray.protocol.budget import Budget
-from vlagents_ray.protocol.messages import PROTOCOL_VERSION, Limits
+from vlagents_ray.protocol.messages import PROTOCOL_VERSION, Budget, Limits
 
 _PREFIX = struct.Struct("<3sBI")
 _ALIGN = 8

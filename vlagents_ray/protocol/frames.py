@@ -23,7 +23,6 @@ from vlagents_ray.errors import (
 from vlagents_ray.images.codecs import RAW, ImageCodec
 from vlagents_ray.interface import Act
 from vlagents_ray.protocol.arrays import Buffer
-from vlagents_ray.protocol.budget import Budget
 from vlagents_ray.protocol.frame_layout import (
     assemble,
     dump,
@@ -36,6 +35,7 @@ from vlagents_ray.protocol.messages import (
     NAME_CHARACTERS,
     OPS,
     RANKS,
+    Budget,
     Limits,
     Op,
     Reply,

@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.errors import MalformedMessage, VLAgentsError, shown
-from vlagents_ray.protocol.budget import Budget
 from vlagents_ray.protocol.frame_layout import parse_json
 from vlagents_ray.protocol.frames import check_request, describe_error
-from vlagents_ray.protocol.messages import Op, Reply, Request
+from vlagents_ray.protocol.messages import Budget, Op, Reply, Request
 from vlagents_ray.protocol.observations import read_obs
 from vlagents_ray.protocol.values import ValueReader
 

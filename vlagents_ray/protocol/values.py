@@ -17,8 +17,8 @@ import numpy as np
 from vlagents_ray.errors import InvalidInput, MalformedMessage, MessageTooLarge, shown
 from vlagents_ray.images.codecs import decode_files
 from vlagents_ray.protocol.arrays import Buffer, is_plain, read_array
-from vlagents_ray.protocol.budget import Budget
 from vlagents_ray.protocol.frame_layout import parse_json
+from vlagents_ray.protocol.messages import Budget
 
 
 class ValueWriter:

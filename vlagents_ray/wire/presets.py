@@ -7,13 +7,13 @@ from typing import Any
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.naming import did_you_mean
-from vlagents_ray.wire.gr00t.presets import PRESETS as GR00T
-from vlagents_ray.wire.lerobot.presets import PRESETS as LEROBOT
-from vlagents_ray.wire.mapping.mapping import KeyMapping
-from vlagents_ray.wire.openpi.presets import PRESETS as OPENPI
-from vlagents_ray.wire.openpi.presets import ROBOARENA
-from vlagents_ray.wire.openvla.presets import PRESETS as OPENVLA
-from vlagents_ray.wire.vla_eval.presets import PRESETS as VLA_EVAL
+from vlagents_ray.wire.gr00t import PRESETS as GR00T
+from vlagents_ray.wire.lerobot import PRESETS as LEROBOT
+from vlagents_ray.wire.mapping import KeyMapping
+from vlagents_ray.wire.openpi import PRESETS as OPENPI
+from vlagents_ray.wire.openpi import ROBOARENA
+from vlagents_ray.wire.openvla import PRESETS as OPENVLA
+from vlagents_ray.wire.vla_eval import PRESETS as VLA_EVAL
 
 PRESETS: dict[str, Mapping[str, Any]] = {**OPENPI, **ROBOARENA, **OPENVLA, **VLA_EVAL, **GR00T, **LEROBOT}
 

@@ -20,8 +20,8 @@ from many import many
 
 from vlagents_ray.errors import InvalidInput, MessageTooLarge
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
-from vlagents_ray.wire.lerobot import protobuf, upstream
-from vlagents_ray.wire.lerobot.codec import PolicyInstructions
+from vlagents_ray.wire import lerobot
+from vlagents_ray.wire.lerobot import PolicyInstructions
 
 MUTATED = int(os.environ.get("VLAGENTS_RAY_FUZZ", many(5000)))
 GROWTH = 64 * 2**20  # bytes, whatever the number of pickles
@@ -66,7 +66,7 @@ def chunk(rows: np.ndarray = ROWS, timestamp: float = 1700000000.25, timestep: i
 
 @pytest.mark.parametrize("kind", CHUNKS)
 def test_a_chunk_of_lerobots_own_server_is_read(kind: str) -> None:
-    found = upstream.read_chunk(base64.b64decode(CHUNKS[kind]))
+    found = lerobot.read_chunk(base64.b64decode(CHUNKS[kind]))
     assert (found.timestamp, found.timestep) == (1700000000.25, 7)
     np.testing.assert_array_equal(found.rows, ROWS)
 
@@ -80,7 +80,7 @@ def test_our_look_alikes_pickle_to_the_bytes_of_lerobots_and_torchs_classes() ->
 @pytest.mark.parametrize("protocol", [4, 5])
 def test_rows_keep_their_bits(dtype: str, shape: tuple[int, int], protocol: int) -> None:
     rows = np.random.default_rng(0).standard_normal(shape).astype(dtype)
-    found = upstream.read_chunk(pickled(chunk(rows), protocol)).rows
+    found = lerobot.read_chunk(pickled(chunk(rows), protocol)).rows
     assert found.dtype == dtype
     assert found.tobytes() == rows.tobytes()
 
@@ -96,7 +96,7 @@ SEEN: dict[str, Any] = {
 
 
 def test_lerobots_server_reads_our_instructions() -> None:
-    found = unpickled(upstream.write_instructions(INSTRUCTIONS))
+    found = unpickled(lerobot.write_instructions(INSTRUCTIONS))
     image = {"dtype": "image", "shape": (None, None, 3), "names": ["height", "width", "channels"]}
     assert found == RemotePolicyConfig(
         "act",
@@ -113,7 +113,7 @@ def test_lerobots_server_reads_our_instructions() -> None:
 
 
 def test_lerobots_server_reads_our_observations() -> None:
-    found = unpickled(upstream.write_observation(SEEN, INSTRUCTIONS, 1700000000.25, 2**30))
+    found = unpickled(lerobot.write_observation(SEEN, INSTRUCTIONS, 1700000000.25, 2**30))
     assert isinstance(found, TimedObservation)
     assert (found.timestamp, found.timestep, found.must_go) == (1700000000.25, 2**30, True)
     values = found.observation
@@ -126,22 +126,22 @@ def test_lerobots_server_reads_our_observations() -> None:
 
 def test_a_state_of_another_length_is_refused_before_it_is_sent() -> None:
     with pytest.raises(InvalidInput, match="got 3 numbers, the mapping says 2"):
-        upstream.write_observation(SEEN | {"observation.state": np.zeros(3, np.float32)}, INSTRUCTIONS, 0.0, 0)
+        lerobot.write_observation(SEEN | {"observation.state": np.zeros(3, np.float32)}, INSTRUCTIONS, 0.0, 0)
 
 
 @pytest.mark.parametrize("name", ["observation.state", "observation.images.wrist"])
 def test_an_observation_without_what_the_server_wants_is_refused_before_it_is_sent(name: str) -> None:
     with pytest.raises(InvalidInput, match=rf"got no \['{name}'\]"):
-        upstream.write_observation({key: value for key, value in SEEN.items() if key != name}, INSTRUCTIONS, 0.0, 0)
+        lerobot.write_observation({key: value for key, value in SEEN.items() if key != name}, INSTRUCTIONS, 0.0, 0)
 
 
 def test_an_observation_in_parts_is_that_observation() -> None:
     data = np.random.default_rng(0).bytes(5 * 2**20 + 1)
-    parts = [protobuf.read_observation_part(message) for message in protobuf.write_observation_parts(data)]
+    parts = [lerobot.read_observation_part(message) for message in lerobot.write_observation_parts(data)]
     assert [part.state for part in parts] == [1, 2, 3]
     assert b"".join(part.data for part in parts) == data
-    [only] = protobuf.write_observation_parts(b"short")
-    assert protobuf.read_observation_part(only).state is protobuf.TransferState.END
+    [only] = lerobot.write_observation_parts(b"short")
+    assert lerobot.read_observation_part(only).state is lerobot.TransferState.END
 
 
 ACTION = named("lerobot.async_inference.helpers", "TimedAction") + b")\x81"
@@ -168,9 +168,7 @@ def action(made: bytes) -> bytes:
 
 
 def test_the_tensor_of_the_tests_below_is_read() -> None:
-    np.testing.assert_array_equal(
-        upstream.read_chunk(b"\x80\4" + action(tensor(1, 4)) + b".").rows, [ROWS.ravel()[1:5]]
-    )
+    np.testing.assert_array_equal(lerobot.read_chunk(b"\x80\4" + action(tensor(1, 4)) + b".").rows, [ROWS.ravel()[1:5]])
 
 
 @pytest.mark.parametrize(
@@ -204,14 +202,14 @@ def test_the_tensor_of_the_tests_below_is_read() -> None:
 )
 def test_what_no_server_of_lerobots_answers_is_refused(program: bytes, says: str) -> None:
     with pytest.raises(InvalidInput, match=says), WATCH.watching():
-        upstream.read_chunk(b"\x80\4" + program + b".")
+        lerobot.read_chunk(b"\x80\4" + program + b".")
     assert WATCH.seen == []
 
 
 def test_rows_of_different_length_are_refused() -> None:
     both = [*chunk(ROWS), *chunk(ROWS[:, :2])]
     with pytest.raises(InvalidInput, match="of the same length and type"):
-        upstream.read_chunk(pickled(both, 4))
+        lerobot.read_chunk(pickled(both, 4))
 
 
 def test_rows_that_share_their_bytes_are_counted_each() -> None:
@@ -220,13 +218,13 @@ def test_rows_that_share_their_bytes_are_counted_each() -> None:
     data = pickled([TimedAction(0.0, i, big) for i in range(40)], 4)
     assert len(data) < 2**20
     with pytest.raises(MessageTooLarge, match=f"more than {DEFAULT_LIMITS.reply_bytes} bytes"):
-        upstream.read_chunk(data)
+        lerobot.read_chunk(data)
 
 
 def attempt(data: bytes) -> str:
     try:
         with WATCH.watching():
-            upstream.read_chunk(data, LIMITS)
+            lerobot.read_chunk(data, LIMITS)
     except InvalidInput as error:
         return error.code
     finally:
@@ -251,4 +249,4 @@ def test_mutated_chunks_execute_nothing_and_cost_little() -> None:
 
 def test_a_chunk_of_more_values_than_a_message_of_a_client_may_have_is_read() -> None:
     rows = np.zeros((1000, 2), np.float32)
-    assert upstream.read_chunk(pickled(chunk(rows), 4), replace(LIMITS, body_bytes=2**24)).rows.shape == (1000, 2)
+    assert lerobot.read_chunk(pickled(chunk(rows), 4), replace(LIMITS, body_bytes=2**24)).rows.shape == (1000, 2)

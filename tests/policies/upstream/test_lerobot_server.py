@@ -17,7 +17,7 @@ from upstream_servers import BROKEN, SLOW, answer
 
 from vlagents_ray.errors import ConfigError, PolicyFailed, PolicyUnavailable
 from vlagents_ray.interface import Act, Obs
-from vlagents_ray.policies.upstream import Upstream, lanes
+from vlagents_ray.policies.upstream import Upstream, connections
 from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.serve.ports import free_port
 
@@ -150,7 +150,7 @@ def test_a_checkpoint_that_the_server_cannot_load_does_not_start(
 def test_a_checkpoint_may_load_for_longer_than_connecting_takes(
     server: tuple[PolicyServer, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(lanes, "_CONNECT_S", 0.3)
+    monkeypatch.setattr(connections, "_CONNECT_S", 0.3)
     server[0].load_s = 0.9
     with opened(server[1], connect_timeout_s=60) as agent:
         require_right(agent, seen(1))

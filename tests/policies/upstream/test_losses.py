@@ -19,8 +19,7 @@ from websockets.exceptions import ConnectionClosedError
 from vlagents_ray.errors import NoReplica, PolicyUnavailable, UnknownSession
 from vlagents_ray.evaluate import EvalConfig
 from vlagents_ray.interface import Obs
-from vlagents_ray.policies.upstream import Upstream
-from vlagents_ray.policies.upstream.clients import websocket
+from vlagents_ray.policies.upstream import Upstream, client
 from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.serve.ports import free_port
 
@@ -153,7 +152,7 @@ def test_a_connection_that_ends_in_its_handshake_is_tried_again(
 ) -> None:
     port, refused = free_port(), []
     start(port)
-    real = websocket.connect
+    real = client.connect
 
     def connect(*args: Any, **options: Any) -> Any:
         if len(refused) < 2:
@@ -161,7 +160,7 @@ def test_a_connection_that_ends_in_its_handshake_is_tried_again(
             raise ConnectionClosedError(None, None)  # as when the upstream is killed in the meantime
         return real(*args, **options)
 
-    monkeypatch.setattr(websocket, "connect", connect)
+    monkeypatch.setattr(client, "connect", connect)
     agent = opened(port)
     assert len(refused) == 2
     require_right(agent, sessions(agent, 1))

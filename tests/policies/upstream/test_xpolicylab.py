@@ -14,7 +14,7 @@ from vlagents_ray.interface import Obs
 from vlagents_ray.policies.upstream import Upstream
 from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.serve.ports import free_port
-from vlagents_ray.wire.xpolicylab import codec
+from vlagents_ray.wire import xpolicylab
 
 MAPPING = {
     "state": {"joints": "state/arm_joint_state"},
@@ -87,10 +87,10 @@ NAMED = {"arm": ROWS[:, :6], "hand": ROWS[:, 6:]}
     ],
 )
 def test_actions_are_read_in_each_form_that_its_policies_answer(actions: Any, found: Any) -> None:
-    reply = codec.read_reply(
+    reply = xpolicylab.read_reply(
         pack_xpolicylab({"message_type": "infer_result", "message_id": "1", "payload": {"actions": actions}})
     )
-    read = codec.read_actions(reply.payload)
+    read = xpolicylab.read_actions(reply.payload)
     if isinstance(found, dict):
         assert isinstance(read, dict)
         assert list(read) == list(found)
@@ -115,7 +115,7 @@ def test_actions_are_read_in_each_form_that_its_policies_answer(actions: Any, fo
 )
 def test_actions_of_another_form_are_refused(actions: Any, says: str) -> None:
     with pytest.raises(MalformedMessage, match=says):
-        codec.read_actions({"actions": actions})
+        xpolicylab.read_actions({"actions": actions})
 
 
 @pytest.mark.parametrize(
@@ -131,4 +131,4 @@ def test_actions_of_another_form_are_refused(actions: Any, says: str) -> None:
 )
 def test_a_reply_that_is_none_is_an_error_of_ours(data: bytes) -> None:
     with pytest.raises(VLAgentsError):
-        codec.read_reply(data)
+        xpolicylab.read_reply(data)

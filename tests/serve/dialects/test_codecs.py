@@ -20,11 +20,10 @@ from mutated_messages import mutated
 
 from vlagents_ray.errors import InvalidInput, MalformedMessage, MessageTooLarge, VLAgentsError
 from vlagents_ray.images.jpeg_png import encode_jpeg, encode_png
-from vlagents_ray.protocol.budget import Budget
-from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
-from vlagents_ray.wire.openpi import codec as openpi_codec
-from vlagents_ray.wire.openvla import codec as openvla_codec
-from vlagents_ray.wire.vla_eval import codec as vla_eval_codec
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Budget, Limits
+from vlagents_ray.wire import openpi as openpi_codec
+from vlagents_ray.wire import openvla as openvla_codec
+from vlagents_ray.wire import vla_eval as vla_eval_codec
 
 IMAGE = np.random.default_rng(0).integers(0, 256, (6, 8, 3), np.uint8)
 OBS = {"observation/image": IMAGE, "state": np.arange(8.0), "prompt": "lift", "nested": {"a": [1, 2.5, None, True]}}

@@ -24,8 +24,8 @@ from vlagents_ray.serve.endpoints.docs_page import docs_page
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.launch.deployment_file import deployment
-from vlagents_ray.wire.openpi import codec as openpi_codec
-from vlagents_ray.wire.openvla import codec as openvla_codec
+from vlagents_ray.wire import openpi as openpi_codec
+from vlagents_ray.wire import openvla as openvla_codec
 
 
 def test_a_replica_that_stops_keeps_no_session_that_nobody_will_ask_for() -> None:

@@ -28,10 +28,10 @@ from vlagents_ray.errors import (
     NotReset,
 )
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.protocol.budget import Budget
 from vlagents_ray.protocol.frames import decode_reply, decode_requests, encode_request
 from vlagents_ray.protocol.messages import (
     STREAM_BYTES,
+    Budget,
     Limits,
     Reply,
     Request,

@@ -22,7 +22,7 @@ from eval_fakes import wait_for
 from starlette.types import Receive, Scope, Send
 
 from vlagents_ray.client.transports.direct_websocket import Stream
-from vlagents_ray.client.transports.local.shm import ShmTransport
+from vlagents_ray.client.transports.shm import ShmTransport
 from vlagents_ray.errors import DeadlineExceeded
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.frames import decode_reply, encode_request
@@ -30,7 +30,7 @@ from vlagents_ray.protocol.messages import DEADLINE_HEADER, SESSION_HEADER, Limi
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
-from vlagents_ray.serve.endpoints.local.shm import ShmServer
+from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.arrival import SPACE, PauseDetector, enable_timestamps, waited_s
 from vlagents_ray.serve.engine.dispatch import Dispatcher

@@ -16,7 +16,7 @@ import pytest
 from eval_fakes import wait_for
 from starlette.testclient import TestClient
 
-from vlagents_ray.client.transports.local.shm import ShmTransport
+from vlagents_ray.client.transports.shm import ShmTransport
 from vlagents_ray.images.codecs import JPEG
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.frames import CONTENT_TYPE, decode_reply, encode_request
@@ -29,7 +29,7 @@ from vlagents_ray.protocol.messages import (
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
-from vlagents_ray.serve.endpoints.local.shm import ShmServer
+from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.engine.dispatch import Dispatcher
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.metrics_buffer import (

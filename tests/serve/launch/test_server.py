@@ -12,8 +12,7 @@ from vlagents_ray.errors import PolicyUnavailable
 from vlagents_ray.serve.access.key_store import new_key
 from vlagents_ray.serve.launch import server
 from vlagents_ray.serve.launch.deployment_file import deployment, together, with_settings
-from vlagents_ray.serve.launch.serve_client import wait_for_proxies
-from vlagents_ray.serve.launch.server import _deploy
+from vlagents_ray.serve.launch.server import _deploy, wait_for_proxies
 
 
 class FakeClient:
@@ -100,7 +99,7 @@ def test_proxies_that_never_listen_are_an_error(monkeypatch: pytest.MonkeyPatch,
         raise getattr(ray.exceptions, late)
 
     monkeypatch.setattr(ray, "get", get)
-    monkeypatch.setattr("vlagents_ray.serve.launch.serve_client.proxy_timeout_s", lambda: 0.0)
+    monkeypatch.setattr("vlagents_ray.serve.launch.server.proxy_timeout_s", lambda: 0.0)
     with pytest.raises(PolicyUnavailable, match="proxies do not listen within 0 s"):
         wait_for_proxies([], list)
 

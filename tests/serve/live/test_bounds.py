@@ -26,7 +26,7 @@ from vlagents_ray.interface import Act, Obs
 from vlagents_ray.policies.noop import Noop
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.robot.dataset import Dataset
-from vlagents_ray.serve.config.live import LiveArgs
+from vlagents_ray.serve.config.deployment import LiveArgs
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.live import ring, snapshot, tap
 from vlagents_ray.serve.live.ring import Ring

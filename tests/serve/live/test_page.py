@@ -25,7 +25,7 @@ from vlagents_ray.protocol.messages import RankName
 from vlagents_ray.robot.loop import LoopReport, run_loop
 from vlagents_ray.robot.simulated import SimulatedRobot
 from vlagents_ray.serve.access import api_keys
-from vlagents_ray.serve.config.live import LiveArgs
+from vlagents_ray.serve.config.deployment import LiveArgs
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 

@@ -15,7 +15,7 @@ from live_server import LiveServer, live_server
 
 from vlagents_ray import Obs, RemoteAgent
 from vlagents_ray.interface import Act, Agent
-from vlagents_ray.serve.config.live import LiveArgs
+from vlagents_ray.serve.config.deployment import LiveArgs
 from vlagents_ray.serve.live.ring import Ring
 
 IMAGE = np.random.default_rng(0).integers(0, 255, (64, 96, 3), np.uint8)

@@ -30,7 +30,7 @@ from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.models import model_cache
 from vlagents_ray.serve.models.checkpoints import Checkpoints
 from vlagents_ray.serve.queue.batch_queue import PendingRequest
-from vlagents_ray.serve.queue.checkpoint_choice import CheckpointChoice
+from vlagents_ray.serve.queue.fair_queue import CheckpointChoice
 from vlagents_ray.serve.sessions import Session
 
 

@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from virtual_environments import ROOT, layered
 
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.serve.config.python_env import EnvironmentArgs
+from vlagents_ray.serve.config.deployment import EnvironmentArgs
 from vlagents_ray.serve.launch.deployment_file import read_deployment
 from vlagents_ray.serve.python_env import probe as interpreter
 from vlagents_ray.serve.python_env.create import create

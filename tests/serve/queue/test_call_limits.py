@@ -24,7 +24,7 @@ from vlagents_ray.protocol.messages import Limits, Reply, Request
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.config.deployment import LimitArgs
 from vlagents_ray.serve.endpoints.http import build_http_app
-from vlagents_ray.serve.endpoints.local.shm import ShmServer
+from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.queue.call_limits import (
     LOAD,
@@ -32,7 +32,7 @@ from vlagents_ray.serve.queue.call_limits import (
     PolicyCall,
     PolicyCalls,
 )
-from vlagents_ray.serve.queue.checkpoint_choice import DEFAULT
+from vlagents_ray.serve.queue.fair_queue import DEFAULT
 
 LIMITS = CallLimits(act_s=10.0, warm_up_s=100.0, load_s=1000.0)
 

@@ -22,8 +22,7 @@ from recorded_sessions import Brightness, recorded, reply_of, seen
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Act, Obs, Parts
-from vlagents_ray.protocol.budget import Budget
-from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Reply, Request
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Budget, Reply, Request
 from vlagents_ray.protocol.values import from_text
 from vlagents_ray.robot.dataset import Dataset
 from vlagents_ray.serve.config.deployment import ServerArgs

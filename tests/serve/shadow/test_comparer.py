@@ -11,8 +11,7 @@ import pytest
 from vlagents_ray.errors import NotReset, PolicyFailed, UnknownSession, VLAgentsError
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.protocol.messages import Reply, Request
-from vlagents_ray.serve.shadow.comparer import Comparer
-from vlagents_ray.serve.shadow.comparison_log import ComparisonLog
+from vlagents_ray.serve.shadow.comparison import Comparer, ComparisonLog
 
 LIMIT = 10**6  # bytes
 

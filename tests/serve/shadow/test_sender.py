@@ -17,9 +17,8 @@ from shadowed_agents import Seeded
 
 from vlagents_ray.errors import PolicyUnavailable
 from vlagents_ray.interface import Act, Obs
-from vlagents_ray.protocol.budget import Budget
 from vlagents_ray.protocol.frames import decode_requests
-from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Reply, Request
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Budget, Reply, Request
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.engine.dispatch import Dispatcher
 from vlagents_ray.serve.engine.engine import Engine

@@ -11,9 +11,9 @@ from vlagents_ray.client.credentials import ANONYMOUS, Credentials
 from vlagents_ray.client.transports.base import RequestChannel
 from vlagents_ray.client.transports.codec_selection import CodecChoice
 from vlagents_ray.client.transports.http import HttpTransport
-from vlagents_ray.client.transports.local.plasma import PlasmaTransport
-from vlagents_ray.client.transports.local.shm import ShmTransport, reaches
+from vlagents_ray.client.transports.plasma import PlasmaTransport
 from vlagents_ray.client.transports.serve_handle import HandleTransport
+from vlagents_ray.client.transports.shm import ShmTransport, reaches
 from vlagents_ray.client.transports.websocket import WebSocketTransport
 from vlagents_ray.errors import ConfigError, ConnectionLost, MessageTooLarge, NotReset, PolicyUnavailable
 from vlagents_ray.protocol.messages import Reply, Request, boot_id

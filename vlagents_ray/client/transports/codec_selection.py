@@ -14,8 +14,7 @@ from vlagents_ray.client.transports.probe import LEAST_BYTES, bytes_probe
 from vlagents_ray.errors import MessageTooLarge, TooManyRequests
 from vlagents_ray.images.codecs import JPEG, LOSSLESS, RAW, ImageCodec, decode_files, encode_files
 from vlagents_ray.interface import Obs
-from vlagents_ray.protocol.budget import Budget
-from vlagents_ray.protocol.messages import Limits
+from vlagents_ray.protocol.messages import Budget, Limits
 
 CodecName = Literal["auto", "exact", "raw", "lossless", "jpeg"]
 Send = Callable[[bytes], None]  # sends a probe and waits for the answer

@@ -15,7 +15,7 @@ import struct
 
 from vlagents_ray.errors import MalformedMessage
 from vlagents_ray.protocol.arrays import Buffer
-from vlagents_ray.protocol.budget import Budget
+from vlagents_ray.protocol.messages import Budget
 
 _HEAD = struct.Struct("<4sI")
 _PROBE_TAG, _ANSWER_TAG = b"VLA?", b"VLA!"

@@ -32,7 +32,7 @@ def select_transport(url: str, transport: str, codec: CodecChoice, credentials: 
 
         return HandleTransport(urlsplit(url).netloc)
     if transport == "plasma":
-        from vlagents_ray.client.transports.local.plasma import PlasmaTransport
+        from vlagents_ray.client.transports.plasma import PlasmaTransport
 
         return PlasmaTransport(urlsplit(url).netloc)
     if transport == "http":

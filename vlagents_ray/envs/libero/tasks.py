@@ -15,7 +15,7 @@ from vlagents_ray.envs.libero.benchmark_protocol import SUITES, base_of
 from vlagents_ray.errors import UnknownEnv
 from vlagents_ray.naming import did_you_mean
 from vlagents_ray.registry import require
-from vlagents_ray.wire.pickles.arrays import read_pickled_array
+from vlagents_ray.wire.pickles import read_pickled_array
 
 
 @dataclass(frozen=True, slots=True)

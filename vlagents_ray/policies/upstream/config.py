@@ -10,12 +10,29 @@ from typing_extensions import Self
 
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import VLAgentsError
-from vlagents_ray.policies.upstream.clients.base import UpstreamClient
-from vlagents_ray.policies.upstream.protocols import PROTOCOLS
-from vlagents_ray.wire.lerobot.codec import PolicyInstructions
-from vlagents_ray.wire.lerobot.upstream import features_of
-from vlagents_ray.wire.mapping.mapping import KeyMapping
+from vlagents_ray.policies.upstream.client import UpstreamClient
+from vlagents_ray.policies.upstream.gr00t import GR00TClient
+from vlagents_ray.policies.upstream.lerobot import LeRobotClient
+from vlagents_ray.policies.upstream.openpi import OpenPiBatchClient, OpenPiClient, RoboArenaClient
+from vlagents_ray.policies.upstream.openvla import OpenVLAClient
+from vlagents_ray.policies.upstream.vla_eval import VlaEvalClient
+from vlagents_ray.policies.upstream.vlagents import VlagentsClient
+from vlagents_ray.policies.upstream.xpolicylab import XPolicyLabClient
+from vlagents_ray.wire.lerobot import PolicyInstructions, features_of
+from vlagents_ray.wire.mapping import KeyMapping
 from vlagents_ray.wire.presets import read_mapping
+
+PROTOCOLS: dict[str, type[UpstreamClient]] = {
+    "openpi": OpenPiClient,
+    "openpi-batch": OpenPiBatchClient,
+    "roboarena": RoboArenaClient,
+    "gr00t": GR00TClient,
+    "openvla": OpenVLAClient,
+    "vla_eval": VlaEvalClient,
+    "vlagents": VlagentsClient,
+    "lerobot": LeRobotClient,
+    "xpolicylab": XPolicyLabClient,
+}
 
 
 class LoadedPolicy(BaseModel, extra="forbid"):

@@ -13,11 +13,10 @@ from typing import Any, ClassVar
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, ContractMismatch, NotReset
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.policies.upstream.clients.base import ClientOptions, UpstreamClient
+from vlagents_ray.policies.upstream.client import ClientOptions, UpstreamClient
 from vlagents_ray.policies.upstream.config import UpstreamConfig
-from vlagents_ray.policies.upstream.lanes import Lanes
-from vlagents_ray.policies.upstream.session_connections import SessionConnections
-from vlagents_ray.wire.mapping.outgoing import Outgoing
+from vlagents_ray.policies.upstream.connections import Lanes, SessionConnections
+from vlagents_ray.wire.outgoing import Outgoing
 
 UPSTREAM_MS = "upstream_ms"  # in `Act.info`: the time that the upstreams needed for the batch, ms
 

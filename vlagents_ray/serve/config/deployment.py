@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import os
+import re
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import fields
+from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
@@ -13,15 +16,181 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Agent
 from vlagents_ray.policies.adapters import ADAPTER
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
+from vlagents_ray.ray_tools.runtime_env import require_no_secrets
 from vlagents_ray.serve.access.api_keys import Keys, load_keys
 from vlagents_ray.serve.config.dialects import DialectArgs
-from vlagents_ray.serve.config.live import LiveArgs
-from vlagents_ray.serve.config.python_env import EnvironmentArgs
-from vlagents_ray.serve.config.shadow import ShadowArgs
-from vlagents_ray.serve.config.viewers import ViewerArgs
 from vlagents_ray.serve.models.checkpoints import Checkpoints
 from vlagents_ray.serve.queue.call_limits import CallLimits
 from vlagents_ray.settings import wrong_settings
+from vlagents_ray.viewers.targets import is_live, require_no_server
+
+# The settings of the live page, under `live:` of a deployment.
+
+
+class LiveArgs(BaseModel):
+    """The last seconds of each session, which a press on the live page saves; see `vlagents_ray.serve.live.ring`."""
+
+    model_config = ConfigDict(extra="forbid", hide_input_in_errors=True)
+
+    folder: str = Field(
+        description="folder of the datasets, on each replica's own node or shared; each replica writes its own below it"
+    )
+    ring_s: float = Field(default=30.0, gt=0, le=600, description="how much of each session is held, s")
+    memory_mb: float = Field(
+        default=256.0, gt=0, description="memory that all sessions of a replica take at most, MB; the oldest goes first"
+    )
+
+    most_gb: float = Field(default=50.0, gt=0, description="size of the folder at which nothing more is saved, GB")
+
+    @field_validator("folder")
+    @classmethod
+    def _absolute(cls, folder: str) -> str:
+        return os.path.abspath(os.path.expanduser(folder))
+
+
+# The settings under `shadow:` in a deployment file: a candidate beside the policy.
+
+
+class ShadowArgs(BaseModel):
+    """A candidate that acts on what the policy acts on; its actions are compared with the policy's, never executed."""
+
+    model_config = ConfigDict(extra="forbid", hide_input_in_errors=True)  # errors are logged
+
+    policy: str | dict[str, Any] = Field(
+        description="the candidate: its deployment file, a registered name, 'module:Class', or the `args` of a "
+        "deployment. It has one replica, with the file's resources and environment"
+    )
+    share: float = Field(default=0.1, gt=0, le=1, description="share of the sessions that the candidate follows")
+    queue: int = Field(
+        default=32, ge=1, description="observations that wait for the candidate at most; further ones are dropped"
+    )
+    record: str | None = Field(
+        default=None,
+        description="folder on the candidate's node, where each comparison becomes a line of JSON; a relative path is "
+        "one from the working directory",
+    )
+    record_mb: int = Field(default=1000, ge=1, description="most MB of these files; the oldest ones are deleted")
+
+    @field_validator("record")
+    @classmethod
+    def _absolute(cls, record: str | None) -> str | None:
+        return None if record is None else os.path.abspath(Path(record).expanduser())
+
+
+# The viewers of a deployment's episodes, under `viewers:` in a deployment file.
+
+
+class ViewerArgs(BaseModel):
+    """Where the episodes of all sessions are shown; unset: nowhere."""
+
+    model_config = ConfigDict(extra="forbid", hide_input_in_errors=True)  # errors are logged
+
+    rerun: str | None = Field(
+        default=None, description="an absolute folder for `.rrd` files, or the address of a viewer of Rerun"
+    )
+    foxglove: str | None = Field(default=None, description="an absolute folder for `.mcap` files")
+
+    @field_validator("foxglove")
+    @classmethod
+    def _no_server(cls, foxglove: str | None) -> str | None:
+        return require_no_server(foxglove)
+
+    @field_validator("rerun", "foxglove")
+    @classmethod
+    def _absolute(cls, target: str | None) -> str | None:
+        if target is not None and not is_live("rerun", target) and not Path(target).is_absolute():
+            raise ValueError(f"got {target!r}, want an absolute folder: replicas run in another one than this command")
+        return target
+
+    def targets(self) -> dict[str, str]:
+        """Return the target of each viewer that has one."""
+        return {name: target for name, target in self.model_dump().items() if target is not None}
+
+
+# The settings under `environment:` in a deployment file: the Python environment that the policy runs in.
+
+
+_PYTHON = re.compile(r"^# python: (3\.\d+)\s*$", re.MULTILINE)
+
+
+def python_wanted_by(requirements: Path) -> str | None:
+    """Return the Python minor version that a requirements file names in a line `# python: 3.12`; None without one."""
+    found = _PYTHON.search(requirements.read_text())
+    return None if found is None else found[1]
+
+
+class EnvironmentArgs(BaseModel):
+    """The Python environment of a policy; by default the policy runs in the replica, in the cluster's environment."""
+
+    model_config = ConfigDict(extra="forbid", hide_input_in_errors=True)  # errors are logged
+
+    python: str | None = Field(
+        default=None,
+        description="interpreter of a virtual environment, on every node the same; a relative path is one from the "
+        "working directory",
+    )
+    process: Literal["auto", "replica", "child"] = Field(
+        default="auto",
+        description="with `python`: is the replica itself to run there (same Python minor and Ray as the cluster's), "
+        "or a child process behind it? auto: the replica where it can",
+    )
+    requirements: list[str] | None = Field(
+        default=None, description="instead of `python`: what Ray installs on each node, once; a list, or a file's path"
+    )
+    installer: Literal["uv", "pip"] = Field(default="pip", description="of `requirements`")
+    env_vars: dict[str, str] = Field(default_factory=dict, description="variables of the policy's process")
+
+    @field_validator("python")
+    @classmethod
+    def _absolute(cls, python: str | None) -> str | None:
+        """Make the path absolute without following links: an environment's interpreter links to that of its creator."""
+        return None if python is None else os.path.abspath(Path(python).expanduser())
+
+    @field_validator("requirements", mode="before")
+    @classmethod
+    def _read(cls, requirements: Any) -> Any:
+        if not isinstance(requirements, str):
+            return requirements
+        file = Path(requirements)
+        if not file.is_file():
+            raise ValueError(f"no such file: got {requirements!r}, want a requirements file or a list of requirements")
+        wanted, ours = python_wanted_by(file), "{}.{}".format(*sys.version_info[:2])
+        if wanted not in (None, ours):
+            raise ValueError(
+                f"{requirements} wants Python {wanted}, and Ray installs requirements for the cluster's, {ours}; make "
+                f"an environment, `vlagents-ray env make {requirements}`, and name its Python in `python` instead"
+            )
+        lines = [line.partition(" #")[0].strip() for line in file.read_text().splitlines()]
+        return [line for line in lines if line and not line.startswith("#")]
+
+    @model_validator(mode="after")
+    def _one(self) -> EnvironmentArgs:
+        if self.python is not None and self.requirements is not None:
+            raise ValueError(
+                f"python {self.python!r} and requirements exclude each other; keep one, or install the requirements "
+                f"into that environment (`vlagents-ray env make`)"
+            )
+        if self.python is None and self.process != "auto":
+            raise ValueError(f"process: got {self.process!r} without `python`; name an interpreter, or leave it out")
+        # The check covers a child process, too: Serve shows the deployment, and a child may become a replica.
+        require_no_secrets({"env_vars": self.env_vars, "requirements": self.requirements})
+        if self.requirements == []:
+            raise ValueError("requirements: got none; name some, or leave it out")
+        return self
+
+    def runtime_env(self) -> dict[str, Any]:
+        """Return Ray's `runtime_env` of the replica; empty if the policy runs in a child process."""
+        if self.process == "child":
+            return {}
+        found: dict[str, Any] = {}
+        if self.python is not None:
+            found["py_executable"] = self.python
+        if self.requirements is not None:
+            found[self.installer] = self.requirements
+        if self.env_vars:
+            found["env_vars"] = self.env_vars
+        return found
+
 
 POLICY, GATEWAY, SHADOW = "Policy", "Gateway", "Shadow"  # the deployments of an application
 

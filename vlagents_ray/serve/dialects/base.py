@@ -1,17 +1,17 @@
 """The base classes of all dialects, and the steps to add one.
 
-A dialect is another system's protocol. It has one folder, `vlagents_ray/serve/dialects/NAME/`:
+A dialect is another system's protocol:
 
-1. A codec converts bytes to values and back, within `Limits`, without unpickling. It imports nothing of the server; one
-   that the policy `upstream` uses as well lies in `vlagents_ray/wire/`.
-2. `handler.py` has one class, which states its settings (`Config`), the system whose clients it serves, the packages
-   that it requires and the mappings that deployment files may name, and serves those clients: an `HttpDialect` for
-   plain requests over HTTP, a `RouteDialect` for WebSockets and anything else on the server's own port, or a
-   `PortDialect` for a protocol that needs its own port.
+1. `vlagents_ray/wire/NAME.py` converts bytes to values and back, within `Limits`, without unpickling, and has the
+   mappings of the system's clients. It imports nothing of the server; the policy `upstream` uses it, too.
+2. `vlagents_ray/serve/dialects/NAME.py` has one class, which states its settings (`Config`), the system whose clients
+   it serves, the packages that it requires and the mappings that deployment files may name, and serves those clients:
+   an `HttpDialect` for plain requests over HTTP, a `RouteDialect` for WebSockets and anything else on the server's own
+   port, or a `PortDialect` for a protocol that needs its own port.
 3. `DIALECTS` in `vlagents_ray/registry.py` has one line for it. A third-party package has an entry point in the group
    `vlagents_ray.dialects` instead; without either, a deployment file names the class, as `my_package:MyDialect`.
 4. `deployments/NAME.yaml` names the dialect under `args.dialects`.
-5. `tests/serve/dialects/NAME/` tests it with the bytes of the real client, and with garbage.
+5. `tests/serve/dialects/test_NAME.py` tests it with the bytes of the real client, and with garbage.
 
 The following is a complete dialect, for clients that post `{"q": [...], "task": "..."}` and read a list of numbers::
 
@@ -53,14 +53,13 @@ import numpy as np
 from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.websockets import WebSocket
 
+from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, MalformedMessage, PolicyUnavailable, VLAgentsError
 from vlagents_ray.interface import Obs
-from vlagents_ray.protocol.budget import Budget
-from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits, Reply
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Budget, Limits, RankName, Reply
 from vlagents_ray.serve.access.api_keys import Identity, NoKey, current_caller
-from vlagents_ray.serve.config.dialects import DialectConfig, KeylessPortConfig, PortConfig
-from vlagents_ray.serve.dialects.gateway_sessions import Connect
+from vlagents_ray.serve.config.dialects import DialectConfig, KeylessPortConfig, PortConfig, read_mapping
 from vlagents_ray.serve.dialects.implicit_session import ImplicitSession
 from vlagents_ray.serve.endpoints.http_messages import LONG_BYTES, problem_response
 from vlagents_ray.serve.engine.admission import Admission, MessageAdmission
@@ -68,7 +67,6 @@ from vlagents_ray.serve.engine.dispatch import Dispatcher
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.metrics_buffer import RequestTrace
 from vlagents_ray.serve.ports import LOOPBACK
-from vlagents_ray.serve.presets import read_mapping
 
 T = TypeVar("T")
 Stream = Callable[[WebSocket], Awaitable[None]]
@@ -76,6 +74,10 @@ Check = Callable[[str | None], Identity]
 """Returns the caller that a client's API key belongs to, or raises `Unauthorized` or `Forbidden`; None means no key."""
 
 logger = logging.getLogger(__name__)
+
+Connect = Callable[[str | None, RankName | None], RemoteAgent]
+"""Connects to the application for one client, with its API key and the most urgent class that the key allows; None
+stands for no key, and for any class."""
 
 POLICY_VIOLATION, INTERNAL_ERROR, TRY_AGAIN_LATER = 1008, 1011, 1013  # WebSocket close codes
 _OUR_NAMES = "vlagents"  # preset for clients without a mapping

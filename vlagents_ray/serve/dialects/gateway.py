@@ -17,8 +17,7 @@ from vlagents_ray.registry import dialect_class
 from vlagents_ray.serve.access.api_keys import NoKey, require_access
 from vlagents_ray.serve.access.audit import write_audit
 from vlagents_ray.serve.config.deployment import ServerArgs
-from vlagents_ray.serve.dialects.base import GatewayContext, PortDialect
-from vlagents_ray.serve.dialects.gateway_sessions import Connect
+from vlagents_ray.serve.dialects.base import Connect, GatewayContext, PortDialect
 from vlagents_ray.serve.dialects.routes import describe, require_fit
 from vlagents_ray.serve.engine.admission import Admission
 from vlagents_ray.serve.ports import LOOPBACK, reserve

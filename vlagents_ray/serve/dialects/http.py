@@ -10,8 +10,7 @@ from starlette.requests import ClientDisconnect
 from starlette.requests import Request as HttpRequest
 from starlette.responses import Response
 
-from vlagents_ray.protocol.budget import Budget
-from vlagents_ray.protocol.messages import SESSION_HEADER
+from vlagents_ray.protocol.messages import SESSION_HEADER, Budget
 from vlagents_ray.serve.access.api_keys import Identity, current_caller
 from vlagents_ray.serve.config.dialects import DialectConfig
 from vlagents_ray.serve.dialects.base import ReplicaContext, RouteDialect, decoded, public_problem

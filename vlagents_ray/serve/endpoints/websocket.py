@@ -3,7 +3,7 @@
 The metadata gives a client the port and an unguessable path, so that a client that may not read the metadata cannot
 use the port; where there are API keys, the handshake must contain one, too. Messages are those of `WS /v1/stream` on
 the server's port, which remains for clients that cannot reach this one. As with local clients the policy thread reads
-the sockets (see `vlagents_ray.serve.endpoints.local.unix_messages`) and decodes the messages.
+the sockets (see `vlagents_ray.serve.endpoints.unix_messages`) and decodes the messages.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from vlagents_ray.serve.access.api_keys import (
 )
 from vlagents_ray.serve.access.origin_check import require_own_page
 from vlagents_ray.serve.endpoints.acceptor import Acceptor
-from vlagents_ray.serve.endpoints.local.unix_messages import Admit
+from vlagents_ray.serve.endpoints.unix_messages import Admit
 from vlagents_ray.serve.endpoints.websocket_connection import WebSocketConnection
 from vlagents_ray.serve.engine import arrival
 from vlagents_ray.serve.engine.engine import Engine

@@ -27,8 +27,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from vlagents_ray.errors import InvalidInput, MalformedMessage, MessageTooLarge, Overloaded, VLAgentsError
 from vlagents_ray.protocol.json_messages import problem
-from vlagents_ray.serve.access.api_keys import Caller, current_caller
-from vlagents_ray.serve.access.scope_check import ScopeCheck
+from vlagents_ray.serve.access.api_keys import Caller, ScopeCheck, current_caller
 from vlagents_ray.serve.endpoints.http_messages import deny, problem_response, request_id
 from vlagents_ray.serve.weights.updates import PushOptions, PushResult
 from vlagents_ray.weights.safetensors import MESSAGE_BYTES, ValueSpec, ValuesReader

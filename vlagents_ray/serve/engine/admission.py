@@ -20,9 +20,8 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Protocol, TypeVar
 
 from vlagents_ray.errors import MessageTooLarge, Overloaded, PolicyUnavailable, VLAgentsError
-from vlagents_ray.images import cpu_affinity
-from vlagents_ray.protocol.budget import Budget
-from vlagents_ray.protocol.messages import Limits, Reply, Request
+from vlagents_ray.images import thread_map
+from vlagents_ray.protocol.messages import Budget, Limits, Reply, Request
 
 T = TypeVar("T")
 
@@ -84,7 +83,7 @@ class Admission:
                 raise PolicyUnavailable("the replica is stopping; connect again")
             threads = self._threads.get(robot)
             if threads is None:
-                number = max(1, cpu_affinity.allowed() - 1 if robot else cpu_affinity.allowed() // 2)
+                number = max(1, thread_map.allowed() - 1 if robot else thread_map.allowed() // 2)
                 name = f"decode-{'robots' if robot else 'others'}"
                 threads = self._threads[robot] = ThreadPoolExecutor(number, name)
             return threads.submit(call)

@@ -15,7 +15,7 @@ from vlagents_ray.protocol.messages import Reply
 from vlagents_ray.serve.models.loaded_model import LoadedModel
 from vlagents_ray.serve.models.model_manager import ModelManager
 from vlagents_ray.serve.queue.batch_queue import PendingRequest
-from vlagents_ray.serve.queue.checkpoint_choice import CheckpointChoice
+from vlagents_ray.serve.queue.fair_queue import CheckpointChoice
 from vlagents_ray.serve.sessions import Session, SessionTable
 
 

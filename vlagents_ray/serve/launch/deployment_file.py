@@ -17,8 +17,7 @@ from vlagents_ray.policies.base.checkpoint import STEP as STEP_PLACE
 from vlagents_ray.policies.wrapper import build_agent
 from vlagents_ray.ray_tools.runtime_env import require_no_secrets
 from vlagents_ray.registry import names, policy_class
-from vlagents_ray.serve.config.deployment import POLICY, ServerArgs, candidate_of
-from vlagents_ray.serve.config.shadow import ShadowArgs
+from vlagents_ray.serve.config.deployment import POLICY, ServerArgs, ShadowArgs, candidate_of
 from vlagents_ray.serve.dialects.routes import require_fit, require_packages
 from vlagents_ray.serve.models.checkpoints import CHOICE, STEP
 from vlagents_ray.serve.python_env.child_main import unloaded_contract

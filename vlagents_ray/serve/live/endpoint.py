@@ -43,10 +43,9 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from vlagents_ray.client.credentials import is_loopback
 from vlagents_ray.errors import ConfigError, MalformedMessage, MessageTooLarge, Overloaded, VLAgentsError
 from vlagents_ray.protocol.json_messages import problem
-from vlagents_ray.serve.access.api_keys import Caller, Keys, current_caller
+from vlagents_ray.serve.access.api_keys import Caller, Keys, ScopeCheck, caller_name, current_caller
 from vlagents_ray.serve.access.audit import log_pressed
 from vlagents_ray.serve.access.origin_check import require_same_origin
-from vlagents_ray.serve.access.scope_check import ScopeCheck, caller_name
 from vlagents_ray.serve.endpoints.access_middleware import LIVE_PAGE, AccessMiddleware
 from vlagents_ray.serve.endpoints.http_messages import deny, html_response, problem_response, request_id
 from vlagents_ray.serve.live.fleet import Fleet, Viewer

@@ -25,7 +25,7 @@ from vlagents_ray.images.jpeg_png import decode
 from vlagents_ray.interface import Obs
 from vlagents_ray.registry import require
 from vlagents_ray.robot.dataset import Dataset
-from vlagents_ray.serve.config.live import LiveArgs
+from vlagents_ray.serve.config.deployment import LiveArgs
 from vlagents_ray.serve.live.tap import ENCODING_SHARE, RATE, LiveTap
 from vlagents_ray.serve.models.loaded_model import LoadedModel
 from vlagents_ray.serve.sessions import SessionTable

@@ -12,7 +12,7 @@ import numpy as np
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.protocol.json_messages import plain_values
-from vlagents_ray.serve.config.live import LiveArgs
+from vlagents_ray.serve.config.deployment import LiveArgs
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.metrics_buffer import SAMPLE, STAGES, LoadMeter
 from vlagents_ray.serve.live.commands import CommandBoard

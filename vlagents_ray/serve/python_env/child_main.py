@@ -27,7 +27,7 @@ from vlagents_ray.interface import Agent
 from vlagents_ray.policies.wrapper import build_agent
 from vlagents_ray.protocol.messages import INNER_OPS, Limits
 from vlagents_ray.serve.access.api_keys import NoKey
-from vlagents_ray.serve.endpoints.local.shm import ShmServer
+from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.queue.call_limits import CallLimits
 

@@ -1,6 +1,6 @@
 """The child process that runs a replica's policy, as the replica sees it; `child_main` is the other side.
 
-Calls of the replica's engine to the policy travel through shared memory (`vlagents_ray.client.transports.local.shm`) to
+Calls of the replica's engine to the policy travel through shared memory (`vlagents_ray.client.transports.shm`) to
 an engine in the child: a batch is one message, and each session has a session in the child.
 """
 
@@ -19,7 +19,7 @@ from collections.abc import Generator, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
-from vlagents_ray.client.transports.local.shm import ShmTransport
+from vlagents_ray.client.transports.shm import ShmTransport
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, ConnectionLost, PolicyFailed, PolicyUnavailable, VLAgentsError
 from vlagents_ray.interface import Parts

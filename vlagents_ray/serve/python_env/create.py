@@ -18,7 +18,7 @@ from pathlib import Path
 import vlagents_ray
 from vlagents_ray.errors import ConfigError, MissingDependency
 from vlagents_ray.policies.base import import_fixes
-from vlagents_ray.serve.config.python_env import python_wanted_by
+from vlagents_ray.serve.config.deployment import python_wanted_by
 
 Progress = Callable[[str], None]
 

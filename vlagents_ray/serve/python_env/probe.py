@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, from_code
-from vlagents_ray.serve.config.python_env import EnvironmentArgs
+from vlagents_ray.serve.config.deployment import EnvironmentArgs
 
 __all__ = ["EnvironmentProbe", "check_policy", "probe", "with_process"]
 

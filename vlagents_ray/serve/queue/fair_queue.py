@@ -19,10 +19,27 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 
 from vlagents_ray.protocol.messages import Reply, Request
-from vlagents_ray.serve.queue.checkpoint_choice import DEFAULT, CheckpointChoice
 from vlagents_ray.serve.queue.preparation import Preparation
 
 logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class CheckpointChoice:
+    """The checkpoint that a session asked for: by default the deployment's own."""
+
+    name: str | None = None  # name of one of the deployment's `choices`; None for the deployment's own
+    step: int | None = None  # training step of the checkpoint; None for the step that the settings name
+
+    def __str__(self) -> str:
+        if self == DEFAULT:
+            return "the deployment's own checkpoint"
+        step = "" if self.step is None else f"step {self.step}"
+        return f"checkpoint {' at '.join(filter(None, ('' if self.name is None else repr(self.name), step)))}"
+
+
+DEFAULT = CheckpointChoice()
+
 
 PATIENCE_S = 1.0  # time after which a simulation gets a slot although robots' requests keep arriving
 

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
-from vlagents_ray.images import cpu_affinity
+from vlagents_ray.images import thread_map
 from vlagents_ray.interface import Agent, Obs
 
 _THREADS = 4  # at most; images are resized without Python's lock
@@ -43,7 +43,7 @@ class Preparations:
     """The threads of a replica that prepare observations."""
 
     def __init__(self) -> None:
-        self._threads = ThreadPoolExecutor(min(_THREADS, cpu_affinity.allowed()), "prepare")
+        self._threads = ThreadPoolExecutor(min(_THREADS, thread_map.allowed()), "prepare")
 
     def begin(self, agent: Agent | None, obs: Obs | None) -> Preparation | None:
         """Begin to prepare an observation for a session's agent; None if there is nothing to do."""

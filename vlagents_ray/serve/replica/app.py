@@ -9,9 +9,8 @@ from typing import Any
 from ray import serve
 from ray.serve import Application
 
-from vlagents_ray.serve.config.deployment import GATEWAY, POLICY, SHADOW, ServerArgs, candidate_of
+from vlagents_ray.serve.config.deployment import GATEWAY, POLICY, SHADOW, ServerArgs, ShadowArgs, candidate_of
 from vlagents_ray.serve.config.dialects import DialectArgs
-from vlagents_ray.serve.config.shadow import ShadowArgs
 from vlagents_ray.serve.dialects.gateway import Gateway
 from vlagents_ray.serve.python_env.probe import with_process
 from vlagents_ray.serve.replica.candidate import CandidateReplica

@@ -18,9 +18,7 @@ from vlagents_ray.serve.dialects.gateway import wait_for_policy
 from vlagents_ray.serve.engine.metrics_buffer import RequestTrace
 from vlagents_ray.serve.replica.engine_replica import EngineReplica
 from vlagents_ray.serve.replica.metrics import ShadowExporter, tags_of
-from vlagents_ray.serve.shadow.comparer import Comparer
-from vlagents_ray.serve.shadow.comparison import require_comparable
-from vlagents_ray.serve.shadow.comparison_log import ComparisonLog
+from vlagents_ray.serve.shadow.comparison import Comparer, ComparisonLog, require_comparable
 
 
 class CandidateReplica(EngineReplica):

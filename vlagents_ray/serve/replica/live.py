@@ -11,8 +11,7 @@ import ray
 from vlagents_ray.errors import UnknownSession
 from vlagents_ray.ray_tools.private import compress_no_websockets
 from vlagents_ray.serve.access.audit import write_audit
-from vlagents_ray.serve.config.live import LiveArgs
-from vlagents_ray.serve.config.viewers import ViewerArgs
+from vlagents_ray.serve.config.deployment import LiveArgs, ViewerArgs
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.live.fleet import Fleet
 from vlagents_ray.serve.live.recordings import SessionRecordings

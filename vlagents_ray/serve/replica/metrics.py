@@ -47,7 +47,7 @@ from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.metrics_buffer import STAGES, Collected, LoadMeter
 from vlagents_ray.serve.periodic import Periodic
 from vlagents_ray.serve.recording.recorder import SessionRecorder
-from vlagents_ray.serve.shadow.comparer import Comparer
+from vlagents_ray.serve.shadow.comparison import Comparer
 
 logger = logging.getLogger(__name__)
 

@@ -11,7 +11,7 @@ import ray
 from vlagents_ray.client.transports.serve_handle import call_replica
 from vlagents_ray.errors import PolicyUnavailable
 from vlagents_ray.protocol.frames import encode_replies
-from vlagents_ray.serve.config.shadow import ShadowArgs
+from vlagents_ray.serve.config.deployment import ShadowArgs
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.replica.candidate import CandidateReplica
 from vlagents_ray.serve.shadow.sender import ShadowSender, Turn

@@ -13,8 +13,7 @@ from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.protocol.messages import Limits, RankName
 from vlagents_ray.registry import dialect_class
 from vlagents_ray.serve.access.api_keys import NoKey
-from vlagents_ray.serve.dialects.base import GatewayContext, PortDialect
-from vlagents_ray.serve.dialects.gateway_sessions import Connect
+from vlagents_ray.serve.dialects.base import Connect, GatewayContext, PortDialect
 from vlagents_ray.serve.ports import free_port, reserve
 
 LIMITS = Limits(body_bytes=2 * 2**20)

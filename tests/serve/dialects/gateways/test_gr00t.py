@@ -280,7 +280,7 @@ def test_sessions_of_a_revoked_key_end_by_themselves(limited: Limited, replicas:
 
 def test_nothing_of_a_message_is_read_before_its_key(limited: Limited, monkeypatch: pytest.MonkeyPatch) -> None:
     read: list[bytes] = []
-    monkeypatch.setattr("vlagents_ray.wire.gr00t.codec.read_request", lambda *_: read.append(b""))
+    monkeypatch.setattr("vlagents_ray.wire.gr00t.read_request", lambda *_: read.append(b""))
     limited.known.add("lab")
     deep = b"\x91" * 100_000
     head = b"\x82\xa9api_token\xa5wrong\xa4data"

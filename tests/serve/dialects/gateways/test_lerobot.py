@@ -19,8 +19,7 @@ from many import many
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.dialects.gateway_sessions import GatewaySessions
-from vlagents_ray.serve.dialects.lerobot import handler
-from vlagents_ray.wire.lerobot import codec
+from vlagents_ray.wire import lerobot
 
 
 def sessions(replicas: Replicas) -> int:
@@ -70,7 +69,7 @@ def test_who_asks_before_the_observation_gets_its_actions(open_lerobot) -> None:
 
 
 def test_without_an_observation_there_are_no_actions(open_lerobot, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vlagents_ray.serve.dialects.lerobot.connection._WAIT_S", 0.05)
+    monkeypatch.setattr("vlagents_ray.serve.dialects.lerobot._WAIT_S", 0.05)
     with AsyncClient(open_lerobot()).begin() as robot:
         assert robot.actions() == []
 
@@ -216,8 +215,8 @@ def test_a_compressed_message_is_not_decompressed(open_lerobot) -> None:
 
 
 def test_an_observation_that_takes_too_long_ends(open_lerobot, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(handler, "_UPLOAD_S", 0.2)
-    monkeypatch.setattr(handler, "_TICK_S", 0.05)
+    monkeypatch.setattr("vlagents_ray.serve.dialects.lerobot._UPLOAD_S", 0.2)
+    monkeypatch.setattr("vlagents_ray.serve.dialects.lerobot._TICK_S", 0.05)
     goes_on = threading.Event()
 
     def slowly() -> Iterator[bytes]:
@@ -235,7 +234,7 @@ def test_an_observation_that_takes_too_long_ends(open_lerobot, monkeypatch: pyte
 
 
 def test_a_client_that_is_gone_loses_its_session(open_lerobot, replicas: Replicas, monkeypatch) -> None:
-    monkeypatch.setattr(handler, "_TICK_S", 0.05)
+    monkeypatch.setattr("vlagents_ray.serve.dialects.lerobot._TICK_S", 0.05)
     port = open_lerobot(idle_s=0.2)
     with AsyncClient(port).begin() as robot:
         robot.act(robot_saw(0))
@@ -278,7 +277,7 @@ def test_an_endpoint_for_ipv4_has_no_clients_over_ipv6(open_lerobot, monkeypatch
 
 
 def test_what_is_no_error_of_ours_is_logged_and_not_shown(open_lerobot, caplog, monkeypatch) -> None:
-    monkeypatch.setattr(codec, "frame", lambda *_: 1 / 0)
+    monkeypatch.setattr(lerobot, "frame", lambda *_: 1 / 0)
     with AsyncClient(open_lerobot()).begin() as robot, pytest.raises(grpc.RpcError) as error:
         robot.send(robot_saw(0))
     status, details = status_of(error)

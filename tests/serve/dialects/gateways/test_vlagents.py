@@ -19,9 +19,8 @@ from rpyc_client import LOCAL, REMOTE, ROOT, TUPLE, VALUE, Client, call, documen
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.ports import reserve
-from vlagents_ray.wire import json_numpy
-from vlagents_ray.wire.vlagents import rpyc
-from vlagents_ray.wire.vlagents.rpyc import Handler
+from vlagents_ray.wire import json_numpy, rpyc
+from vlagents_ray.wire.rpyc import Handler
 
 REPLY, EXCEPTION = 2, 3
 FRAMES = int(os.environ.get("VLAGENTS_RAY_FUZZ", many(5000)))

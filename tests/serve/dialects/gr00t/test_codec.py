@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from vlagents_ray.errors import InvalidObservation, MalformedMessage, MessageTooLarge, VLAgentsError
 from vlagents_ray.protocol.messages import Limits
-from vlagents_ray.wire.gr00t import codec as gr00t_codec
+from vlagents_ray.wire import gr00t as gr00t_codec
 
 LIMITS = Limits()
 

@@ -22,10 +22,9 @@ from lerobot_messages import FEATURES, HELPERS, TimedObservation, pickled, robot
 from many import many
 
 from vlagents_ray.errors import InvalidInput, MalformedMessage, MessageTooLarge
-from vlagents_ray.protocol.budget import Budget
-from vlagents_ray.protocol.messages import Limits
-from vlagents_ray.serve.presets import read_mapping
-from vlagents_ray.wire.lerobot import codec
+from vlagents_ray.protocol.messages import Budget, Limits
+from vlagents_ray.serve.config.dialects import read_mapping
+from vlagents_ray.wire import lerobot
 
 LIMITS = Limits(body_bytes=2**20)
 MUTATED = int(os.environ.get("VLAGENTS_RAY_FUZZ", many(5000)))
@@ -79,8 +78,8 @@ OBSERVATIONS = {
 IMAGE = np.arange(12, dtype=np.uint8).reshape(2, 2, 3)
 
 
-def read(data: bytes, limits: Limits = LIMITS) -> codec.RobotObservation:
-    return codec.read_observation(data, Budget(limits))
+def read(data: bytes, limits: Limits = LIMITS) -> lerobot.RobotObservation:
+    return lerobot.read_observation(data, Budget(limits))
 
 
 def value_of(value: Any, protocol: int = 4) -> Any:
@@ -94,12 +93,12 @@ MAPPING = read_mapping("lerobot")
 def attempt(data: bytes) -> str:
     """Read what may be either of the messages, as the dialect does; returns the error's code, or "read"."""
     said = []
-    for reader in (read, lambda data: codec.read_instructions(data, LIMITS)):
+    for reader in (read, lambda data: lerobot.read_instructions(data, LIMITS)):
         try:
             with WATCH.watching():
                 found = reader(data)
-                if isinstance(found, codec.RobotObservation):
-                    MAPPING.obs(codec.frame(found, ROBOT), LIMITS)
+                if isinstance(found, lerobot.RobotObservation):
+                    MAPPING.obs(lerobot.frame(found, ROBOT), LIMITS)
             said.append("read")
         except InvalidInput as error:
             said.append(error.code)
@@ -107,7 +106,7 @@ def attempt(data: bytes) -> str:
     return min(said, key=lambda code: code != "read")
 
 
-ROBOT = codec.read_instructions(pickled(setup()), LIMITS)
+ROBOT = lerobot.read_instructions(pickled(setup()), LIMITS)
 
 
 @pytest.mark.parametrize("name", OBSERVATIONS)
@@ -122,8 +121,8 @@ def test_an_observation_of_lerobots_own_client_is_read(name: str) -> None:
 
 
 def test_policy_instructions_of_lerobots_own_client_are_read() -> None:
-    found = codec.read_instructions(base64.b64decode(SETUP), LIMITS)
-    want = codec.PolicyInstructions("act", "me/act", ("shoulder.pos", "gripper.pos"), ("front", "wrist"), 10)
+    found = lerobot.read_instructions(base64.b64decode(SETUP), LIMITS)
+    want = lerobot.PolicyInstructions("act", "me/act", ("shoulder.pos", "gripper.pos"), ("front", "wrist"), 10)
     assert found == want
 
 

@@ -23,7 +23,7 @@ from vlagents_ray.serve.dialects.routes import dialect_routes
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.wire.openpi import codec
+from vlagents_ray.wire import openpi
 
 STATE = np.array([0, 0, 0, 0, 0, 1, 0.04, -0.04])
 
@@ -48,7 +48,7 @@ def batch(*tasks: tuple[int, str | None]) -> bytes:
         {"observation/image": image(p), "observation/wrist_image": image(0), "observation/state": STATE}
         for p, _ in tasks
     ]
-    return codec.encode(
+    return openpi.encode(
         {"batch": [one | ({"prompt": text} if text else {}) for one, (_, text) in zip(seen, tasks, strict=True)]}
     )
 
@@ -104,14 +104,14 @@ def test_a_batch_of_another_size_ends_the_episodes_of_all_its_places(served_batc
 
 def test_nothing_is_acted_on_if_one_observation_is_wrong(served_batches: Any) -> None:
     client, _, sizes = served_batches
-    wrong = codec.encode({"batch": [{"observation/image": image(0), "observation/state": STATE, "prompt": "task 1"}]})
+    wrong = openpi.encode({"batch": [{"observation/image": image(0), "observation/state": STATE, "prompt": "task 1"}]})
     for asked, said in (
         (batch((1, "task 1"), (2, None)), "instruction"),
         (wrong, "observation/wrist_image"),
-        (codec.encode({"batch": []}), "want a list of one observation or more"),
-        (codec.encode({"batch": np.zeros(3)}), "want a list of one observation or more"),
-        (codec.encode({"batch": [1]}), "want a map"),
-        (codec.encode({"reset": 1}), "want true"),
+        (openpi.encode({"batch": []}), "want a list of one observation or more"),
+        (openpi.encode({"batch": np.zeros(3)}), "want a list of one observation or more"),
+        (openpi.encode({"batch": [1]}), "want a map"),
+        (openpi.encode({"reset": 1}), "want true"),
     ):
         with client.websocket_connect("/openpi") as socket:
             socket.receive_bytes()
@@ -141,7 +141,7 @@ def test_each_observation_of_a_batch_counts_for_its_key_before_any_is_acted_on()
         socket.recv()
         ask = partial(batch, *[(1, "task 1")] * 3)
         socket.send(ask())
-        assert codec.decode(socket.recv())["actions"].shape == (3, 2, 7)  # type: ignore[arg-type]
+        assert openpi.decode(socket.recv())["actions"].shape == (3, 2, 7)  # type: ignore[arg-type]
         socket.send(ask())
         assert "requests a second" in str(socket.recv())
         assert agent.sizes == [3]
@@ -156,6 +156,6 @@ def test_a_reset_begins_the_next_episode_of_every_session(answered: bool) -> Non
         for _ in range(2):
             assert call(socket, libero(1))["actions"][0, 2] == 1
             assert call(socket, batch((1, "task 1")))["actions"][0, 0, 2] == 1
-            socket.send_bytes(codec.encode({"reset": True}))
+            socket.send_bytes(openpi.encode({"reset": True}))
             if answered:
-                assert codec.decode(socket.receive_bytes()) == {"reset": True}
+                assert openpi.decode(socket.receive_bytes()) == {"reset": True}

@@ -20,7 +20,7 @@ from vlagents_ray.serve.dialects.routes import dialect_routes
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.wire.openpi import codec as openpi_codec
+from vlagents_ray.wire import openpi as openpi_codec
 
 METADATA_TOLD = {"policy": "mirror", "checkpoint": None, "version": "0", "reset_pose": [0.5]}
 

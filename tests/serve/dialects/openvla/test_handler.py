@@ -20,7 +20,7 @@ from vlagents_ray.serve.dialects.routes import dialect_routes
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.wire.openvla import codec as openvla_codec
+from vlagents_ray.wire import openvla as openvla_codec
 
 
 def test_openvla_answers_an_action_plain_and_encoded_twice(context: tuple[TestClient, Engine]) -> None:

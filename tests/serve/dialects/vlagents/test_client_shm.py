@@ -13,7 +13,7 @@ import pytest
 from process_resources import descriptors
 
 from vlagents_ray.errors import InvalidObservation
-from vlagents_ray.serve.dialects.vlagents.client_shm import SharedMemory
+from vlagents_ray.serve.dialects.vlagents import SharedMemory
 
 
 @pytest.fixture(name="segment")
@@ -36,7 +36,7 @@ def test_what_the_client_wrote_is_read_each_time_anew(segment: Segment) -> None:
 def test_a_readers_end_leaves_the_segment_to_its_client(segment: Segment) -> None:
     """Also that of its whole process, whose resource tracker must not have heard of it."""
     code = (
-        "import sys\nfrom vlagents_ray.serve.dialects.vlagents.client_shm import SharedMemory\n"
+        "import sys\nfrom vlagents_ray.serve.dialects.vlagents import SharedMemory\n"
         "print(SharedMemory(same_machine=True).read(sys.argv[1], 5).decode())"
     )
     done = subprocess.run(

@@ -15,10 +15,8 @@ from rpyc_client import document
 from vlagents_ray.errors import InvalidObservation, MalformedMessage, MessageTooLarge, VLAgentsError
 from vlagents_ray.images.jpeg_png import encode_jpeg
 from vlagents_ray.interface import GOAL_IMAGE, Act
-from vlagents_ray.protocol.budget import Budget
-from vlagents_ray.protocol.messages import Limits
-from vlagents_ray.serve.dialects.vlagents import codec as vlagents_codec
-from vlagents_ray.wire import json_numpy
+from vlagents_ray.protocol.messages import Budget, Limits
+from vlagents_ray.wire import json_numpy, vlagents
 
 LIMITS = Limits()
 
@@ -38,9 +36,9 @@ class Memory:
         return bytearray(self.segments[name][:size])
 
 
-def act(value: object, memory: Memory | None = None, limits: Limits = LIMITS) -> vlagents_codec.ObservationRequest:
+def act(value: object, memory: Memory | None = None, limits: Limits = LIMITS) -> vlagents.ObservationRequest:
     text = value if isinstance(value, str) else json_numpy.dumps(value)
-    return vlagents_codec.read_act(text, Budget(limits), memory or Memory())
+    return vlagents.read_act(text, Budget(limits), memory or Memory())
 
 
 def test_one_robot_keeps_its_names() -> None:
@@ -85,18 +83,18 @@ def test_of_several_frames_the_last_is_taken() -> None:
 
 def test_a_reset_of_0_2_brings_instruction_and_options() -> None:
     old = {"cameras": {}, "camera_data_type": "raw", "gripper": None, "state": np.ones(3), "info": {}}
-    episode = vlagents_codec.read_reset(json_numpy.dumps([old, "go", {"seed": 4}]), Budget(LIMITS), Memory())
+    episode = vlagents.read_reset(json_numpy.dumps([old, "go", {"seed": 4}]), Budget(LIMITS), Memory())
     assert (episode.seen.instruction, episode.kwargs, episode.seen.robots) == ("go", {"seed": 4}, ())
     assert episode.seen.obs.state["state"].dtype == np.float32
     for options in ({"obs": 1}, {"contract": {}}, 3):
         with pytest.raises(MalformedMessage, match="options"):
-            vlagents_codec.read_reset(json_numpy.dumps([old, "go", options]), Budget(LIMITS), Memory())
+            vlagents.read_reset(json_numpy.dumps([old, "go", options]), Budget(LIMITS), Memory())
 
 
 def test_rows_become_steps_and_the_gripper_has_a_place_of_its_own() -> None:
     rows = np.array([[1, 2, -1], [3, 4, 1]], np.float32)
-    parts = {"arm": vlagents_codec.Part(gripper=-1, gripper_open=-1.0, gripper_closed=1.0)}
-    acts = json.loads(vlagents_codec.write_act(Act(rows, True, {"a": 1}), ["arm"], parts))["acts"]
+    parts = {"arm": vlagents.Part(gripper=-1, gripper_open=-1.0, gripper_closed=1.0)}
+    acts = json.loads(vlagents.write_act(Act(rows, True, {"a": 1}), ["arm"], parts))["acts"]
     assert [step["arm"]["gripper"] for step in acts] == [1.0, 0.0]
     assert [step["arm"]["done"] for step in acts] == [False, True]
     assert [step["arm"]["info"] for step in acts] == [{"a": 1}, {}]
@@ -104,8 +102,8 @@ def test_rows_become_steps_and_the_gripper_has_a_place_of_its_own() -> None:
 
 
 def test_columns_are_shared_out_among_robots() -> None:
-    parts = {"left": vlagents_codec.Part(0, 2, 1), "right": vlagents_codec.Part(2, 4)}
-    [step] = json.loads(vlagents_codec.write_act(Act(np.arange(4.0)), ["left", "right"], parts))["acts"]
+    parts = {"left": vlagents.Part(0, 2, 1), "right": vlagents.Part(2, 4)}
+    [step] = json.loads(vlagents.write_act(Act(np.arange(4.0)), ["left", "right"], parts))["acts"]
     assert step["left"]["action"]["shape"] == [1]
     assert step["left"]["gripper"] == 1.0
     assert step["right"]["action"]["shape"] == [2]

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from rpyc_client import LOCAL, REMOTE, ROOT, TUPLE, VALUE, call, request
 
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge, VLAgentsError
-from vlagents_ray.wire.vlagents import rpyc
-from vlagents_ray.wire.vlagents.rpyc import Handler
+from vlagents_ray.wire import rpyc
+from vlagents_ray.wire.rpyc import Handler
 
 LIMIT = 2**16
 

@@ -17,7 +17,7 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Obs
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.launch.deployment_file import deployment
-from vlagents_ray.wire.openpi import codec
+from vlagents_ray.wire import openpi
 
 PATH = "/v1/realtime/robot/openpi"
 
@@ -88,7 +88,7 @@ def test_a_reset_and_another_session_id_begin_an_episode(robots: Any) -> None:
         socket.receive_bytes()
         acts = [ask(socket, libero(1, session_id=name))[0, 2] for name in ("a", "a", "b", "b", "a")]
         assert acts == [1, 2, 1, 2, 1]
-        assert ask(socket, codec.encode({"endpoint": "reset"})) == {"status": "reset successful"}
+        assert ask(socket, openpi.encode({"endpoint": "reset"})) == {"status": "reset successful"}
         assert ask(socket, libero(1, session_id="a"))[0, 2] == 1
 
 
@@ -107,9 +107,9 @@ def test_an_error_is_a_map_and_the_connection_stays_open(robots: Any) -> None:
         socket.receive_bytes()
         for data, said in (
             (b"\xc1", "msgpack"),
-            (codec.encode([1]), "map"),
-            (codec.encode({"prompt": "task 1"}), "observation/image"),
-            (codec.encode({"endpoint": "kill"}), "endpoint"),
+            (openpi.encode([1]), "map"),
+            (openpi.encode({"prompt": "task 1"}), "observation/image"),
+            (openpi.encode({"endpoint": "kill"}), "endpoint"),
             (libero(1, prompt=None), "instruction"),
             (libero(1, seed="x"), "seed"),
             (libero(1, seed=-1), "seed"),

@@ -8,7 +8,7 @@ import pytest
 from shm_client import LIMITS, Keeper
 
 from vlagents_ray.serve.access.api_keys import NoKey
-from vlagents_ray.serve.endpoints.local.shm import ShmServer
+from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.engine.engine import Engine
 
 

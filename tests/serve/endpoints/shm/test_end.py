@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from eval_fakes import wait_for
 
-from vlagents_ray.client.transports.local.shm import ShmTransport
+from vlagents_ray.client.transports.shm import ShmTransport
 from vlagents_ray.errors import ConnectionLost
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.messages import (
@@ -23,7 +23,7 @@ from vlagents_ray.protocol.messages import (
     Request,
 )
 from vlagents_ray.serve.access.api_keys import NoKey
-from vlagents_ray.serve.endpoints.local.shm import ShmServer
+from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.engine.engine import Engine
 
 

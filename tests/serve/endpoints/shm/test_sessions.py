@@ -25,7 +25,7 @@ from vlagents_ray.errors import (
 )
 from vlagents_ray.interface import Obs
 from vlagents_ray.protocol.messages import Request
-from vlagents_ray.serve.endpoints.local.shm import ShmServer
+from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.engine.engine import Engine
 
 
@@ -133,7 +133,7 @@ def test_a_killed_client_leaves_nothing(served: tuple[Engine, ShmServer]) -> Non
     before = descriptors()
     code = (
         "import sys, time, numpy as np\n"
-        "from vlagents_ray.client.transports.local.shm import ShmTransport\n"
+        "from vlagents_ray.client.transports.shm import ShmTransport\n"
         "from vlagents_ray import Obs\n"
         "from vlagents_ray.protocol.messages import Request\n"
         f"t = ShmTransport({asdict(endpoint.address)!r}); t.connect(5)\n"

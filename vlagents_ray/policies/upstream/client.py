@@ -1,0 +1,209 @@
+"""What the clients of all protocols have in common."""
+
+from __future__ import annotations
+
+import abc
+import contextlib
+import inspect
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
+from websockets.protocol import State
+from websockets.sync.client import connect
+
+from vlagents_ray.errors import ConnectionLost, MalformedMessage, PolicyFailed, PolicyUnavailable, Unauthorized
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
+from vlagents_ray.wire.lerobot import PolicyInstructions
+from vlagents_ray.wire.outgoing import Outgoing
+
+if TYPE_CHECKING:
+    from websockets.sync.client import ClientConnection
+
+
+logger = logging.getLogger(__name__)
+
+Answer = np.ndarray | Mapping[str, np.ndarray]  # (D,) or (H, D), or such by the upstream's names
+_LOGGED = 8000  # characters of an upstream's error
+
+
+@dataclass(frozen=True, slots=True)
+class ClientOptions:
+    """What a client needs to know about its upstream."""
+
+    url: str
+    timeout_s: float  # s: an answer that takes longer counts as lost
+    key: str | None = field(default=None, repr=False)  # the upstream's API key
+    limits: Limits = DEFAULT_LIMITS
+    instructions: PolicyInstructions | None = None  # of LeRobot's server: the checkpoint that it loads
+    load_s: float = 600.0  # s: for loading it
+
+
+class UpstreamClient(abc.ABC):
+    """One connection to an upstream, which one thread uses at a time."""
+
+    batches: ClassVar[bool] = False
+    """Whether `ask` sends all observations in one message."""
+    keeps_sessions: ClassVar[bool] = False
+    """Whether the upstream keeps a session for each connection, by default."""
+    one_client: ClassVar[bool] = False
+    """Whether the upstream keeps the state of one client, and takes one connection therefore."""
+    one_session: ClassVar[bool] = False
+    """Whether the upstream keeps the state of one session, whatever its connections."""
+    mapping: ClassVar[str | None] = None
+    """The preset that is used if the deployment states no mapping."""
+    schemes: ClassVar[tuple[str, ...]] = ()
+    """The schemes that a URL may have, the usual one first."""
+    takes_key: ClassVar[bool] = True
+    """Whether the protocol has a place for an API key."""
+    text_key: ClassVar[str] = "task"
+    """What the `*` of the instruction's key stands for."""
+
+    def __init__(self, options: ClientOptions) -> None:
+        self.options = options
+
+    @staticmethod
+    def is_nested(key: str) -> bool:
+        """Return whether a key `a/b` of the mapping is the key `b` within `a`; else, it is one key."""
+        return "/" in key
+
+    @abc.abstractmethod
+    def connect(self, timeout_s: float) -> dict[str, Any]:
+        """Connect, and return what the upstream says about itself.
+
+        Raises:
+            PolicyUnavailable: It cannot be reached.
+        """
+
+    @property
+    @abc.abstractmethod
+    def is_open(self) -> bool:
+        """Whether the connection can be used."""
+
+    @abc.abstractmethod
+    def ask(self, observations: Sequence[Mapping[str, Any]]) -> list[Answer]:
+        """Return the actions for one observation, or for several if `batches`.
+
+        Raises:
+            ConnectionLost: The connection broke, or there was no answer in time; `close` was called.
+            PolicyFailed: The upstream answered with an error.
+            MalformedMessage, MessageTooLarge: Its answer is invalid.
+        """
+
+    def begin(self) -> None:  # noqa: B027 - not abstract: a protocol may have no such message
+        """Say that an episode begins, if the protocol can; raises what `ask` raises."""
+
+    @abc.abstractmethod
+    def close(self) -> None:
+        """Close the connection; it may be called twice."""
+
+    def differences(self, metadata: Mapping[str, Any], outgoing: Outgoing) -> list[str]:
+        """Return in what the upstream, by what it said about itself, differs from the mapping, with a remedy each."""
+        return []
+
+    def chunk(self, metadata: Mapping[str, Any]) -> int | None:
+        """Return the number of rows of the upstream's actions, if it said so."""
+        return None
+
+    def failed(self, text: object) -> PolicyFailed:
+        """Log an error that the upstream answered with, and return ours, without the upstream's details."""
+        logger.error("upstream %s answered with an error: %s", self.options.url, str(text)[:_LOGGED])
+        return PolicyFailed(f"upstream {self.options.url}: it answered with an error, which the server's log has")
+
+    def unreadable(self, got: object, want: str) -> MalformedMessage:
+        """Return the error for an answer that is not what the protocol says."""
+        return MalformedMessage(
+            f"upstream {self.options.url}: got {got}, want {want}; does it speak the protocol of the deployment?"
+        )
+
+
+# A WebSocket to an upstream.
+
+
+_LOG = logging.getLogger("vlagents_ray.upstream.websocket")
+_LOG.setLevel(logging.CRITICAL)  # it logs each lost connection as an error, which is raised as well
+_CLOSE_S = 1
+_REFUSED = (401, 403)
+# An upstream that computes on its event loop answers no pings meanwhile. Older versions of `websockets` send none.
+_NO_PINGS: dict[str, Any] = {"ping_interval": None} if "ping_interval" in inspect.signature(connect).parameters else {}
+
+
+class UpstreamSocket:
+    """A WebSocket to an upstream, which bounds the size of messages and the time of waiting.
+
+    A thread of its own answers the upstream's pings, so that a connection stays open while no session acts.
+    """
+
+    def __init__(self, options: ClientOptions, headers: dict[str, str]) -> None:
+        self._options = options
+        self._headers = headers
+        self._connection: ClientConnection | None = None
+        self._open = contextlib.ExitStack()
+
+    @property
+    def is_open(self) -> bool:
+        """Whether messages can be sent."""
+        return self._connection is not None and self._connection.protocol.state is State.OPEN
+
+    def open(self, timeout_s: float) -> None:
+        """Connect; raises `PolicyUnavailable` if it cannot be reached, `Unauthorized` if it refuses the key."""
+        url = self._options.url
+        try:
+            opening = connect(
+                url,
+                open_timeout=timeout_s,
+                close_timeout=_CLOSE_S,
+                compression=None,
+                max_size=self._options.limits.body_bytes,
+                additional_headers=self._headers,
+                logger=_LOG,
+                **_NO_PINGS,
+            )
+            self._connection = self._open.enter_context(opening)
+        except InvalidStatus as error:
+            if error.response.status_code in _REFUSED:
+                raise Unauthorized(
+                    f"upstream {url}: it refuses the API key (HTTP {error.response.status_code}); name the environment "
+                    f"variable with the right one in key_env"
+                ) from error
+            raise PolicyUnavailable(f"upstream {url}: refused with HTTP {error.response.status_code}") from error
+        except (OSError, InvalidHandshake, ConnectionClosed, TimeoutError) as error:
+            raise PolicyUnavailable(f"upstream {url}: cannot connect ({error}); is it running?") from error
+
+    def send(self, message: bytes) -> None:
+        """Send a binary message; raises `ConnectionLost`."""
+        try:
+            self._opened().send(message)
+        except (ConnectionClosed, OSError) as error:
+            raise self._lost(str(error)) from error
+
+    def recv(self, timeout_s: float | None = None) -> bytes | str:
+        """Return the next message.
+
+        Raises:
+            ConnectionLost: The connection broke, or no message came in time.
+        """
+        wait_s = self._options.timeout_s if timeout_s is None else timeout_s
+        try:
+            return self._opened().recv(timeout=wait_s)
+        except TimeoutError as error:
+            raise self._lost(f"no answer within {wait_s:.3g} s") from error
+        except (ConnectionClosed, OSError) as error:
+            raise self._lost(str(error)) from error
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._connection = None
+        self._open.close()
+
+    def _opened(self) -> ClientConnection:
+        if self._connection is None:
+            raise ConnectionLost(f"upstream {self._options.url}: the connection is closed")
+        return self._connection
+
+    def _lost(self, text: str) -> ConnectionLost:
+        self.close()
+        return ConnectionLost(f"upstream {self._options.url}: {text}")

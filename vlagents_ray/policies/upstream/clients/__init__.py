@@ -1,1 +1,0 @@
-"""The clients of other policy servers, one module a protocol."""

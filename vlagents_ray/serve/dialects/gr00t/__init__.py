@@ -1,1 +1,0 @@
-"""GR00T's protocol: msgpack over ZeroMQ, on its own port."""

@@ -1,0 +1,370 @@
+"""LeRobot's asynchronous inference over gRPC: a session for each connection of a robot client."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import socket
+import threading
+import time
+import uuid
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from vlagents_ray.errors import (
+    Forbidden,
+    InvalidInput,
+    MalformedMessage,
+    MessageTooLarge,
+    NotReset,
+    PolicyUnavailable,
+    VLAgentsError,
+)
+from vlagents_ray.interface import Obs
+from vlagents_ray.registry import require
+from vlagents_ray.serve.access.api_keys import NoKey
+from vlagents_ray.serve.config.dialects import KeylessPortConfig, MappingSetting
+from vlagents_ray.serve.dialects.base import GatewayContext, PortDialect
+from vlagents_ray.serve.dialects.gateway_sessions import GatewayClients, GatewaySessions
+from vlagents_ray.serve.engine.admission import MessageAdmission
+from vlagents_ray.wire import lerobot
+from vlagents_ray.wire.lerobot import PRESETS, PolicyInstructions, RobotObservation, TransferState
+from vlagents_ray.wire.mapping import KeyMapping
+
+logger = logging.getLogger(__name__)
+
+_WAIT_S = 2.0  # time for which a request for actions waits for an observation, as at LeRobot's own server
+_HZ = 30.0  # rate of the actions' time stamps if the policy's contract states none, as at LeRobot's own server
+
+
+@dataclass(slots=True)
+class _Waiting:
+    """An observation that the policy did not get yet."""
+
+    seen: RobotObservation
+    obs: Obs
+    instruction: str | None
+    admission: MessageAdmission
+
+
+class LeRobotConnection:
+    """One client, from its `Ready` on. Its requests come on several threads; the session is used by one at a time."""
+
+    def __init__(self, context: GatewayContext, mapping: KeyMapping, checkpoint: str | None) -> None:
+        self._context = context
+        self._mapping = mapping
+        self._checkpoint = checkpoint
+        self._session = GatewaySessions(context.connect, context.contract)
+        self._session.show(NoKey.OPEN, None)  # the protocol has no key, and the deployment accepted that
+        self._robot: PolicyInstructions | None = None
+        self._acted = -1  # time step of the last observation that the policy got
+        self._waiting: _Waiting | None = None
+        self._arrival = threading.Condition()
+        self._acting = threading.Lock()
+        self._requests = 0  # number of requests without a reply
+        self._used = time.monotonic()
+        self._ended = False
+
+    @property
+    def begun(self) -> bool:
+        """Whether the client has a session."""
+        return self._session.begun
+
+    def quiet_s(self, now: float) -> float:
+        """Return the time since the client's last request, s; 0 while it waits for a reply."""
+        return 0.0 if self._requests else now - self._used
+
+    def refusal(self) -> str | None:
+        """Return None, as the client has no key that could become invalid."""
+        return None
+
+    @contextmanager
+    def request(self) -> Iterator[None]:
+        """Count a request as without a reply."""
+        with self._arrival:
+            self._requests += 1
+        try:
+            yield
+        finally:
+            with self._arrival:
+                self._requests -= 1
+                self._used = time.monotonic()
+
+    def set_up(self, robot: PolicyInstructions) -> None:
+        """Take the policy instructions; raise `InvalidInput` for another checkpoint than the deployment's."""
+        if self._checkpoint not in (None, robot.checkpoint):
+            raise InvalidInput(
+                f"pretrained_name_or_path: got {robot.checkpoint[:80]!r}, this server acts for {self._checkpoint!r}; "
+                "start the client with that"
+            )
+        logger.info("lerobot: a client of %r %r begins", robot.policy_type[:80], robot.checkpoint[:80])
+        self._robot = robot
+
+    def observe(self, data: bytes, admission: MessageAdmission) -> None:
+        """Take an observation in place of an earlier one that the policy did not get yet.
+
+        One of a time step that the policy got already is left out, unless the client has no action left.
+
+        Args:
+            data: The pickle.
+            admission: The admission of the message, which is released when the observation is dropped or acted on.
+        """
+        if self._robot is None:
+            raise NotReset("SendPolicyInstructions: got none since Ready; start the client again")
+        admission.begin("act")
+        seen = lerobot.read_observation(data, admission)
+        if seen.timestep <= self._acted and not seen.must_go:
+            return
+        theirs = lerobot.frame(seen, self._robot)
+        obs, instruction = self._mapping.obs(theirs, self._context.limits, self._context.contract)
+        if not self._session.begun:
+            self._mapping.warn_of_unread_cameras(theirs, "lerobot")
+        with self._arrival:
+            earlier, self._waiting = self._waiting, _Waiting(seen, obs, instruction, admission)
+            self._arrival.notify()
+        if earlier is not None:
+            earlier.admission.release()
+
+    def actions(self) -> bytes | None:
+        """Return the pickle of the actions for the newest observation; None if there is none for two seconds."""
+        deadline = time.monotonic() + _WAIT_S
+        if not self._acting.acquire(timeout=_WAIT_S):
+            return None
+        try:
+            waiting = self._next(deadline)
+            return None if waiting is None else self._act(waiting)
+        finally:
+            self._acting.release()
+            if self._ended:
+                self.end()
+
+    def end(self) -> None:
+        """End the client's session, after the current request."""
+        with self._arrival:
+            self._ended = True
+            self._waiting = None
+            self._arrival.notify_all()
+        if self._acting.acquire(blocking=False):
+            try:
+                self._session.close()
+            except Exception:
+                logger.exception("lerobot: a session did not end")
+            finally:
+                self._acting.release()
+
+    def _next(self, deadline: float) -> _Waiting | None:
+        with self._arrival:
+            self._arrival.wait_for(lambda: self._waiting or self._ended, deadline - time.monotonic())
+            waiting, self._waiting = self._waiting, None
+        return None if self._ended else waiting
+
+    def _act(self, waiting: _Waiting) -> bytes:
+        robot, contract, seen = self._robot, self._context.contract, waiting.seen
+        if robot is None:
+            raise NotReset("SendPolicyInstructions: got none since Ready; start the client again")
+        before, self._acted = self._acted, max(self._acted, seen.timestep)
+        try:
+            act = self._session.act(waiting.obs, waiting.instruction)
+        except BaseException:
+            self._acted = before  # the client's next observation of this time step is not left out
+            raise
+        finally:
+            waiting.admission.release()
+        rows: np.ndarray = self._mapping.rows(act.action, None if contract is None else contract.action)
+        hz = (contract and contract.control_hz) or _HZ
+        return lerobot.write_chunk(rows[: robot.actions_per_chunk], seen.timestamp, seen.timestep, 1 / hz)
+
+
+_UPLOAD_S = 30.0  # maximum time of an observation, from its first part to its last
+_TICK_S = 0.5
+_END_S = 3.0
+_REQUESTS = 4  # maximum number of requests of one client at a time; LeRobot's has two
+_HEARTBEAT_MS = 10_000
+_DETAILS = 500  # maximum number of characters of an error, which gRPC sends in a header of 8 KiB at most
+# HTTP status -> name of gRPC's; the client sends a request again by itself if it is UNAVAILABLE or DEADLINE_EXCEEDED
+_STATUS = {
+    400: "INVALID_ARGUMENT",
+    403: "PERMISSION_DENIED",
+    404: "NOT_FOUND",
+    409: "FAILED_PRECONDITION",
+    413: "RESOURCE_EXHAUSTED",
+    422: "INVALID_ARGUMENT",
+    429: "RESOURCE_EXHAUSTED",
+    503: "UNAVAILABLE",
+    504: "DEADLINE_EXCEEDED",
+}
+
+
+class LeRobotDialectConfig(KeylessPortConfig):
+    """The settings of LeRobot's asynchronous inference, the protocol of its `RobotClient`."""
+
+    mapping: MappingSetting = "lerobot"
+    port: int = Field(default=8080, ge=1, le=65535)
+    checkpoint: str | None = Field(
+        default=None,
+        description="the `pretrained_name_or_path` that clients must state; unset: any, as it is not loaded: the "
+        "policy of the deployment acts",
+    )
+
+
+class LeRobotDialect(PortDialect):
+    """LeRobot's gRPC service; gRPC's threads process the requests, one more thread removes clients that are gone."""
+
+    Config = LeRobotDialectConfig
+    clients = "LeRobot"
+    summary = (
+        "A session is the connection, until it is idle; an episode begins with `Ready` and with each new task. The "
+        "newest observation is acted on. Pickles are read as data: numbers, texts and numpy arrays."
+    )
+    scheme = "grpc"
+    requires = ("grpc",)
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = PRESETS
+    config: LeRobotDialectConfig
+
+    def __init__(self, name: str, config: LeRobotDialectConfig, context: GatewayContext) -> None:
+        super().__init__(name, config, context)
+        self._clients: GatewayClients[str, LeRobotConnection] = GatewayClients(context)
+        self._uploads: dict[Any, float] = {}  # gRPC's context of each observation that is being received -> its start
+        self._server: Any = None
+        self._ipv4 = True
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._watch, name="lerobot", daemon=True)
+
+    def serve(self, listener: socket.socket) -> None:
+        grpc = require("grpc")
+        self._ipv4 = listener.family == socket.AF_INET
+        host, port = listener.getsockname()[:2]
+        most = _REQUESTS * self.context.sessions
+        self._server = grpc.server(
+            ThreadPoolExecutor(most, "lerobot-client"),
+            handlers=[grpc.method_handlers_generic_handler(lerobot.SERVICE, self._methods(grpc))],
+            options=[
+                ("grpc.so_reuseport", 0),  # another process could share the port otherwise
+                ("grpc.max_concurrent_streams", _REQUESTS),
+                ("grpc.max_connection_idle_ms", int(1e3 * self.context.idle_s)),
+                ("grpc.server_handshake_timeout_ms", _HEARTBEAT_MS),
+                ("grpc.keepalive_time_ms", _HEARTBEAT_MS),
+                ("grpc.keepalive_timeout_ms", _HEARTBEAT_MS),
+                # a compressed message would be decompressed whatever its size
+                ("grpc.compression_enabled_algorithms_bitset", 1),
+            ],
+            maximum_concurrent_rpcs=most,
+        )
+        try:
+            self._server.add_insecure_port(f"[{host}]:{port}" if ":" in host else f"{host}:{port}")
+        finally:
+            listener.close()  # gRPC has the port now
+        self._server.start()
+        self._thread.start()
+
+    def alive(self) -> bool:
+        return self._thread.is_alive()
+
+    def close(self) -> None:
+        self._closing.set()
+        self._clients.end_all()
+        if self._server is not None:
+            self._server.stop(None).wait(_END_S)
+        if self._thread.is_alive():
+            self._thread.join(_END_S)
+
+    def _methods(self, grpc: Any) -> dict[str, Any]:
+        """Return the service's methods, over plain bytes."""
+        unary, stream = grpc.unary_unary_rpc_method_handler, grpc.stream_unary_rpc_method_handler
+        return {
+            "Ready": unary(partial(self._answer, grpc, self._ready)),
+            "SendPolicyInstructions": unary(partial(self._answer, grpc, self._set_up)),
+            "SendObservations": stream(partial(self._answer, grpc, self._observe)),
+            "GetActions": unary(partial(self._answer, grpc, self._act)),
+        }
+
+    def _answer(self, grpc: Any, method: Callable[[Any, Any], bytes], request: Any, context: Any) -> bytes:
+        """Return the reply to a request, or end it with gRPC's status of an error."""
+        try:
+            return method(request, context)
+        except VLAgentsError as error:
+            status, text = _STATUS.get(error.status, "INTERNAL"), f"{error.code}: {error}"
+        except Exception as error:
+            if isinstance(error, grpc.RpcError):  # the client is gone
+                return lerobot.EMPTY
+            name = uuid.uuid4().hex
+            logger.exception("lerobot: request %s failed", name)
+            status, text = "INTERNAL", f"internal error; the server's log has the details under {name}"
+        context.abort(getattr(grpc.StatusCode, status), text[:_DETAILS])
+        raise AssertionError  # abort raises
+
+    def _ready(self, _: bytes, context: Any) -> bytes:
+        if self._closing.is_set():
+            raise PolicyUnavailable("the server is stopping; connect again")
+        if self._ipv4 and context.peer().startswith("ipv6:"):  # gRPC listens there, too, if the host is 0.0.0.0
+            raise Forbidden("this server is for IPv4; connect to such an address, or set dialects.lerobot.host to '::'")
+        make = partial(LeRobotConnection, self.context, self.mapping, self.config.checkpoint)
+        self._clients.add(context.peer(), make)
+        return lerobot.EMPTY
+
+    def _set_up(self, message: bytes, context: Any) -> bytes:
+        with self._client(context) as client:
+            if (data := lerobot.read_data(message)) is None:
+                raise MalformedMessage("policy instructions: got none")
+            client.set_up(lerobot.read_instructions(data, self.context.limits))
+        return lerobot.EMPTY
+
+    def _observe(self, parts: Iterator[bytes], context: Any) -> bytes:
+        with self._client(context) as client:
+            robot = self.config.rank == "robot"
+            admission = MessageAdmission(self.context.admission, self.context.limits, None, robot=robot, inline=False)
+            self._uploads[context] = time.monotonic()
+            try:
+                data = _joined(parts, admission)
+            finally:
+                del self._uploads[context]
+            client.observe(data, admission)
+        return lerobot.EMPTY
+
+    def _act(self, _: bytes, context: Any) -> bytes:
+        with self._client(context) as client:
+            actions = client.actions()
+        return lerobot.EMPTY if actions is None else lerobot.write_data(actions)
+
+    @contextlib.contextmanager
+    def _client(self, context: Any) -> Iterator[LeRobotConnection]:
+        """Yield the client of a request, which is told apart by its connection."""
+        client = self._clients.get(context.peer())
+        if client is None:
+            raise NotReset("Ready: got none over this connection, or it was idle for too long; start the client again")
+        with client.request():
+            yield client
+
+    def _watch(self) -> None:
+        """Remove clients that are gone, and end observations that take too long, until the dialect is closed."""
+        while not self._closing.wait(_TICK_S):
+            self._clients.forget_quiet()
+            late = time.monotonic() - _UPLOAD_S
+            for context, begun in list(self._uploads.items()):
+                if begun < late:
+                    context.cancel()
+
+
+def _joined(messages: Iterator[bytes], admission: MessageAdmission) -> bytes:
+    """Return the pickle whose parts come in messages; each is counted when it arrives."""
+    parts: list[memoryview] = []
+    size, limit = 0, admission.limits.body_bytes
+    for message in messages:
+        part = lerobot.read_observation_part(message)
+        if part.state is TransferState.BEGIN and parts:
+            raise MalformedMessage("observation: begins twice")
+        size += len(part.data)
+        if size > limit:
+            raise MessageTooLarge(f"observation: more than {limit} bytes; send smaller images, or raise `limits`")
+        admission.receive(len(part.data))
+        parts.append(part.data)
+        if part.state is TransferState.END:
+            return b"".join(parts)
+    raise MalformedMessage("observation: ended before its last part")

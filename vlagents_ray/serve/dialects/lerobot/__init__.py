@@ -1,1 +1,0 @@
-"""LeRobot's asynchronous inference over gRPC, on its own port."""

@@ -1,0 +1,371 @@
+"""openpi's clients over WebSocket: requests and replies are binary maps, and the server sends the first message.
+
+RoboArena's clients (`roboarena/`) use nearly the same protocol and also connect to the root. Both dialects may be on:
+RoboArena's requests name an `endpoint`, openpi's do not. The first message is then RoboArena's configuration, which
+openpi's client takes for metadata.
+
+An error is a text with a request id, after which the connection is closed (1011) except for 429; openpi's own server
+sends a traceback.
+
+A batch, `{"batch": [observation, ...]}`, is that of openpi's pull request 941 (its head 5bdadc8), which was open when
+this was written: the reply is one map, whose `actions` are stacked. openpi's own client sends nothing when it is reset;
+the message `{"reset": True}` is that of its derivatives, such as BEHAVIOR-1K's client, which waits for no reply. The
+replies that the latter reads are in `rows.py`.
+"""
+
+from __future__ import annotations
+
+import abc
+import asyncio
+import time
+import uuid
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from vlagents_ray.errors import MalformedMessage, TooManyRequests, VLAgentsError, shown
+from vlagents_ray.protocol.messages import Reply
+from vlagents_ray.serve.config.dialects import DialectConfig, MappingSetting
+from vlagents_ray.serve.dialects.base import (
+    INTERNAL_ERROR,
+    POLICY_VIOLATION,
+    RouteDialect,
+    Stream,
+    accept_or_refuse,
+    decoded,
+    public_problem,
+)
+from vlagents_ray.serve.dialects.implicit_session import ImplicitSession, SessionObs, act_together
+from vlagents_ray.serve.engine.dispatch import REFUSED, Dispatcher
+from vlagents_ray.serve.engine.metrics_buffer import RequestTrace
+from vlagents_ray.wire import openpi
+from vlagents_ray.wire.openpi import PRESETS
+
+
+class MapDialect(RouteDialect):
+    """A dialect whose messages are maps in openpi's encoding; all such dialects share the server's root."""
+
+    root = "openpi"
+
+    async def stream(self, socket: WebSocket) -> None:
+        """Serve one connection at this dialect's path."""
+        await MapEndpoint([self]).stream(socket)
+
+    def at_root(self, sharing: Sequence[MapDialect]) -> Stream:
+        return MapEndpoint(sharing).stream
+
+    @abc.abstractmethod
+    def first(self) -> dict[str, Any]:
+        """Return the message that a client gets when it connects."""
+
+    @abc.abstractmethod
+    def speaks(self, message: dict[str, Any]) -> bool:
+        """Return whether a message comes from a client of this dialect."""
+
+    @property
+    def idle_s(self) -> float | None:
+        """The time after which the connection of a client that sends nothing is closed, s; None if it stays open."""
+        return None
+
+    def begins(self, message: dict[str, Any], connection: MapConnection) -> bytes | str | None:
+        """Begin an episode if the message requires it.
+
+        Returns:
+            The reply if the message is not an observation; empty if the client waits for none.
+        """
+        return None
+
+    def batch(self, message: dict[str, Any]) -> list[Any] | None:
+        """Return the observations of a message that is a batch; None if it is one observation."""
+        return None
+
+    def rows_taken(self, message: dict[str, Any]) -> int | None:
+        """Return how many rows the client executes before its next message; None if it gets whole chunks."""
+        return None
+
+    def reset_arguments(self, message: dict[str, Any]) -> dict[str, Any]:
+        """Return the keyword arguments of the policy's reset, should this observation begin an episode."""
+        return {}
+
+    def answer(self, replies: Sequence[Reply], before_ms: float | None, *, batched: bool) -> Any:
+        """Return the replies in the client's format; `before_ms` is the server's time for the previous message."""
+        inference_ms = max(reply.timing["inference_ms"] for reply in replies)
+        infer_ms = max(reply.timing["queue_ms"] + reply.timing["inference_ms"] for reply in replies)
+        rows = [self.rows(reply) for reply in replies]
+        return {
+            "actions": _stacked(rows) if batched else rows[0],
+            "policy_timing": {"infer_ms": inference_ms} | ({"batch_size": len(rows)} if batched else {}),
+            "server_timing": {"infer_ms": infer_ms} | ({} if before_ms is None else {"prev_total_ms": before_ms}),
+        }
+
+    def failure(self, text: str) -> bytes | None:
+        """Return an error as a message after which the connection stays open; None: it is a text, then a close."""
+        return None
+
+
+def _stacked(chunks: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the chunks of a batch as (B, H, D)."""
+    if len(shapes := {chunk.shape for chunk in chunks}) > 1:
+        raise VLAgentsError(
+            f"batch: got chunks of the shapes {sorted(shapes)}, and its reply is one array; send each by itself"
+        )
+    return np.stack(chunks)
+
+
+class OpenPiDialectConfig(DialectConfig):
+    """The settings of `openpi-client`, over WebSocket."""
+
+    mapping: MappingSetting  # each of openpi's robots has different keys, so there is no default
+    metadata: dict[str, Any] = Field(
+        default_factory=dict, description="added to what the client is sent first, such as reset_pose"
+    )
+    answer_reset: bool = Field(
+        default=False, description='whether {"reset": True} is answered, by the same; clients differ in waiting for it'
+    )
+    answer: Literal["chunk", "row"] = Field(
+        default="chunk",
+        description="a reply has a whole chunk, as `actions`; or the next row of one that is kept here, as `action`, "
+        "which BEHAVIOR-1K's client reads",
+    )
+    execute: int | None = Field(default=None, ge=1, description="rows of each chunk that are used; null: all")
+
+
+class OpenPiDialect(MapDialect):
+    """openpi's protocol: a session begins with the connection, and an episode with each new prompt.
+
+    The observations of a batch are those of further sessions, in order. A batch of another size ends all their
+    episodes, as nothing says which of its observations is whose.
+    """
+
+    Config = OpenPiDialectConfig
+    clients = "openpi"
+    summary = (
+        "A session is the connection, or a place in its batches; an episode begins with each new prompt. An error is a "
+        "text, then close 1011."
+    )
+    paths: ClassVar[Mapping[str, str]] = {"WS /openpi": "stream"}
+    presets = PRESETS
+    config: OpenPiDialectConfig
+
+    def first(self) -> dict[str, Any]:
+        known = self.context.metadata()
+        return {key: known.get(key) for key in ("policy", "checkpoint", "version")} | self.config.metadata
+
+    def speaks(self, message: dict[str, Any]) -> bool:
+        return "endpoint" not in message
+
+    def begins(self, message: dict[str, Any], connection: MapConnection) -> bytes | str | None:
+        if message.keys() != {"reset"}:
+            return None
+        if message["reset"] is not True:
+            raise MalformedMessage(f"reset: got {shown(message['reset'])}, want true")
+        connection.end_episodes()
+        return openpi.encode(message) if self.config.answer_reset else b""
+
+    def batch(self, message: dict[str, Any]) -> list[Any] | None:
+        if message.keys() != {"batch"}:
+            return unstacked(message, self.context.engine.sessions.limit) if self.config.answer == "row" else None
+        batch = message["batch"]
+        if not isinstance(batch, list) or not batch:
+            raise MalformedMessage(f"batch: got {shown(batch)}, want a list of one observation or more")
+        return batch
+
+    def rows(self, reply: Reply) -> np.ndarray:
+        return super().rows(reply)[: self.config.execute]
+
+    def rows_taken(self, message: dict[str, Any]) -> int | None:
+        return number_of_rows(message) if self.config.answer == "row" else None
+
+
+class MapConnection:
+    """The state of one dialect on a connection, with its session."""
+
+    def __init__(self, dialect: MapDialect) -> None:
+        self.dialect = dialect
+        self.sender: Dispatcher = dialect.sender()
+        self.session: ImplicitSession = dialect.session(self.sender)
+        self.episode: str | None = None  # the client's name of the episode
+        self._batched: list[ImplicitSession] = []  # the session of each place in a batch
+        self._rows = Rows()
+        self._before_ms: float | None = None
+
+    def end_episodes(self) -> None:
+        """Let the next observation of each session begin an episode."""
+        for session in (self.session, *self._batched):
+            session.episode.end()
+
+    async def answer(
+        self, message: dict[str, Any], trace: RequestTrace, request_id: str, gate: Dispatcher
+    ) -> bytes | str:
+        """Return the reply to one message; `gate` counts the observations of a batch after the first for the key."""
+        dialect = self.dialect
+        if (answer := dialect.begins(message, self)) is not None:
+            return answer
+        batch = dialect.batch(message)
+        observations = [message] if batch is None else batch
+        gate.count(len(observations) - 1)
+        read = [dialect.read(one) for one in observations]
+        sessions = [self.session] if batch is None else await self._of_batch(len(batch))
+        if not sessions[0].episode.begun:
+            dialect.mapping.warn_of_unread_cameras(observations[0], dialect.name)
+        seen = [SessionObs(session, *one) for session, one in zip(sessions, read, strict=True)]
+        number, batched = dialect.rows_taken(message), batch is not None
+        begins = any(session.episode.begins(instruction) for session, _, instruction in seen)
+        if number is not None and not begins and self._rows.has(number, stacked=batched):
+            return openpi.encode(self._rows.take(number))
+        trace.decoded_alike(len(observations))
+        replies = await act_together(seen, request_id, **dialect.reset_arguments(message))
+        data = trace.written(replies, lambda: openpi.encode(self._said(replies, number, batched=batched)))
+        self._before_ms = (time.perf_counter() - trace.arrived) * 1e3
+        return data
+
+    def _said(self, replies: Sequence[Reply], number: int | None, *, batched: bool) -> Any:
+        """Return the replies in the client's format, with the first `number` rows only unless it is None."""
+        said = self.dialect.answer(replies, self._before_ms, batched=batched)
+        if number is not None:
+            self._rows.replace(said.pop("actions"))
+            said |= self._rows.take(number)
+        return said
+
+    async def _of_batch(self, number: int) -> list[ImplicitSession]:
+        """Return the session of each place in a batch of that size; the episodes of another size end."""
+        if number != len(self._batched):
+            surplus, self._batched = self._batched[number:], self._batched[:number]
+            for session in surplus:
+                await session.close()
+            for session in self._batched:
+                session.episode.end()
+            while len(self._batched) < number:
+                self._batched.append(self.dialect.session(self.sender, uuid.uuid4().hex))
+        return self._batched
+
+
+class MapEndpoint:
+    """A path at which clients of these dialects connect; the last dialect sends the first message."""
+
+    def __init__(self, dialects: Sequence[MapDialect]) -> None:
+        self._dialects = dialects
+        self._context = dialects[0].context
+
+    async def stream(self, socket: WebSocket) -> None:
+        """Serve one connection; its sessions end with it."""
+        if not await accept_or_refuse(socket, self._context):
+            return
+        connections: dict[str, MapConnection] = {}
+        gate = self._dialects[0].gate()
+        try:
+            await socket.send_bytes(openpi.encode(self._dialects[-1].first()))
+            while True:
+                await gate.wait_unthrottled()
+                event = await asyncio.wait_for(socket.receive(), self._dialects[0].idle_s)
+                if event["type"] == "websocket.disconnect":
+                    return
+                if not await self._answer(socket, event.get("bytes"), connections, gate):
+                    return
+        except asyncio.TimeoutError:
+            await socket.close()
+        except WebSocketDisconnect:
+            return
+        finally:
+            for connection in connections.values():
+                connection.sender.release(for_good=True)
+
+    async def _answer(
+        self, socket: WebSocket, data: bytes | None, connections: dict[str, MapConnection], gate: Dispatcher
+    ) -> bool:
+        """Reply to one message; return False if the connection was closed."""
+        trace, request_id = self._dialects[0].trace(), uuid.uuid4().hex
+        admission = gate.admission(self._context.limits, 0 if data is None else len(data), self._dialects[0].rank)
+        try:
+            admission.begin_message()
+            if data is None:
+                raise MalformedMessage("message: got text, want a binary map")
+            message = await decoded(lambda data, budget: openpi.decode(data, budget.limits), data, admission)
+            dialect = next((dialect for dialect in self._dialects if dialect.speaks(message)), self._dialects[0])
+            arrived, trace = trace.arrived, dialect.trace()
+            trace.arrived = arrived
+            connection = connections.get(dialect.name) or connections.setdefault(dialect.name, MapConnection(dialect))
+            answer = await connection.answer(message, trace, request_id, gate)
+        except Exception as error:  # noqa: BLE001 - the error is the reply to the client
+            problem = public_problem(error, trace.transport, request_id)
+            trace.refused(problem.code)
+            text = f"{problem} (request {request_id})"
+            failure = self._dialects[0].failure(text)
+            await (socket.send_text(text) if failure is None else socket.send_bytes(failure))
+            if isinstance(problem, TooManyRequests):  # the connection stays open, as nothing was acted on
+                if gate.refused_too_often:
+                    await socket.close(POLICY_VIOLATION, REFUSED)
+                return not gate.refused_too_often
+            if failure is None:
+                await socket.close(INTERNAL_ERROR, "Internal server error.")
+            return failure is not None
+        finally:
+            admission.release()
+        if isinstance(answer, str):
+            await socket.send_text(answer)
+        elif answer:
+            await socket.send_bytes(answer)
+        return True
+
+
+# Replies that have one row of a chunk, as BEHAVIOR-1K's client reads them.
+#
+# The client is `WebsocketPolicy` or `MultiWebsocketPolicy` of BEHAVIOR-1K's OmniGibson/omnigibson/eval/policies.py at
+# 020ca52, over utils/network_utils.py at c8a6cd8; docs/challenge/evaluation.md at 01f0ed2 describes its protocol.
+#
+# It reads `action`, (D,). It may ask for K rows by `__action_chunk_size__`, to execute them without a further message:
+# they come as `action_chunk`, (K, D), whose first row equals `action`; if that is absent, it asks for single rows from
+# then on. The observations of B environments may be stacked, those of a single one included: `task_id` is then (B, 1),
+# and `action` (B, D). The client of the challenge of 2025 (omnigibson/learning) reads the same, without chunks and
+# stacks.
+
+
+_NUMBER = "__action_chunk_size__"
+
+
+class Rows:
+    """The rows of a connection's chunks that its client has not got yet."""
+
+    def __init__(self) -> None:
+        self._left: np.ndarray | None = None  # (H, D), or (B, H, D) of stacked environments
+
+    def replace(self, chunk: np.ndarray) -> None:
+        """Let the next rows be those of a chunk, (H, D) or (B, H, D)."""
+        self._left = chunk
+
+    def has(self, number: int, *, stacked: bool) -> bool:
+        """Return whether `number` rows are left, of stacked environments or of one."""
+        return self._left is not None and self._left.ndim == 2 + stacked and self._left.shape[-2] >= number
+
+    def take(self, number: int) -> dict[str, np.ndarray]:
+        """Return the reply with the next `number` rows; it has a single one if fewer are left."""
+        if self._left is None or not self._left.shape[-2]:
+            raise IndexError("no row is left")
+        number = number if number <= self._left.shape[-2] else 1
+        taken, self._left = self._left[..., :number, :], self._left[..., number:, :]
+        return {"action": taken[..., 0, :]} | ({"action_chunk": taken} if number > 1 else {})
+
+
+def number_of_rows(message: dict[str, Any]) -> int:
+    """Return how many rows the client executes before its next message."""
+    number = message.get(_NUMBER, 1)
+    if type(number) is not int or number < 1:
+        raise MalformedMessage(f"{_NUMBER}: got {shown(number)}, want an integer, 1 or more")
+    return number
+
+
+def unstacked(message: dict[str, Any], most: int) -> list[dict[str, Any]] | None:
+    """Return the observation of each environment, at most `most`, if they are stacked; None if they are not."""
+    task = message.get("task_id")
+    if not isinstance(task, np.ndarray) or task.ndim != 2:
+        return None
+    if not 1 <= len(task) <= most:
+        raise MalformedMessage(f"task_id: got {task.shape}, want 1 to {most} environments, the limit of sessions")
+    arrays = {key: value for key, value in message.items() if isinstance(value, np.ndarray)}
+    for key, value in arrays.items():
+        if value.shape[:1] != task.shape[:1]:
+            raise MalformedMessage(f"{key[:80]}: got {value.shape}, want {len(task)} environments, as task_id has")
+    return [message | {key: value[place] for key, value in arrays.items()} for place in range(len(task))]

@@ -1,1 +1,0 @@
-"""openpi's protocol: msgpack over WebSocket."""

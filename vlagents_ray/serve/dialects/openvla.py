@@ -1,0 +1,52 @@
+"""OpenVLA's REST protocol: `POST /act` with an observation, to which the reply is an action.
+
+Errors have their own status here, while OpenVLA's own server replies with 200 and "error".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+from pydantic import Field
+from starlette.requests import Request as HttpRequest
+from starlette.responses import Response
+
+from vlagents_ray.protocol.messages import Budget
+from vlagents_ray.serve.config.dialects import DialectConfig, MappingSetting
+from vlagents_ray.serve.dialects.http import HttpDialect
+from vlagents_ray.wire import openvla
+from vlagents_ray.wire.openvla import PRESETS
+
+
+class OpenVLADialectConfig(DialectConfig):
+    """The settings of the REST clients of OpenVLA, and of its forks that post whole observations."""
+
+    mapping: MappingSetting = "openvla"
+    chunk: bool = Field(default=False, description="answer all rows, as OFT's clients want it, not the first alone")
+
+
+class OpenVLADialect(HttpDialect):
+    """OpenVLA's protocol, which has no sessions unless the client names one."""
+
+    Config = OpenVLADialectConfig
+    clients = "OpenVLA"
+    summary = "An episode is one request, unless that names a session. An error has its status and problem+json."
+    paths: ClassVar[Mapping[str, str]] = {"POST /act": "act"}
+    presets = PRESETS
+    config: OpenVLADialectConfig
+
+    async def act(self, http: HttpRequest) -> Response:
+        """Answer one request; the reply is encoded once or twice like the request."""
+        twice = False
+
+        def read(data: bytes, budget: Budget) -> dict[str, Any]:
+            nonlocal twice
+            theirs, twice = openvla.decode(data, budget.limits)
+            return theirs
+
+        def write(rows: np.ndarray) -> bytes:
+            return openvla.encode(list(rows) if self.config.chunk else rows[0], twice)
+
+        return await self.answer(http, read, write)

@@ -1,1 +1,0 @@
-"""OpenVLA's protocol: json_numpy over HTTP."""

@@ -1,0 +1,241 @@
+"""vla-eval's benchmarks over WebSocket: they send "hello", the begin and end of episodes, and an observation per step.
+
+A benchmark executes one action per step, so each reply holds one row of a chunk. A benchmark that sends observations
+without waiting (its live mode) gets a reply to the newest one; the server does not act on older ones.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import uuid
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, ClassVar
+
+from pydantic import Field
+from starlette.requests import Request as HttpRequest
+from starlette.responses import JSONResponse, Response
+from starlette.routing import BaseRoute, Route
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from vlagents_ray.chunking.buffer import ChunkBuffer
+from vlagents_ray.errors import MalformedMessage, MessageTooLarge, PolicyUnavailable, VLAgentsError, shown
+from vlagents_ray.protocol.messages import Budget, RankName
+from vlagents_ray.serve.config.dialects import DialectConfig, MappingSetting
+from vlagents_ray.serve.dialects.base import (
+    POLICY_VIOLATION,
+    RouteDialect,
+    Stream,
+    accept_or_refuse,
+    decoded,
+    public_problem,
+)
+from vlagents_ray.serve.dialects.implicit_session import ImplicitSession
+from vlagents_ray.serve.endpoints.http_messages import problem_response
+from vlagents_ray.serve.engine.admission import MessageAdmission
+from vlagents_ray.serve.engine.dispatch import REFUSED, Dispatcher
+from vlagents_ray.wire import vla_eval
+from vlagents_ray.wire.vla_eval import PRESETS
+
+_WAITING = 16  # maximum of waiting messages of a client that does not wait for replies
+
+
+class VlaEvalDialectConfig(DialectConfig):
+    """The settings of vla-eval's benchmarks."""
+
+    mapping: MappingSetting = "vla-eval"
+    rank: RankName = "simulation"
+    execute: int | None = Field(default=None, ge=1, description="rows of each chunk that are executed; null: all")
+    observation_params: dict[str, Any] = Field(
+        default_factory=dict, description="what benchmarks are asked for, such as send_state: true"
+    )
+
+
+class VlaEvalDialect(RouteDialect):
+    """vla-eval's protocol, in which the client states the begin and the end of each episode."""
+
+    Config = VlaEvalDialectConfig
+    clients = "vla-eval"
+    summary = "A session is the connection, which says where episodes begin and end. An error is an `error` message."
+    paths: ClassVar[Mapping[str, str]] = {"WS /vla-eval": "stream"}
+    root = "vla_eval"
+    presets = PRESETS
+    config: VlaEvalDialectConfig
+
+    def routes(self) -> list[BaseRoute]:
+        return [*super().routes(), Route("/health", self.health)]
+
+    def at_root(self, sharing: Sequence[VlaEvalDialect]) -> Stream:
+        return self.stream
+
+    async def health(self, _http: HttpRequest) -> Response:
+        """Reply whether the policy is ready, like vla-eval's own servers."""
+        try:
+            self.context.engine.require_ready()
+        except VLAgentsError as error:
+            return problem_response(error, "", PolicyUnavailable.status)
+        return JSONResponse({"status": "ok"})
+
+    async def stream(self, socket: WebSocket) -> None:
+        """Serve one connection; its session ends with it."""
+        if not await accept_or_refuse(socket, self.context):
+            return
+        sender, gate = self.sender(), self.gate()
+        connection = _Connection(self.session(sender))
+        inbox = _Inbox()
+        reading = asyncio.ensure_future(inbox.fill(socket, gate, self))
+        try:
+            while (received := await inbox.next()) is not None:
+                answer = await self._answer(received, connection)
+                if answer is not None:
+                    await socket.send_bytes(vla_eval.encode(answer))
+            if inbox.end is not None:
+                await socket.close(POLICY_VIOLATION, inbox.end)
+        except WebSocketDisconnect:
+            return
+        finally:
+            sender.release(for_good=True)
+            reading.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await reading
+
+    async def _answer(self, received: _Received, connection: _Connection) -> vla_eval.Message | None:
+        message = received.message
+        if isinstance(message, VLAgentsError):
+            return _error(message, 0, uuid.uuid4().hex)
+        if message.kind == "hello":
+            return self._hello(message)
+        if message.kind in ("episode_start", "episode_end"):
+            connection.end_episode()
+            return None
+        if message.kind != "observation":
+            return None  # the message reports an error of the client
+        return await self._act(message, received.admission, connection)
+
+    def _hello(self, message: vla_eval.Message) -> vla_eval.Message:
+        version = message.payload.get("protocol_version")
+        if type(version) is not int or version != vla_eval.PROTOCOL_VERSION:
+            error = MalformedMessage(f"protocol_version: got {shown(version, 20)}, want {vla_eval.PROTOCOL_VERSION}")
+            return _error(error, message.seq, uuid.uuid4().hex)
+        known = self.context.metadata()
+        payload: dict[str, Any] = {
+            "harness_version": f"vlagents-ray {known.get('version')}",
+            "protocol_version": vla_eval.PROTOCOL_VERSION,
+            "model_server": known.get("policy"),
+            "capabilities": {},
+        }
+        if self.config.observation_params:
+            payload["observation_params"] = self.config.observation_params
+        return vla_eval.Message("hello", payload, message.seq)
+
+    async def _act(
+        self, message: vla_eval.Message, admission: MessageAdmission, connection: _Connection
+    ) -> vla_eval.Message:
+        trace = self.trace()
+        request_id = uuid.uuid4().hex
+        try:
+            payload = await admission.decoded(partial(vla_eval.decode_images, message.payload))
+            obs, instruction = self.read(payload)
+            if not connection.session.episode.begun:
+                self.mapping.warn_of_unread_cameras(payload, self.name)
+            if connection.chunk.next is None or connection.session.episode.begins(instruction):
+                trace.decoded_alike()
+                reply = await connection.session.act(obs, instruction, request_id)
+                rows = trace.written(reply, lambda: self.rows(reply))
+                connection.chunk.replace(rows[: self.config.execute])
+            return vla_eval.Message("action", {"actions": connection.chunk.take().action}, message.seq)
+        except Exception as error:  # noqa: BLE001 - the client is answered with it
+            problem = public_problem(error, self.name, request_id)
+            trace.refused(problem.code)
+            return _error(problem, message.seq, request_id)
+        finally:
+            admission.release()
+
+
+class _Connection:
+    """The session of one connection, and the rows of its chunk."""
+
+    def __init__(self, session: ImplicitSession) -> None:
+        self.session = session
+        self.chunk = ChunkBuffer()  # the rows that are not sent yet
+
+    def end_episode(self) -> None:
+        """Let the next observation begin an episode."""
+        self.chunk.drop()
+        self.session.episode.end()
+
+
+@dataclass(slots=True)
+class _Received:
+    """A received message, whose images are not decoded yet, or the error of a refused one."""
+
+    message: vla_eval.Message | VLAgentsError
+    admission: MessageAdmission
+
+    @property
+    def is_observation(self) -> bool:
+        return isinstance(self.message, vla_eval.Message) and self.message.kind == "observation"
+
+
+class _Inbox:
+    """The unprocessed messages of a client; an observation replaces one directly before it."""
+
+    def __init__(self) -> None:
+        self._messages: deque[_Received | None] = deque()
+        self._there = asyncio.Event()
+        self.end: str | None = None  # the reason why the server ends the connection
+
+    async def next(self) -> _Received | None:
+        """Wait for the oldest message and return it; None if the client is gone."""
+        while not self._messages:
+            self._there.clear()
+            await self._there.wait()
+        return self._messages.popleft()
+
+    async def fill(self, socket: WebSocket, gate: Dispatcher, dialect: VlaEvalDialect) -> None:
+        """Receive messages until the client is gone, or too many of its messages wait for replies."""
+        try:
+            while not gate.refused_too_often:
+                await gate.wait_unthrottled()
+                if (event := await socket.receive())["type"] == "websocket.disconnect":
+                    return
+                data = event.get("bytes")
+                admission = gate.admission(dialect.context.limits, 0 if data is None else len(data), dialect.rank)
+                if len(self._messages) >= _WAITING:
+                    self.end = f"{_WAITING} messages wait for answers; send no more than that at once"
+                    most = MessageTooLarge(self.end)
+                    self._put(_Received(most, admission))
+                    return
+                self._put(await self._read(data, admission))
+            self.end = REFUSED
+        finally:
+            self._put(None)
+
+    @staticmethod
+    async def _read(data: bytes | None, admission: MessageAdmission) -> _Received:
+        """Decode a message, which counts as a request of the key."""
+        try:
+            admission.begin_message()
+            if data is None:
+                raise MalformedMessage("message: got text, want a binary map")
+            return _Received(await decoded(_read_message, data, admission), admission)
+        except Exception as error:  # noqa: BLE001 - the client is answered with it
+            return _Received(public_problem(error, "vla_eval", "of an unreadable message"), admission)
+
+    def _put(self, received: _Received | None) -> None:
+        last = self._messages[-1] if self._messages else None
+        if last is not None and received is not None and last.is_observation and received.is_observation:
+            self._messages.pop()
+        self._messages.append(received)
+        self._there.set()
+
+
+def _read_message(data: bytes, budget: Budget) -> vla_eval.Message:
+    return vla_eval.decode(data, budget.limits)
+
+
+def _error(error: VLAgentsError, seq: int, request_id: str) -> vla_eval.Message:
+    return vla_eval.Message("error", {"error": f"{error} (request {request_id})", "code": error.code}, seq)

@@ -1,0 +1,504 @@
+"""Clients of the package `vlagents` over RPyC, with one thread and one session per client."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.metadata
+import logging
+import os
+import re
+import socket
+import stat
+import threading
+import time
+import uuid
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from vlagents_ray.contract import ActionSpec, Contract
+from vlagents_ray.errors import (
+    InvalidInput,
+    InvalidObservation,
+    MalformedMessage,
+    MessageTooLarge,
+    VLAgentsError,
+    shown,
+)
+from vlagents_ray.interface import Obs
+from vlagents_ray.serve.access.api_keys import NoKey
+from vlagents_ray.serve.config.dialects import DialectConfig, KeylessPortConfig
+from vlagents_ray.serve.dialects.base import GatewayContext, PortDialect
+from vlagents_ray.serve.dialects.gateway_sessions import GatewaySessions
+from vlagents_ray.serve.engine.admission import MessageAdmission
+from vlagents_ray.wire import json_numpy, rpyc, vlagents
+from vlagents_ray.wire.mapping import KeyMapping
+from vlagents_ray.wire.rpyc import Handler, RpycCall
+
+logger = logging.getLogger(__name__)
+
+_FRAME_S = 30.0  # maximum time of a message, from its first byte to its last
+_SEND_S = 10.0  # maximum time for a client to accept a reply
+_METHODS = ("act", "reset", "name", "is_initialized", "git_status")
+
+
+@dataclass(frozen=True, slots=True)
+class Terms:
+    """The settings of the deployment for this protocol."""
+
+    name: str  # name of the model, which clients must state
+    version: str  # version of this package
+    shared_memory: bool  # whether the shared memory of clients on this machine is read
+    mapping: KeyMapping | None  # None if clients use our names
+    parts: Mapping[str, vlagents.Part] | vlagents.Part  # columns of each robot, or of the only one
+
+
+class VlagentsConnection:
+    """One connection of a client, from its first byte to its last."""
+
+    def __init__(self, context: GatewayContext, terms: Terms, connection: socket.socket) -> None:
+        self._context = context
+        self._terms = terms
+        self._connection = connection
+        self._session = GatewaySessions(context.connect, context.contract)
+        self._session.show(NoKey.OPEN, None)  # the protocol has no key, and the deployment accepted that
+        self._segments = SharedMemory(same_machine=terms.shared_memory and _is_same_machine(connection))
+
+    def run(self) -> None:
+        """Process the client's requests until it disconnects, is silent for too long, or sends an invalid message."""
+        try:
+            self._connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            while (frame := self._receive()) is not None:
+                if not self._handle(*frame):
+                    return
+        except (InvalidInput, OSError, ValueError) as error:
+            logger.info("vlagents: disconnected a client: %s", error)
+        except Exception:
+            logger.exception("vlagents: disconnected a client")
+        finally:
+            shut_down(self._connection)
+            self._connection.close()
+            self._segments.close()
+            self._session.close()
+
+    def _handle(self, body: bytearray, compressed: bool) -> bool:
+        """Process one message; return False if the client closes the connection."""
+        try:
+            call = rpyc.read_call(body, compressed, self._context.limits.body_bytes)
+        except rpyc.Refused as refused:
+            self._send(rpyc.exception(refused.sequence, "AttributeError", str(refused)))
+            return True
+        if call is None:
+            return True
+        if call.handler is Handler.CLOSE:
+            return False
+        self._send(self._answer(call))
+        return True
+
+    def _answer(self, call: RpycCall) -> bytes:
+        try:
+            if call.handler is Handler.GETROOT:
+                return rpyc.reference_reply(call.sequence, rpyc.ROOT)
+            if call.handler is Handler.GETATTR:
+                return rpyc.reference_reply(call.sequence, _number(call.args))
+            return rpyc.reply(call.sequence, self._value(call))
+        except VLAgentsError as error:
+            return rpyc.exception(call.sequence, _builtin(error), f"{error.code}: {error}")
+        except Exception:
+            name = uuid.uuid4().hex
+            logger.exception("vlagents: request %s failed", name)
+            return rpyc.exception(
+                call.sequence, "RuntimeError", f"internal error; the server's log has the details under {name}"
+            )
+
+    def _value(self, call: RpycCall) -> Any:
+        if call.handler is Handler.PING:
+            return _echo(call)
+        if call.handler is Handler.DEL:
+            return None
+        if call.handler is Handler.INSPECT:
+            return tuple((name, None) for name in _METHODS)
+        method, args = _called(call)
+        return self._method(method, args)
+
+    def _method(self, method: str, args: tuple[Any, ...]) -> Any:
+        if method in ("act", "reset"):
+            if len(args) != 1 or not isinstance(args[0], (str, bytes)):
+                raise MalformedMessage(f"{method}: want one argument, text")
+            return self._act(args[0]) if method == "act" else self._reset(args[0])
+        if args:
+            raise MalformedMessage(f"{method}: want no arguments")
+        if method == "name":
+            return self._terms.name
+        if method == "is_initialized":
+            return True  # the gateway accepts clients only then
+        return json_numpy.dumps({"vlagents_ray": self._terms.version})
+
+    def _act(self, text: str | bytes) -> str:
+        admission = self._admission(text)
+        seen = vlagents.read_act(text, admission, self._segments)
+        obs = self._ours(seen.obs)
+        act = self._session.act(obs, seen.instruction) if seen.robots else self._session.act_on(obs)
+        admission.release()
+        parts = self._terms.parts
+        if isinstance(parts, vlagents.Part):
+            if len(seen.robots) > 1:
+                raise InvalidInput(
+                    f"got the robots {list(seen.robots)[:8]}; state their columns in dialects.vlagents.robots"
+                )
+            parts = dict.fromkeys(seen.robots, parts)
+        return vlagents.write_act(act, seen.robots, parts)
+
+    def _reset(self, text: str | bytes) -> str:
+        admission = self._admission(text)
+        episode = vlagents.read_reset(text, admission, self._segments)
+        obs = self._ours(episode.seen.obs)
+        info = self._session.reset(obs, episode.seen.instruction, **episode.kwargs)
+        admission.release()
+        return json_numpy.dumps(info)
+
+    def _admission(self, text: str | bytes) -> MessageAdmission:
+        return MessageAdmission(self._context.admission, self._context.limits, None, len(text), inline=False)
+
+    def _ours(self, obs: Obs) -> Obs:
+        """Return the observation under our names, converted if the deployment has a mapping."""
+        if self._terms.mapping is None:
+            return obs
+        theirs: dict[str, Any] = {"cameras": obs.cameras, "state": obs.state, "info": obs.info}
+        if obs.gripper is not None:
+            theirs["gripper"] = obs.gripper
+        ours, _ = self._terms.mapping.obs(theirs, self._context.limits, self._context.contract)
+        if not self._session.begun:
+            self._terms.mapping.warn_of_unread_cameras(theirs, "vlagents")
+        return ours
+
+    def _receive(self) -> tuple[bytearray, bool] | None:
+        """Receive the next message, and whether it is compressed; None if the client disconnected before it."""
+        header = self._read(rpyc.HEADER.size, self._context.idle_s, time.monotonic() + self._context.idle_s + _FRAME_S)
+        if header is None:
+            return None
+        length, compressed = rpyc.read_header(header, self._context.limits.body_bytes)
+        body = self._read(length, _FRAME_S, time.monotonic() + _FRAME_S)
+        if body is None:
+            raise ConnectionResetError("the client disconnected within a message")
+        return body, compressed
+
+    def _read(self, length: int, silent_s: float, deadline: float) -> bytearray | None:
+        """Receive `length` bytes, allocating memory as they arrive; return None if the client disconnected before them.
+
+        Args:
+            length: The number of bytes.
+            silent_s: Maximum time between two parts, s.
+            deadline: End of the reception, s, of `time.monotonic()`.
+        """
+        data = bytearray()
+        while len(data) < length:
+            left_s = min(silent_s, deadline - time.monotonic())
+            if left_s <= 0:
+                raise MessageTooLarge("a message took longer than a client may take")
+            self._connection.settimeout(left_s)
+            more = self._connection.recv(min(length - len(data), 2**20))
+            if not more:
+                if data:
+                    raise ConnectionResetError("the client disconnected within a message")
+                return None
+            data += more
+        return data
+
+    def _send(self, frame: bytes) -> None:
+        self._connection.settimeout(_SEND_S)
+        self._connection.sendall(frame)
+
+
+def _echo(call: RpycCall) -> str | bytes | None:
+    """Return the value with which a ping is answered."""
+    match call.args:
+        case ():
+            return None
+        case (str() | bytes() | None as said, *_):
+            return said
+    raise MalformedMessage(f"ping: got {shown(call.args[0])}, want text")
+
+
+def _number(args: tuple[Any, ...]) -> int:
+    """Return the number of the method that a client looks up."""
+    match args:
+        case (rpyc.Reference(rpyc.ROOT), str(name)) if name in _METHODS:
+            return _METHODS.index(name) + 1
+    raise MalformedMessage(f"the server has {list(_METHODS)} and nothing else")
+
+
+def _called(call: RpycCall) -> tuple[str, tuple[Any, ...]]:
+    """Return the name of the method that a client calls, by number or by name, and the arguments."""
+    match call.handler, call.args:
+        case Handler.CALL, (rpyc.Reference(number), tuple(args), *options) if 0 < number <= len(_METHODS):
+            name = _METHODS[number - 1]
+        case Handler.CALLATTR, (rpyc.Reference(rpyc.ROOT), str(name), tuple(args), *options) if name in _METHODS:
+            pass
+        case _:
+            raise MalformedMessage(f"rpyc: want a call of one of {list(_METHODS)} of the root")
+    if any(options):
+        raise MalformedMessage(f"{name}: takes no arguments by name")
+    return name, args
+
+
+def _builtin(error: VLAgentsError) -> str:
+    if isinstance(error, TimeoutError):
+        return "TimeoutError"
+    return "ValueError" if isinstance(error, ValueError) else "RuntimeError"
+
+
+def _is_same_machine(connection: socket.socket) -> bool:
+    """Whether the client is on this machine, in which case both ends have the same address."""
+    try:
+        return bool(connection.getpeername()[0] == connection.getsockname()[0])
+    except OSError:  # the client is gone already
+        return False
+
+
+def shut_down(connection: socket.socket) -> None:
+    """Shut a connection down, which wakes the thread that reads from it."""
+    with contextlib.suppress(OSError):
+        connection.shutdown(socket.SHUT_RDWR)
+
+
+# Access by name to the shared memory of a client on this machine.
+#
+# Segments are copied, never mapped: if a client shrinks a mapped segment, SIGBUS would end this process. This module
+# neither creates nor removes segments, nor registers them with Python's resource tracker, so that the client alone owns
+# them.
+
+
+_FOLDER = "/dev/shm"  # noqa: S108 - the folder of Linux for shared memory
+# The names that Python's `SharedMemory` generates; clients may name no other file in the folder.
+_NAME = re.compile(r"/?(psm_[0-9a-f]{1,32})")
+_KEPT = 64
+
+
+class SharedMemory:
+    """The segments of one client, kept open between its requests."""
+
+    def __init__(self, *, same_machine: bool) -> None:
+        """Prepare to read; unless the client is on the `same_machine`, every name is refused."""
+        self._same_machine = same_machine
+        self._open: dict[str, int] = {}
+
+    def read(self, name: str, size: int) -> bytearray:
+        """Return a copy of the first `size` bytes of a segment; raise `InvalidObservation` if that is impossible."""
+        if not self._same_machine:
+            raise InvalidObservation(
+                "shared memory: the client is not on the server's machine; leave on_same_machine=False"
+            )
+        descriptor = self._descriptor(name)
+        if os.fstat(descriptor).st_size < size:  # checked before memory is allocated
+            raise InvalidObservation(f"shared memory {name[:40]!r}: shorter than the {size} bytes of its shape")
+        data = bytearray(size)
+        got = 0
+        while got < size:
+            more = os.preadv(descriptor, [memoryview(data)[got:]], got)
+            if more == 0:
+                raise InvalidObservation(f"shared memory {name[:40]!r}: became shorter while it was read")
+            got += more
+        return data
+
+    def close(self) -> None:
+        """Close all segments, without removing them."""
+        for descriptor in self._open.values():
+            os.close(descriptor)
+        self._open.clear()
+
+    def _descriptor(self, name: str) -> int:
+        match = _NAME.fullmatch(name)
+        if match is None:
+            raise InvalidObservation(f"shared memory: got the name {name[:40]!r}, want one like 'psm_01234567'")
+        known = self._open.get(match[1])
+        if known is not None:
+            return known
+        try:
+            descriptor = os.open(f"{_FOLDER}/{match[1]}", os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK)
+        except OSError as error:
+            raise InvalidObservation(f"shared memory {name[:40]!r}: cannot be opened ({error.strerror})") from error
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            os.close(descriptor)
+            raise InvalidObservation(f"shared memory {name[:40]!r}: is none")
+        if len(self._open) >= _KEPT:  # a client creates another segment when its images grow
+            os.close(self._open.pop(next(iter(self._open))))
+        self._open[match[1]] = descriptor
+        return descriptor
+
+
+_END_S = 3.0
+
+
+class GripperArgs(BaseModel):
+    """The column of a robot's gripper in a row of the policy's actions, and its values."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    column: int = Field(default=-1, description="as in Python: -1 is the last")
+    open: float | None = Field(default=None, description="its value for open; default: the policy's contract, or 1")
+    closed: float | None = Field(default=None, description="and for closed; default: the policy's contract, or 0")
+
+    @model_validator(mode="after")
+    def _two_values(self) -> GripperArgs:
+        if self.open is not None and self.open == self.closed:
+            raise ValueError(f"open and closed are both {self.open}; they must differ")
+        return self
+
+
+class RobotArgs(BaseModel):
+    """The columns of one robot in a row."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    start: int | None = None
+    stop: int | None = None
+    gripper: GripperArgs | None = Field(
+        default=None, description="the column that goes into SingleAct.gripper; unset: none"
+    )
+
+
+class VlagentsDialectConfig(KeylessPortConfig):
+    """The settings of the RPyC protocol of the package `vlagents`, 0.2 and 0.3.
+
+    A mapping reads cameras/NAME, state/NAME, gripper, info; without one, the client's names stay as they are.
+    """
+
+    port: int = Field(default=8080, ge=1, le=65535)
+    name: str | None = Field(
+        default=None, description="the model's name, which clients must give; default: the application's"
+    )
+    gripper: GripperArgs | None = Field(
+        default=None, description="of the only robot: the column that goes into SingleAct.gripper; unset: none"
+    )
+    robots: dict[str, RobotArgs] = Field(default_factory=dict, description="with several, which columns are whose")
+    shared_memory: bool = Field(default=True, description="read the cameras of clients on this machine in place")
+
+    @model_validator(mode="after")
+    def _one_way(self) -> VlagentsDialectConfig:
+        if self.gripper is not None and self.robots:
+            raise ValueError("gripper is for a single robot; with robots, state each robot's own")
+        return self
+
+
+class VlagentsDialect(PortDialect):
+    """The protocol of the package `vlagents`, with one thread and one session per client."""
+
+    Config = VlagentsDialectConfig
+    clients = "vlagents"
+    summary = (
+        "A session is the connection; an episode begins with `reset` and with each new instruction. An error "
+        "is raised at the client as a built-in exception."
+    )
+    scheme = "rpyc"
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
+        # our own names, for clients that need a mapping but whose protocol defines no names
+        "vlagents": {
+            "cameras": {"*": "cameras/*"},
+            "state": {"*": "state/*"},
+            "gripper": {"key": "gripper", "optional": True},
+            "instruction": "instruction",
+            "info": {"info": "info"},
+        },
+    }
+    config: VlagentsDialectConfig
+
+    def __init__(self, name: str, config: VlagentsDialectConfig, context: GatewayContext) -> None:
+        super().__init__(name, config, context)
+        self._terms = Terms(
+            name=config.name or context.app,
+            version=importlib.metadata.version("vlagents-ray"),
+            shared_memory=config.shared_memory,
+            mapping=config.keys(),
+            parts=self._parts(config),
+        )
+        self._clients: dict[threading.Thread, socket.socket] = {}
+        self._lock = threading.Lock()
+        self._closing = False
+        self._listener: socket.socket | None = None
+        self._accepting: threading.Thread | None = None
+
+    @classmethod
+    def lacks(cls, config: DialectConfig, contract: Contract | None) -> list[str]:  # noqa: ARG003 - overrides
+        """Return nothing: the instruction is sent beside the observation, and `robots` states each robot's columns."""
+        return []
+
+    def serve(self, listener: socket.socket) -> None:
+        listener.listen()
+        self._listener = listener
+        self._accepting = threading.Thread(target=self._accept, args=(listener,), name="vlagents", daemon=True)
+        self._accepting.start()
+
+    def alive(self) -> bool:
+        return self._accepting is not None and self._accepting.is_alive()
+
+    def close(self) -> None:
+        self._closing = True
+        if self._listener is not None:
+            shut_down(self._listener)
+        with self._lock:
+            clients = dict(self._clients)
+        for connection in clients.values():
+            shut_down(connection)
+        deadline = time.monotonic() + _END_S
+        if self._accepting is not None:
+            self._accepting.join(_END_S)
+        if self._listener is not None:
+            self._listener.close()
+        for thread in clients:
+            thread.join(max(0.0, deadline - time.monotonic()))
+
+    def _accept(self, listener: socket.socket) -> None:
+        while not self._stopped():
+            try:
+                connection, peer = listener.accept()
+            except OSError as error:
+                if self._stopped():
+                    break
+                logger.warning("vlagents: cannot accept a client: %s", error)
+                time.sleep(0.1)  # if descriptors are exhausted, other connections have to end first
+                continue
+            client = VlagentsConnection(self.context, self._terms, connection)
+            thread = threading.Thread(target=self._serve, args=(client,), name=f"vlagents {peer[0]}", daemon=True)
+            with self._lock:
+                full = len(self._clients) >= self.context.sessions
+                if not full:
+                    self._clients[thread] = connection
+            if full:
+                logger.warning("vlagents: %d clients are connected, the limit; one was refused", self.context.sessions)
+                connection.close()
+            else:
+                thread.start()
+
+    def _stopped(self) -> bool:
+        return self._closing
+
+    def _serve(self, client: VlagentsConnection) -> None:
+        try:
+            client.run()
+        finally:
+            with self._lock:
+                del self._clients[threading.current_thread()]
+
+    def _parts(self, config: VlagentsDialectConfig) -> dict[str, vlagents.Part] | vlagents.Part:
+        if config.robots:
+            return {name: self._part(robot.start, robot.stop, robot.gripper) for name, robot in config.robots.items()}
+        return self._part(None, None, config.gripper)
+
+    def _part(self, start: int | None, stop: int | None, gripper: GripperArgs | None) -> vlagents.Part:
+        if gripper is None:
+            return vlagents.Part(start, stop)
+        spec = ActionSpec() if self.context.contract is None else self.context.contract.action
+        return vlagents.Part(
+            start,
+            stop,
+            gripper.column,
+            _first(gripper.open, spec.gripper_open, 1.0),
+            _first(gripper.closed, spec.gripper_closed, 0.0),
+        )
+
+
+def _first(*values: float | None) -> float:
+    return next(value for value in values if value is not None)

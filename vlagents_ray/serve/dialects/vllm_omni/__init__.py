@@ -1,1 +1,0 @@
-"""vLLM-Omni's protocol for robots: RoboArena's, at a path of its own."""

@@ -1,0 +1,251 @@
+"""The endpoint for processes of the Ray cluster on this node: frames in mutable plasma objects.
+
+The replica keeps a pool of observation channels (mutable objects, the memory under Ray's `Channel`) and leases them to
+clients: a client writes its frames into one as raw bytes, so that nothing is unpickled and the client may use another
+version of numpy. The rest is `vlagents_ray.serve.endpoints.unix_messages`: a message on a Unix socket announces a
+frame, the policy thread reads the frame and replies, and the end of the connection, whatever its cause, returns the
+channel to the pool.
+
+A socket accompanies the channel because Ray's readers wait by polling (an idle `Channel.read` takes one CPU, with a
+time-out or without) and do not notice the death of the writer. The channels are pooled because Ray frees a channel's
+memory only when all processes that registered as its readers or writers have ended. The socket lies in Ray's own
+folder, beside the object store's, so that it is reachable from wherever the store is, other network namespaces
+included.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import secrets
+import socket
+import threading
+import time
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import ray
+from ray.exceptions import RayChannelError, RayChannelTimeoutError
+
+from vlagents_ray.errors import MalformedMessage, MessageTooLarge
+from vlagents_ray.protocol.messages import Limits, LocalAddress, PlasmaAddress
+from vlagents_ray.ray_tools.private import (
+    channel_pieces,
+    create_channel,
+    plain_content,
+    plasma_folder,
+    read_channel,
+    register_writer,
+    write_channel,
+)
+from vlagents_ray.serve.access.api_keys import NoKey
+from vlagents_ray.serve.endpoints.unix_messages import BACKLOG, UnixServer
+from vlagents_ray.serve.engine.engine import Engine
+
+logger = logging.getLogger(__name__)
+
+_SHARE = 0.5  # maximum share of the node's object store; beyond the store's size Ray silently puts channels on disk
+_LEAST = 64 * 1024  # minimum size of a channel, bytes
+_HEADER = 64  # size of Ray's own metadata, bytes
+_CLAIM_S = 60.0  # a lease that no connection claims within this time belongs to a client that is gone
+
+
+@dataclass(slots=True)
+class Channel:
+    """A mutable object that this process reads and one client at a time writes."""
+
+    ref: Any
+    capacity: int  # maximum size of a frame, bytes
+    leased: float = 0.0  # time of the latest lease, s, monotonic
+
+    def read(self) -> bytes:
+        """Return a copy of the frame that was written, without waiting; raise `MalformedMessage` if there is none."""
+        found = self._take()
+        if found.metadata != PlasmaAddress.TAG:  # Ray's parser below trusts its input, as it does everywhere
+            raise MalformedMessage("plasma: what the channel holds is no frame; is this a client of vlagents_ray?")
+        return b"".join(channel_pieces(found.data))
+
+    def intact(self) -> bool:
+        """Discard an unread frame; return False if the writer was killed while writing, which locks the channel."""
+        with contextlib.suppress(MalformedMessage):
+            self._take()
+        try:
+            register_writer(self.ref)
+            if write_channel(self.ref, plain_content(b"x"), 0) is not None:
+                return False
+            self._take()
+        except (RayChannelError, MalformedMessage):
+            return False
+        return True
+
+    def _take(self) -> Any:
+        """Return the frame that was written last, in place; it is valid as long as the caller holds it."""
+        try:
+            return read_channel(self.ref)
+        except RayChannelTimeoutError as error:
+            raise MalformedMessage("plasma: a message came without a frame in its channel") from error
+
+
+class Pool:
+    """The channels of one replica, as many as were ever in use at once; thread-safe."""
+
+    def __init__(self, limits: Limits) -> None:
+        self._limits = limits
+        self._lock = threading.Lock()
+        self._free: list[Channel] = []
+        self._leased: dict[bytes, Channel] = {}
+        self._bytes = 0
+
+    def lease(self, length: int) -> tuple[bytes, int]:
+        """Lease a channel to a client; this takes milliseconds.
+
+        Args:
+            length: Size of the frames, bytes.
+
+        Returns:
+            The id of the channel and the maximum size of its frames, bytes.
+
+        Raises:
+            MessageTooLarge: `length` is over `limits.body_bytes`, or the object store is too small.
+        """
+        if length > 2 * self._limits.body_bytes:  # includes Ray's framing; the decoder checks the exact limit
+            raise MessageTooLarge(f"frame: got {length} bytes, the limit is {self._limits.body_bytes}")
+        with self._lock:
+            oldest = time.monotonic() - _CLAIM_S
+            for lost in [key for key, channel in self._leased.items() if channel.leased < oldest]:
+                self._return_channel(self._leased.pop(lost))
+            fitting = [channel for channel in self._free if channel.capacity >= length]
+            channel = min(fitting, key=lambda one: one.capacity, default=None)
+            if channel is not None:
+                self._free.remove(channel)
+        if channel is None:
+            channel = self._create(max(_LEAST, 1 << (length - 1).bit_length()))
+        channel.leased = time.monotonic()
+        key: bytes = channel.ref.binary()
+        with self._lock:
+            self._leased[key] = channel
+        return key, channel.capacity
+
+    def claim(self, key: bytes) -> Channel:
+        """Return the leased channel `key`, which from now on belongs to the connection that named it."""
+        with self._lock:
+            channel = self._leased.pop(key, None)
+        if channel is None:
+            raise MalformedMessage("plasma: this channel is not leased; ask for one")
+        return channel
+
+    def release(self, channel: Channel) -> None:
+        """Return a channel to the pool, for the next client."""
+        with self._lock:
+            self._return_channel(channel)
+
+    def counts(self) -> tuple[int, int]:
+        """Return the number of free channels and the size of all channels, bytes."""
+        with self._lock:
+            return len(self._free), self._bytes
+
+    def _return_channel(self, channel: Channel) -> None:
+        if channel.intact():
+            self._free.append(channel)
+            return
+        logger.warning(
+            "plasma: a client was killed while it wrote; its channel of %d bytes is lost until this replica ends",
+            channel.capacity,
+        )
+
+    def _create(self, capacity: int) -> Channel:
+        """Create a channel without holding the lock: the policy thread needs that, and allocation can be slow."""
+        store = _store_bytes()
+        with self._lock:
+            if self._bytes + capacity > _SHARE * store:
+                raise MessageTooLarge(
+                    f"plasma: no room for a channel of {capacity} bytes: this node's object store has {store:.0f}, "
+                    f"a replica's channels may take {_SHARE:.0%} of it and take {self._bytes}; start Ray with a larger "
+                    f"object_store_memory (`ray start --object-store-memory BYTES`), or use transport 'shm'"
+                )
+            self._bytes += capacity
+        try:
+            ref = create_channel(capacity + _HEADER)
+        except BaseException:
+            with self._lock:
+                self._bytes -= capacity
+            raise
+        return Channel(ref, capacity)
+
+
+class PlasmaServer(UnixServer):
+    """Accepts the clients that have leased a channel from its pool."""
+
+    name: ClassVar[str] = "plasma"
+
+    def __init__(self, engine: Engine, limits: Limits) -> None:
+        """Prepare the pool and the socket; `limits` are those of a frame."""
+        self.pool = Pool(limits)
+        super().__init__(engine, NoKey.INSIDE, limits, partial(LeasedChannel, self.pool))  # the cluster needs no key
+        folder = plasma_folder()
+        # The name is no longer than that of the store's socket in the same folder, since socket paths are limited.
+        self._path = folder / f"vla{secrets.token_hex(4)}"
+        self.plasma = PlasmaAddress(str(self._path), ray.get_runtime_context().get_node_id())
+
+    def listen(self) -> None:
+        """Listen, and only then give the socket its name; remove the sockets of killed replicas."""
+        for other in self._path.parent.glob("vla????????"):
+            _remove_if_dead(other)
+        hidden = self._path.with_name(f".{self._path.name}")
+        self._listener.bind(str(hidden))
+        hidden.chmod(0o600)
+        self._listener.listen(BACKLOG)
+        hidden.rename(self._path)
+
+    def close(self) -> None:
+        """Close the listener and all connections, and remove the socket; call it after the engine has ended."""
+        super().close()
+        self._path.unlink(missing_ok=True)
+
+
+class LeasedChannel:
+    """A `Payload`: the channel of one client, which leases a larger one when its frames outgrow it."""
+
+    def __init__(self, pool: Pool) -> None:
+        self._pool = pool
+        self._channel: Channel | None = None
+
+    def read(self, message: memoryview, descriptors: list[int]) -> tuple[np.ndarray, bool, memoryview]:
+        """See `Payload`; the memory is a copy of the frame in the channel that the message names."""
+        if len(message) < PlasmaAddress.REQUEST.size:
+            raise MalformedMessage(f"plasma: got {len(message)} bytes, want at least {PlasmaAddress.REQUEST.size}")
+        key, flags = PlasmaAddress.REQUEST.unpack_from(message)
+        if self._channel is None or self._channel.ref.binary() != key:
+            self.free()
+            self._channel = self._pool.claim(key)
+        memory = np.frombuffer(self._channel.read(), np.uint8)
+        return memory, bool(flags & LocalAddress.COMPACT), message[PlasmaAddress.REQUEST.size :]
+
+    def freed(self) -> int:
+        """See `Payload`; always 0, since frames are copied and a reply implies that the channel is free."""
+        return 0
+
+    def free(self) -> None:
+        """See `Payload`; other clients can lease the channel from now on."""
+        if self._channel is not None:
+            self._pool.release(self._channel)
+            self._channel = None
+
+
+def _store_bytes() -> float:
+    node_id = ray.get_runtime_context().get_node_id()
+    size: float = next(node["Resources"]["object_store_memory"] for node in ray.nodes() if node["NodeID"] == node_id)
+    return size
+
+
+def _remove_if_dead(path: Path) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK) as probe:
+        try:
+            probe.connect(str(path))
+        except ConnectionRefusedError:
+            path.unlink(missing_ok=True)
+        except OSError:  # the socket is busy or another user's, so its replica is alive
+            return

@@ -1,1 +1,0 @@
-"""The messages and the mappings of GR00T's protocol."""

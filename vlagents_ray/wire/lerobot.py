@@ -1,0 +1,464 @@
+"""The pickled messages of LeRobot's asynchronous inference: policy instructions, observations and chunks of actions.
+
+The facts come from LeRobot 0.4.4's `async_inference/helpers.py` and `robot_client.py`; those of 0.6.1 are the same. A
+client pickles its data classes. They are read as data, see `pickles`, and the chunk is written as a pickle in which the
+client finds its own `TimedAction` and `torch.tensor`.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+import struct
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.errors import (
+    ConfigError,
+    InvalidObservation,
+    MalformedMessage,
+    MessageTooLarge,
+    MissingCamera,
+    MissingState,
+)
+from vlagents_ray.protocol.arrays import Buffer
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Budget, Limits
+from vlagents_ray.protocol.observations import is_number
+from vlagents_ray.wire.mapping import KeyMapping
+from vlagents_ray.wire.pickles import NUMPY_CALLS, TORCH_CALLS, Name, fields_of, read_pickle, text, write_record
+
+HELPERS = "lerobot.async_inference.helpers"
+SETUP, OBSERVATION = Name(HELPERS, "RemotePolicyConfig"), Name(HELPERS, "TimedObservation")
+_REQUESTS: Mapping[Name, Sequence[str]] = {
+    SETUP: (
+        "policy_type", "pretrained_name_or_path", "lerobot_features", "actions_per_chunk", "device", "rename_map",
+    ),
+    OBSERVATION: ("timestamp", "timestep", "observation", "must_go"),
+}  # fmt: skip
+_STEPS = 2**31  # time steps fit into a pickle's plain integers
+_SHOWN = 40  # maximum number of a client's keys in an error, and of characters of each
+
+
+@dataclass(frozen=True, slots=True)
+class PolicyInstructions:
+    """What a client says of itself and of the policy before its first observation."""
+
+    policy_type: str
+    checkpoint: str  # the checkpoint that LeRobot's own server would load
+    state: tuple[str, ...]  # names of the numbers of `observation.state`, in order
+    cameras: tuple[str, ...]
+    actions_per_chunk: int
+    device: str = "cpu"  # on which LeRobot's own server computes
+
+
+@dataclass(frozen=True, slots=True)
+class RobotObservation:
+    """A client's observation."""
+
+    timestamp: float  # the client's clock, s since 1970
+    timestep: int  # number of the last action that the client executed
+    values: Mapping[str, Any]  # numbers, texts and arrays by the robot's names
+    must_go: bool  # whether the client has no action left
+
+
+def read_instructions(data: Buffer, limits: Limits) -> PolicyInstructions:
+    """Return the policy instructions in a pickle.
+
+    Raises:
+        MalformedMessage: The pickle has anything but these, see `pickles`.
+        MessageTooLarge: It exceeds a limit.
+        InvalidObservation: The robot's features are none of numbers and cameras, or are to be renamed.
+    """
+    stated = _pickled_fields(data, limits, SETUP)
+    policy_type, checkpoint = (_text(stated, name) for name in ("policy_type", "pretrained_name_or_path"))
+    rows, features, renames = (stated[name] for name in ("actions_per_chunk", "lerobot_features", "rename_map"))
+    if type(rows) is not int or rows < 1:
+        raise MalformedMessage(f"actions_per_chunk: got {_shown(rows)}, want an integer of 1 or more")
+    if not (isinstance(features, dict) and isinstance(renames, dict)):
+        raise MalformedMessage(f"lerobot_features, rename_map: got {_shown(features)}, {_shown(renames)}, want dicts")
+    if renames:
+        raise InvalidObservation("rename_map: got names, want none; rename them in dialects.lerobot.mapping")
+    state: tuple[str, ...] = ()
+    for name, feature in features.items():
+        if not isinstance(feature, dict):
+            raise MalformedMessage(f"lerobot_features: {name[:_SHOWN]!r}: got {_shown(feature)}, want a dict")
+        kind = _text(feature, "dtype")
+        if name == STATE and kind == "float32":
+            state = _names(feature)
+        elif not (name.startswith(IMAGES) and kind in ("image", "video")):
+            raise InvalidObservation(
+                f"lerobot_features: got {name[:_SHOWN]!r} of {kind[:_SHOWN]!r}, want {STATE!r} of float32, and "
+                f"images {IMAGES + 'NAME'!r}"
+            )
+    cameras = tuple(name.removeprefix(IMAGES) for name in features if name != STATE)
+    if len(cameras) > limits.cameras or len(state) > limits.state_values:
+        raise MessageTooLarge(
+            f"lerobot_features: got {len(cameras)} cameras and {len(state)} numbers of state, the limits are "
+            f"{limits.cameras} and {limits.state_values}"
+        )
+    return PolicyInstructions(policy_type, checkpoint, state, cameras, rows)
+
+
+def read_observation(data: Buffer, budget: Budget) -> RobotObservation:
+    """Return the observation in a pickle; its arrays view the pickle, and are counted in `budget`.
+
+    Raises:
+        MalformedMessage: The pickle has anything but an observation, see `pickles`.
+        MessageTooLarge: It exceeds a limit.
+    """
+    stated = _pickled_fields(data, budget.limits, OBSERVATION)
+    timestamp, timestep, values, must_go = (stated[name] for name in _REQUESTS[OBSERVATION])
+    if not is_number(timestamp) or not math.isfinite(timestamp):
+        raise MalformedMessage(f"timestamp: got {_shown(timestamp)}, want a finite number")
+    if type(timestep) is not int or not 0 <= timestep < _STEPS:
+        raise MalformedMessage(f"timestep: got {_shown(timestep)}, want an integer in [0, 2**31)")
+    if type(must_go) is not bool:
+        raise MalformedMessage(f"must_go: got {_shown(must_go)}, want a bool")
+    if not isinstance(values, dict):
+        raise MalformedMessage(f"observation: got {_shown(values)}, want a dict")
+    for name, value in values.items():
+        if isinstance(value, np.ndarray):
+            budget.count(value.nbytes)
+        elif not (isinstance(value, (str, bool)) or is_number(value)):
+            raise MalformedMessage(
+                f"observation: {name[:_SHOWN]!r}: got {_shown(value)}, want a number, text or numpy array"
+            )
+    return RobotObservation(float(timestamp), timestep, values, must_go)
+
+
+def frame(observation: RobotObservation, robot: PolicyInstructions) -> dict[str, Any]:
+    """Return an observation by LeRobot's names, as LeRobot's own server does before it calls a policy.
+
+    Returns:
+        `observation.state`, (D,) float32, in the order of the robot's features, `observation.images.NAME`, and `task`.
+
+    Raises:
+        MissingState, MissingCamera: The observation lacks a feature that the policy instructions state.
+        InvalidObservation: A number of the state is none.
+    """
+    values = observation.values
+    have = [name[:_SHOWN] for name in values][:_SHOWN]
+    found: dict[str, Any] = {}
+    if robot.state:
+        numbers = []
+        for name in robot.state:
+            if name not in values:
+                raise MissingState(name[:_SHOWN], have=have)
+            value = values[name]
+            if isinstance(value, np.ndarray) and value.size == 1:
+                value = value.item()
+            if not is_number(value):
+                raise InvalidObservation(f"{name[:_SHOWN]!r}: got {_shown(value)}, want a number")
+            numbers.append(value)
+        with np.errstate(over="ignore"):  # becomes infinite, as at LeRobot's own server
+            found[STATE] = np.array(numbers, np.float64).astype(np.float32)
+    for name in robot.cameras:
+        if name not in values:
+            raise MissingCamera(name[:_SHOWN], have=have)
+        found[IMAGES + name] = values[name]
+    if TASK in values:
+        found[TASK] = values[TASK]
+    return found
+
+
+def write_chunk(rows: np.ndarray, timestamp: float, timestep: int, period_s: float) -> bytes:
+    """Return the pickle of a chunk: a list of `TimedAction`, which the client unpickles.
+
+    The pickle has the form that LeRobot's server writes, except that each tensor is a call of `torch.tensor` with its
+    numbers, of float32's values: that needs no torch here, and no archive within the pickle.
+
+    Args:
+        rows: The chunk, (H, D) float32.
+        timestamp: Time of the observation, s, which is that of the first action.
+        timestep: Number of the first action, that of the observation.
+        period_s: Time between two actions, s.
+    """
+    if timestep + len(rows) > _STEPS:
+        raise InvalidObservation(f"timestep: got {timestep}, which leaves no numbers for {len(rows)} actions")
+    parts = [b"\x80\x02", _global(0, HELPERS, "TimedAction"), _global(1, "torch", "tensor"), b"]("]
+    for number, row in enumerate(rows):
+        values = b"".join(b"G" + struct.pack(">d", value) for value in row.tolist())
+        parts += [
+            b"h\0)\x81}(",
+            text("timestamp"), b"G", struct.pack(">d", timestamp + number * period_s),
+            text("timestep"), b"J", struct.pack("<i", timestep + number),
+            text("action"), b"h\1](", values, b"e\x85R",
+            b"ub",
+        ]  # fmt: skip
+    return b"".join([*parts, b"e."])
+
+
+def _global(memo: int, module: str, name: str) -> bytes:
+    """Return the opcodes that put a class or function into the memo."""
+    return f"c{module}\n{name}\n".encode() + bytes([ord("q"), memo, ord("0")])
+
+
+def _pickled_fields(data: Buffer, limits: Limits, wanted: Name) -> dict[str, Any]:
+    return fields_of(read_pickle(data, limits, _REQUESTS, NUMPY_CALLS), wanted)
+
+
+def _text(stated: Mapping[str, Any], name: str) -> str:
+    value = stated.get(name)
+    if not isinstance(value, str):
+        raise MalformedMessage(f"{name}: got {_shown(value)}, want text")
+    return value
+
+
+def _shown(value: object) -> str:
+    """Return a client's value as an error shows it: a number, or the type of anything else, whatever its size."""
+    return repr(value) if is_number(value) else type(value).__name__
+
+
+def _names(feature: Mapping[str, Any]) -> tuple[str, ...]:
+    names = feature.get("names")
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise InvalidObservation(f"lerobot_features: {STATE!r}: want `names`, a list of texts")
+    return tuple(names)
+
+
+# The protobuf messages of LeRobot's `AsyncInference` service, read and written by hand.
+#
+# The facts come from LeRobot 0.4.4's `transport/services.proto`, and 0.6.1 has the same: `Observation` has the field 1,
+# `transfer_state`, and the field 2, `data`; `PolicySetup` and `Actions` have the field 1, `data`; `Empty` has none.
+
+
+SERVICE = "transport.AsyncInference"
+_VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5  # types of a field
+_VARINT_BYTES = 10  # maximum length of a number
+_PART_BYTES = 2 * 2**20  # as LeRobot's own client sends; its server takes messages of 4 MiB
+
+
+class TransferState(enum.IntEnum):
+    """The place of a part in its message."""
+
+    BEGIN = 1
+    MIDDLE = 2
+    END = 3
+
+
+@dataclass(frozen=True, slots=True)
+class ObservationPart:
+    """A part of a pickled observation."""
+
+    state: TransferState
+    data: memoryview
+
+
+def read_observation_part(message: bytes) -> ObservationPart:
+    """Return the content of an `Observation`; raise `MalformedMessage` if it is none."""
+    number, data = 0, memoryview(b"")
+    for field, value in _protobuf_fields(message):
+        if field == 1 and isinstance(value, int):
+            number = value
+        elif field == 2 and isinstance(value, memoryview):
+            data = value
+    try:
+        return ObservationPart(TransferState(number), data)
+    except ValueError as error:
+        raise MalformedMessage(f"observation: got transfer state {number}, want 1, 2 or 3") from error
+
+
+def write_observation_parts(data: bytes) -> Iterator[bytes]:
+    """Yield the `Observation` messages of a pickled observation."""
+    for at in range(0, len(data), _PART_BYTES):
+        end = at + _PART_BYTES
+        state = TransferState.END if end >= len(data) else TransferState.MIDDLE if at else TransferState.BEGIN
+        yield bytes([1 << 3 | _VARINT, state, *_head(2, len(data[at:end]))]) + data[at:end]
+
+
+def read_data(message: bytes) -> memoryview | None:
+    """Return the pickle in a `PolicySetup` or an `Actions`; None if it has none."""
+    for field, value in _protobuf_fields(message):
+        if field == 1 and isinstance(value, memoryview):
+            return value
+    return None
+
+
+def write_data(data: bytes) -> bytes:
+    """Return a `PolicySetup` or an `Actions` with a pickle."""
+    return _head(1, len(data)) + data
+
+
+def method(name: str) -> str:
+    """Return the path of a method of the service."""
+    return f"/{SERVICE}/{name}"
+
+
+EMPTY = b""  # an `Empty`, and an `Actions` without a pickle
+
+
+def _head(number: int, length: int) -> bytes:
+    """Return what precedes the bytes of a field."""
+    size = bytearray()
+    while length > 0x7F:
+        size.append(length & 0x7F | 0x80)
+        length >>= 7
+    return bytes([number << 3 | _BYTES, *size, length])
+
+
+def _protobuf_fields(message: bytes) -> Iterator[tuple[int, int | memoryview]]:
+    """Yield the number and the value of each field that is a number or bytes; others are skipped."""
+    view, at = memoryview(message), 0
+    while at < len(view):
+        key, at = _varint(view, at)
+        kind = key & 7
+        if kind == _VARINT:
+            value, at = _varint(view, at)
+            yield key >> 3, value
+            continue
+        length = {_FIXED64: 8, _FIXED32: 4}.get(kind)
+        if kind == _BYTES:
+            length, at = _varint(view, at)
+        if length is None or at + length > len(view):
+            raise MalformedMessage("protobuf: a field of an unknown type, or that ends too early")
+        if kind == _BYTES:
+            yield key >> 3, view[at : at + length]
+        at += length
+
+
+def _varint(view: memoryview, at: int) -> tuple[int, int]:
+    """Return the number at `at`, and the place after it."""
+    number = 0
+    for place, byte in enumerate(view[at : at + _VARINT_BYTES]):
+        number |= (byte & 0x7F) << (7 * place)
+        if byte < 0x80:
+            return number, at + place + 1
+    raise MalformedMessage("protobuf: a number that ends too early")
+
+
+# The mapping of LeRobot's robots: the names of its datasets, which its own server makes of a robot's.
+
+
+STATE, IMAGES, TASK = "observation.state", "observation.images.", "task"
+
+PRESETS: dict[str, dict[str, Any]] = {
+    "lerobot": {
+        "cameras": {"*": f"{IMAGES}*"},
+        "state": {"joints": {"key": STATE, "optional": True}},
+        "instruction": TASK,
+    },
+}
+
+
+# The client's side of LeRobot's asynchronous inference: instructions and observations are written, chunks are read.
+#
+# The facts come from LeRobot 0.4.4's `async_inference/policy_server.py` and `helpers.py`; those of 0.6.1 are the same.
+# The server unpickles what a client sends. It answers a pickled list of `TimedAction`, whose tensors are read as data,
+# see `pickles`.
+
+
+_ACTION = Name(HELPERS, "TimedAction")
+_REPLIES = {_ACTION: ("timestamp", "timestep", "action")}
+_ITEMS = 100_000  # opcodes of a chunk: a row has about fifty
+
+
+@dataclass(frozen=True, slots=True)
+class TimedChunk:
+    """The actions that a server answers."""
+
+    timestamp: float  # that of the observation, s since 1970
+    timestep: int  # that of the observation
+    rows: np.ndarray  # (H, D) of the type that the server computed
+
+
+def features_of(mapping: KeyMapping) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the names of the state's numbers and of the cameras, which the server wants before the first observation.
+
+    Raises:
+        ConfigError: The mapping does not name them all, or has keys that LeRobot's server does not read.
+    """
+    cameras = tuple(one.key.removeprefix(IMAGES) for one in mapping.cameras.values())
+    for name, one in mapping.cameras.items():
+        if "*" in name or not one.key.startswith(IMAGES):
+            raise ConfigError(
+                f"mapping.cameras: got {name}: {one.key}, want each camera by its name, e.g. "
+                f"{{front: {IMAGES}front}}: LeRobot's server wants all names before the first observation"
+            )
+    ends = [part.stop for parts in mapping.state.values() for part in parts]
+    keys = {part.key for parts in mapping.state.values() for part in parts}
+    if mapping.gripper is not None:
+        keys.add(mapping.gripper.key)
+        ends.append(mapping.gripper.index + 1)
+    known = [end for end in ends if end is not None]
+    if keys != {STATE} or len(known) < len(ends):
+        raise ConfigError(
+            f"mapping.state: got the keys {sorted(keys)}, want {STATE} alone, and `stop` in each part, e.g. "
+            f"{{joints: {{key: {STATE}, stop: 6}}}}: LeRobot's server wants the number of numbers first"
+        )
+    if mapping.instruction not in (TASK, None) or mapping.info:
+        raise ConfigError(f"mapping: LeRobot's server reads images, {STATE} and {TASK}; remove other keys")
+    return tuple(f"{STATE}.{i}" for i in range(max(known))), cameras
+
+
+def write_instructions(instructions: PolicyInstructions) -> bytes:
+    """Return the pickle of policy instructions."""
+    state: dict[str, Any] = {
+        STATE: {"dtype": "float32", "shape": (len(instructions.state),), "names": list(instructions.state)}
+    }
+    # The server reads an image in its own size, and resizes it to the policy's.
+    image = {"dtype": "image", "shape": (None, None, 3), "names": ["height", "width", "channels"]}
+    return write_record(
+        SETUP,
+        {
+            "policy_type": instructions.policy_type,
+            "pretrained_name_or_path": instructions.checkpoint,
+            "lerobot_features": state | {IMAGES + name: image for name in instructions.cameras},
+            "actions_per_chunk": instructions.actions_per_chunk,
+            "device": instructions.device,
+            "rename_map": {},
+        },
+    )
+
+
+def write_observation(
+    theirs: Mapping[str, Any], instructions: PolicyInstructions, timestamp: float, timestep: int
+) -> bytes:
+    """Return the pickle of an observation, which the server computes in any case (`must_go`).
+
+    Args:
+        theirs: By LeRobot's names: `observation.state`, (D,) float32; `observation.images.NAME`, (H, W, 3) uint8; and
+            `task`, a text.
+        instructions: Those that the server got: they name the numbers and the cameras.
+        timestamp: Of the observation, s since 1970; the server's answer repeats it.
+        timestep: The server's answer repeats it.
+
+    Raises:
+        InvalidObservation: It lacks a camera or the state, or that has another length than the instructions say.
+    """
+    wanted = (STATE, *(IMAGES + name for name in instructions.cameras))
+    if missing := [name for name in wanted if name not in theirs]:  # which the mapping calls optional
+        raise InvalidObservation(f"lerobot: got no {missing}; the server wants all that the mapping names")
+    state = theirs[STATE]
+    if len(state) != len(instructions.state):
+        raise InvalidObservation(f"{STATE!r}: got {len(state)} numbers, the mapping says {len(instructions.state)}")
+    values: dict[str, Any] = dict(zip(instructions.state, map(float, state), strict=True))
+    values |= {name: theirs[IMAGES + name] for name in instructions.cameras}
+    if TASK in theirs:
+        values[TASK] = theirs[TASK]
+    fields = {"timestamp": timestamp, "timestep": timestep, "observation": values, "must_go": True}
+    return write_record(OBSERVATION, fields)
+
+
+def read_chunk(data: Buffer, limits: Limits = DEFAULT_LIMITS) -> TimedChunk:
+    """Return the chunk in a pickle.
+
+    Raises:
+        MalformedMessage: The pickle has anything but a chunk, see `pickles`.
+        MessageTooLarge: It exceeds a limit.
+    """
+    actions = read_pickle(data, replace(limits, items=max(limits.items, _ITEMS)), _REPLIES, TORCH_CALLS)
+    if not isinstance(actions, list) or not actions:
+        raise MalformedMessage(f"actions: got {type(actions).__name__}, want a list of TimedAction")
+    fields = [fields_of(action, _ACTION) for action in actions]
+    rows = [one["action"] for one in fields]
+    if not all(isinstance(row, np.ndarray) for row in rows) or len({(row.shape, row.dtype) for row in rows}) != 1:
+        raise MalformedMessage("actions: want tensors of the same length and type")
+    if sum(row.nbytes for row in rows) > limits.reply_bytes:  # rows may share their bytes
+        raise MessageTooLarge(f"actions: more than {limits.reply_bytes} bytes")
+    timestamp, timestep = fields[0]["timestamp"], fields[0]["timestep"]
+    if not is_number(timestamp) or not math.isfinite(timestamp) or type(timestep) is not int:
+        raise MalformedMessage("actions: want a number as timestamp, and an integer as timestep")
+    return TimedChunk(float(timestamp), timestep, np.stack(rows))

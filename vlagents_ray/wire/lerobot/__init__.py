@@ -1,1 +1,0 @@
-"""LeRobot's asynchronous inference: its gRPC messages, and the pickles in them, which are read as data."""

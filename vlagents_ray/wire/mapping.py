@@ -1,0 +1,613 @@
+"""Conversion of another system's observation to an `Obs`, and of our action to theirs: keys, layouts, grippers.
+
+A deployment file states a mapping as a preset's name (`presets`), as an object, or as an
+object that names a preset and changes some of its fields:
+
+    {"cameras": {"front": "observation/image", "wrist": {"key": "images/wrist", "layout": "chw"}},
+     "state": {"joints": {"key": "state", "stop": 6}, "pose": ["position", "rotation"]},
+     "gripper": {"key": "state", "index": 6, "open": 0.04, "closed": 0.0},
+     "instruction": "prompt|task_id", "instructions": {"0": "turn on the radio"},
+     "info": {"unnorm_key": "unnorm_key"},
+     "action": {"arm": {"stop": 6}, "hand": {"start": 6}},
+     "action_gripper": {"index": 6, "open": -1, "closed": 1}}
+
+The client's keys are paths: `images/wrist` is either that key itself or `wrist` within `images`. `states|state` is the
+first of the two that exists. A name and a key that end with `*` stand for all keys that match: `"*": "video/*"`. Left
+sides are our names, right sides the client's, except in `action`, whose left sides are the names that the client reads,
+and in `instructions`, which has the text of each integer that a client sends in place of an instruction. Unknown fields
+are errors; a text stands for an entry with that key and no other field.
+
+An observation is refused if the mapping reads nothing of it, or none of the cameras or none of the states in it.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, fields
+from functools import lru_cache
+from typing import Any, Literal, TypeVar
+
+import numpy as np
+
+from vlagents_ray.contract import ActionSpec, Contract
+from vlagents_ray.errors import (
+    ConfigError,
+    InvalidAction,
+    InvalidObservation,
+    MessageTooLarge,
+    MissingCamera,
+    MissingState,
+    shown,
+)
+from vlagents_ray.interface import Obs
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
+from vlagents_ray.protocol.observations import as_camera, as_state, is_number
+
+logger = logging.getLogger(__name__)
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class CameraKey:
+    """The location of an image, (H, W, 3) or (3, H, W) RGB; of (1, T, H, W, 3) the newest image is used, the last of T.
+
+    Pixels are uint8, or floats in [0, 1]. The layout `any` means channels first if the length of the first axis is 3;
+    of `rgba`, (H, W, 4), the alpha is left out.
+    """
+
+    key: str
+    layout: Literal["hwc", "chw", "any", "rgba"] = "hwc"
+    optional: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class StateKey:
+    """The location of a vector (D,), from `start` to `stop`; of (1, T, D) the newest vector is used, the last of T."""
+
+    key: str
+    start: int | None = None
+    stop: int | None = None
+    optional: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class GripperKey:
+    """The location of the gripper's opening, and its readings when open and closed; it is linear between them."""
+
+    key: str
+    index: int = 0
+    open: float = 1.0
+    closed: float = 0.0
+    optional: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class ActionRange:
+    """The columns of our action, (H, D), that the client reads under one name."""
+
+    start: int | None = None
+    stop: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ActionGripper:
+    """A gripper's column in an action, and the client's commands to open and close it."""
+
+    index: int = -1
+    open: float = 1.0
+    closed: float = 0.0
+
+
+def closed(cls: type, data: object, where: str) -> dict[str, Any]:
+    """Return the fields in `data`; raise `ConfigError` for a field that `cls` lacks."""
+    if not isinstance(data, Mapping):
+        raise ConfigError(f"{where}: got {type(data).__name__}, want an object")
+    known = [one.name for one in fields(cls)]
+    unknown = sorted(str(key) for key in data if key not in known)
+    if unknown:
+        raise ConfigError(f"{where}: unknown keys {unknown}, want some of {known}")
+    return dict(data)
+
+
+def each(top: Mapping[str, Any], name: str, read: Callable[[Any, str], T]) -> dict[str, T]:
+    """Return the entries of `top[name]`, each the result of `read(value, where)`; `where` is its path, for errors."""
+    entries = top.get(name) or {}
+    if not isinstance(entries, Mapping):
+        raise ConfigError(f"mapping.{name}: got {type(entries).__name__}, want an object")
+    return {str(key): read(value, f"mapping.{name}.{key}") for key, value in entries.items()}
+
+
+def entry(cls: type[T], value: Any, where: str) -> T:
+    """Return an entry of a mapping, the dataclass `cls`; a text is its key."""
+    values = closed(cls, {"key": value} if isinstance(value, str) else value, where)
+    known = {one.name: str(one.type) for one in fields(cls)}  # type: ignore[arg-type]
+    for name, got in values.items():
+        if not _FITS[known[name]](got):
+            raise ConfigError(f"{where}.{name}: got {got!r}, want {known[name]}")
+    if "key" in known and not values.get("key"):
+        raise ConfigError(f"{where}: no key; say where it lies in their observation")
+    if "*" in (key := values.get("key", "")) and key.index("*") != len(key) - 1:
+        raise ConfigError(f"{where}: got key {key!r}, want '*' at its end alone")
+    if "open" in known and values.get("open", 1.0) == values.get("closed", 0.0):
+        raise ConfigError(f"{where}: open and closed are the same, {values.get('open', 1.0)}")
+    return cls(**values)
+
+
+_FITS: dict[str, Callable[[Any], bool]] = {
+    "str": lambda value: isinstance(value, str),
+    "int": lambda value: type(value) is int,
+    "int | None": lambda value: value is None or type(value) is int,
+    "float": lambda value: type(value) in (int, float) and np.isfinite(value),
+    "bool": lambda value: isinstance(value, bool),
+    "Literal['hwc', 'chw', 'any', 'rgba']": lambda value: value in ("hwc", "chw", "any", "rgba"),
+    'Literal["hwc", "chw", "any", "rgba"]': lambda value: value in ("hwc", "chw", "any", "rgba"),
+}
+
+
+def parts(value: Any, where: str) -> tuple[StateKey, ...]:
+    """Return the keys of one state, whose values are joined."""
+    values = value if isinstance(value, list) else [value]
+    if not values:
+        raise ConfigError(f"{where}: got an empty list, want one key at least")
+    return tuple(entry(StateKey, one, where) for one in values)
+
+
+def text(value: Any, where: str) -> str:
+    """Return a value that must be text."""
+    if not isinstance(value, str):
+        raise ConfigError(f"{where}: got {type(value).__name__}, want text")
+    return value
+
+
+def stated(value: Any) -> Any:
+    """Return `value` as plain JSON values, without fields that are None."""
+    if isinstance(value, dict):
+        return {name: stated(item) for name, item in value.items() if item is not None}
+    if isinstance(value, (list, tuple)):
+        return [stated(item) for item in value]
+    return value
+
+
+# Paths into nested observations, such as `images/wrist`: either that key itself, or `wrist` within `images`.
+#
+# `states|state` stands for the first of the two that exists.
+
+
+_SHOWN = 40  # maximum number of keys that an error lists, and of characters of a key
+_LONGEST = 200  # characters of a client's key that are compared
+
+
+def lookup(nested: Mapping[Any, Any], path: str) -> Any:
+    """Return the value at `path`; None if there is none."""
+    if path in nested:
+        return nested[path]
+    if "|" in path:
+        return next((value for one in path.split("|") if (value := lookup(nested, one)) is not None), None)
+    end = path.find("/")
+    while end >= 0:
+        inside = nested.get(path[:end])
+        if isinstance(inside, Mapping):
+            value = lookup(inside, path[end + 1 :])
+            if value is not None:
+                return value
+        end = path.find("/", end + 1)
+    return None
+
+
+def keys(nested: Mapping[Any, Any]) -> list[str]:
+    """Return the paths of all values that are not mappings, in order, at most 40, to be listed in an error."""
+    return [short_path(path) for path, _ in leaves(nested)]
+
+
+def short_path(path: str) -> str:
+    """Return a path as an error may list it, each key cut to 40 characters."""
+    return "/".join(key[:_SHOWN] for key in path.split("/"))
+
+
+def leaves(nested: Mapping[Any, Any], prefix: str = "") -> list[tuple[str, Any]]:
+    """Return the paths and values of all values that are not mappings, in order, at most 40; see `short_path`."""
+    found: list[tuple[str, Any]] = []
+    for key, value in nested.items():
+        if len(found) >= _SHOWN:
+            break
+        path = f"{prefix}{(key if isinstance(key, str) else shown(key))[:_LONGEST]}"
+        if isinstance(value, Mapping):
+            found += leaves(value, f"{path}/")
+        else:
+            found.append((path, value))
+    return found[:_SHOWN]
+
+
+def reads(key: str, path: str) -> bool:
+    """Whether the key of a mapping stands for the value at `path`."""
+    return any(matches(path, one) for one in key.split("|"))
+
+
+def matches(name: str, pattern: str) -> bool:
+    """Whether `pattern`, which may end with `*`, stands for `name`."""
+    return name.startswith(pattern[:-1]) if pattern.endswith("*") else name == pattern
+
+
+def pick(
+    flat: Mapping[str, Any], name: str, key: str, optional: bool, missing: Callable[..., InvalidObservation]
+) -> list[tuple[str, str, Any]]:
+    """Return the values that a key of a mapping stands for.
+
+    Args:
+        flat: The client's observation.
+        name: Our name of the value; its `*` stands for the same text as that of `key`.
+        key: The client's key.
+        optional: Whether the value may be missing.
+        missing: Creates the error that is raised if the value is missing.
+
+    Returns:
+        Our name, the client's key and the value, of each.
+    """
+    if "*" not in key:
+        value = lookup(flat, key)
+        there = [] if value is None or isinstance(value, Mapping) else [(name, key, value)]
+    else:
+        folder, _, last = key.rpartition("/")
+        inside = lookup(flat, folder) if folder else flat
+        prefix = last.removesuffix("*")
+        there = [
+            (name.replace("*", theirs.removeprefix(prefix)), f"{folder}/{theirs}".removeprefix("/"), value)
+            for theirs, value in (inside.items() if isinstance(inside, Mapping) else ())
+            if isinstance(theirs, str) and theirs.startswith(prefix) and len(theirs) > len(prefix)
+        ]
+        optional = True
+    if not there and not optional:
+        raise missing(key, have=keys(flat))
+    return there
+
+
+# The values that a mapping finds in another system's observation, as ours.
+
+
+def read_image(key: str, value: Any, layout: str, limits: Limits) -> np.ndarray:
+    """Return an image as (H, W, 3) uint8 RGB; raise `InvalidObservation` or `MessageTooLarge`."""
+    if isinstance(value, np.ndarray):
+        value = _newest(key, value, 3)
+        if value.dtype.kind == "f":
+            value = _eight_bits(key, value)
+        if layout == "rgba" and value.ndim == 3 and value.shape[2] == 4:
+            value = np.ascontiguousarray(value[:, :, :3])
+        elif layout in ("chw", "any") and value.ndim == 3 and value.shape[0] == 3:
+            value = np.ascontiguousarray(value.transpose(1, 2, 0))
+        elif layout == "chw":
+            raise InvalidObservation(f"camera {key!r}: got {value.shape} {value.dtype}, want (3, H, W) uint8 RGB")
+    return as_camera(key, value, limits)
+
+
+def _eight_bits(key: str, image: np.ndarray) -> np.ndarray:
+    """Convert floats in [0, 1] to uint8, rounded down as openpi's own server does (`_parse_image` in its policies)."""
+    if image.size and not (image.min() >= 0 and image.max() <= 1):  # true for NaN, too
+        raise InvalidObservation(
+            f"camera {key!r}: got {image.dtype} from {image.min():g} to {image.max():g}, want uint8, or floats "
+            f"in [0, 1]; scale it"
+        )
+    return (255 * image).astype(np.uint8)
+
+
+def may_be_camera(value: Any) -> bool:
+    """Return whether a value may be an image."""
+    return isinstance(value, np.ndarray) and value.ndim >= 3
+
+
+def may_be_state(value: Any) -> bool:
+    """Return whether a value is a vector of numbers; images and camera matrices are not."""
+    if isinstance(value, list):
+        return bool(value) and all(map(is_number, value))
+    return isinstance(value, np.ndarray) and value.dtype.kind in "fiu" and value.squeeze().ndim == 1
+
+
+def read_state(
+    flat: Mapping[str, Any], name: str, sources: tuple[StateKey, ...], limits: Limits
+) -> dict[str, np.ndarray]:
+    """Return the state `name`, whose parts are joined, (D,) float32; several states if the name ends with `*`."""
+    joined: dict[str, list[np.ndarray]] = {}
+    for part in sources:
+        found = pick(flat, name, part.key, part.optional, MissingState)
+        for ours, key, value in found:
+            vector = read_vector(key, value, limits)
+            if part.stop is not None and part.stop > vector.size:
+                raise InvalidObservation(f"state {key!r}: got {vector.size} numbers, want {part.stop} at least")
+            joined.setdefault(ours, []).append(vector[part.start : part.stop])
+    return {ours: vectors[0] if len(vectors) == 1 else np.concatenate(vectors) for ours, vectors in joined.items()}
+
+
+def read_vector(key: str, value: Any, limits: Limits) -> np.ndarray:
+    """Return a value as (D,) float32."""
+    if isinstance(value, np.ndarray):
+        value = np.atleast_1d(_newest(key, value, 1))
+    elif isinstance(value, np.number):
+        value = [value.item()]
+    elif is_number(value):
+        value = [value]
+    return as_state(key, value, limits)
+
+
+def _newest(key: str, value: np.ndarray, ndim: int) -> np.ndarray:
+    """Remove the batch axis, of length 1, and the time axis that some clients add in front; keep the last time."""
+    if value.ndim > ndim and value.shape[0] != 1:
+        raise InvalidObservation(
+            f"{key!r}: got {value.shape}, a batch of {value.shape[0]}, want one; send each by itself"
+        )
+    if value.ndim == ndim + 2 and value.shape[1] > 0:
+        value = value[:, -1]
+    return value if value.ndim != ndim + 1 else value.reshape(value.shape[1:])
+
+
+def read_text(key: str, value: Any, texts: Mapping[str, str], limits: Limits, *, needed: bool) -> str | None:
+    """Return an instruction.
+
+    Args:
+        key: The client's key, for errors.
+        value: A text, a list or array of one text, or an array of one integer.
+        texts: The text that each integer stands for.
+        limits: The limits of a request.
+        needed: Whether an integer without a text is an error; if not, there is no instruction.
+
+    Raises:
+        InvalidObservation: `value` is none of these, or an integer without a text that is needed.
+        MessageTooLarge: The text is too long.
+    """
+    while isinstance(value, (list, tuple)) and len(value) == 1:  # some clients send a batch of one
+        value = value[0]
+    if isinstance(value, np.ndarray) and value.dtype.kind in "Uiu" and value.size == 1:
+        value = value.item()
+        if isinstance(value, int):
+            if needed and str(value) not in texts:
+                raise InvalidObservation(
+                    f"{key!r}: got {value}, want one of {sorted(texts)}; add its text to mapping.instructions"
+                )
+            value = texts.get(str(value))
+    if value is not None and not isinstance(value, str):
+        raise InvalidObservation(f"{key!r}: got {type(value).__name__}, want text")
+    if value is not None and len(value) > limits.text:
+        raise MessageTooLarge(f"{key!r}: got {len(value)} characters, the limit is {limits.text}")
+    return value
+
+
+_OVERSHOOT = 0.25  # share of a gripper's range by which a sensor may read beyond its ends
+
+
+@dataclass(frozen=True, slots=True)
+class KeyMapping:
+    """The key mapping of one system; the module describes its fields."""
+
+    cameras: Mapping[str, CameraKey] = field(default_factory=dict)
+    state: Mapping[str, tuple[StateKey, ...]] = field(default_factory=dict)  # joined in this order
+    gripper: GripperKey | None = None
+    instruction: str | None = None
+    instructions: Mapping[str, str] = field(default_factory=dict)  # by the integer that is sent in their place
+    info: Mapping[str, str] = field(default_factory=dict)  # all optional
+    action: Mapping[str, ActionRange] = field(default_factory=dict)
+    action_gripper: tuple[ActionGripper, ...] = ()
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> KeyMapping:
+        """Read a mapping from plain JSON values; raise `ConfigError` for an unknown key or a wrong type."""
+        top = closed(cls, data, "mapping")
+        instruction = top.get("instruction")
+        if instruction is not None and not isinstance(instruction, str):
+            raise ConfigError(f"mapping.instruction: got {type(instruction).__name__}, want a key")
+        gripper = top.get("gripper")
+        grippers = top.get("action_gripper") or []
+        return cls(
+            cameras=each(top, "cameras", lambda value, where: entry(CameraKey, value, where)),
+            state=each(top, "state", parts),
+            gripper=None if gripper is None else entry(GripperKey, gripper, "mapping.gripper"),
+            instruction=instruction,
+            instructions=each(top, "instructions", text),
+            info=each(top, "info", lambda value, where: entry(StateKey, value, where).key),
+            action=each(top, "action", lambda value, where: entry(ActionRange, value, where)),
+            action_gripper=tuple(
+                entry(ActionGripper, one, "mapping.action_gripper")
+                for one in (grippers if isinstance(grippers, list) else [grippers])
+            ),
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the mapping as plain JSON values for `from_json`, without fields that are not set."""
+        return {name: stated(value) for name, value in asdict(self).items() if value not in (None, {}, ())}
+
+    def obs(
+        self, flat: Mapping[str, Any], limits: Limits = DEFAULT_LIMITS, contract: Contract | None = None
+    ) -> tuple[Obs, str | None]:
+        """Convert a client's observation.
+
+        Args:
+            flat: The client's observation.
+            limits: The limits of a request.
+            contract: The policy's contract: a gripper that it does not need is left out if its reading is invalid.
+
+        Returns:
+            Our observation, whose arrays may view those of `flat`, and its instruction; None if there is none.
+
+        Raises:
+            MissingCamera, MissingState: A key is missing.
+            InvalidObservation: A value is invalid, or the mapping reads nothing of the observation, or none of the
+                cameras or none of the states in it.
+        """
+        cameras: dict[str, np.ndarray] = {}
+        for name, camera in self.cameras.items():
+            for ours, key, value in pick(flat, name, camera.key, camera.optional, MissingCamera):
+                cameras[ours] = read_image(key, value, camera.layout, limits)
+        state: dict[str, np.ndarray] = {}
+        for name, sources in self.state.items():
+            state |= read_state(flat, name, sources, limits)
+        if max(len(cameras), len(state)) > limits.cameras:
+            raise MessageTooLarge(
+                f"observation: got {len(cameras)} cameras and {len(state)} states, the limit is {limits.cameras}"
+            )
+        info = {name: value for name, key in self.info.items() if (value := lookup(flat, key)) is not None}
+        gripper = self._opening(flat, limits, needed=contract is not None and bool(contract.gripper))
+        obs = Obs(cameras, gripper, state, info)
+        if not cameras or not state:
+            self._require_read(flat, obs)
+        return obs, self._instruction(flat, limits, needed=contract is not None and bool(contract.instruction))
+
+    def rows(self, action: np.ndarray, spec: ActionSpec | None = None) -> np.ndarray:
+        """Return our action, (D,) or (H, D), as (H, D) float32 with the gripper's commands in the client's convention.
+
+        `spec`, the action of the policy's contract, states the policy's own convention; without it, the commands are
+        not changed.
+        """
+        rows = np.atleast_2d(np.asarray(action, np.float32))
+        if spec is None or spec.gripper_open is None or spec.gripper_closed is None:
+            return rows
+        ours = spec.gripper_open - spec.gripper_closed
+        for one in self.action_gripper:
+            if (one.open, one.closed) == (spec.gripper_open, spec.gripper_closed):
+                continue
+            if not -rows.shape[1] <= one.index < rows.shape[1]:
+                raise InvalidAction(f"action: got {rows.shape[1]} numbers a row, want a gripper's at {one.index}")
+            rows = rows.copy()
+            opening = (rows[:, one.index] - spec.gripper_closed) / ours
+            rows[:, one.index] = one.closed + opening * (one.open - one.closed)
+        return rows
+
+    def actions(self, action: np.ndarray, spec: ActionSpec | None = None) -> dict[str, np.ndarray]:
+        """Return `rows` by the names that the client reads, each (H, n); as `action` if the mapping names none."""
+        rows = self.rows(action, spec)
+        if not self.action:
+            return {"action": rows}
+        return {name: rows[:, one.start : one.stop] for name, one in self.action.items()}
+
+    def lacks(self, contract: Contract | None) -> list[str]:
+        """Return what the policy needs and no observation of this mapping has, one sentence each with its remedy."""
+        if contract is None:
+            return []
+        found = [
+            f"{kind} {name!r}: the policy needs it, the mapping gives {sorted(given)}; add it to mapping.{field_}"
+            for kind, field_, needs, given in (
+                ("camera", "cameras", contract.cameras or {}, self.cameras),
+                ("state", "state", contract.state or {}, self.state),
+            )
+            for name in needs
+            if not any(matches(name, pattern) for pattern in given)
+        ]
+        if contract.gripper and self.gripper is None:
+            found.append("gripper: the policy needs it, the mapping has none; add mapping.gripper")
+        if contract.instruction and self.instruction is None:
+            found.append("instruction: the policy needs one, the mapping has none; add mapping.instruction")
+        dim = contract.action.dim
+        last = max((one.index + 1 if one.index >= 0 else -one.index for one in self.action_gripper), default=0)
+        last = max([last, *(max(one.start or 0, one.stop or 0) for one in self.action.values())])
+        if dim is not None and last > dim:
+            found.append(
+                f"action: the policy gives {dim} numbers a row, the mapping wants {last}; change mapping.action"
+            )
+        return found
+
+    def warn_of_unread_cameras(self, flat: Mapping[str, Any], dialect: str) -> None:
+        """Log the cameras of a client's observation that the mapping does not read, which the policy never sees.
+
+        It is logged once for all clients of a dialect that send the same ones. This looks at each key: call it when a
+        session begins, not for each observation.
+        """
+        if unread := self._unread(flat, may_be_camera):
+            _log_unread(dialect, tuple(unread), tuple(camera.key for camera in self.cameras.values()))
+
+    def _unread(self, flat: Mapping[str, Any], is_one: Callable[[Any], bool]) -> list[str]:
+        """Return the paths of the values for which `is_one` holds and which no key of the mapping stands for."""
+        known = [one.key for one in self.cameras.values()] + [one.key for all_ in self.state.values() for one in all_]
+        known += [*self.info.values(), *([] if self.gripper is None else [self.gripper.key])]
+        return [
+            short_path(path)
+            for path, value in leaves(flat)
+            if is_one(value) and not any(reads(key, path) for key in known)
+        ]
+
+    def _require_read(self, flat: Mapping[str, Any], obs: Obs) -> None:
+        """Raise if `obs` has nothing of the client's observation, or none of its cameras or none of its states."""
+        images = [camera.key for camera in self.cameras.values()]
+        numbers = [part.key for sources in self.state.values() for part in sources]
+        grippers = [] if self.gripper is None else [self.gripper.key]
+        known = [*images, *numbers, *grippers]
+        if known and not obs.cameras and not obs.state and obs.gripper is None:
+            raise InvalidObservation(
+                f"observation: got {keys(flat)}, of which the mapping reads nothing; it looks for {known}: "
+                f"choose the preset of this client, or change the mapping"
+            )
+        for kind, wanted, found, is_one in (
+            ("cameras", images, obs.cameras, may_be_camera),
+            ("state", numbers, obs.state, may_be_state),
+        ):
+            if not wanted or found:
+                continue
+            if lost := self._unread(flat, is_one):
+                raise InvalidObservation(
+                    f"observation: got {lost}, which the mapping does not read, and nothing at {wanted}; add them to "
+                    f"mapping.{kind}, or to mapping.info if the policy does without"
+                )
+
+    def _opening(self, flat: Mapping[str, Any], limits: Limits, *, needed: bool) -> float | None:
+        """Return the gripper's opening in [0, 1], 1 = open; None if there is none or it is invalid and not `needed`."""
+        if (gripper := self.gripper) is None:
+            return None
+        value = lookup(flat, gripper.key)
+        if value is None:
+            if gripper.optional:
+                return None
+            raise MissingState(gripper.key, have=keys(flat))
+        vector = read_vector(gripper.key, value, limits)
+        if not -vector.size <= gripper.index < vector.size:
+            raise InvalidObservation(
+                f"{gripper.key!r}: got {vector.size} numbers, want the gripper's at {gripper.index}"
+            )
+        reading = float(vector[gripper.index])
+        opening = (reading - gripper.closed) / (gripper.open - gripper.closed)
+        if not -_OVERSHOOT <= opening <= 1 + _OVERSHOOT:  # true for NaN, too
+            if not needed:
+                return None
+            raise InvalidObservation(
+                f"{gripper.key!r}: got {reading:g} for the gripper, want {gripper.closed:g} (closed) to "
+                f"{gripper.open:g} (open); scale it, or change mapping.gripper"
+            )
+        return min(1.0, max(0.0, opening))
+
+    def _instruction(self, flat: Mapping[str, Any], limits: Limits, *, needed: bool) -> str | None:
+        found = [] if self.instruction is None else pick(flat, "", self.instruction, True, MissingState)
+        if not found or self.instruction is None:
+            return None
+        return read_text(self.instruction, found[0][2], self.instructions, limits, needed=needed)
+
+
+@lru_cache(maxsize=64)  # logs only what it did not log before
+def _log_unread(dialect: str, unread: tuple[str, ...], read: tuple[str, ...]) -> None:
+    logger.warning(
+        f"{dialect}: a client sends the cameras {list(unread)}, which the policy does not get: the mapping reads "
+        f"{list(read)}; if the policy takes them, add them to mapping.cameras"
+    )
+
+
+# Parts of mappings that the clients of several systems share: the layout of LIBERO's and ALOHA's vectors.
+
+
+# Six joints in rad and one gripper in [0, 1] per arm, the left arm first.
+ALOHA_STATE = {
+    "left/joints": {"key": "state", "stop": 6},
+    "left/gripper": {"key": "state", "start": 6, "stop": 7},
+    "right/joints": {"key": "state", "start": 7, "stop": 13},
+    "right/gripper": {"key": "state", "start": 13, "stop": 14},
+}
+ALOHA_ACTION = [{"index": 6}, {"index": 13}]
+
+
+def libero_state(key: str) -> dict[str, Any]:
+    """Return the mapping of LIBERO's state, which a client sends under `key`.
+
+    The state holds the end effector's pose in the robot's base frame (position in m, axis-angle in rad) and two finger
+    joints, 0.04 m when open.
+    """
+    return {
+        "state": {
+            "xyz_axis_angle": {"key": key, "stop": 6},
+            "gripper_qpos": {"key": key, "start": 6, "stop": 8},
+        },
+        "gripper": {"key": key, "index": 6, "open": 0.04, "closed": 0.0},
+    }

@@ -1,0 +1,117 @@
+"""OpenVLA's REST bodies: JSON with arrays in the format of `json-numpy`, encoded once or twice.
+
+`{"__numpy__": base64, "dtype": "|u1", "shape": [H, W, 3]}` is an array. Clients that do not patch their json module
+encode twice: a request is `{"encoded": "<the JSON>"}` and its reply a JSON string that holds the JSON.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.errors import MalformedMessage, MessageTooLarge
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
+from vlagents_ray.wire import json_numpy
+from vlagents_ray.wire.mapping import ALOHA_ACTION, ALOHA_STATE, libero_state
+
+
+def decode(body: bytes, limits: Limits = DEFAULT_LIMITS) -> tuple[dict[str, Any], bool]:
+    """Return the observation in a request's body, and whether it was encoded twice.
+
+    Raises `MalformedMessage` or `MessageTooLarge`.
+    """
+    if len(body) > limits.body_bytes:
+        raise MessageTooLarge(f"body: got {len(body)} bytes, the limit is {limits.body_bytes}")
+    payload = _load(body, limits)
+    if twice := "encoded" in payload:
+        if len(payload) != 1 or not isinstance(payload["encoded"], str):
+            raise MalformedMessage("body: want 'encoded' alone, and text in it")
+        payload = _load(payload["encoded"].encode("utf-8", "replace"), limits)
+    return payload, twice
+
+
+def encode(action: np.ndarray | Sequence[np.ndarray], twice: bool) -> bytes:
+    """Return the reply with one action, (D,), or several."""
+    text = json_numpy.dumps(action)
+    return (json.dumps(text) if twice else text).encode()
+
+
+def _load(text: bytes, limits: Limits) -> dict[str, Any]:
+    payload = json_numpy.loads(text, limits)
+    if not isinstance(payload, dict):
+        raise MalformedMessage(f"body: got {type(payload).__name__}, want an object")
+    return payload
+
+
+def encode_observation(observation: Mapping[str, Any]) -> bytes:
+    """Return the body of a request, encoded once."""
+    return json_numpy.dumps(observation).encode()
+
+
+def decode_action(body: bytes, limits: Limits = DEFAULT_LIMITS) -> np.ndarray | None:
+    """Return the action in a reply, (D,) or (H, D); None if the reply is "error", as OpenVLA's own server says it.
+
+    Raises `MalformedMessage` or `MessageTooLarge`.
+    """
+    value = json_numpy.loads(body, limits)
+    if isinstance(value, str) and value != "error":  # encoded twice
+        value = json_numpy.loads(value, limits)
+    if isinstance(value, str):
+        return None
+    if isinstance(value, list) and value and all(isinstance(row, np.ndarray) for row in value):
+        if len(shapes := {row.shape for row in value}) != 1:
+            raise MalformedMessage(f"action: got rows of the shapes {sorted(shapes)[:8]}, want the same in all")
+        value = np.stack(value)
+    elif isinstance(value, list):
+        value = _plain_numbers(value)
+    if not isinstance(value, np.ndarray):
+        raise MalformedMessage(f"action: got {type(value).__name__}, want an array, or a list of rows")
+    return value
+
+
+def _plain_numbers(values: list[Any]) -> np.ndarray:
+    try:
+        array = np.asarray(values)
+    except ValueError as error:
+        raise MalformedMessage(f"action: no array of numbers ({error})") from error
+    if array.dtype.kind not in "fiu":
+        raise MalformedMessage(f"action: got {array.dtype}, want numbers")
+    return array
+
+
+# Mappings of the clients of OpenVLA and OpenVLA-OFT.
+
+
+PRESETS: dict[str, dict[str, Any]] = {
+    # openvla, vla-scripts/deploy.py
+    "openvla": {
+        "cameras": {"front": "image"},
+        "instruction": "instruction",
+        "info": {"unnorm_key": "unnorm_key"},
+        "action_gripper": {"index": 6, "open": 1.0, "closed": 0.0},
+    },
+    # openvla-oft: observations as in experiments/robot/libero; vla-scripts/deploy.py replies with the model's output, 1
+    # = open, which its clients convert to LIBERO's -1 themselves (normalize_gripper_action, invert_gripper_action)
+    "openvla-oft": {
+        "cameras": {"front": "full_image", "wrist": {"key": "wrist_image", "optional": True}},
+        **libero_state("state"),
+        "instruction": "instruction",
+        "info": {"unnorm_key": "unnorm_key"},
+        "action_gripper": {"index": 6, "open": 1.0, "closed": 0.0},
+    },
+    # openvla-oft, experiments/robot/aloha/run_aloha_eval.py: `state` is qpos, (14,)
+    "openvla-oft-aloha": {
+        "cameras": {
+            "front": "full_image",
+            "left_wrist": {"key": "left_wrist_image", "optional": True},
+            "right_wrist": {"key": "right_wrist_image", "optional": True},
+        },
+        "state": ALOHA_STATE,
+        "instruction": "instruction",
+        "info": {"unnorm_key": "unnorm_key"},
+        "action_gripper": ALOHA_ACTION,
+    },
+}

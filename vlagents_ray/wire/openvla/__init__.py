@@ -1,1 +1,0 @@
-"""The bodies and the mappings of OpenVLA's REST protocol."""

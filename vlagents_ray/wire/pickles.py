@@ -1,0 +1,579 @@
+"""Pickles of a few known shapes, whose opcodes are read as data: nothing is unpickled, looked up or imported.
+
+A pickle is a program for a stack machine, and its dangerous opcodes import and call whatever it names. This reader has
+no such opcode: a pair of module and name is compared, as text, with the closed lists of its caller, whose entries stand
+for the caller's own functions. An opcode, a name or a shape that is not listed is refused.
+
+The opcodes are those that Python's own pickler writes in protocol 4 and 5 for dicts, lists, tuples, texts, numbers,
+numpy's arrays and data classes. `Limits` bound the number of opcodes (`items`), the nesting (`depth`) and the texts.
+Bytes are not copied. Arrays that a call allocates count towards `decoded_bytes`, so that memory is bounded.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from vlagents_ray.errors import MalformedMessage, MessageTooLarge, shown
+from vlagents_ray.protocol.arrays import Buffer, read_array
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
+
+_PROTOCOLS = (4, 5)
+_INTEGER = 9  # maximum number of bytes of an integer
+_SHOWN = 60  # maximum number of characters of a client's text in an error
+
+
+class Name(NamedTuple):
+    """A class or function that a pickle names."""
+
+    module: str
+    name: str
+
+
+class Record:
+    """An object of a data class, of which only the name and the fields are known."""
+
+    __slots__ = ("fields", "name")
+
+    def __init__(self, name: Name) -> None:
+        self.name = name
+        self.fields: dict[str, Any] | None = None  # None until they were read
+
+
+class Reduced:
+    """An object that a pickle makes by a call, and may describe afterwards."""
+
+    __slots__ = ("allocated", "read_state", "value")
+
+    def __init__(self, read_state: Callable[[Any], Any] | None = None, value: Any = None, allocated: int = 0) -> None:
+        self.read_state = read_state
+        self.allocated = allocated  # bytes beyond those of the message
+        self.value = value  # None until it was described
+
+
+Call = Callable[[tuple[Any, ...]], "Reduced | int | float"]
+"""Returns what a call in a pickle stands for, given its arguments; raises `MalformedMessage` for others."""
+
+
+class _StackValue(NamedTuple):
+    """A value on the stack."""
+
+    value: Any
+    depth: int = 0  # levels of containers in it
+    items: int = 1  # values in it
+
+
+def read_pickle(
+    data: Buffer, limits: Limits, records: Mapping[Name, Sequence[str]], calls: Mapping[Name, Call | None]
+) -> Any:
+    """Return the object that a pickle consists of; one of a data class may lack its fields.
+
+    Args:
+        data: The pickle. Arrays of the result view its memory.
+        limits: Limits of the number of opcodes (`items`), of nesting (`depth`) and of texts (`text`).
+        records: The data classes that may occur, with the names of their fields.
+        calls: The functions that may occur, with our own in their place; None for a class that is an argument only.
+
+    Raises:
+        MalformedMessage: The bytes are no pickle, or have another opcode, name or shape than those listed here.
+        MessageTooLarge: The pickle exceeds a limit.
+    """
+    return _StackMachine(data, limits, records, calls).whole()
+
+
+def fields_of(value: Any, wanted: Name) -> dict[str, Any]:
+    """Return the fields of an object of a data class; raise `MalformedMessage` for anything else."""
+    if not isinstance(value, Record) or value.name != wanted or value.fields is None:
+        raise MalformedMessage(f"pickle: got {_kind(value)}, want a {wanted.name} with its fields")
+    return value.fields
+
+
+class _StackMachine:
+    """A stack machine without calls."""
+
+    def __init__(
+        self, data: Buffer, limits: Limits, records: Mapping[Name, Sequence[str]], calls: Mapping[Name, Call | None]
+    ) -> None:
+        self._data = memoryview(data)
+        self._at = 0
+        self._limits = limits
+        self._records = records
+        self._calls = calls
+        self._items = 0
+        self._stack: list[_StackValue] = []
+        self._below: list[list[_StackValue]] = []  # the stacks below each open mark
+        self._memo: list[_StackValue] = []
+        self._allocated = 0  # bytes beyond those of the message
+        # Name, first argument and result of the last call that allocated.
+        self._latest: tuple[Any, Any, Reduced] = None, None, Reduced()
+
+    def whole(self) -> Any:
+        """Read the pickle to its end."""
+        if self.take(1)[0] != _PROTO or self.take(1)[0] not in _PROTOCOLS:
+            raise MalformedMessage(f"pickle: want one of protocol {_PROTOCOLS[0]} or {_PROTOCOLS[1]}")
+        while (opcode := self.take(1)[0]) != _STOP:
+            self._count(1)
+            read = _OPCODES.get(opcode)
+            if read is None:
+                raise MalformedMessage(f"pickle: got opcode {opcode:#04x}, which is not read here")
+            read(self)
+        root = _finished(self.pop())
+        if self._stack or self._below or self._at != len(self._data):
+            raise MalformedMessage("pickle: more than one object in a message")
+        return root
+
+    def take(self, length: int) -> memoryview:
+        """Return the next bytes."""
+        end = self._at + length
+        if end > len(self._data):
+            raise MalformedMessage("pickle: a message that ends too early")
+        found = self._data[self._at : end]
+        self._at = end
+        return found
+
+    def push(self, value: Any, depth: int = 0, items: int = 1) -> None:
+        """Put a value onto the stack."""
+        if depth > self._limits.depth:
+            raise MessageTooLarge(f"pickle: more than {self._limits.depth} levels of nesting")
+        self._stack.append(_StackValue(value, depth, items))
+
+    def pop(self) -> Any:
+        """Take the value at the top of the stack."""
+        return self._entry().value
+
+    def text(self, length: int) -> None:
+        """Read a text."""
+        if length > self._limits.text:
+            raise MessageTooLarge(f"pickle: a text of {length} bytes, the limit is {self._limits.text}")
+        try:
+            self.push(str(self.take(length), "utf-8"))
+        except UnicodeDecodeError as error:
+            raise MalformedMessage(f"pickle: a text that is not UTF-8 ({error.reason})") from error
+
+    def integer(self) -> None:
+        """Read an integer of a stated number of bytes."""
+        length = self.take(1)[0]
+        if length > _INTEGER:
+            raise MessageTooLarge(f"pickle: an integer of {length} bytes, the limit is {_INTEGER}")
+        self.push(int.from_bytes(self.take(length), "little", signed=True))
+
+    def mark(self) -> None:
+        """Begin a group of values."""
+        self._below.append(self._stack)
+        self._stack = []
+
+    def remember(self) -> None:
+        """Put the value at the top of the stack into the memo, too."""
+        self._memo.append(self._top())
+
+    def recall(self, index: int) -> None:
+        """Push a value of the memo; one that can still change is refused, so that no value contains itself."""
+        if index >= len(self._memo):
+            raise MalformedMessage("pickle: a reference to nothing")
+        entry = self._memo[index]
+        value = entry.value
+        if isinstance(value, (list, dict, Record)) or (isinstance(value, Reduced) and value.value is None):
+            raise MalformedMessage(f"pickle: a second reference to {_kind(value)}; send a copy")
+        self._count(entry.items)
+        self._stack.append(entry)
+
+    def tuple_of(self, entries: Sequence[_StackValue]) -> None:
+        """Make a tuple of values."""
+        self.push(
+            tuple(_finished(entry.value) for entry in entries),
+            _above(entries),
+            1 + sum(entry.items for entry in entries),
+        )
+
+    def extend(self, entries: Sequence[_StackValue]) -> None:
+        """Append values to the list below them."""
+        self._into(list, entries).extend(_finished(entry.value) for entry in entries)
+
+    def update(self, entries: Sequence[_StackValue]) -> None:
+        """Put keys and values into the dict below them."""
+        keys = [entry.value for entry in entries[::2]]
+        if len(entries) % 2 or not all(type(key) is str for key in keys):
+            raise MalformedMessage("pickle: want a dict with texts as keys")
+        values = [_finished(entry.value) for entry in entries[1::2]]
+        self._into(dict, entries).update(zip(keys, values, strict=True))
+
+    def last(self, number: int | None) -> list[_StackValue]:
+        """Take the last values, or all since the mark, from the stack."""
+        if number is not None:
+            return [self._entry() for _ in range(number)][::-1]
+        if not self._below:
+            raise MalformedMessage("pickle: a group without its mark")
+        group, self._stack = self._stack, self._below.pop()
+        return group
+
+    def name(self) -> None:
+        """Replace module and name by the entry of the closed list that they stand for."""
+        name, module = self.pop(), self.pop()
+        if not (type(module) is str and type(name) is str):
+            raise MalformedMessage("pickle: a name that is no text")
+        found = Name(module, name)
+        if found not in self._calls and found not in self._records:
+            raise MalformedMessage(
+                f"pickle: names {module[:_SHOWN]!r} {name[:_SHOWN]!r}, which is not read here; send numbers, texts and "
+                "numpy arrays of numbers"
+            )
+        self.push(found)
+
+    def reduce(self) -> None:
+        """Make the object that a call stands for."""
+        arguments, name = self.pop(), self.pop()
+        read = self._calls.get(name) if isinstance(name, Name) else None
+        if read is None or type(arguments) is not tuple:
+            raise MalformedMessage(f"pickle: got a call of {_kind(name)}, want a numpy array of numbers")
+        first = arguments[0] if arguments else None
+        if (name, len(arguments)) == (self._latest[0], 1) and first is self._latest[1]:  # further tensors of a storage
+            self.push(self._latest[2])
+            return
+        found = read(arguments)
+        if isinstance(found, Reduced) and found.allocated:
+            self._allocated += found.allocated
+            if self._allocated > self._limits.decoded_bytes:
+                raise MessageTooLarge(
+                    f"pickle: takes over {self._limits.decoded_bytes} bytes, decoded; send less at once, or raise "
+                    "`limits.decoded_bytes`"
+                )
+            self._latest = name, first, found
+        self.push(found)
+
+    def new(self) -> None:
+        """Begin an object of a data class."""
+        arguments, name = self.pop(), self.pop()
+        if arguments != () or not isinstance(name, Name) or name not in self._records:
+            raise MalformedMessage(f"pickle: got an object of {_kind(name)}, want one of LeRobot's messages")
+        self.push(Record(name))
+
+    def build(self) -> None:
+        """Describe the object below the value at the top."""
+        state = self._entry()
+        target = self._top().value
+        if isinstance(target, Record) and target.fields is None and type(state.value) is dict:
+            fields = self._records[target.name]
+            if state.value.keys() != set(fields):
+                got = shown(list(state.value))
+                raise MalformedMessage(f"pickle: {target.name.name}: got the fields {got}, want {list(fields)}")
+            target.fields = state.value
+            self._stack[-1] = _StackValue(target, state.depth + 1)
+        elif isinstance(target, Reduced) and target.value is None and target.read_state is not None:
+            target.value = target.read_state(state.value)
+        else:
+            raise MalformedMessage(f"pickle: got the state of {_kind(target)}, which has none")
+
+    def _count(self, items: int) -> None:
+        self._items += items
+        if self._items > self._limits.items:
+            raise MessageTooLarge(f"pickle: more than {self._limits.items} values in a message")
+
+    def _top(self) -> _StackValue:
+        if not self._stack:
+            raise MalformedMessage("pickle: an opcode without its value")
+        return self._stack[-1]
+
+    def _entry(self) -> _StackValue:
+        entry = self._top()
+        self._stack.pop()
+        return entry
+
+    def _into(self, kind: type, entries: Sequence[_StackValue]) -> Any:
+        """Return the container below `entries`, which will contain them."""
+        container = self._entry()
+        if type(container.value) is not kind:
+            raise MalformedMessage(f"pickle: got {_kind(container.value)}, want a {kind.__name__}")
+        items = container.items + sum(entry.items for entry in entries)
+        self.push(container.value, max(container.depth, _above(entries)), items)
+        return container.value
+
+
+def _above(entries: Sequence[_StackValue]) -> int:
+    return 1 + max((entry.depth for entry in entries), default=0)
+
+
+def _finished(value: Any) -> Any:
+    """Return the value that a container keeps of one on the stack."""
+    if not isinstance(value, Reduced):
+        return value
+    if value.value is None:
+        raise MalformedMessage("pickle: an array or a type without its content")
+    return value.value
+
+
+def _kind(value: Any) -> str:
+    if isinstance(value, Record):
+        return value.name.name
+    if isinstance(value, Name):
+        return f"{value.module}.{value.name}"
+    return "an array" if isinstance(value, Reduced) else type(value).__name__
+
+
+_PROTO, _STOP = 0x80, ord(".")
+_U1, _U2, _U4, _U8 = (struct.Struct(f"<{kind}") for kind in "BHIQ")
+_I4, _F8 = struct.Struct("<i"), struct.Struct(">d")
+
+
+def _number(form: struct.Struct, then: Callable[[_StackMachine, Any], None]) -> Callable[[_StackMachine], None]:
+    return lambda reader: then(reader, form.unpack(reader.take(form.size))[0])
+
+
+def _bytes(reader: _StackMachine, length: int) -> None:
+    reader.push(reader.take(length))
+
+
+def _fixed(value: Any) -> Callable[[_StackMachine], None]:
+    return lambda reader: reader.push(value)
+
+
+_OPCODES: dict[int, Callable[[_StackMachine], Any]] = {
+    ord("N"): _fixed(None),
+    0x88: _fixed(True),
+    0x89: _fixed(False),
+    ord("K"): _number(_U1, _StackMachine.push),
+    ord("M"): _number(_U2, _StackMachine.push),
+    ord("J"): _number(_I4, _StackMachine.push),
+    0x8A: _StackMachine.integer,
+    ord("G"): _number(_F8, _StackMachine.push),
+    0x8C: _number(_U1, _StackMachine.text),
+    ord("X"): _number(_U4, _StackMachine.text),
+    ord("C"): _number(_U1, _bytes),
+    ord("B"): _number(_U4, _bytes),
+    0x96: _number(_U8, _bytes),  # a bytearray
+    ord("("): _StackMachine.mark,
+    ord(")"): _fixed(()),
+    0x85: lambda reader: reader.tuple_of(reader.last(1)),
+    0x86: lambda reader: reader.tuple_of(reader.last(2)),
+    0x87: lambda reader: reader.tuple_of(reader.last(3)),
+    ord("t"): lambda reader: reader.tuple_of(reader.last(None)),
+    ord("]"): lambda reader: reader.push([], 1),
+    ord("a"): lambda reader: reader.extend(reader.last(1)),
+    ord("e"): lambda reader: reader.extend(reader.last(None)),
+    ord("}"): lambda reader: reader.push({}, 1),
+    ord("s"): lambda reader: reader.update(reader.last(2)),
+    ord("u"): lambda reader: reader.update(reader.last(None)),
+    0x94: _StackMachine.remember,
+    ord("h"): _number(_U1, _StackMachine.recall),
+    ord("j"): _number(_U4, _StackMachine.recall),
+    0x93: _StackMachine.name,
+    ord("R"): _StackMachine.reduce,
+    0x81: _StackMachine.new,
+    ord("b"): _StackMachine.build,
+    0x95: lambda reader: reader.take(_U8.size),  # a frame, whose length is of no use here
+}
+
+
+# numpy's arrays, types and numbers in a pickle: the calls by which numpy's own pickles state them.
+#
+# The facts come from the pickles of numpy 1.26 and 2.4 in protocol 4 and 5. Arrays of objects, text, times or
+# structures, and big-endian ones, are refused.
+
+
+class _Dtype(str):
+    """The name of a plain numpy type, such as `<f4`."""
+
+    __slots__ = ()
+
+
+def _dtype(arguments: tuple[Any, ...]) -> Reduced:
+    """`numpy.dtype`: ("f4", False, True), then (3, "<", None, None, None, -1, -1, 0)."""
+    match arguments:
+        case (str(kind), bool() | int(), bool() | int()):
+            return Reduced(lambda state: _ordered_dtype(kind, state))
+    raise MalformedMessage("pickle: numpy.dtype: want the type of plain numbers")
+
+
+def _ordered_dtype(kind: str, state: Any) -> _Dtype:
+    match state:
+        case (int(3), str("<") | str("|") as order, None, None, None, int(-1), int(-1), int(0)):
+            return _Dtype(order + kind)
+    raise MalformedMessage("pickle: numpy.dtype: want the type of plain numbers in little-endian order")
+
+
+def _array(arguments: tuple[Any, ...]) -> Reduced:
+    """`_reconstruct`: (numpy.ndarray, (0,), b"b"), then (1, shape, dtype, whether by columns, data)."""
+    match arguments:
+        case (Name("numpy", "ndarray"), (int(0),), memoryview() as kind) if bytes(kind[:2]) == b"b":
+            return Reduced(_content)
+    raise MalformedMessage("pickle: numpy: want a plain array")
+
+
+def _content(state: Any) -> np.ndarray:
+    match state:
+        case (int(1), tuple(shape), _Dtype() as dtype, bool(by_columns), memoryview() as data):
+            return _ordered(data, dtype, shape, by_columns)
+    raise MalformedMessage("pickle: numpy: want the shape, the type of numbers and the data of an array")
+
+
+def _frombuffer(arguments: tuple[Any, ...]) -> Reduced:
+    """`_frombuffer`, of protocol 5: (data, dtype, shape, "C" or "F")."""
+    match arguments:
+        case (memoryview() as data, _Dtype() as dtype, tuple(shape), str("C") | str("F") as order):
+            return Reduced(value=_ordered(data, dtype, shape, order == "F"))
+    raise MalformedMessage("pickle: numpy: want an array by rows; send numpy.ascontiguousarray of it")
+
+
+def _scalar(arguments: tuple[Any, ...]) -> int | float:
+    """`scalar`: (dtype, data)."""
+    match arguments:
+        case (_Dtype() as dtype, memoryview() as data):
+            number: int | float = read_array(data, str(dtype), ()).item()
+            return number
+    raise MalformedMessage("pickle: numpy: want a plain number")
+
+
+def _ordered(data: memoryview, dtype: str, shape: tuple[Any, ...], by_columns: bool) -> np.ndarray:
+    return read_array(data, str(dtype), shape[::-1]).T if by_columns else read_array(data, str(dtype), shape)
+
+
+# numpy renamed its modules in 2.0.
+NUMPY_CALLS: dict[Name, Call | None] = {Name("numpy", "dtype"): _dtype, Name("numpy", "ndarray"): None} | {
+    Name(f"numpy.{core}.{module}", name): read
+    for core in ("core", "_core")
+    for module, name, read in (
+        ("multiarray", "_reconstruct", _array),
+        ("multiarray", "scalar", _scalar),
+        ("numeric", "_frombuffer", _frombuffer),
+    )
+}
+
+
+def read_pickled_array(data: bytes) -> np.ndarray:
+    """Return the numpy array that a pickle consists of, which views `data`.
+
+    Raises:
+        MalformedMessage: The pickle has anything but such an array, see `pickles`.
+        MessageTooLarge: It exceeds a limit.
+    """
+    found = read_pickle(data, DEFAULT_LIMITS, {}, NUMPY_CALLS)
+    if not isinstance(found, np.ndarray):
+        raise MalformedMessage(f"pickle: got {type(found).__name__}, want a numpy array")
+    return found
+
+
+# torch's tensors in a pickle: the calls by which torch states them, and the file of numbers within.
+#
+# The facts come from the pickles of torch 2.13. A tensor is a view of a storage, whose bytes are a file of
+# `torch.save` in its form before version 1.6: four pickles of protocol 2 that are always the same but for the type, the
+# key and the number of elements, a fifth with the key, and the numbers. That text is compared, and not read as pickles.
+
+
+_DTYPES = {b"Float": "<f4", b"Double": "<f8", b"Half": "<f2", b"BFloat16": "<u2"}
+_CONSTANT = (
+    b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P\x19."  # torch's magic number
+    b"\x80\x02M\xe9\x03."  # version 1001
+    b"\x80\x02}q\0(X\x10\0\0\0protocol_versionq\1M\xe9\3X\r\0\0\0little_endianq\2\x88X\n\0\0\0type_sizesq\3}q\4("
+    b"X\5\0\0\0shortq\5K\2X\3\0\0\0intq\6K\4X\4\0\0\0longq\7K\4uu."
+)
+_FILE = re.compile(
+    re.escape(_CONSTANT) + rb"\x80\x02\(X\x07\0\0\0storageq\0ctorch\n(?P<kind>Float|Double|Half|BFloat16)Storage\nq\x01"
+    rb"X.\0\0\0(?P<key>[0-9]{1,20})q\x02X\x03\0\0\0cpuq\x03(?:K.|M..|J....)Ntq\x04Q\."
+    rb"\x80\x02\]q\0X.\0\0\0(?P=key)q\x01a\."
+    rb"(?P<size>.{8})",
+    re.DOTALL,
+)
+
+
+def _storage(arguments: tuple[Any, ...]) -> Reduced:
+    """`_load_from_bytes`: (a file of torch.save,)."""
+    match arguments:
+        case (memoryview() as data,) if (file := _FILE.match(data)) is not None:
+            numbers, size = data[file.end() :], int.from_bytes(file["size"], "little")
+            found = read_array(numbers, _DTYPES[file["kind"]], (size,))
+            if file["kind"] != b"BFloat16":
+                return Reduced(value=found)
+            wide = found.astype("<u4")  # the upper half of a float32
+            wide <<= 16
+            return Reduced(value=wide.view("<f4"), allocated=wide.nbytes)
+    raise MalformedMessage("pickle: torch: want a storage of floating-point numbers on the CPU")
+
+
+def _tensor(arguments: tuple[Any, ...]) -> Reduced:
+    """`_rebuild_tensor_v2`: (storage, offset, size, stride, whether it has a gradient, no hooks)."""
+    match arguments:
+        case (np.ndarray() as storage, int(start), (int(size),), (int(stride),), bool(), dict() as hooks) if (
+            not hooks and start >= 0 and size >= 0 and start + size <= storage.size and (stride == 1 or size < 2)
+        ):
+            return Reduced(value=storage[start : start + size])
+    raise MalformedMessage("pickle: torch: want a tensor of one dimension, whose numbers lie side by side")
+
+
+def _no_hooks(arguments: tuple[Any, ...]) -> Reduced:
+    """`OrderedDict`: ()."""
+    if arguments:
+        raise MalformedMessage("pickle: torch: want a tensor without hooks")
+    return Reduced(value={})
+
+
+TORCH_CALLS: dict[Name, Call | None] = {
+    Name("torch._utils", "_rebuild_tensor_v2"): _tensor,
+    Name("torch.storage", "_load_from_bytes"): _storage,
+    Name("collections", "OrderedDict"): _no_hooks,
+}
+
+
+# Pickles that are written by hand, as Python's own pickler would need the classes.
+
+
+_ARRAY, _KIND, _DTYPE = (
+    Name("numpy._core.multiarray", "_reconstruct"),
+    Name("numpy", "ndarray"),
+    Name("numpy", "dtype"),
+)
+
+
+def write_record(name: Name, fields: Mapping[str, Any]) -> bytes:
+    """Return the pickle of an object of a data class, in protocol 4.
+
+    Args:
+        name: The class.
+        fields: Its fields: numbers below 2**31, texts, truth values, None, arrays of plain numbers, and tuples, lists
+            and dicts of these.
+    """
+    return b"".join((b"\x80\4", _named(name), b")\x81", written(fields), b"b."))
+
+
+def written(value: Any) -> bytes:
+    """Return the opcodes that push a value onto the stack."""
+    if isinstance(value, str):
+        return text(value)
+    if isinstance(value, float):
+        return b"G" + struct.pack(">d", value)
+    if isinstance(value, np.ndarray):
+        return _written_array(value)
+    if isinstance(value, Mapping):
+        return b"}(" + b"".join(text(key) + written(one) for key, one in value.items()) + b"u"
+    if isinstance(value, tuple):
+        return b"(" + b"".join(map(written, value)) + b"t"
+    if isinstance(value, list):
+        return b"](" + b"".join(map(written, value)) + b"e"
+    if value is None or isinstance(value, bool):
+        return {None: b"N", True: b"\x88", False: b"\x89"}[value]
+    return b"J" + struct.pack("<i", value)
+
+
+def text(value: str) -> bytes:
+    """Return the opcodes that push a text."""
+    data = value.encode()
+    return b"X" + struct.pack("<I", len(data)) + data
+
+
+def _named(name: Name) -> bytes:
+    return text(name.module) + text(name.name) + b"\x93"
+
+
+def _written_array(value: np.ndarray) -> bytes:
+    """Return the calls by which numpy's own pickles, from version 1.26 on, state an array of protocol 4."""
+    value = np.ascontiguousarray(value)
+    order, kind = value.dtype.str[0], value.dtype.str[1:]
+    dtype = (
+        _named(_DTYPE) + written((kind, False, True)) + b"R" + written((3, order, None, None, None, -1, -1, 0)) + b"b"
+    )
+    data = value.tobytes()
+    made = _named(_ARRAY) + _named(_KIND) + written((0,)) + b"C\1b\x87R"
+    head = written(1) + written(value.shape) + dtype + written(False) + b"B" + struct.pack("<I", len(data))
+    return b"".join((made, b"(", head, data, b"tb"))

@@ -1,0 +1,331 @@
+"""The part of RPyC's protocol that a service with text as arguments and results needs; facts from rpyc 6.0.
+
+RPyC lets a peer access attributes of the server's objects, call them, and pass objects that the server calls back. This
+reader supports none of that: it knows the root and its methods by number, and accepts only values without references.
+So a peer can call the methods that the server offers, and nothing else.
+
+A frame is a header (length, compressed?), a message and a newline. A message is its kind and one value, written
+in "brine": `(sequence number, content)`.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+from vlagents_ray.errors import MalformedMessage, MessageTooLarge
+
+HEADER = struct.Struct("!LB")  # size of the message in bytes, and whether it is compressed
+END = b"\n"
+ROOT = 0  # the number of the root; its methods have the following numbers
+_ROOT_NAME = ("vlagents_ray.Policy", 1, 1)  # a peer's reference to it: its class, numbers of class and object
+_METHOD_CLASS = "builtins.method"  # a peer knows this class and does not inspect it
+_METHODS_AT_MOST = 64
+_COMPRESS_OVER = 3000  # bytes, RPyC's own threshold
+_REQUEST, _REPLY, _EXCEPTION = 1, 2, 3
+_VALUE, _TUPLE, _LOCAL, _REMOTE = 1, 2, 3, 4  # labels of boxed values
+
+
+class Handler(IntEnum):
+    """The operations that a peer may request; RPyC's other ones would access objects."""
+
+    PING = 1
+    CLOSE = 2
+    GETROOT = 3
+    GETATTR = 4
+    CALL = 7
+    CALLATTR = 8
+    DEL = 15
+    INSPECT = 16
+
+
+@dataclass(frozen=True, slots=True)
+class Reference:
+    """A peer's reference to the root, or to one of its methods."""
+
+    number: int
+
+
+@dataclass(frozen=True, slots=True)
+class RpycCall:
+    """A request of the peer."""
+
+    sequence: int
+    handler: Handler
+    args: tuple[Any, ...]
+
+
+def read_header(header: bytes | bytearray, limit: int) -> tuple[int, bool]:
+    """Return the number of bytes that follow, the newline included, and whether the message is compressed."""
+    length, compressed = HEADER.unpack(header)
+    if length > limit:
+        raise MessageTooLarge(f"rpyc: a message of {length} bytes, the limit is {limit}")
+    if compressed > 1 or length == 0:
+        raise MalformedMessage("rpyc: not a frame")
+    return length + len(END), bool(compressed)
+
+
+def read_call(body: bytes | bytearray, compressed: bool, limit: int) -> RpycCall | None:
+    """Return the request in a frame's body, which follows the header; None if the message needs no reply."""
+    message = memoryview(body)[: -len(END)]
+    if compressed:
+        message = memoryview(_inflate(message, limit))
+    if len(message) == 0:
+        raise MalformedMessage("rpyc: an empty message")
+    kind = message[0]
+    if kind in (_REPLY, _EXCEPTION):  # the server sends no requests, so it expects no replies
+        return None
+    if kind != _REQUEST:
+        raise MalformedMessage(f"rpyc: got a message of kind {kind}, want a request")
+    content = read_brine(message[1:])
+    if not (isinstance(content, tuple) and len(content) == 2 and _is_int(content[0])):
+        raise MalformedMessage("rpyc: want (sequence number, request)")
+    sequence, request = content
+    if not (isinstance(request, tuple) and len(request) == 2 and _is_int(request[0])):
+        raise MalformedMessage("rpyc: want (handler, arguments)")
+    try:
+        handler = Handler(request[0])
+    except ValueError:
+        raise Refused(sequence, f"rpyc: handler {request[0]} is not offered here") from None
+    try:
+        args = _unbox(request[1])
+    except MalformedMessage as error:
+        raise Refused(sequence, str(error)) from error
+    if not isinstance(args, tuple):
+        raise Refused(sequence, "rpyc: want a tuple of arguments")
+    return RpycCall(sequence, handler, args)
+
+
+class Refused(MalformedMessage):
+    """A request that is decodable but refused; its sender gets the error as a reply."""
+
+    def __init__(self, sequence: int, text: str) -> None:
+        super().__init__(text)
+        self.sequence = sequence
+
+
+def reply(sequence: int, value: Any) -> bytes:
+    """Return the frame of a reply with a value: None, bool, int, float, text, bytes or tuples of these."""
+    return _frame(_REPLY, (sequence, (_VALUE, value)))
+
+
+def reference_reply(sequence: int, number: int) -> bytes:
+    """Return the frame of a reply with a reference to the root, or to one of its methods."""
+    name = _ROOT_NAME if number == ROOT else (_METHOD_CLASS, 2, number)
+    return _frame(_REPLY, (sequence, (_REMOTE, name)))
+
+
+def exception(sequence: int, kind: str, text: str) -> bytes:
+    """Return the frame that raises the built-in exception `kind` at the peer, without a traceback."""
+    return _frame(_EXCEPTION, (sequence, (("builtins", kind), (text,), (), "")))
+
+
+def request(sequence: int, handler: Handler, boxed_args: tuple[int, Any]) -> bytes:
+    """Return the frame of a request to a server, with its arguments in boxes."""
+    return _frame(_REQUEST, (sequence, (int(handler), boxed_args)))
+
+
+def boxed_value(value: Any) -> tuple[int, Any]:
+    """Return the box of a value without references."""
+    return _VALUE, value
+
+
+def boxed_tuple(*boxes: tuple[int, Any]) -> tuple[int, Any]:
+    """Return the box of a tuple of boxes."""
+    return _TUPLE, boxes
+
+
+def boxed_reference(name: tuple[Any, ...]) -> tuple[int, Any]:
+    """Return the box of a reference to the peer's own object, by the name that the peer gave it."""
+    return _LOCAL, name
+
+
+def read_reply(body: bytes | bytearray, compressed: bool, limit: int) -> tuple[int, bool, Any] | None:
+    """Return a reply's sequence number, whether it is one and no exception, and its content; None for a request."""
+    message = memoryview(body)[: -len(END)]
+    if compressed:
+        message = memoryview(_inflate(message, limit))
+    if len(message) == 0:
+        raise MalformedMessage("rpyc: an empty message")
+    if message[0] not in (_REPLY, _EXCEPTION):  # nothing is offered to a server, so its requests get no answer
+        return None
+    content = read_brine(message[1:])
+    if not (isinstance(content, tuple) and len(content) == 2 and _is_int(content[0])):
+        raise MalformedMessage("rpyc: want (sequence number, reply)")
+    return content[0], message[0] == _REPLY, content[1]
+
+
+def _frame(kind: int, content: tuple[Any, ...]) -> bytes:
+    message = bytes([kind]) + write_brine(content)
+    compressed = len(message) > _COMPRESS_OVER
+    if compressed:
+        message = zlib.compress(message, 1)
+    return HEADER.pack(len(message), compressed) + message + END
+
+
+def _inflate(data: memoryview, limit: int) -> bytes:
+    machine = zlib.decompressobj()
+    try:
+        message = machine.decompress(data, limit + 1)
+    except zlib.error as error:
+        raise MalformedMessage(f"rpyc: not compressed as its header says ({error})") from error
+    if len(message) > limit:
+        raise MessageTooLarge(f"rpyc: a message of more than {limit} bytes")
+    if not machine.eof:
+        raise MalformedMessage("rpyc: a compressed message without an end")
+    return message
+
+
+def _unbox(boxed: Any) -> Any:
+    if not (isinstance(boxed, tuple) and len(boxed) == 2):
+        raise MalformedMessage("rpyc: want (label, value)")
+    label, value = boxed
+    if label == _VALUE:
+        return value
+    if label == _TUPLE and isinstance(value, tuple):
+        return tuple(_unbox(item) for item in value)
+    if label == _LOCAL and isinstance(value, tuple) and len(value) == 3:
+        if value == _ROOT_NAME:
+            return Reference(ROOT)
+        if value[:2] == (_METHOD_CLASS, 2) and _is_int(value[2]) and 0 < value[2] < _METHODS_AT_MOST:
+            return Reference(value[2])
+    raise MalformedMessage("rpyc: objects are not taken here; send values")
+
+
+def _is_int(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)
+
+
+# Brine, RPyC's encoding of values: None, bool, int, float, text, bytes, and tuples of these; facts from rpyc 6.0.
+#
+# Its other types (slices, sets, complex numbers, …) are refused, as no client needs them here.
+
+
+_DEPTH = 16
+_ITEMS = 1024  # maximum number of values in a message
+_DIGITS = 20  # maximum length of an integer, its sign included
+_F8, _U4 = struct.Struct("!d"), struct.Struct("!L")
+
+
+def read_brine(data: memoryview) -> Any:
+    """Return the one value that `data` consists of; raise `MalformedMessage` or `MessageTooLarge` if it is invalid."""
+    return _BrineReader(data).all()
+
+
+def write_brine(value: Any) -> bytes:
+    """Return a value in brine, the inverse of `read`; raise `TypeError` for a type that is not supported."""
+    parts: list[bytes] = []
+    _write(value, parts)
+    return b"".join(parts)
+
+
+class _BrineReader:
+    def __init__(self, data: memoryview) -> None:
+        self._data = data
+        self._at = 0
+        self._items = 0
+
+    def all(self) -> Any:
+        """Return the value that the message consists of."""
+        value = self._value(0)
+        if self._at != len(self._data):
+            raise MalformedMessage("brine: more than one value in a message")
+        return value
+
+    def _take(self, count: int) -> memoryview:
+        end = self._at + count
+        if end > len(self._data):
+            raise MalformedMessage("brine: a message that ends too early")
+        found = self._data[self._at : end]
+        self._at = end
+        return found
+
+    def _value(self, depth: int) -> Any:
+        self._items += 1
+        if self._items > _ITEMS or depth > _DEPTH:
+            raise MessageTooLarge(f"brine: more than {_ITEMS} values or {_DEPTH} levels in a message")
+        tag = self._take(1)[0]
+        if 0x20 <= tag < 0xF0:
+            return tag - 0x50
+        if tag in _SINGLE:
+            return _SINGLE[tag]
+        if tag == 0x18:
+            return _F8.unpack(self._take(8))[0]
+        if tag == 0x08:
+            return self._text(depth)
+        if tag in _BYTES:
+            return bytes(self._take(_BYTES[tag](self)))
+        if tag in _TUPLES:
+            return self._tuple(_TUPLES[tag](self), depth)
+        if tag in _INTS:
+            return self._integer(_INTS[tag](self))
+        raise MalformedMessage(f"brine: got a value of kind {tag:#04x}, want text, numbers or tuples")
+
+    def _text(self, depth: int) -> str:
+        data = self._value(depth + 1)
+        if not isinstance(data, bytes):
+            raise MalformedMessage("brine: text that is none")
+        try:
+            return data.decode()
+        except UnicodeDecodeError as error:
+            raise MalformedMessage(f"brine: not UTF-8 ({error.reason})") from error
+
+    def _tuple(self, length: int, depth: int) -> tuple[Any, ...]:
+        if length > _ITEMS:
+            raise MessageTooLarge(f"brine: a tuple of {length} values, the limit is {_ITEMS}")
+        return tuple(self._value(depth + 1) for _ in range(length))
+
+    def _integer(self, length: int) -> int:
+        digits = bytes(self._take(length))
+        sign = digits[:1] == b"-"
+        if not digits[sign:].isdigit() or length > _DIGITS:
+            raise MalformedMessage("brine: not a number")
+        return int(digits)
+
+    def length1(self) -> int:
+        """Read a length of one byte."""
+        return self._take(1)[0]
+
+    def length4(self) -> int:
+        """Read a length of four bytes."""
+        return int(_U4.unpack(self._take(4))[0])
+
+
+def _fixed(length: int) -> Callable[[_BrineReader], int]:
+    return lambda _: length
+
+
+_SINGLE: dict[int, Any] = {0x00: None, 0x01: b"", 0x02: (), 0x03: True, 0x04: False}
+_BYTES = {0x09 + n: _fixed(n) for n in (1, 2, 3, 4)} | {0x0E: _BrineReader.length1, 0x0F: _BrineReader.length4}
+_TUPLES = {0x0F + n: _fixed(n) for n in (1, 2, 3, 4)} | {0x14: _BrineReader.length1, 0x15: _BrineReader.length4}
+_INTS = {0x16: _BrineReader.length1, 0x17: _BrineReader.length4}
+
+
+def _write(value: Any, parts: list[bytes]) -> None:
+    if value is None:
+        parts.append(b"\x00")
+    elif isinstance(value, bool):
+        parts.append(b"\x03" if value else b"\x04")
+    elif isinstance(value, int):
+        if -0x30 <= value < 0xA0:
+            parts.append(bytes([value + 0x50]))
+        else:
+            digits = str(value).encode()
+            parts.append(b"\x16" + bytes([len(digits)]) + digits)
+    elif isinstance(value, float):
+        parts.append(b"\x18" + _F8.pack(value))
+    elif isinstance(value, str):
+        parts.append(b"\x08")
+        _write(value.encode(), parts)
+    elif isinstance(value, bytes):
+        parts.append(b"\x01" if not value else b"\x0f" + _U4.pack(len(value)) + value)
+    elif isinstance(value, tuple):
+        parts.append(b"\x02" if not value else b"\x15" + _U4.pack(len(value)))
+        for item in value:
+            _write(item, parts)
+    else:
+        raise TypeError(f"brine: cannot send {type(value).__name__}")

@@ -1,1 +1,0 @@
-"""The messages and the mapping of vla-eval's protocol."""

@@ -1,1 +1,0 @@
-"""The messages of the package `vlagents`: RPyC with text."""

@@ -1,1 +1,0 @@
-"""XPolicyLab's messages."""
