@@ -6,7 +6,7 @@
 #
 # An expert of the built-in tabletop demonstrates, and a small ACT learns from the state alone, in minutes and without a
 # GPU. docs/training.md explains the options, has the same with images, and what came of it; demonstrations of a robot
-# (`python -m vlagents_ray.robot URL --record demos/cups`) take the place of steps 1 and 2.
+# (`vlagents-ray robot URL --record demos/cups`) take the place of steps 1 and 2.
 set -euo pipefail
 out=${OUT:-runs/act-state} episodes=${EPISODES:-600} steps=${STEPS:-1000} every=${EVERY:-100} played=${PLAYED:-50}
 

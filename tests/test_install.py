@@ -104,6 +104,13 @@ print(decode(encode_jpeg(obs.cameras["front"])).shape)
     assert run(robot, code) == "(8, 8, 3)"
 
 
+def test_a_robot_has_the_command_that_drives_it(robot: Path) -> None:
+    command = [robot.with_name("vlagents-ray"), "robot", "http://127.0.0.1:9", "--env", "tabletop", "--hz", "0"]
+    ran = subprocess.run(command, check=False, capture_output=True, text=True, timeout=60)
+    assert ran.returncode == 2
+    assert "vlagents-ray robot: error: argument --hz: got '0', want a number above 0" in ran.stderr
+
+
 def test_the_import_takes_half_a_second_at_the_most(robot: Path) -> None:
     code = "import time, vlagents_ray, vlagents_ray.robot; print(time.process_time())"  # the interpreter's start, too
     assert any(float(run(robot, code)) < 0.5 for _ in range(10))  # beside others that want the caches, it takes longer

@@ -12,6 +12,7 @@ import vlagents_ray
 
 PACKAGE = Path(vlagents_ray.__file__).parent
 FILES = (
+    "cli/robot",
     "contract",
     "dataset_contract",
     "errors",

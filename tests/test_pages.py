@@ -30,7 +30,7 @@ RUN = {"vlagents-ray doctor", "vlagents-ray policies"}
 NOT_RUN = {
     "vlagents-ray envs": "a block of docs/evaluation/index.md runs it",
     "vlagents-ray slurm eval": "the name of a command",
-    "vlagents-ray robot --env tabletop --teleop keyboard": "tests/cli/test_robot.py types its keys",
+    "vlagents-ray robot --env tabletop --leader keyboard": "tests/cli/test_robot.py types its keys",
     "vlagents-ray serve my_policies:Reach --set gain=0.3": "test_served_pages.py serves examples/own_policy.py so",
     "vlagents-ray env make requirements/hf.txt --into .venv-hf": "it downloads packages",
     "vlagents-ray env make requirements/libero.txt": "it downloads packages",

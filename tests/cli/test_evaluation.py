@@ -61,7 +61,7 @@ def test_a_checkpoint_may_count_at_once_and_the_first_step_be_the_last(
     words = [*WORDS, "--out", str(tmp_path / "out"), "--watch", str(tmp_path), "--settle", "0", "--until", "0"]
     done = CliRunner().invoke(app, words)
     assert done.exit_code == 0, done.output
-    assert seen == [{"settle_s": 0.0, "until": 0, "live": None}]
+    assert seen == [{"settle_s": 0.0, "until": 0, "marker": None, "live": None}]
 
 
 def test_out_of_time_has_an_exit_status_of_its_own(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -189,6 +189,7 @@ def test_each_option_that_is_a_setting_is_one_of_a_single_model() -> None:
         for option in inspect.signature(command.evaluate_command).parameters
     }
     of_the_run_itself = {
+        "context",
         "what",
         "watch",
         "until",

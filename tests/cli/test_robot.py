@@ -19,7 +19,7 @@ from manual_clock import Clock
 from typer.testing import CliRunner
 
 from vlagents_ray.cli.main import app
-from vlagents_ray.cli.robot.terminal_view import TerminalView, blocks
+from vlagents_ray.cli.simulated_robot import TerminalView, blocks
 from vlagents_ray.policies.scripted import Scripted
 
 REPEATS = 20  # the loop has ten ticks in that time
@@ -78,7 +78,7 @@ def test_a_human_drives_a_simulation_and_labels_its_episodes(tmp_path: Path) -> 
         wait("seed")
         press("q")
 
-    said = at_terminal([*QUICK, "--teleop", "keyboard", "--record", str(tmp_path)], keys)
+    said = at_terminal([*QUICK, "--leader", "keyboard", "--record", str(tmp_path)], keys)
     assert "recorded: 2 episodes" in said
     assert labels(tmp_path) == ["success", "failure"]
     first = frames(tmp_path, 0)
@@ -97,7 +97,7 @@ def test_a_human_corrects_a_policy(tmp_path: Path) -> None:
         wait("seed")
         press("q")
 
-    words = ["scripted", *QUICK, "--teleop", "keyboard", "--record", str(tmp_path), "--hz", "5"]
+    words = ["scripted", *QUICK, "--leader", "keyboard", "--record", str(tmp_path), "--hz", "5"]
     said = at_terminal(words, keys)
     assert "success" in said, "the policy solves it after the correction"
     seen = frames(tmp_path, 0)
@@ -111,7 +111,7 @@ def test_a_human_corrects_a_policy(tmp_path: Path) -> None:
 
 def test_cameras_are_drawn_two_pixels_a_character_and_redrawn_in_place(monkeypatch: pytest.MonkeyPatch) -> None:
     clock, written = Clock(), []
-    monkeypatch.setattr("vlagents_ray.cli.robot.terminal_view.time.monotonic", clock)
+    monkeypatch.setattr("vlagents_ray.cli.simulated_robot.time.monotonic", clock)
     monkeypatch.setattr("shutil.get_terminal_size", lambda **_: os.terminal_size((80, 10)))
     view = TerminalView(written.append)
     image = np.zeros((16, 16, 3), np.uint8)
@@ -176,9 +176,9 @@ def test_a_policy_of_this_process_is_loaded_once(monkeypatch: pytest.MonkeyPatch
     ("words", "cure"),
     [
         ([], "want one of them"),
-        (["--teleop", "pedals"], "keyboard"),
-        (["--teleop", "keyboard"], "no terminal"),
-        (["scripted", "--ask-for-help", "0.5"], "--teleop keyboard"),
+        (["--leader", "pedals"], "keyboard"),
+        (["--leader", "keyboard"], "no terminal"),
+        (["scripted", "--ask-for-help", "0.5"], "--leader keyboard"),
         (["scripted", "--mode", "often"], "open_loop"),
         (["http://127.0.0.1:9", "--set", "a=1"], "has its settings already"),
     ],

@@ -86,7 +86,8 @@ def test_a_robot_outside_of_the_cluster_keeps_its_loop_beside_an_evaluation(tmp_
         robot.limit("1gbit")
         robot.environment |= {KEY_VARIABLE: token}
         loop = ["--hz", "50", "--seconds", "20", "--transport", "websocket", "--baseline", "0", "--safe", "hold"]
-        command = [sys.executable, "-m", "vlagents_ray.robot", f"http://{head.name}:8000", *loop]
+        code = "from vlagents_ray.cli import main; main()"
+        command = [sys.executable, "-c", code, "robot", f"http://{head.name}:8000", *loop]
         for attempt in (1, 2, 3):  # a machine that stands still for a second spoils one
             try:
                 robot.run(command)  # it fails if a tick has no action of the policy

@@ -18,9 +18,9 @@ from serve_command import free_address, serving
 
 from vlagents_ray import Act, Agent, Obs, RemoteAgent
 from vlagents_ray.chunking.player import ChunkPlayer
+from vlagents_ray.cli.robot import main
 from vlagents_ray.client.transports.select import TransportName
 from vlagents_ray.robot import Watchdog, run_loop
-from vlagents_ray.robot.__main__ import main
 from vlagents_ray.robot.pacing import empty_loop
 
 HZ = 50.0

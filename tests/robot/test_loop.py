@@ -26,10 +26,10 @@ import pytest
 
 from vlagents_ray import Act, ActionSpec, Agent, CameraSpec, ConfigError, Contract, Obs, PolicyFailed, StateSpec
 from vlagents_ray.chunking.player import ChunkPlayer
+from vlagents_ray.cli.robot import _restarting as restarting
+from vlagents_ray.cli.robot import main
 from vlagents_ray.errors import InvalidAction
 from vlagents_ray.robot import Guard, Watchdog, run_loop
-from vlagents_ray.robot.__main__ import _restarting as restarting
-from vlagents_ray.robot.__main__ import main
 from vlagents_ray.robot.pacing import Pacer, empty_loop, jitter, undisturbed
 from vlagents_ray.robot.simulated import SimulatedRobot
 
@@ -479,7 +479,7 @@ def test_a_person_restarts_the_command_by_enter_at_its_terminal() -> None:
     code = """
 import threading
 from vlagents_ray.robot import Watchdog
-from vlagents_ray.robot.__main__ import _restarting
+from vlagents_ray.cli.robot import _restarting
 
 stopped, restarted = threading.Event(), threading.Event()
 
@@ -507,7 +507,7 @@ def test_with_a_keyboard_as_leader_each_key_has_one_consumer_and_enter_restarts_
     """The command line of docs/interventions.md, whose server is a policy in its process."""
     code = """
 import sys
-import vlagents_ray.robot.__main__ as command
+import vlagents_ray.cli.robot as command
 from vlagents_ray import Act, ActionSpec, Agent, Contract
 from vlagents_ray.robot.teleoperation import Keyboard
 import numpy as np
@@ -659,7 +659,7 @@ def test_a_loop_that_runs_for_days_keeps_no_more_than_it_needs(monkeypatch: pyte
 def test_the_command_stops_the_robot_when_it_is_told_to_end(wish: signal.Signals) -> None:
     code = """
 import sys, time
-import vlagents_ray.robot.__main__ as command
+import vlagents_ray.cli.robot as command
 
 def run(options):
     try:
@@ -729,7 +729,7 @@ ATTEMPTS = 5  # what else the machine does in such a second may mislead
 def test_the_command_drives_with_single_actions_as_it_is(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], mode: str
 ) -> None:
-    monkeypatch.setattr("vlagents_ray.robot.__main__.RemoteAgent", Served)
+    monkeypatch.setattr("vlagents_ray.cli.robot.RemoteAgent", Served)
     for _ in range(ATTEMPTS):
         status = main([*SHORT, "--hz", "10", "--mode", mode])
         said = re.search(r"ticks without an action of the policy: (\d+) of (\d+)", capsys.readouterr().out)
@@ -742,7 +742,7 @@ def test_the_command_drives_with_single_actions_as_it_is(
 
 
 def test_the_simulated_robot_takes_actions_of_which_nothing_is_stated(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vlagents_ray.robot.__main__.RemoteAgent", Served)
+    monkeypatch.setattr("vlagents_ray.cli.robot.RemoteAgent", Served)
     monkeypatch.setattr(Served, "contract", Contract(action=ActionSpec(dim=2)))
     assert main([*SHORT, "--hz", "10"]) in (0, 1, 3)  # a busy machine leaves ticks without an action
 
@@ -750,7 +750,7 @@ def test_the_simulated_robot_takes_actions_of_which_nothing_is_stated(monkeypatc
 def test_a_run_of_safe_actions_does_not_look_like_success(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr("vlagents_ray.robot.__main__.RemoteAgent", Served)
+    monkeypatch.setattr("vlagents_ray.cli.robot.RemoteAgent", Served)
     monkeypatch.setattr(Served, "slow_s", 0.3)
     for _ in range(ATTEMPTS):  # on a busy machine there may be hardly a tick within the time
         status = main(SHORT)
@@ -766,7 +766,7 @@ def test_a_run_of_safe_actions_does_not_look_like_success(
 def test_the_command_lets_a_human_take_over_and_records_that(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    monkeypatch.setattr("vlagents_ray.robot.__main__.RemoteAgent", Served)
+    monkeypatch.setattr("vlagents_ray.cli.robot.RemoteAgent", Served)
     monkeypatch.setattr(Served, "contract", Contract(action=ActionSpec(dim=2, delta=False)))
     assert main([*SHORT, "--leader", "scripted_leader:HoldingLeader", "--record", str(tmp_path)]) == 0
     said = capsys.readouterr().out
@@ -779,11 +779,11 @@ def test_the_command_lets_a_human_take_over_and_records_that(
 def test_a_setting_that_does_not_fit_is_refused_before_anything_is_timed(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("vlagents_ray.robot.__main__.RemoteAgent", Served)
+    monkeypatch.setattr("vlagents_ray.cli.robot.RemoteAgent", Served)
     monkeypatch.setattr(Served, "contract", None)
     assert main(["http://nowhere", "--robot", "vlagents_ray.robot.simulated:SimulatedRobot"]) == 2
     said = capsys.readouterr()
-    assert "--safe hold" in said.err
+    assert "safe='hold'" in said.err
     assert "empty loop" not in said.out
 
 
@@ -806,7 +806,7 @@ def test_a_setting_that_does_not_fit_is_refused_before_anything_is_timed(
 def test_options_are_checked_before_a_server_is_asked(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], options: list[str], wanted: str
 ) -> None:
-    monkeypatch.setattr("vlagents_ray.robot.__main__.RemoteAgent", None)
+    monkeypatch.setattr("vlagents_ray.cli.robot.RemoteAgent", None)
     try:
         status: object = main([*SHORT, *options])
     except SystemExit as ended:
@@ -815,17 +815,17 @@ def test_options_are_checked_before_a_server_is_asked(
     assert wanted in capsys.readouterr().err
 
 
-def test_errors_of_the_library_name_the_commands_options(
+def test_errors_of_the_library_end_the_command_with_their_message(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("vlagents_ray.robot.__main__.RemoteAgent", Served)
+    monkeypatch.setattr("vlagents_ray.cli.robot.RemoteAgent", Served)
     monkeypatch.setattr(Served, "contract", Contract(action=ActionSpec(dim=2, delta=True)))
     assert main([*SHORT, "--safe", "hold"]) == 2
     said = capsys.readouterr().err
-    assert said.startswith("ConfigError: --safe: got 'hold', which ")
-    assert "give --safe zero, or 'auto'" in said
+    assert said.startswith("ConfigError: safe: got 'hold', which ")
+    assert "give safe='zero', or 'auto'" in said
     assert main([*SHORT, "--measure", "joints"]) == 2
-    assert capsys.readouterr().err.startswith("ConfigError: --measure: got one for relative actions")
+    assert capsys.readouterr().err.startswith("ConfigError: measure: got one for relative actions")
 
 
 def test_the_command_says_what_it_cannot_do(capsys: pytest.CaptureFixture[str]) -> None:

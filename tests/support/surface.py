@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import argparse
 import ast
 import importlib
 import inspect
@@ -16,6 +15,8 @@ import warnings
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
+
+from vlagents_ray.cli.robot import command_parser
 
 ROOT = Path(__file__).parents[2]
 FILE = ROOT / "tests/surface.txt"
@@ -49,7 +50,7 @@ def surface() -> str:
         "Exported tables: columns": columns(),
         "results.db: columns": database(),
         "Command line: vlagents-ray": commands(),
-        "Command line: python -m vlagents_ray.robot": robot_options(),
+        "Command line: vlagents-ray robot": robot_options(),
         "Environment variables": variables(),
     }
     return "\n".join(f"# {title}\n" + "".join(f"{line}\n" for line in lines) for title, lines in sections.items())
@@ -219,7 +220,7 @@ def _commands(command: Any, name: str) -> Iterator[str]:
 
 
 def robot_options() -> Iterator[str]:
-    parser: argparse.ArgumentParser = importlib.import_module("vlagents_ray.robot.__main__")._parser()
+    parser, _, _ = command_parser()
     for one in sorted(parser._actions, key=lambda one: one.dest):
         if one.dest != "help":
             what = " / ".join(one.option_strings) or one.dest.upper()

@@ -12,6 +12,11 @@ from types import FrameType
 
 def main() -> None:
     """Run the console script; say what to install where only the light install is there."""
+    if sys.argv[1:2] == ["robot"]:  # which the light install has, and in which Ctrl-C stops the robot
+        from vlagents_ray.cli.robot import main as robot
+
+        find_modules_here()
+        sys.exit(robot(sys.argv[2:]))
     signal.signal(signal.SIGINT, _end_at_once)  # until a command has its own handler: `cli.console.errors`
     try:
         from vlagents_ray.cli.main import app
@@ -20,7 +25,8 @@ def main() -> None:
             raise
         sys.stderr.write(
             f"vlagents-ray: {error.name!r} is not installed; this is the light install of a robot's computer.\n"
-            "For the commands: pip install 'vlagents-ray[serve]', and 'vlagents-ray[sim]' to evaluate.\n"
+            "It has `vlagents-ray robot`. For the other commands: pip install 'vlagents-ray[serve]', and "
+            "'vlagents-ray[sim]' to evaluate.\n"
         )
         sys.exit(1)
     find_modules_here()

@@ -66,7 +66,7 @@ def list_(file: File = None) -> None:
 
 @keys.command("revoke")
 def revoke_(name: Name, file: File = None) -> None:
-    """Revoke a key. Running servers notice within seconds, and hang up on whoever used it."""
+    """Revoke a key. Running servers notice within seconds, and close the connections that use it."""
     with errors():
         revoke(_existing(file), name)
         out.print(f"key {name} revoked")

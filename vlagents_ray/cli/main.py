@@ -23,7 +23,6 @@ from vlagents_ray.cli.evaluation.results import (
 )
 from vlagents_ray.cli.keys import keys
 from vlagents_ray.cli.new import new
-from vlagents_ray.cli.robot.command import robot_command
 from vlagents_ray.cli.serve import serve_command
 from vlagents_ray.cli.slurm import slurm
 from vlagents_ray.cli.tune import tune_command
@@ -72,7 +71,6 @@ app.command("export")(export_command)
 app.command("merge")(merge_command)
 app.command("replay")(replay_command)
 app.command("report")(report_command)
-app.command("robot")(robot_command)
 app.command("tune")(tune_command)
 app.command("verify")(verify_command)
 app.add_typer(bench, name="bench")
@@ -80,6 +78,16 @@ app.add_typer(env, name="env")
 app.add_typer(keys, name="keys")
 app.add_typer(new, name="new")
 app.add_typer(slurm, name="slurm")
+
+
+@app.command(
+    "robot", add_help_option=False, context_settings={"allow_extra_args": True, "ignore_unknown_options": True}
+)
+def robot_command(context: typer.Context) -> None:
+    """Drive a robot, or a simulation, by a policy, by a human, or by a policy that a human corrects."""
+    from vlagents_ray.cli.robot import main
+
+    raise typer.Exit(main(context.args))
 
 
 @app.command()

@@ -182,7 +182,7 @@ class RayLoss:
             raise self.error
 
     def watch(self) -> None:
-        """Watch Ray until the command ends, and end the process if Ray is lost. Runs on a thread of its own."""
+        """Watch Ray until the command ends, and end the process if Ray is lost. Runs on its own thread."""
         while self.error is None and not self.left.is_set():
             self._watch_ray()
         if self.error is None:

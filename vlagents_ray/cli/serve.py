@@ -54,7 +54,7 @@ def serve_command(
         typer.Option(help="File of the API keys (`vlagents-ray keys new`); default: VLAGENTS_RAY_KEYS_FILE or _KEYS."),
     ] = None,
     insecure: Annotated[
-        bool, typer.Option("--insecure", help="Let in whoever reaches the port, without keys.")
+        bool, typer.Option("--insecure", help="Accept every client that reaches the port, without keys.")
     ] = False,
     plain_http: Annotated[
         bool, typer.Option("--plain-http", help="Keys may cross the network unencrypted: no warning.")

@@ -117,7 +117,7 @@ def _actions(recorded: Recorded, replayed: Path) -> str:
 
 
 def _first_difference(before: np.ndarray, now: np.ndarray) -> int | None:
-    """The index of the first row that differs in any byte; None if there is none."""
+    """Return the index of the first row that differs in any byte, or None."""
     rows = zip(before, now, strict=False)
     return next((i for i, (a, b) in enumerate(rows) if a.tobytes() != b.tobytes()), None)
 

@@ -110,7 +110,7 @@ class _Beginning:
 
 
 class EpisodeViewer:
-    """Shows episodes, on a thread of its own.
+    """Shows episodes on its own thread.
 
         with EpisodeViewer(RerunRecordings("recordings")) as viewer:
             with viewer.episode("stack_0", "stack the cups"):

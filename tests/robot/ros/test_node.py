@@ -19,7 +19,7 @@ from eval_fakes import wait_for
 from ros_arm import BEAT, CAMERA, COMMANDS, JOINTS, NAMES, SIDE, TOLD, RosArm, header
 from rosbridge_double import RosbridgeDouble, rosbridge_double
 
-import vlagents_ray.robot.__main__ as command
+import vlagents_ray.cli.robot as command
 from vlagents_ray import Act, ActionSpec, Agent, CameraSpec, ChunkPlayer, Contract, Obs, StateSpec
 from vlagents_ray.errors import ConfigError, InvalidAction
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, PROTOCOL_VERSION

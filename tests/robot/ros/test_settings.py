@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import yaml
 
-import vlagents_ray.robot.__main__ as robot_command
+import vlagents_ray.cli.robot as robot_command
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.robot.ros import read_settings
 from vlagents_ray.robot.ros.settings import settings_from
@@ -35,11 +35,9 @@ def test_the_files_and_commands_of_the_documentation_are_read() -> None:
     page = (EXAMPLES.parents[1] / "docs/ros.md").read_text()
     files = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
     lines = [*page.replace("\\\n", " ").splitlines(), *(EXAMPLES / "arm.yaml").read_text().splitlines()]
-    commands = [line.split("vlagents_ray.robot ")[1] for line in lines if "python -m vlagents_ray.robot " in line]
+    commands = [line.split("vlagents-ray robot ")[1] for line in lines if "vlagents-ray robot " in line]
     assert [settings_from(yaml.safe_load(file), "docs/ros.md").dim for file in files] == [4]
-    assert [robot_command._parser().parse_args(shlex.split(words)).url for words in commands] == 2 * [
-        "http://gpu-box:8000"
-    ]
+    assert [robot_command.parse(shlex.split(words)).policy for words in commands] == 2 * ["http://gpu-box:8000"]
 
 
 def test_types_and_limits_have_defaults(tmp_path: Path) -> None:

@@ -20,12 +20,12 @@ from manual_clock import Clock
 
 from vlagents_ray import Obs, RemoteAgent
 from vlagents_ray.chunking.player import ChunkPlayer
+from vlagents_ray.cli.robot import main
 from vlagents_ray.client.commands import COMMAND, COMMANDED, CommandInbox
 from vlagents_ray.errors import InvalidInput, Overloaded, UnknownSession
 from vlagents_ray.interface import Act
 from vlagents_ray.policies.noop import Noop
 from vlagents_ray.protocol.messages import Reply, Request
-from vlagents_ray.robot.__main__ import main
 from vlagents_ray.robot.loop import LoopReport, run_loop
 from vlagents_ray.serve.access import api_keys
 from vlagents_ray.serve.live import endpoint

@@ -29,8 +29,10 @@ if TYPE_CHECKING:
     from vlagents_ray.evaluate import EvalConfig, WorkerConfig
 
 
+# ruff: noqa: ARG001 - options are read by name from `context.params`
 # An option that is a field of `EvalConfig`, or of its policy, suite or worker, has the field's name here.
 def evaluate_command(
+    context: typer.Context,
     what: Annotated[
         list[str],
         typer.Argument(
@@ -54,7 +56,7 @@ def evaluate_command(
         typer.Option(
             "--worker-gpus",
             min=0,
-            help="GPUs likewise, to render on: 0.25 is a quarter of one; default: 0, in software.",
+            help="GPUs per worker for rendering; may be a fraction (0.25). Default: 0 (software rendering).",
         ),
     ] = None,
     seeds: Annotated[int | None, typer.Option("--seed", min=0, help="Episode i uses seed + i; default: 0.")] = None,
@@ -146,62 +148,51 @@ def evaluate_command(
     A file holds policies, their checkpoints, suites of environments, seeds; --out, --workers, --video, --record,
     --rerun, --foxglove, --track, --retries and --resume win over it.
 
-    Exit status: 0 when every episode has its result; 75 when --end-at left some over, and 130 after Ctrl-C or SIGTERM
-    (--resume goes on after both); 2 for wrong settings; 3 when an error of the policy ended every episode of a cell; 1
-    for what else failed, and when infrastructure lost an episode for good (--resume tries it again).
+    Exit status: 0 when every episode has its result; 75 when --end-at left some over, 130 if interrupted (resume both
+    with --resume); 2 for invalid settings; 3 when an error of the policy ended every episode of a cell; 1 for any other
+    failure, and when infrastructure lost an episode for good (--resume tries it again).
     """
-    given = locals()  # every option by its name
     with errors(), exit_if_ray_is_lost(RESUME):
-        evaluation = config_from_options(given)
-        watching: dict[str, Any] = {"until": until, "settle_s": settle, "marker": marker}
-        watching = {name: value for name, value in watching.items() if value is not None}
-        if watching and watch is None:
-            raise ConfigError(f"got {sorted(watching)} without --watch")
-        if dry_run and watch is not None:
-            raise ConfigError("--dry-run and --watch exclude each other: nobody knows yet which steps there will be")
-        if end_at is not None and watch is not None:
-            raise ConfigError("--end-at and --watch exclude each other: watching ends with --until, or by Ctrl-C")
+        evaluation = config_from_options(context.params)
         on_robot = evaluation.real_robot is not None
-        _require_robot(given, on_robot)
-        if replica_per_gpu and address is None:
-            raise ConfigError("--replica-per-gpu: want --address, a cluster whose GPUs can be counted")
-        if dry_run and (live or live_at):
-            raise ConfigError("--dry-run and --live exclude each other: nothing is played that could be watched")
+        _require_together(context.params, on_robot=on_robot)
+        from vlagents_ray.cli.evaluation.live import live_address
+        from vlagents_ray.cli.evaluation.run import print_plan, run_evaluation, run_on_robot, watch_training
+
+        page = live_address(live_at) if live or live_at else None
         if on_robot:
-            from vlagents_ray.cli.evaluation.run import run_on_robot
-
             run_on_robot(evaluation, address, operator=operator or "page", unblinded=unblind)
-            return
-        if dry_run:
-            from vlagents_ray.cli.evaluation.run import print_plan
-
+        elif dry_run:
             with quiet_ray(None):
                 print_plan(evaluation)
-            return
-        page = None
-        if live or live_at:
-            from vlagents_ray.cli.evaluation.live import live_address
-
-            page = live_address(live_at)
-        if watch is not None:
-            from vlagents_ray.cli.evaluation.run import watch_training
-
-            watch_training(evaluation, watch, address, live=page, **watching)
+        elif watch is not None:
+            settle_s = 10.0 if settle is None else settle
+            watch_training(evaluation, watch, address, until=until, settle_s=settle_s, marker=marker, live=page)
         else:
-            from vlagents_ray.cli.evaluation.run import run_evaluation
-
             end = None if end_at is None else parse_time(end_at, "--end-at")
             run_evaluation(evaluation, address, end_at=end, replica_per_gpu=replica_per_gpu, live=page)
 
 
-def _require_robot(options: Mapping[str, Any], on_robot: bool) -> None:
-    """Raise `ConfigError` for options that need a robot without one, or that exclude one."""
-    if not on_robot:
-        if needing := [f"--{name}" for name in ("operator", "unblind") if options[name]]:
-            raise ConfigError(f"got {needing} without --robot")
-        return
-    names = ("watch", "dry_run", "end_at", "track", "live", "live_at")
-    if excluded := [f"--{name.replace('_', '-')}" for name in names if options[name]]:
+def _require_together(options: Mapping[str, Any], *, on_robot: bool) -> None:
+    """Raise `ConfigError` for options that need another one, or that exclude one another."""
+
+    def given(*names: str) -> list[str]:
+        values = {name: options[name] for name in names}
+        return [f"--{name.replace('_', '-')}" for name, one in values.items() if one or (one == 0 and one is not False)]
+
+    if options["watch"] is None and (needing := given("until", "settle", "marker")):
+        raise ConfigError(f"got {needing} without --watch")
+    if options["dry_run"] and options["watch"] is not None:
+        raise ConfigError("--dry-run and --watch exclude each other: the steps of the training are not known yet")
+    if options["end_at"] is not None and options["watch"] is not None:
+        raise ConfigError("--end-at and --watch exclude each other: watching ends with --until, or by Ctrl-C")
+    if options["replica_per_gpu"] and options["address"] is None:
+        raise ConfigError("--replica-per-gpu: want --address, a cluster whose GPUs can be counted")
+    if options["dry_run"] and given("live", "live_at"):
+        raise ConfigError("--dry-run and --live exclude each other: nothing is played that could be watched")
+    if not on_robot and (needing := given("operator", "unblind")):
+        raise ConfigError(f"got {needing} without --robot")
+    if on_robot and (excluded := given("watch", "dry_run", "end_at", "track", "live", "live_at")):
         raise ConfigError(f"--robot and {excluded} exclude each other")
     if options["operator"] not in (None, "page", "terminal"):
         raise ConfigError(f"--operator: got {options['operator']!r}, want page or terminal")
@@ -211,7 +202,7 @@ def config_from_options(options: Mapping[str, Any]) -> EvalConfig:
     """Build the configuration of an evaluation from the options of `vlagents-ray eval`.
 
     Args:
-        options: The parameters of `evaluate_command`, by their names.
+        options: The parameters of `evaluate_command`, by their names, as in `context.params`.
 
     Raises:
         ConfigError: The options do not go together, or one cannot be parsed.

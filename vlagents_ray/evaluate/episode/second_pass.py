@@ -76,7 +76,7 @@ class PlayedEpisode:
         return differs and f"after the last step, {differs} differs"
 
     def _difference(self, number: int, obs: Obs) -> str | None:
-        """Return the part of observation `number` that is not in `obs`; None if there is none."""
+        """Return the part of observation `number` that is not in `obs`, or None."""
         then, now = self._seen[number], _digests(obs)
         parts = [(kind, name) for kind in (0, 1) for name in then[kind]]
         return next((name for kind, name in parts if then[kind][name] != now[kind].get(name)), None)

@@ -154,7 +154,7 @@ class Gallery:
 
 
 def episodes(results: Results, gallery: Gallery) -> Episodes | None:
-    """All episodes; None if there is none."""
+    """Return all episodes, or None without any."""
     order = {name: index for index, name in enumerate(results.contenders)}
     cells = sorted(results.cells, key=lambda cell: order[cell.contender])
     found = [(cell, one) for cell in cells for one in cell.episodes]

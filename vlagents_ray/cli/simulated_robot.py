@@ -1,18 +1,24 @@
-"""Episodes of an environment in the control loop of a robot."""
+"""Episodes of an environment in the control loop of a robot: driven by a policy, by a human, or by both."""
 
 from __future__ import annotations
 
+import argparse
 import contextlib
-from collections.abc import Iterable
+import shutil
+import time
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import typer
+
 from vlagents_ray.chunking.buffer import Mode
 from vlagents_ray.chunking.control import Control, Leader
 from vlagents_ray.chunking.player import ChunkPlayer
-from vlagents_ray.cli.console import out
-from vlagents_ray.cli.robot.terminal_view import TerminalView
+from vlagents_ray.cli.console import errors, out
+from vlagents_ray.cli.options import parse_settings
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.contract import Contract, require_match
 from vlagents_ray.envs.base import EvalEnv, make_env
@@ -25,6 +31,9 @@ from vlagents_ray.robot.episode import Label
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.teleoperation import HELP, AxesDevice, AxesLeader, Keyboard, SpaceMouse, TeleoperatedAgent
 
+_PERIOD_S = 0.2
+_LARGEST = 64  # px of the side of a picture; a terminal over SSH is slow
+_TEXT_LINES = 6  # of the terminal, which the pictures leave
 DEVICES = ("keyboard", "spacemouse")
 KEYS = "p pauses and continues; y success, n failure, x discard end the episode; q quits"
 _HZ = 10.0  # of environments that state no rate
@@ -33,6 +42,61 @@ _MOVES = {
     "human": "you move the robot",
     "paused": "nothing moves the robot",
 }
+
+
+class TerminalView:
+    """A view of cameras side by side, redrawn in place five times a second at most.
+
+    Args:
+        write: Writes text to the terminal, and flushes it.
+    """
+
+    def __init__(self, write: Callable[[str], object]) -> None:
+        self._write = write
+        self._lines = 0  # of the pictures above the cursor
+        self._next_s = 0.0  # of `time.monotonic`
+
+    def draw(self, cameras: Mapping[str, np.ndarray]) -> None:
+        """Draw the cameras' images, (H, W, 3) uint8 RGB, over those drawn last, if it is time."""
+        now = time.monotonic()
+        if not cameras or now < self._next_s:
+            return
+        self._next_s = now + _PERIOD_S
+        terminal = shutil.get_terminal_size()
+        side = min(_LARGEST, terminal.columns // len(cameras) - 1, 2 * (terminal.lines - _TEXT_LINES))
+        lines = blocks([image for _, image in sorted(cameras.items())], max(2, side - side % 2))
+        up = f"\x1b[{self._lines}A" if self._lines else ""
+        self._write(up + "".join(f"\r{line}\x1b[0m\x1b[K\n" for line in lines))
+        self._lines = len(lines)
+
+    def leave(self) -> None:
+        """Leave the pictures as they are, and draw the next ones below what is written in between."""
+        self._lines = 0
+
+
+def blocks(images: list[np.ndarray], side: int) -> list[str]:
+    """Draw images side by side, two pixels a character.
+
+    Args:
+        images: The images, (H, W, 3) uint8 RGB each.
+        side: The larger side of each, in pixels; even.
+
+    Returns:
+        The lines, with escape sequences of 24-bit colours.
+    """
+    rows = [np.zeros((side, 0, 3), np.uint8)]
+    for image in images:
+        height, width = (max(2, round(side * n / max(image.shape[:2]))) for n in image.shape[:2])
+        y, x = np.arange(height) * image.shape[0] // height, np.arange(width) * image.shape[1] // width
+        padded = np.zeros((side, width + 1, 3), np.uint8)
+        padded[:height, :width] = image[y][:, x]
+        rows.append(padded)
+    pixels = np.concatenate(rows, axis=1)
+    return ["".join(map(_cell, *pair)) for pair in zip(pixels[::2].tolist(), pixels[1::2].tolist(), strict=True)]
+
+
+def _cell(above: list[int], below: list[int]) -> str:
+    return "\x1b[38;2;{};{};{};48;2;{};{};{}m▀".format(*above, *below)
 
 
 class EnvPolicy(Wrapper):
@@ -62,15 +126,46 @@ class EnvPolicy(Wrapper):
         return list(obs)
 
 
+def drive(options: argparse.Namespace) -> int:
+    """Play what the options of `vlagents-ray robot --env` say, and return the command's exit status."""
+    try:
+        with errors():
+            if options.ask_for_help is not None and options.leader != "keyboard":
+                raise ConfigError("--ask-for-help: got it without a way to answer, want --leader keyboard")
+            run = RobotRun(
+                env=options.env,
+                env_options=parse_settings(options.env_set, "--env-set"),
+                policy=options.policy,
+                settings=parse_settings(options.set, "--set"),
+                leader=options.leader,
+                record=None if options.record is None else Path(options.record),
+                hz=options.hz,
+                mode=options.mode,
+                execute=options.execute,
+                max_step=options.max_step,
+                step=options.step,
+                ask_for_help=options.ask_for_help,
+                samples=options.samples,
+            )
+            try:
+                run.play(range(options.seed, options.seed + options.episodes))
+            except KeyboardInterrupt:
+                kept = "" if run.recorder is None else f"; {run.recorder.episodes} episodes are in {run.record}"
+                raise KeyboardInterrupt(f"interrupted{kept}") from None
+    except typer.Exit as ended:
+        return ended.exit_code
+    return 0
+
+
 @dataclass
 class RobotRun:
-    """What `vlagents-ray robot` plays, and how; the fields are its options."""
+    """What `vlagents-ray robot --env` plays, and how; the fields are its options."""
 
     env: str
     env_options: dict[str, Any]
     policy: str | None
     settings: dict[str, Any]
-    teleop: str | None
+    leader: str | None
     record: Path | None
     hz: float | None
     mode: Mode
@@ -84,7 +179,7 @@ class RobotRun:
     recorder: Recorder | None = field(default=None, init=False)
     _control: Control | None = field(default=None, init=False)
     _view: TerminalView | None = field(default=None, init=False)
-    _said: str | None = field(default=None, init=False)  # who moves the robot, or why nobody does, as printed
+    _said: str | None = field(default=None, init=False)  # what moves the robot, as printed
 
     def play(self, seeds: Iterable[int]) -> None:
         """Play an episode for each seed, and print what became of it.
@@ -103,9 +198,9 @@ class RobotRun:
             if self.record is not None:
                 recorder = stack.enter_context(Recorder(self.record, hz, interventions=leader is not None))
                 self.recorder = recorder
-            if self.teleop == "keyboard":
+            if self.leader == "keyboard":
                 out.print(f"{HELP}\n{KEYS}")
-            if self.teleop is not None and out.is_terminal:
+            if self.leader is not None and out.is_terminal:
                 self._view = TerminalView(_write)
             for seed in seeds:
                 if self.over:
@@ -116,7 +211,7 @@ class RobotRun:
 
     def _play(self, env: EvalEnv, agent: Agent, seed: int, hz: float, recorder: Recorder | None) -> None:
         self.verdict = None
-        robot = EnvRobot(env, seed, endless=self.teleop is not None)
+        robot = EnvRobot(env, seed, endless=self.leader is not None)
         self._say(f"seed {seed}: {env.instruction}")
 
         def label() -> Label:
@@ -147,12 +242,12 @@ class RobotRun:
         )
 
     def _leader(self, contract: Contract, stack: contextlib.ExitStack) -> Leader | None:
-        if self.teleop is None:
+        if self.leader is None:
             return None
-        if self.teleop not in DEVICES:
-            raise ConfigError(f"--teleop: got {self.teleop!r}, want one of {list(DEVICES)}")
+        if self.leader not in DEVICES:
+            raise ConfigError(f"--leader: got {self.leader!r}, want one of {list(DEVICES)}")
         device: AxesDevice
-        if self.teleop == "keyboard":
+        if self.leader == "keyboard":
             verdicts = {"y": "success", "n": "failure", "x": "discard"}
             keys = {key: lambda label=label: setattr(self, "verdict", label) for key, label in verdicts.items()}
             device = stack.enter_context(Keyboard({**keys, "p": self._pause, "q": self._quit}))
@@ -163,7 +258,7 @@ class RobotRun:
     def _agent(self, contract: Contract, leader: Leader | None) -> Agent:
         if self.policy is None:
             if leader is None:
-                raise ConfigError("robot: got neither a policy nor --teleop, want one of them, or both")
+                raise ConfigError("robot: got neither a policy nor --leader, want one of them, or both")
             return TeleoperatedAgent(leader, contract)
         remote = "://" in self.policy
         if remote and self.settings:

@@ -1,4 +1,6 @@
-"""`python -m vlagents_ray.robot URL`: let a served policy drive a robot, or a simulated one, and print a report.
+"""Drive a robot, with the light install: a served policy in the control loop, and a report at its end.
+
+With --env a simulation is driven: by a policy, by a human, or by a policy that a human corrects.
 
 Exit status: 0 if every tick had an action of the policy, 1 if not, 3 if fewer than half had, 2 if it could not run.
 """
@@ -7,14 +9,13 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import re
 import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from typing import get_args
+from typing import Any, get_args
 
-from vlagents_ray.chunking.buffer import ENSEMBLE, MERGES
+from vlagents_ray.chunking.buffer import ENSEMBLE, MERGES, Mode
 from vlagents_ray.chunking.control import Leader
 from vlagents_ray.chunking.player import ChunkPlayer
 from vlagents_ray.client.agent import RemoteAgent
@@ -34,25 +35,48 @@ from vlagents_ray.viewers.targets import open_viewers
 MOSTLY_SAFE = 3  # exit status
 WAIT_S = 1.0  # deadline of a tick in the modes that wait for an answer; half of the default of --silent-s
 _DEVICES: dict[str, type[Keyboard | SpaceMouse]] = {"keyboard": Keyboard, "spacemouse": SpaceMouse}
+_HZ = 50.0  # of a robot
 RESTART_KEYS = "c\n"  # Enter is the keyboard's own while that moves the robot
 _HEADER = ("", "ticks", "missed", "within 2 ms", "p50 ms", "p99 ms", "max ms")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command, and return its exit status."""
-    parser = _parser()
-    options = parser.parse_args(arguments)
-    if options.mode != "async" and (options.merge != "newest" or options.rtc):
-        parser.error(f"--merge and --rtc: got one of them with --mode {options.mode}, want --mode async")
+    options = parse(arguments)
+    if options.env is not None:
+        from vlagents_ray.cli.simulated_robot import drive
+
+        return drive(options)
     try:
         with _ended_by_signals():
             report = _run(options)
     except VLAgentsError as error:
-        print(f"{type(error).__name__}: {_by_options(str(error), parser)}", file=sys.stderr)  # noqa: T201
+        print(f"{type(error).__name__}: {error}", file=sys.stderr)  # noqa: T201
         return 2
     if report.mostly_safe is not None:
         return MOSTLY_SAFE
     return 1 if report.safe_ticks else 0
+
+
+def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
+    """Parse the words of the command; the process ends with status 2 where they do not go together."""
+    parser, of_robot, of_env = command_parser()
+    options = parser.parse_args(arguments)
+    in_env = options.env is not None
+    given = [one.option_strings[0] for one in (of_robot if in_env else of_env) if _is_given(options, one)]
+    if given:
+        parser.error(f"got {', '.join(given)} with{'' if in_env else 'out'} --env; leave them out")
+    if not in_env and options.policy is None:
+        parser.error("got neither a URL nor --env, want one of them")
+    if options.mode is None:
+        options.mode = "open_loop" if in_env else "async"
+    if options.mode != "async" and (options.merge != "newest" or options.rtc):
+        parser.error(f"--merge and --rtc: got one of them with --mode {options.mode}, want --mode async")
+    return options
+
+
+def _is_given(options: argparse.Namespace, action: argparse.Action) -> bool:
+    return bool(getattr(options, action.dest) != action.default)
 
 
 @contextlib.contextmanager
@@ -73,14 +97,17 @@ def _ended_by_signals() -> Iterator[None]:
 
 def _run(options: argparse.Namespace) -> LoopReport:
     say: Callable[[str], None] = lambda line: print(line, flush=True)  # noqa: E731, T201
-    deadline_s = options.deadline_ms / 1e3 if options.deadline_ms is not None else WAIT_S * (options.mode != "async")
+    hz = options.hz or _HZ
+    deadline_s = 0.0 if options.mode == "async" else WAIT_S
+    if options.deadline_ms is not None:
+        deadline_s = options.deadline_ms / 1e3
     make_robot = import_class("--robot", options.robot) if options.robot else None
     make_leader = import_class("--leader", options.leader) if ":" in (options.leader or "") else None
     with contextlib.ExitStack() as stack:
         topics = _topics(options, stack)
         commands = CommandInbox() if options.operate else None
         agent = RemoteAgent(  # the player closes it
-            options.url, transport=options.transport, timeout_s=options.timeout_s, commands=commands
+            options.policy, transport=options.transport, timeout_s=options.timeout_s, commands=commands
         )
         agent.initialize()
         contract = agent.contract
@@ -107,9 +134,9 @@ def _run(options: argparse.Namespace) -> LoopReport:
         robot: Robot = topics or (SimulatedRobot(contract) if make_robot is None else make_robot())
         recorder = None
         if options.record:
-            recorder = stack.enter_context(Recorder(options.record, options.hz, interventions=leader is not None))
+            recorder = stack.enter_context(Recorder(options.record, hz, interventions=leader is not None))
         viewers = [stack.enter_context(viewer) for viewer in open_viewers(options.rerun, options.foxglove)]
-        hangs_s = max(0.2, 5 / options.hz) + deadline_s
+        hangs_s = max(0.2, 5 / hz) + deadline_s
 
         def stop(reason: str) -> None:
             robot.stop()
@@ -124,11 +151,11 @@ def _run(options: argparse.Namespace) -> LoopReport:
         stack.enter_context(_restarting(watchdog, say))
         if options.baseline > 0:
             say(_line(_HEADER))
-            say(_row("empty loop", empty_loop(options.hz, options.baseline, real_time=options.real_time)))
+            say(_row("empty loop", empty_loop(hz, options.baseline, real_time=options.real_time)))
         report = run_loop(
             robot,
             player,
-            hz=options.hz,
+            hz=hz,
             instruction=options.instruction,
             seconds=options.seconds,
             watchdog=watchdog,
@@ -241,100 +268,117 @@ def _number(kind: type[float] | type[int] = float, *, least: float = 0, above: b
     return read
 
 
-def _by_options(message: str, parser: argparse.ArgumentParser) -> str:
-    """Replace the names of arguments in an error message of the library by the options that set them."""
-    options = {action.dest: action.option_strings[0] for action in parser._actions if action.option_strings}
-    options |= {"real_time_chunking": "--rtc", "deadline_s": "--deadline-ms"}
-    names = "|".join(options)
-    message = re.sub(rf"^({names})(?=:| )", lambda found: options[found[1]], message)
-    return re.sub(
-        rf"\b({names})=(?:'(\w+)'|(\w+))", lambda found: f"{options[found[1]]} {found[2] or found[3]}", message
+def command_parser() -> tuple[argparse.ArgumentParser, list[argparse.Action], list[argparse.Action]]:
+    """Return the parser, with the options that are refused beside --env, and those that are refused without it."""
+    parser = argparse.ArgumentParser(
+        prog="vlagents-ray robot", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m vlagents_ray.robot", description=__doc__)
+    groups = parser.add_argument_group("a robot"), parser.add_argument_group("a simulation")
+    of_robot: list[argparse.Action] = []
+    of_env: list[argparse.Action] = []
     add = parser.add_argument
-    add("url", help="the server, as for RemoteAgent: http://gpu-box:8000")
-    add("--hz", type=_number(above=True), default=50.0, help="control rate (%(default)s)")
-    add("--seconds", type=_number(above=True), default=60.0, help="how long (%(default)s)")
-    add("--instruction", help="the task in words")
+
+    def real(*names: str, **settings: Any) -> None:
+        of_robot.append(groups[0].add_argument(*names, **settings))
+
+    def simulated(*names: str, **settings: Any) -> None:
+        of_env.append(groups[1].add_argument(*names, **settings))
+
     add(
+        "policy",
+        nargs="?",
+        help="the URL of its server: http://gpu-box:8000; with --env also a registered policy, 'module:Class', or "
+        "nothing for a human alone",
+    )
+    add("--hz", type=_number(above=True), help=f"control rate (default: {_HZ:g}, or the environment's)")
+    real("--seconds", type=_number(above=True), default=60.0, help="how long (%(default)s)")
+    real("--instruction", help="the task in words")
+    real(
         "--robot",
         metavar="MODULE:CLASS",
         help="your class of the robot, created without arguments; default: a simulated one",
     )
-    add("--ros", metavar="FILE", help="a robot behind topics of ROS 2, from this file; see docs/ros.md")
+    real("--ros", metavar="FILE", help="a robot behind topics of ROS 2, from this file; see docs/ros.md")
     add(
         "--leader",
         metavar="LEADER",
-        help="what a human takes over with: keyboard, spacemouse, or MODULE:CLASS of yours, see Leader",
+        help="what a human takes over with: keyboard, spacemouse, or, without --env, MODULE:CLASS of yours, see Leader",
     )
     add("--step", type=_number(above=True), help="what a key or axis of these adds to a number of the action at a tick")
-    add("--mode", choices=("open_loop", "ensemble", "async"), default="async", help="see ChunkPlayer (%(default)s)")
+    add("--mode", choices=get_args(Mode), help="see ChunkPlayer (default: async; with --env open_loop)")
     add("--execute", type=_number(int, least=1), metavar="N", help="rows of a chunk to execute before asking again")
-    add("--horizon", type=_number(int, least=1), metavar="N", help="rows of a chunk that may be executed at all")
-    add(
+    real("--horizon", type=_number(int, least=1), metavar="N", help="rows of a chunk that may be executed at all")
+    real(
         "--max-age-s",
         type=_number(above=True),
         metavar="S",
         help="largest age of the observation from which an action was computed",
     )
-    add(
+    real(
         "--merge", choices=(*MERGES, ENSEMBLE), default="newest", help="how overlapping chunks are merged (%(default)s)"
     )
-    add("--rtc", action="store_true", help="real-time chunking: send the rest of the plan, and the delay")
-    add(
+    real("--rtc", action="store_true", help="real-time chunking: send the rest of the plan, and the delay")
+    real(
         "--deadline-ms",
         type=_number(),
         help=f"how long a tick may wait for an action (async: 0, else {WAIT_S * 1e3:.0f})",
     )
-    add(
+    real(
         "--safe",
         choices=("auto", "hold", "zero"),
         default="auto",
         help="the action of a tick without one of the policy (%(default)s: by contract)",
     )
     add("--max-step", type=_number(), help="largest change of a number of the action from one tick to the next")
-    add("--measure", metavar="PART", help="part of the state with the measured pose, for --max-step, e.g. joints")
-    add(
+    real("--measure", metavar="PART", help="part of the state with the measured pose, for --max-step, e.g. joints")
+    real(
         "--restart",
         choices=get_args(Restart),
         help="how motion restarts after a stop by the watchdog: by Enter, C or SIGUSR1, or by itself "
         "(default: manual; auto for a simulated robot)",
     )
-    add(
+    real(
         "--silent-s",
         type=_number(above=True),
         default=2.0,
         help="stop the robot when the server is silent this long (%(default)s)",
     )
-    add(
+    real(
         "--timeout-s",
         type=_number(above=True),
         default=10.0,
         help="time after which a request is given up (%(default)s)",
     )
-    add("--transport", choices=("auto", "shm", "websocket", "http"), default="auto", help="(%(default)s)")
+    real("--transport", choices=("auto", "shm", "websocket", "http"), default="auto", help="(%(default)s)")
     add("--record", metavar="DIR", help="record a LeRobotDataset v3.0 there; needs the extra 'record'")
-    add("--rerun", metavar="DIR", help="write a .rrd file there for Rerun, or 'live': show the run in a running viewer")
-    add(
+    real(
+        "--rerun", metavar="DIR", help="write a .rrd file there for Rerun, or 'live': show the run in a running viewer"
+    )
+    real(
         "--foxglove", metavar="DIR", help="write an .mcap file there for Foxglove, or 'live': let it connect to the run"
     )
-    add(
+    real(
         "--operate",
         action="store_true",
         help="obey the buttons of the server's live page: pause, stop, success, failure",
     )
-    add("--real-time", action="store_true", help="ask for SCHED_FIFO in place of a nice value")
-    add(
+    real("--real-time", action="store_true", help="ask for SCHED_FIFO in place of a nice value")
+    real(
         "--baseline",
         type=_number(),
         default=5.0,
         metavar="S",
         help="first measure an empty loop for this long (%(default)s)",
     )
-    return parser
+    groups[1].add_argument("--env", metavar="NAME", help="the environment: tabletop, maniskill/PickCube-v1, …")
+    settings: dict[str, Any] = {"action": "append", "metavar": "KEY=VALUE", "default": []}
+    simulated("--env-set", **settings, help="an option of the environment: width=256")
+    simulated("--set", **settings, help="a setting of the policy, repeatable")
+    simulated("--episodes", type=_number(int, least=1), default=10, metavar="N", help="how many (%(default)s)")
+    simulated("--seed", type=int, default=0, help="of the first episode; the others count on (%(default)s)")
+    simulated("--ask-for-help", type=_number(), metavar="U", help="pause where the policy's uncertainty is above this")
+    simulated("--samples", type=_number(int, least=2), metavar="N", help="to compute the uncertainty from")
+    return parser, of_robot, of_env
 
 
 def _row(name: str, jitter: dict[str, float]) -> str:
@@ -344,7 +388,3 @@ def _row(name: str, jitter: dict[str, float]) -> str:
 
 def _line(cells: Sequence[str]) -> str:
     return f"{cells[0]:<20}" + "".join(f"{cell:>13}" for cell in cells[1:])
-
-
-if __name__ == "__main__":
-    sys.exit(main())
