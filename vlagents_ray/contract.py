@@ -91,7 +91,7 @@ class Contract:
         """Return the contract as plain JSON values, which processes with another version of numpy can read."""
         stated = asdict(self)
         if self.behaviour is None:
-            del stated["behaviour"]  # clients of earlier versions do not know the key
+            del stated["behaviour"]  # only policies for learners state it
         return {key: _plain(value) for key, value in stated.items()}
 
     @classmethod

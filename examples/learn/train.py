@@ -10,6 +10,7 @@ needs torch and the extra 'learn'.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar
@@ -31,6 +32,7 @@ from vlagents_ray.learn import Publisher, Rollouts, TrainingEvaluation, arrays
 from vlagents_ray.serve.launch.deployment_file import deployment, together
 from vlagents_ray.serve.launch.server import running_server
 
+HERE = str(Path(__file__).parent.absolute())
 ENV = "tabletop/lift"
 ENV_OPTIONS: dict[str, Any] = {"width": 96, "height": 96, "max_steps": 30}
 TEACHER = "teacher"
@@ -95,6 +97,8 @@ def learn(plan: LearnPlan) -> Summary:
         ConfigError: The folder has another run, or has one and `resume` is off.
     """
     torch.set_num_threads(1)  # its networks are small
+    # Ray starts the replicas with these variables, and they import the policies from this folder.
+    os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [HERE, os.environ.get("PYTHONPATH")]))
     checkpoints = RunCheckpoints(plan)
     sources = {TEACHER: "teacher:Teacher"} | {method: METHODS[method].student for method in plan.methods}
     policies = {app: deployment(source, batch={"max_size": 64}) for app, source in sources.items()}

@@ -13,7 +13,6 @@ from vlagents_ray.envs.tabletop import Tabletop
 from vlagents_ray.errors import ConfigError, UnknownEnv
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig, SuiteConfig
 from vlagents_ray.evaluate.plan.cases import cells, expand
-from vlagents_ray.evaluate.plan.config import ClockConfig
 from vlagents_ray.evaluate.plan.jobs import (
     EpisodeKey,
     Job,
@@ -137,21 +136,6 @@ def test_an_env_in_two_suites_that_do_not_differ_is_refused() -> None:
     suites = [SuiteConfig(name="few", envs=[LINE]), SuiteConfig(name="all", envs=[LINE, OTHER_LINE], seeds=[100])]
     with pytest.raises(ConfigError, match=r"\['eval_fakes:Line'\] stand in two suites with the same settings"):
         cells(EvalConfig(policies=[PolicyConfig()], suites=suites, out=Path("out")))
-
-
-def test_episodes_in_real_time_are_others_than_before_rows_were_placed_by_executed_actions(
-    config: Callable[..., EvalConfig], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def prints() -> tuple[str, str]:
-        suites = [SuiteConfig(envs=[LINE]), SuiteConfig(name="clock", envs=[LINE], clock=ClockConfig(neutral=[0]))]
-        synchronous, real_time = cells(config().model_copy(update={"suites": suites}))
-        return synchronous.fingerprint, real_time.fingerprint
-
-    now = prints()
-    monkeypatch.setattr("vlagents_ray.evaluate.plan.cases._COUNTS", "ticks")
-    before = prints()
-    assert now[0] == before[0]
-    assert now[1] != before[1]
 
 
 def test_policies_whose_episodes_would_share_their_files_are_refused(config: Callable[..., EvalConfig]) -> None:
