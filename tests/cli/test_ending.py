@@ -114,14 +114,9 @@ def test_an_evaluation_does_not_begin_after_an_interrupt_that_was_dropped() -> N
 
 
 def test_sigterm_while_ray_starts_interrupts_the_command() -> None:
-    def start() -> None:
-        with own_sigterm():
-            signal.signal(signal.SIGTERM, lambda number, _: sys.exit(number))  # as `ray.init` does
-            signal.raise_signal(signal.SIGTERM)
-
     with interrupts():
-        with pytest.raises(KeyboardInterrupt):
-            start()
+        with pytest.raises(KeyboardInterrupt), own_sigterm():
+            sys.exit(signal.SIGTERM)  # as the handler of `ray.init` does
         with pytest.raises(KeyboardInterrupt):  # the command's own handler is back
             signal.raise_signal(signal.SIGTERM)
 
