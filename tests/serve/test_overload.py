@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import fcntl
 import http.client
 import json
+import os
 import socket
 import struct
 import threading
@@ -57,12 +59,14 @@ from vlagents_ray.protocol.messages import (
     DEFAULT_LIMITS,
     Budget,
     Limits,
+    LocalAddress,
     PlasmaAddress,
     Reply,
     Request,
 )
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints.shm import ShmServer
+from vlagents_ray.serve.endpoints.unix_messages import UnixConnection
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.admission import Admission, MessageAdmission, NeedsDecodingThread
 from vlagents_ray.serve.engine.dispatch import Dispatcher
@@ -629,6 +633,51 @@ def test_a_local_client_over_its_rate_is_not_read_meanwhile(replica: KeyedReplic
     for op in ("act", "reset"):  # in compact form, and in a frame
         wait_for(lambda op=op: is_left_alone(op))  # type: ignore[misc]
     transport.close()
+
+
+def test_local_clients_over_their_rate_wait_without_threads_and_leave_nothing_behind(
+    replica: KeyedReplica, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    visitor = replica.visitor("right")
+    replica.known.change(visitor.name, rate=1e-6)
+    replica.known.keys.check(visitor.token, "app").admit()
+    started, read = [], []
+    start, receive = threading.Thread.start, UnixConnection._receive
+
+    def noted(thread: threading.Thread) -> None:
+        if threading.current_thread().name.startswith("policy") and thread.name != "keys":  # which reads the key file
+            started.append(thread.name)
+        start(thread)
+
+    def counted(one: UnixConnection, *args: Any) -> None:
+        read.append(one)
+        receive(one, *args)
+
+    monkeypatch.setattr(threading.Thread, "start", noted)
+    monkeypatch.setattr(UnixConnection, "_receive", counted)
+
+    def held() -> list[UnixConnection]:
+        return [one for one in list(replica.local._clients) if getattr(one.caller, "name", "") == visitor.name]
+
+    message = frame(reset())
+    descriptor = os.memfd_create("message", os.MFD_ALLOW_SEALING)
+    os.write(descriptor, message)
+    fcntl.fcntl(descriptor, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK)
+    crowd = [socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) for _ in range(8)]
+    for one in crowd:
+        one.connect("\0" + replica.local.address.socket)
+        one.send(visitor.token.encode())
+        for _ in range(6):
+            socket.send_fds(one, [LocalAddress.REQUEST.pack(0, 0, len(message))], [descriptor])
+    wait_for(lambda: len(held()) == len(crowd) and all(one._pauses for one in held()))
+    wait_for(lambda: len(read) > 2)  # one a second of all that wait
+    for one in crowd:
+        one.close()
+    left = len(read)
+    wait_for(lambda: not held())
+    os.close(descriptor)
+    assert len(read) <= left + 2, "messages of clients that are gone were read"
+    assert started == []
 
 
 @pytest.mark.parametrize("path", ["own", "/v1/stream", "/vla-eval"])

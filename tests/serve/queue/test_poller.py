@@ -128,6 +128,29 @@ def test_nobody_listens_beside_a_lone_session(slow: Callable[..., Slow]) -> None
     assert "policy-reader" not in {thread.name for thread in threading.enumerate() if thread not in before}
 
 
+def test_timers_run_in_order_on_the_thread_that_polls_even_beside_a_batch(slow: Callable[..., Slow]) -> None:
+    one = slow()
+    ran: list[tuple[str, str]] = []
+
+    def set_timers(*delays: float) -> None:
+        for delay_s in delays:
+            one.queue.call_later(delay_s, lambda s=delay_s: ran.append((f"{s:g}", threading.current_thread().name)))
+
+    one.queue.start()
+    one.queue.call_soon(lambda: set_timers(0.1, 0.05))
+    wait_for(lambda: ran == [("0.05", "policy"), ("0.1", "policy")])
+    one.learn("a", "b")
+    one.hold("a", "b")
+    one.queue.call_soon(lambda: set_timers(0.2))
+    wait_for(lambda: ran[2:] == [("0.2", "policy-reader")])
+    one.open.set()
+    wait_for(lambda: one.called("answer a", "answer b"))
+    one.queue.call_soon(lambda: set_timers(0.5))  # set before the reader is lent the poller again
+    one.hold("a", "b")
+    wait_for(lambda: len(ran) == 4)
+    one.open.set()
+
+
 def test_a_callback_may_end_its_watch_beside_a_batch(slow: Callable[..., Slow]) -> None:
     one = slow()
     ours, theirs = socket.socketpair()
