@@ -25,8 +25,8 @@ import pytest
 from api_key_replica import (
     WAYS,
     KeyedReplica,
+    PlasmaChannel,
     Visitor,
-    _Channel,
     _read_map,
     _read_reply,
     _read_vla_eval,
@@ -170,7 +170,7 @@ def _over_shm(visitor: Visitor, _when: str) -> str:
 
 def _over_plasma(visitor: Visitor, _when: str) -> str:
     key = visitor.name.encode().ljust(28, b"\0")
-    _Channel.frames[key] = frame(reset())
+    PlasmaChannel.frames[key] = frame(reset())
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:
         connection.settimeout(10)
         connection.connect(visitor.replica.plasma.plasma.socket)
