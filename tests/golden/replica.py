@@ -19,6 +19,7 @@ from dialect_server import METADATA
 from eval_fakes import wait_for
 from in_process_replicas import Replicas
 
+from tests.golden.failing import fail
 from tests.golden.lines import CallLine, GrpcLine, HttpLine, Line, RpycLine, UnixLine, WebSocketLine, ZmqLine
 from tests.golden.masks import masked
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
@@ -75,7 +76,7 @@ class Policy(Agent):
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         if instruction == "no reset":
-            raise RuntimeError("a secret")
+            fail()
         self.instruction, self.acts, self.seen = instruction or "", 0, deque([_pixel(obs)], maxlen=3)
         return {"instruction": instruction, "options": kwargs}
 
@@ -88,7 +89,7 @@ class Policy(Agent):
             self.gate.acting.set()
             self.gate.opened.wait(20)
         if asked == "fail":
-            raise RuntimeError("a secret")
+            fail()
         self.observe(obs)
         self.acts += 1
         state = float(sum(part.sum() for part in obs.state.values()))

@@ -112,15 +112,6 @@ def test_what_is_executed_until_an_answer_comes_is_of_the_weights_before_it(conf
     assert versions(settings, Pushed) == [NO_VERSION, 1, 1, 1, 2, 2, 2, 3, 3, 3]
 
 
-def test_an_older_trajectory_names_no_versions(tmp_path: Path) -> None:
-    recorder = TrajectoryRecorder()
-    for _ in range(2):
-        recorder.add_observation(Obs(state={"position": np.zeros(1, np.float32)}))
-    recorder.add_action(np.zeros(1, np.float32), 0.0, False)
-    (tmp_path / "old.npz").write_bytes(replace(recorder.finish(), versions=None).to_bytes())
-    assert Trajectory.load(tmp_path / "old.npz").versions is None
-
-
 def height(video: bytes) -> int:
     with av.open(io.BytesIO(video)) as container:
         return container.streams.video[0].height
