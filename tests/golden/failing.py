@@ -1,4 +1,4 @@
-"""The line at which the recorded policy fails, which errors name: in a file of its own, so that no other edit moves it."""
+"""The line at which the recorded policy fails, which errors name; in its own file, so that no other edit moves it."""
 
 from typing import NoReturn
 
