@@ -13,7 +13,7 @@ from eval_fakes import wait_for
 from in_process_replicas import Replicas, export
 from numbered_checkpoints import Library, act, ask, begin, reset
 
-from vlagents_ray import Agent, Obs
+from vlagents_ray import Act, Agent, Obs
 from vlagents_ray.errors import (
     CheckpointFailed,
     DeadlineExceeded,
@@ -359,10 +359,16 @@ def test_a_session_goes_on_by_its_checkpoint_where_its_replica_sends_it(library:
     with replicas.agent() as agent:
         agent.reset(Obs(), "x", checkpoint="b")
         replicas.engines[0].drain()
-        acts = [agent.act(Obs()) for _ in range(5)]
-        assert [act.action.tolist() for act in acts] == [[2, step] for step in range(1, 6)]
+        acts: list[Act] = []
+
+        def has_moved() -> bool:  # the other replica is asked beside the acts
+            acts.append(agent.act(Obs()))
+            return [len(engine.sessions) for engine in replicas.engines] == [0, 1]
+
+        wait_for(has_moved)
+        acts.append(agent.act(Obs()))
+        assert [act.action.tolist() for act in acts] == [[2, step] for step in range(1, len(acts) + 1)]
         assert not any("resumed" in act.info for act in acts)
-        assert [len(engine.sessions) for engine in replicas.engines] == [0, 1]
     replicas.close()
 
 
