@@ -46,7 +46,7 @@ def timed(prepare: Callable[[], Any], call: Callable[[Any], object], calls: int)
 
 
 def obey(lines: Iterable[str], out: TextIO, measure: Callable[[int], list[float]], said: dict[str, Any]) -> None:
-    """Warm up, write `said` as the line of a ready client, and answer each line until there is none."""
+    """Warm up, write `said` as the line of a ready client, and answer each line until the input ends."""
     measure(WARM_UP)
     print(json.dumps(said), file=out, flush=True)
     for line in lines:

@@ -290,7 +290,7 @@ def replay_dataset(
 
 
 def parse_episodes(text: str) -> Sequence[int]:
-    """Return the numbers in a list such as "0-9,12"; raises `ConfigError` if it is none."""
+    """Return the numbers in a list such as "0-9,12"; raise `ConfigError` for any other text."""
     found: list[int] = []
     for part in parse_list(text):
         first, dash, last = part.partition("-")

@@ -35,10 +35,12 @@ def is_probe(message: Buffer) -> bool:
 
 
 def read_probe(message: bytes, budget: Budget) -> None:
-    """Count a probe as one request of a simulation; raises `MalformedMessage` if the message is none."""
+    """Count a probe as one request of a simulation; raise `MalformedMessage` for any other message."""
     budget.begin_message()
-    if len(message) < _HEAD.size or not is_probe(message):
-        raise MalformedMessage(f"probe: got {message[:4]!r} at its start, want {_PROBE_TAG!r} and what follows it")
+    if not is_probe(message):
+        raise MalformedMessage(f"probe: got {message[:4]!r} at its start, want {_PROBE_TAG!r}")
+    if len(message) < LEAST_BYTES:
+        raise MalformedMessage(f"probe: got {len(message)} bytes, want at least {LEAST_BYTES}")
     budget.begin("probe", "simulation")
 
 
