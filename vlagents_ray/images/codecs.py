@@ -45,11 +45,6 @@ class ImageCodec:
         if self.subsampling not in SUBSAMPLINGS:
             raise InvalidInput(f"subsampling: got {self.subsampling!r}, want one of {list(SUBSAMPLINGS)}")
 
-    @property
-    def exact(self) -> bool:
-        """Whether every pixel arrives unchanged."""
-        return self.name != "jpeg"
-
     def file(self, image: np.ndarray) -> bytes:
         """Encode an image as a JPEG or PNG file; a raw codec has no files.
 

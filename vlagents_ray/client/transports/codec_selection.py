@@ -42,10 +42,6 @@ class LinkSpeed:
     round_trip_s: float
     bandwidth: float  # bytes/s from client to server, including the work of both sides on each byte
 
-    def seconds(self, size: int) -> float:
-        """Return the time, s, for a message of `size` bytes and a short answer."""
-        return self.round_trip_s + size / self.bandwidth
-
 
 def measure(
     send: Send, clock: Callable[[], float] = time.perf_counter, within_s: float = float("inf")
@@ -139,10 +135,10 @@ class CodecChoice:
             most_bytes: The largest message.
             timeout_s: How long the request may take, probes included.
         """
-        if self._compressed is None or obs is None:
+        if obs is None or self._compressed is None or self.codec is self._compressed:
             return self.codec or RAW
         size = sum(image.nbytes for image in obs.cameras.values())
-        if size and (self.codec is None or (self.codec == RAW and size > self._size)):
+        if size > self._size:  # 0 while nothing is chosen
             try:
                 if not self._near and self.link is None:
                     self.link = measure(send, within_s=_SHARE * timeout_s)
