@@ -38,7 +38,7 @@ from vlagents_ray.client.transports.select import TransportName
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.noop import Noop
-from vlagents_ray.serve.engine import dispatch
+from vlagents_ray.serve.engine import sender
 from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.serve.launch.server import running_server
 from vlagents_ray.serve.live.tap import LEASE_S
@@ -60,24 +60,23 @@ class Measured(Noop):
 
 
 class Untapped(Measured):
-    """`noop` in a replica whose dispatcher was compiled without the lines for the live page."""
+    """`noop` in a replica whose senders were compiled without the lines for the live page."""
 
     def initialize(self) -> None:
         """Replace the methods of this process."""
         super().initialize()
-        looked_for = r"    if \(\w+ := self\._engine\.[\w.]+\) is not None:\n(        .*\n)+"
-        _without(dispatch.Dispatcher.send, looked_for, "")
-        _without(dispatch.Dispatcher.admission, r"keep = self\._engine\..*", "keep = False")
+        for method in (sender.Sender.send, sender.Sender.admission):
+            _without(method, r"self\._engine\.observers\.any|engine\.observers\.any", "False")
 
 
 def _without(method: Callable[..., Any], lines: str, instead: str) -> None:
-    """Compile a method of the dispatcher again with something else in place of the only lines that match."""
+    """Compile a method of the sender again with something else in place of the only lines that match."""
     source, found_lines = re.subn(lines, instead, textwrap.dedent(inspect.getsource(method)))
     if found_lines != 1:
         raise ConfigError(f"{method.__name__}: got {found_lines} places with the lines for the tap, want 1; look there")
     found: dict[str, Any] = {}
-    exec(source, vars(dispatch), found)  # noqa: S102 - the package's own source
-    setattr(dispatch.Dispatcher, method.__name__, found[method.__name__])
+    exec(source, vars(sender), found)  # noqa: S102 - the package's own source
+    setattr(sender.Sender, method.__name__, found[method.__name__])
 
 
 class Turn(NamedTuple):

@@ -22,13 +22,13 @@ from cpp_client import CppClient, CppError, build
 from eval_fakes import wait_for
 from golden import GOLDEN, of_request
 from hostile_answers import ADDED_MB, ANSWERS
+from in_flight import read_requests
 from in_memory_keys import ChangingKeys
 from scripted_server import Visit, answer, document, scripted_server
 
 from vlagents_ray import Act, ActionSpec, Agent, Contract, Obs
 from vlagents_ray.errors import Overloaded
 from vlagents_ray.images.jpeg_png import encode_jpeg
-from vlagents_ray.protocol.frames import decode_requests
 from vlagents_ray.protocol.messages import PROTOCOL_VERSION, Budget, Limits, Request
 from vlagents_ray.serve import periodic
 from vlagents_ray.serve.access import api_keys
@@ -223,7 +223,7 @@ def test_written_frames_mean_what_the_golden_ones_do(name: str, shared_driver: C
         "history": [observed(each) for each in meaning.get("history", [])],
     }
     data = bytes.fromhex(shared_driver.call("request", **asked))
-    [request] = decode_requests(data, Budget(Limits()))
+    [request] = read_requests(data, Budget(Limits()))
     assert isinstance(request, Request)
     written = of_request(request)
     assert written == {key: value for key, value in meaning.items() if key in written}

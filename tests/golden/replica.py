@@ -162,7 +162,7 @@ class Server:
         return Policy(OPEN if self._dialects else STRICT, self._gate, settings["checkpoint"])
 
     def _start(self) -> None:
-        if self._ready and self._replicas is None and not self.engines[0].queue.alive():
+        if self._ready and self._replicas is None and not self.engines[0].alive:
             self.engines[0].start()
 
     def _http(self, number: int) -> int:

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
+from in_flight import submit
 
 from vlagents_ray.errors import ConfigError, InvalidInput, InvalidWeights, UnchangedWeights
 from vlagents_ray.interface import Act, Agent, Obs
@@ -34,7 +35,7 @@ def act(engine: Engine, session: str = "s") -> Act:
     """The first act of an episode of a simulation."""
     replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
     for request in (Request("reset", Obs(), rank="simulation"), Request("act", Obs(), rank="simulation")):
-        engine.submit(session, request, replies.put)
+        submit(engine, session, request, replies.put)
         reply = replies.get(timeout=30)
     assert reply.act is not None, reply.error
     return reply.act

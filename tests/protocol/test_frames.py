@@ -11,6 +11,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from in_flight import read_requests
 from many import many
 
 from vlagents_ray.errors import (
@@ -29,7 +30,6 @@ from vlagents_ray.protocol.frame_layout import pack
 from vlagents_ray.protocol.frames import (
     decode_replies,
     decode_reply,
-    decode_requests,
     encode_replies,
     encode_request,
     encode_requests,
@@ -46,7 +46,7 @@ from vlagents_ray.protocol.messages import (
 
 def decode_request(frame: Buffer, limits: Limits = DEFAULT_LIMITS) -> Request:
     """The only request of a frame; raises why it is refused."""
-    [request] = decode_requests(frame, Budget(limits))
+    [request] = read_requests(frame, Budget(limits))
     if isinstance(request, Reply):
         assert request.error is not None
         raise request.error
@@ -268,7 +268,7 @@ def test_a_small_file_that_is_named_again_and_again_does_not_become_much_memory(
     file = encode_jpeg(np.zeros((256, 256, 3), np.uint8))
     frame = b"".join(pack({"requests": requests}, [file, bytes(50_000)]))
     tracemalloc.start()
-    answers = decode_requests(frame, Budget(limits))
+    answers = read_requests(frame, Budget(limits))
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     if len(requests) == 1:
@@ -279,7 +279,7 @@ def test_a_small_file_that_is_named_again_and_again_does_not_become_much_memory(
 
 def test_images_of_as_many_requests_as_a_frame_may_hold_are_decoded() -> None:
     seen = [Obs({"front": np.zeros((224, 224, 3), np.uint8)})] * DEFAULT_LIMITS.requests
-    answers = decode_requests(encode_requests([Request("act", obs) for obs in seen], JPEG), Budget(DEFAULT_LIMITS))
+    answers = read_requests(encode_requests([Request("act", obs) for obs in seen], JPEG), Budget(DEFAULT_LIMITS))
     assert all(isinstance(answer, Request) for answer in answers)
 
 
@@ -288,7 +288,7 @@ def test_a_long_header_is_refused_unread(values: int, reason: str) -> None:
     header = b'{"op":"act","blobs":[],"obs":{"info":{"a":[' + b"[]," * values + b"1]}}}"
     tracemalloc.start()
     with pytest.raises(MessageTooLarge, match=reason):
-        decode_requests(b"VLA\x01" + struct.pack("<I", len(header)) + header, Budget(DEFAULT_LIMITS))
+        read_requests(b"VLA\x01" + struct.pack("<I", len(header)) + header, Budget(DEFAULT_LIMITS))
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 5 * len(header)
@@ -312,7 +312,7 @@ def test_requests_that_share_a_frame_come_back_in_order(seen: list[Obs]) -> None
         Request("act", obs, session=f"s{i}", rank="simulation", step=i, request_id=f"r{i}")
         for i, obs in enumerate(seen)
     ]
-    got = decode_requests(encode_requests(sent), Budget(DEFAULT_LIMITS))
+    got = read_requests(encode_requests(sent), Budget(DEFAULT_LIMITS))
     assert len(got) == len(sent)
     for i, (one, obs) in enumerate(zip(got, seen, strict=True)):
         assert isinstance(one, Request)
@@ -324,7 +324,7 @@ def test_requests_that_share_a_frame_come_back_in_order(seen: list[Obs]) -> None
 
 def test_a_wrong_request_in_a_frame_is_answered_alone() -> None:
     good, bad = Request("act", Obs(), request_id="a"), Request("act", None, request_id="b")
-    got = decode_requests(encode_requests([good, bad, good]), Budget(DEFAULT_LIMITS))
+    got = read_requests(encode_requests([good, bad, good]), Budget(DEFAULT_LIMITS))
     assert [type(one) for one in got] == [Request, Reply, Request]
     assert isinstance(got[1], Reply)
     assert (got[1].request_id, type(got[1].error)) == ("b", MalformedMessage)
@@ -361,15 +361,15 @@ def test_fields_of_a_request_are_checked(change: dict, error: type[VLAgentsError
 @pytest.mark.parametrize("requests", [{}, [], [1], None])
 def test_a_frame_of_requests_is_a_list(requests: object) -> None:
     with pytest.raises(MalformedMessage):
-        decode_requests(b"".join(pack({"requests": requests}, [])), Budget(DEFAULT_LIMITS))
+        read_requests(b"".join(pack({"requests": requests}, [])), Budget(DEFAULT_LIMITS))
     with pytest.raises(MessageTooLarge):
-        decode_requests(b"".join(pack({"requests": [{}] * 5}, [])), Budget(Limits(requests=4)))
+        read_requests(b"".join(pack({"requests": [{}] * 5}, [])), Budget(Limits(requests=4)))
 
 
 @pytest.mark.parametrize("name", ["a b", "a\nERROR forged", "a\x1b[2K", "é", "a\u2028b", "\x7f", "\0"])
 @pytest.mark.parametrize("field", ["request_id", "session"])
 def test_names_forge_no_line_in_a_log(field: str, name: str) -> None:
-    [reply] = decode_requests(encode_requests([Request("close", **{field: name})]), Budget(DEFAULT_LIMITS))
+    [reply] = read_requests(encode_requests([Request("close", **{field: name})]), Budget(DEFAULT_LIMITS))
     assert isinstance(reply, Reply)
     assert isinstance(reply.error, MalformedMessage)
     assert reply.request_id == ""

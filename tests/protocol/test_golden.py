@@ -10,6 +10,7 @@ import golden
 import jsonschema
 import numpy as np
 import pytest
+from in_flight import read_requests
 from starlette.testclient import TestClient
 
 from vlagents_ray.client.transports.probe import bytes_probe, is_probe
@@ -21,7 +22,6 @@ from vlagents_ray.protocol.frame_layout import pack, unpack
 from vlagents_ray.protocol.frames import (
     CONTENT_TYPE,
     decode_replies,
-    decode_requests,
     encode_replies,
     encode_request,
     encode_requests,
@@ -68,7 +68,7 @@ def test_the_files_are_what_the_command_writes(tmp_path: Path) -> None:
 
 @of("requests")
 def test_the_codec_reads_what_a_request_says_and_writes_its_bytes(frame: golden.Golden) -> None:
-    requests = decode_requests(frame.data, Budget(DEFAULT_LIMITS))
+    requests = read_requests(frame.data, Budget(DEFAULT_LIMITS))
     assert all(isinstance(request, Request) for request in requests)
     assert [golden.of_request(request) for request in requests] == plain(frame.meaning)  # type: ignore[arg-type]
     if frame.by_codec:

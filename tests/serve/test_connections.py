@@ -40,8 +40,8 @@ from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
-from vlagents_ray.serve.engine.dispatch import Dispatcher
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.sender import Sender
 
 BASE = urlsplit("http://127.0.0.1")
 SLOW_S, IDLE_S = 0.4, 3.0  # where a test is about those; others hold though this process stands still
@@ -216,9 +216,9 @@ def test_what_comes_with_a_right_handshake_is_read(keyed: Replica, cut: int) -> 
 
 def test_who_forgets_to_say_whose_requests_they_are_fails(keyed: Replica) -> None:
     with pytest.raises(TypeError, match="caller"):
-        Dispatcher(keyed.engine, "http")  # type: ignore[call-arg]
+        Sender(keyed.engine, "http")  # type: ignore[call-arg]
     with pytest.raises(TypeError, match="want a Caller"):
-        Dispatcher(keyed.engine, "http", caller=None)  # type: ignore[arg-type]
+        Sender(keyed.engine, "http", caller=None)  # type: ignore[arg-type]
     unguarded = TestClient(build_http_app(keyed.engine, dict, Limits()), raise_server_exceptions=False)
     assert unguarded.post("/v1/reset", json={"obs": {}}, headers={"x-session-id": "a"}).status_code == 500
     assert keyed.policy.seen == []

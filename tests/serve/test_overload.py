@@ -37,6 +37,7 @@ from api_key_replica import (
 )
 from dialect_server import body, libero
 from eval_fakes import wait_for
+from in_flight import read_requests
 
 import vlagents_ray
 from vlagents_ray.client.credentials import Credentials
@@ -50,6 +51,7 @@ from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol import frame_layout, json_messages
 from vlagents_ray.protocol.frames import (
     CONTENT_TYPE,
+    Decoded,
     decode_replies,
     decode_reply,
     decode_requests,
@@ -69,8 +71,8 @@ from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.endpoints.unix_messages import UnixConnection
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.admission import Admission, MessageAdmission, NeedsDecodingThread
-from vlagents_ray.serve.engine.dispatch import Dispatcher
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.sender import Sender
 from vlagents_ray.wire import gr00t as gr00t_codec
 from vlagents_ray.wire import json_numpy, msgpack
 from vlagents_ray.wire import openpi as openpi_codec
@@ -298,7 +300,7 @@ def test_nothing_that_serves_decodes_without_an_admission() -> None:
 
 
 def test_closing_is_free_and_decodes_nothing(decoded: list[str]) -> None:
-    [answer] = decode_requests(frame({"op": "close", "obs": SEEN, "history": [SEEN]}), Budget(DEFAULT_LIMITS))
+    [answer] = read_requests(frame({"op": "close", "obs": SEEN, "history": [SEEN]}), Budget(DEFAULT_LIMITS))
     assert isinstance(answer, Request)
     assert answer.obs is None
     assert answer.history == []
@@ -310,7 +312,7 @@ def test_closing_is_free_and_decodes_nothing(decoded: list[str]) -> None:
 
 def test_each_image_is_decoded_once_however_often_it_is_named(decoded: list[str]) -> None:
     both = {"cameras": {"a": {"$": ["img", 0]}, "b": {"$": ["img", 1]}}, "info": {"again": {"$": ["img", 0]}}}
-    answers = decode_requests(
+    answers = read_requests(
         frame(*[{"op": "reset", "obs": both, "history": [both] * 5}] * 3, files=[JPEG, PNG]), message_admission()
     )
     assert all(isinstance(answer, Request) for answer in answers)
@@ -322,7 +324,7 @@ def test_what_a_request_names_is_counted_each_time_and_taken_once() -> None:
     held = Admission(10**9)
     message = MessageAdmission(held, limits, lambda _: True)
     good, bad = {"op": "reset", "obs": SEEN, "history": [SEEN] * 3}, {"op": "reset", "obs": SEEN, "history": [SEEN] * 4}
-    first, second, third = decode_requests(frame(good, bad, good), message)
+    first, second, third = read_requests(frame(good, bad, good), message)
     assert isinstance(first, Request)
     assert isinstance(second, Reply)
     assert isinstance(second.error, MessageTooLarge)
@@ -367,7 +369,7 @@ def test_robots_have_a_share_of_the_memory_for_themselves() -> None:
 
     def message(rank: str) -> tuple[MessageAdmission, VLAgentsError | None]:
         one = MessageAdmission(whole, DEFAULT_LIMITS, lambda _: True)
-        [answer] = decode_requests(frame(reset(rank=rank)), one)
+        [answer] = read_requests(frame(reset(rank=rank)), one)
         return one, answer.error if isinstance(answer, Reply) else None
 
     simulations = [message("simulation") for _ in range(6)]
@@ -385,7 +387,7 @@ def test_robots_have_a_share_of_the_memory_for_themselves() -> None:
 
 def test_a_message_that_will_never_fit_is_not_told_to_wait() -> None:
     small = Admission(DECODED)
-    [answer] = decode_requests(frame(reset(rank="simulation")), MessageAdmission(small, DEFAULT_LIMITS, lambda _: True))
+    [answer] = read_requests(frame(reset(rank="simulation")), MessageAdmission(small, DEFAULT_LIMITS, lambda _: True))
     assert isinstance(answer, Reply)
     assert isinstance(answer.error, MessageTooLarge)
     assert "limits.in_flight_bytes" in str(answer.error)
@@ -547,7 +549,7 @@ def test_a_client_that_leaves_while_its_image_is_decoded_leaves_nothing(
 def test_an_event_loop_goes_on_while_a_message_is_decoded(held_up: tuple[threading.Event, list[str]]) -> None:
     go_on, decoders = held_up
 
-    async def run() -> list[Request | Reply]:
+    async def run() -> Decoded:
         message = message_admission()
         reading = asyncio.ensure_future(
             message.decoded(lambda budget: decode_requests(frame(reset(), files=[LARGE]), budget))
@@ -558,8 +560,7 @@ def test_an_event_loop_goes_on_while_a_message_is_decoded(held_up: tuple[threadi
         go_on.set()
         return await reading
 
-    [answer] = asyncio.run(run())
-    assert isinstance(answer, Request)
+    assert len(asyncio.run(run()).requests) == 1
 
 
 def test_a_message_that_is_read_again_elsewhere_counts_once() -> None:
@@ -567,12 +568,12 @@ def test_a_message_that_is_read_again_elsewhere_counts_once() -> None:
     message = message_admission(admit=lambda op: bool(counted.append(op)) or True)
     data = frame(reset(), reset(obs={"cameras": {"front": {"$": ["img", 1]}}}), files=[JPEG, LARGE])
 
-    def read(budget: Budget) -> list[Request | Reply]:
+    def read(budget: Budget) -> Decoded:
         return decode_requests(data, budget)
 
     with pytest.raises(NeedsDecodingThread):
         read(message)
-    assert all(isinstance(answer, Request) for answer in message.decode_on_thread(read).result(30))
+    assert not message.decode_on_thread(read).result(30).refused
     assert counted == ["message", "reset"]
 
 
@@ -584,8 +585,7 @@ def test_simulations_images_are_decoded_one_by_one(monkeypatch: pytest.MonkeyPat
     two = {"cameras": {"a": {"$": ["img", 0]}, "b": {"$": ["img", 1]}}}
     message = message_admission(admit=lambda _: False)
     data = frame(reset(obs=two), files=[LARGE, LARGE])
-    [answer] = message.decode_on_thread(lambda budget: decode_requests(data, budget)).result(30)
-    assert isinstance(answer, Request)
+    assert not message.decode_on_thread(lambda budget: decode_requests(data, budget)).result(30).refused
 
 
 # Over the rate.
@@ -693,4 +693,4 @@ def test_what_cannot_be_read_counts_too(replica: KeyedReplica, path: str) -> Non
 
 def test_a_sender_that_is_not_over_its_rate_is_read_at_once() -> None:
     engine: Any = SimpleNamespace()
-    assert Dispatcher(engine, "shm", caller=NoKey.OPEN).throttled_s() == 0.0
+    assert Sender(engine, "shm", caller=NoKey.OPEN).throttled_s() == 0.0

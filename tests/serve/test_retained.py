@@ -32,7 +32,7 @@ from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.dialects import gr00t
 from vlagents_ray.serve.dialects.base import GatewayContext
 from vlagents_ray.serve.engine.admission import Admission
-from vlagents_ray.serve.engine.dispatch import REFUSALS
+from vlagents_ray.serve.engine.sender import REFUSALS
 from vlagents_ray.wire.lerobot import read_chunk
 from vlagents_ray.wire.pickles import _CONSTANT
 

@@ -14,6 +14,7 @@ from vlagents_ray.errors import PolicyUnavailable, UnknownSession
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.serve.models import agent_copies
 from vlagents_ray.serve.models.agent_copies import AgentCopies
+from vlagents_ray.serve.requests import Origin
 from vlagents_ray.serve.sessions import SessionTable
 
 torch = pytest.importorskip("torch")
@@ -229,8 +230,8 @@ def test_another_version_of_a_policy_has_another_fingerprint() -> None:
 def test_a_connection_ends_its_own_sessions_only() -> None:
     table = SessionTable(limit=10, idle_s=60)
     for name in ("a", "b"):
-        table.open(name, "left")
-    table.open("b", "right")  # its client came again, by another connection
+        table.open(name, Origin(owner="left"))
+    table.open("b", Origin(owner="right"))  # its client came again, by another connection
     table.open("c")
     table.close_owned("left", ["a", "b", "c", "d"])
     assert table.ids() == ["b", "c"]

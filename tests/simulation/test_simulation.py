@@ -13,13 +13,12 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
+from in_flight import submit
 
 from tests.simulation.clients import Robot, Violation, play
 from tests.simulation.world import Replica, World
 from vlagents_ray.errors import UnknownSession, VLAgentsError
-from vlagents_ray.protocol.messages import Reply, Request
-from vlagents_ray.serve.engine.dispatch import Dispatcher
-from vlagents_ray.serve.engine.responses import ReplyCollector
+from vlagents_ray.serve.requests import PendingRequest
 from vlagents_ray.serve.scaling import held_sessions, session_migration
 from vlagents_ray.serve.sessions import Session
 
@@ -113,21 +112,22 @@ def export_at_once(replica: Replica) -> None:
     held.release = release  # type: ignore[method-assign]
 
 
-class LateSender(Dispatcher):
+def deadlines_begin_anew(replica: Replica) -> None:
     """Counts the deadline anew once the session was fetched, and asks nobody whether it was answered."""
+    engine = replica.engine
 
-    def _refuse(
-        self, collector: ReplyCollector, index: int, request: Request, error: VLAgentsError, arrived: float | None
-    ) -> None:
+    def seek(pending: PendingRequest, error: VLAgentsError) -> bool:
         def retry() -> None:
             try:
-                self._put([self._ticket(collector, index, request, None, again=True)])
+                submit(engine, pending.session_id, pending.request, pending.done)
             except VLAgentsError as again:
-                collector.put(index, Reply(request.request_id, error=again))
+                pending.fail(again)
 
-        finder = self._engine.finder
-        if not (isinstance(error, UnknownSession) and finder and finder.fetch(self._session(request), retry)):
-            collector.put(index, Reply(request.request_id, error=error))
+        if pending.request.op != "act" or not isinstance(error, UnknownSession) or engine.finder is None:
+            return False
+        return engine.finder.fetch(pending.session_id, retry)
+
+    engine._seek = seek  # type: ignore[method-assign]
 
 
 @pytest.mark.parametrize(
@@ -135,7 +135,7 @@ class LateSender(Dispatcher):
     [
         ({"spoil": overwrite}, "of an older episode|a session was|lost or doubled"),
         ({"spoil": export_at_once}, "a session was"),
-        ({"sender": LateSender}, "never would be|lost or doubled"),
+        ({"spoil": deadlines_begin_anew}, "never would be|lost or doubled"),
     ],
     ids=["older episodes overwrite", "a slow export destroys", "deadlines begin anew"],
 )

@@ -1,6 +1,6 @@
 """Replicas, a network and clients in one thread under a virtual clock, and the faults that a seed has for them.
 
-The queue, the sessions, the engine, the moves between replicas and `Dispatcher` are the real ones. What a replica's
+The queue, the sessions, the engine, the moves between replicas and `Sender` are the real ones. What a replica's
 thread, its event loop and Ray's calls between replicas do is played here: a batch takes a time that is drawn, a message
 is late, comes twice or out of order, or waits until a partition heals; a replica stops, is killed or frozen; clocks are
 set.
@@ -15,14 +15,16 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from in_flight import ask, send
 
 from tests.simulation.virtual_time import Clock, Loop
 from vlagents_ray import Act, Agent, Obs
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.protocol.messages import Op, Reply, Request
 from vlagents_ray.serve.access.api_keys import NoKey
-from vlagents_ray.serve.engine.dispatch import Dispatcher
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.sender import Sender
+from vlagents_ray.serve.queue.batch_queue import Taken
 from vlagents_ray.serve.scaling.held_sessions import Peer, PeerEnded
 from vlagents_ray.serve.scaling.session_migration import SessionMigrator
 
@@ -109,27 +111,28 @@ class Replica:
         """Of the policy's thread."""
         if self._busy:
             return
-        batch = self.engine.queue.take()
+        batch, expired = self.engine.queue.take() or Taken([], [])
+        self.engine.run(Taken([], expired))
         if batch:
             self._busy = True
             draw = self.world.draw
-            self.loop.call_later(self.slowness * draw.random() ** 4 + 0.001, self._finish, batch)
+            self.loop.call_later(self.slowness * draw.random() ** 4 + 0.001, self._finish, Taken(batch, []))
         elif self.engine.queue.depth():
             self._wake()
 
-    def _finish(self, batch: Any) -> None:
-        self.engine.queue.run_timed(batch)
+    def _finish(self, taken: Taken) -> None:
+        self.engine.run(taken)
         self._busy = False
         self._turn()
 
     def receive(self, request: Request, session_id: str, answer: Callable[[list[Reply]], None], timed: bool) -> None:
         """A client's request: `timed` as over HTTP, else as over a connection, where only the queue knows deadlines."""
-        sender = self.world.sender(self.engine, "http", session_id, connected=False, caller=NoKey.OPEN)
+        sender = Sender(self.engine, "http", session_id, connected=False, caller=NoKey.OPEN)
         if timed:
-            task = self.loop.create_task(sender.ask([request]))
+            task = self.loop.create_task(ask(sender, [request]))
             task.add_done_callback(lambda done: answer(done.result()))
         else:
-            sender.send([request], answer)
+            send(sender, [request], answer)
 
 
 class _Peer(Peer):
@@ -186,16 +189,10 @@ class Plan:
 
 
 class World:
-    """All of it, for one seed. `spoil` may undo a fix in each replica; `sender` is what serves the clients."""
+    """All of it, for one seed. `spoil` may undo a fix in each replica."""
 
-    def __init__(
-        self,
-        seed: int,
-        spoil: Callable[[Replica], None] = lambda _: None,
-        sender: type[Dispatcher] = Dispatcher,
-    ) -> None:
+    def __init__(self, seed: int, spoil: Callable[[Replica], None] = lambda _: None) -> None:
         self.draw = random.Random(seed)
-        self.sender = sender
         self.clock = Clock()
         self.plan = Plan(self.draw)
         self.log = Log()

@@ -10,6 +10,8 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
+from in_flight import submit
+
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.connection import Connection
 from vlagents_ray.client.transports.codec_selection import CodecChoice
@@ -29,8 +31,8 @@ from vlagents_ray.protocol.messages import (
     Request,
 )
 from vlagents_ray.serve.access.api_keys import NoKey
-from vlagents_ray.serve.engine.dispatch import Dispatcher
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.sender import Sender
 from vlagents_ray.serve.models.checkpoints import Checkpoints
 from vlagents_ray.serve.scaling.held_sessions import Peer, PeerEnded
 from vlagents_ray.serve.scaling.session_migration import SessionMigrator
@@ -93,7 +95,7 @@ class InProcess:
 
     def __init__(self, replicas: Replicas) -> None:
         self._replicas = replicas
-        self._sender: Dispatcher | None = None
+        self._sender: Sender | None = None
         self._number = -1
 
     def connect(self, timeout_s: float) -> dict[str, Any]:
@@ -103,7 +105,7 @@ class InProcess:
         numbered = sorted(enumerate(self._replicas.engines), key=lambda one: one[0] != self._replicas.prefer)
         for number, engine in numbered:
             if number not in self._replicas.dead | self._replicas.frozen and not engine.draining:
-                self._number, self._sender = number, Dispatcher(engine, "in process", caller=NoKey.OPEN)
+                self._number, self._sender = number, Sender(engine, "in process", caller=NoKey.OPEN)
                 contract = engine.contract
                 return {"protocol": PROTOCOL_VERSION, "contract": contract.to_json() if contract else None}
         raise PolicyUnavailable("no replica lives")
@@ -121,9 +123,8 @@ class InProcess:
             raise DeadlineExceeded("no answer")
         answers: queue.SimpleQueue[bytes] = queue.SimpleQueue()
         frame = encode_requests(requests)
-        self._sender.send(
-            decode_requests(frame, Budget(DEFAULT_LIMITS)), lambda replies: answers.put(encode_replies(replies))
-        )
+        decoded = decode_requests(frame, Budget(DEFAULT_LIMITS))
+        self._sender.send(self._sender.message(), decoded, lambda message: answers.put(encode_replies(message.replies)))
         try:
             answer = answers.get(timeout=timeout_s)
         except queue.Empty:
@@ -173,5 +174,5 @@ def version_of(state: dict[str, Any]) -> tuple[int, int]:
 
 def _ask(engine: Engine, session_id: str, request: Request) -> Reply:
     replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
-    engine.submit(session_id, request, replies.put)
+    submit(engine, session_id, request, replies.put)
     return replies.get(timeout=30)

@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from in_flight import submit
 
 from vlagents_ray import Act, Agent, Obs
 from vlagents_ray.contract import Contract, StateSpec
@@ -100,7 +101,7 @@ class Library:
 def ask(engine: Engine, session: str, op: str, **fields: Any) -> queue.SimpleQueue[Reply]:
     """Where the answer will come."""
     replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
-    engine.submit(session, Request(op, Obs(**fields.pop("obs", {})), **fields), replies.put)  # type: ignore[arg-type]
+    submit(engine, session, Request(op, Obs(**fields.pop("obs", {})), **fields), replies.put)  # type: ignore[arg-type]
     return replies
 
 

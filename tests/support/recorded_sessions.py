@@ -11,14 +11,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from in_flight import send
 
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.config.deployment import RecordArgs
-from vlagents_ray.serve.engine.dispatch import Dispatcher
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.sender import Sender
 from vlagents_ray.serve.recording.recorder import SessionRecorder
 from vlagents_ray.serve.replica.recording import open_recorder
 
@@ -56,16 +57,16 @@ class Recorded:
     recorder: SessionRecorder
 
     def robot(self) -> Robot:
-        return Robot(Dispatcher(self.engine, "shm", caller=NoKey.OPEN))
+        return Robot(Sender(self.engine, "shm", caller=NoKey.OPEN))
 
 
 @dataclass(frozen=True)
 class Robot:
-    sender: Dispatcher
+    sender: Sender
 
     def ask(self, request: Request) -> Reply:
         replies: Future[list[Reply]] = Future()
-        self.sender.send([request], replies.set_result)
+        send(self.sender, [request], replies.set_result)
         [reply] = replies.result(10)
         return reply
 

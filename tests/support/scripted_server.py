@@ -37,7 +37,7 @@ class Visit:
         data = self.socket.recv()
         while bytes(data[:4]) == b"VLA?":  # type: ignore[arg-type]
             data = self.socket.recv()
-        [request] = decode_requests(data, Budget(DEFAULT_LIMITS))  # type: ignore[arg-type]
+        [request] = decode_requests(data, Budget(DEFAULT_LIMITS)).requests  # type: ignore[arg-type]
         assert isinstance(request, Request), request
         self.requests.append(request)
         return request

@@ -27,6 +27,7 @@ from vlagents_ray.serve.launch.deployment_file import own_settings, policy_appli
 from vlagents_ray.serve.models.checkpoints import CHOICE, STEP
 from vlagents_ray.serve.python_env.child_agent import make_agent, version_of
 from vlagents_ray.serve.python_env.probe import with_process
+from vlagents_ray.serve.requests import PendingRequest, Rank
 from vlagents_ray.serve.weights.updates import OPTION
 
 Sessions = Callable[[], Agent]
@@ -60,7 +61,7 @@ class LocalAgent(Agent):
 
     def _ask(self, request: Request) -> Reply:
         answer: Future[Reply] = Future()
-        self._engine.submit(self._session, request, answer.set_result)
+        self._engine.submit([PendingRequest(self._session, request, answer.set_result, Rank.SIMULATION)])
         reply = answer.result()
         if reply.error is not None:
             raise reply.error

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 from vlagents_ray.errors import (
     MalformedMessage,
@@ -95,8 +95,15 @@ def _write_request(request: Request, writer: ValueWriter, codec: ImageCodec) -> 
     return node
 
 
-def decode_requests(data: Buffer, budget: Budget, ops: Sequence[Op] = OPS) -> list[Request | Reply]:
-    """Return the requests in a frame, each one of `ops`; a refused request is replaced by the reply with its error.
+class Decoded(NamedTuple):
+    """The requests of a frame, and the answers to those that could not be read, by their places among all."""
+
+    requests: list[Request]
+    refused: dict[int, Reply]
+
+
+def decode_requests(data: Buffer, budget: Budget, ops: Sequence[Op] = OPS) -> Decoded:
+    """Return the requests in a frame, each one of `ops`.
 
     `budget` is charged for the message before any of it is parsed, and for each further request before its images are
     decoded.
@@ -114,17 +121,17 @@ def decode_requests(data: Buffer, budget: Budget, ops: Sequence[Op] = OPS) -> li
         raise MalformedMessage(f"requests: got {shown(nodes)}, want a list of requests")
     if len(nodes) > limits.requests:
         raise MessageTooLarge(f"requests: got {len(nodes)}, the limit is {limits.requests} in one frame")
-    read: list[Request | Reply] = []
+    decoded = Decoded([], {})
     reader = ValueReader(blobs, budget)
-    for node in nodes:
+    for place, node in enumerate(nodes):
         try:
             budget.begin(node.get("op"), node.get("rank"))
             reader.begin()
-            read.append(_read_request(node, reader, limits, ops))
+            decoded.requests.append(_read_request(node, reader, limits, ops))
         except VLAgentsError as error:
             name = node.get("request_id")
-            read.append(Reply(name if isinstance(name, str) and is_name(name) else "", error=error))
-    return read
+            decoded.refused[place] = Reply(name if isinstance(name, str) and is_name(name) else "", error=error)
+    return decoded
 
 
 def _read_request(node: dict[str, Any], reader: ValueReader, limits: Limits, ops: Sequence[Op] = OPS) -> Request:

@@ -46,7 +46,8 @@ RANKS: tuple[RankName, ...] = ("robot", "simulation")
 class Request:
     """One call of `Agent.reset`, `Agent.act` or `Agent.close` on a remote policy, or one of `INNER_OPS`.
 
-    It is not frozen, since a frozen one takes three times as long to make (2.2 instead of 0.7 us).
+    Once it was decoded, nothing of it is changed, and only `drop_observations` takes something away. It is not frozen,
+    since a frozen one takes three times as long to make (2.2 instead of 0.7 us).
     """
 
     op: Op
@@ -62,7 +63,12 @@ class Request:
     step: int | None = None
     request_id: str = ""
     deadline_ms: float | None = None  # how long the reply is of use, counted from the arrival of the request
-    waited_ms: float = 0.0  # how much of the deadline had passed when the server read it; not sent
+
+    def drop_observations(self) -> None:
+        """Let go of the observations, which were used, and may lie in memory that their sender wants back."""
+        self.obs = None
+        if self.history:
+            self.history = []
 
 
 @dataclass(slots=True)

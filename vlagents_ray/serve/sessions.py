@@ -16,7 +16,7 @@ from typing import Generic, Protocol, TypeVar
 
 from vlagents_ray.errors import PolicyUnavailable, TooManyRequests, UnknownSession
 from vlagents_ray.interface import Agent
-from vlagents_ray.serve.queue.fair_queue import PendingRequest
+from vlagents_ray.serve.requests import NOWHERE, Origin, PendingRequest
 from vlagents_ray.serve.weights.versions import WeightsVersion
 
 M = TypeVar("M")  # type of a loaded model
@@ -50,14 +50,12 @@ class Session(Generic[M]):
     told_to_follow: bool | None = None  # what an operator wants of its later episodes; None: what their resets say
     over: bool = False  # whether the session has ended, so that no table contains it
     resetting: PendingRequest | None = None  # reset that waits for its checkpoint
-    owner: str = ""  # connection with which it ends; if empty, it ends when it is closed or idle for long
+    origin: Origin = NOWHERE  # of its last request; without an owner it ends when it is closed or idle for long
     steps: int = 0  # step of its state: drawn at each reset, above all earlier steps, and incremented by each act
     first: int = 0  # step drawn at the last reset that was run
     expected: int = 0  # step drawn for the latest reset, which may still be queued
     moves: int = 0  # number of moves between replicas since the last reset
     announced: bool = False  # whether the other replicas know that it is here, so that they keep no older state
-    transport: str = ""  # transport of its last request
-    connection: str = ""  # connection of its last request, if that carries several sessions; otherwise its own
     used: float = field(default_factory=time.monotonic)  # time of its last request, s
 
     @property
@@ -133,32 +131,18 @@ class SessionTable(Generic[M]):
         session.used = time.monotonic()
         return session
 
-    def open(
-        self,
-        session_id: str,
-        owner: str = "",
-        transport: str = "",
-        connection: str = "",
-        quota: tuple[str, int | None] | None = None,
-    ) -> Session[M]:
-        """Return the session, which is created if it is new.
-
-        Args:
-            session_id: Id of the session.
-            owner: Connection with which the session ends; empty if it has none.
-            transport: Transport of the request.
-            connection: Connection of the request, if it carries several sessions.
-            quota: A prefix of session ids, and the largest number of sessions with it (None: no limit).
+    def open(self, session_id: str, origin: Origin = NOWHERE) -> Session[M]:
+        """Return the session, which is created if it is new, for a request from there.
 
         Raises:
             PolicyUnavailable: The replica holds as many sessions as it may.
-            TooManyRequests: The quota is used up.
+            TooManyRequests: The key of the origin's caller holds as many sessions as it may.
         """
         with self._lock:
             session = self._sessions.get(session_id)
             if session is None:
-                if quota is not None and quota[1] is not None:
-                    self._require_below(quota[0], quota[1])
+                if origin.caller is not None and (most := origin.caller.sessions) is not None:
+                    self._require_below(origin.prefix, most)
                 if len(self._sessions) >= self.limit:
                     self._drop_idle()
                 if len(self._sessions) >= self.limit:
@@ -166,7 +150,7 @@ class SessionTable(Generic[M]):
                 session = self._sessions[session_id] = Session(session_id)
                 self.opened += 1
         session.used = time.monotonic()
-        session.owner, session.transport, session.connection = owner, transport, connection
+        session.origin = origin
         return session
 
     def begin(self, session: Session[M], known: int | None) -> int:
@@ -273,7 +257,7 @@ class SessionTable(Generic[M]):
         with self._lock:
             for session_id in session_ids:
                 session = self._sessions.get(session_id)
-                if session is not None and session.owner == connection:
+                if session is not None and session.origin.owner == connection:
                     self._forget(session_id)
 
     def close_those_of(self, model: M) -> None:
@@ -289,14 +273,14 @@ class SessionTable(Generic[M]):
     def by_transport(self) -> dict[str, int]:
         """Return the number of sessions by transport."""
         with self._lock:
-            return Counter(session.transport for session in self._sessions.values())
+            return Counter(session.origin.transport for session in self._sessions.values())
 
     def by_connection(self, transports: Container[str], within_s: float) -> Counter[str]:
         """Return the number of sessions by connection, over these transports and used within the last `within_s`."""
         since = time.monotonic() - within_s
         with self._lock:
             sessions = list(self._sessions.values())
-        return Counter(s.connection for s in sessions if s.transport in transports and s.used >= since)
+        return Counter(s.origin.connection for s in sessions if s.origin.transport in transports and s.used >= since)
 
     def ids(self) -> list[str]:
         """Return the ids of all sessions."""

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from fake_cuda import FakeCuda
+from in_flight import checked, submit
 
 from vlagents_ray import Obs
 from vlagents_ray.contract import ActionSpec, Contract
@@ -166,7 +167,7 @@ def test_an_act_that_waits_for_the_device_waits_for_the_end_of_a_capture(cuda: F
 
     def ask(op: Any) -> queue.SimpleQueue[Reply]:
         replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
-        engine.submit("a", Request(op, Obs()), replies.put)
+        submit(engine, "a", Request(op, Obs()), replies.put)
         return replies
 
     try:
@@ -258,10 +259,11 @@ def test_a_model_on_a_gpu_acts_from_graphs_in_less_memory_and_until_the_gpu_fail
         replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
         tickets = []
         for op in ("reset", "act"):
-            tickets = [
-                engine.ticket(str(seed), Request(op, Obs(), "go", {"seed": seed} if op == "reset" else {}), replies.put)  # type: ignore[arg-type]
-                for seed in range(rows)
-            ]
+            given: dict[str, Any] = {"instruction": "go"} if op == "reset" else {}
+            tickets = []
+            for seed in range(rows):
+                request = Request(op, Obs(), **given, kwargs={"seed": seed} if op == "reset" else {})  # type: ignore[arg-type]
+                tickets.append(checked(engine, str(seed), request, replies.put))
             engine.queue.put(*tickets)
             found = [replies.get(timeout=10) for _ in tickets]
         return found

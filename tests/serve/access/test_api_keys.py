@@ -17,6 +17,7 @@ from typing import Any
 
 import pytest
 from eval_fakes import wait_for
+from in_flight import send
 
 from vlagents_ray import Obs
 from vlagents_ray.errors import ConfigError, Forbidden, TooManyRequests, Unauthorized
@@ -35,8 +36,8 @@ from vlagents_ray.serve.access.key_store import (
     read_keys,
     revoke,
 )
-from vlagents_ray.serve.engine.dispatch import Dispatcher
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.sender import Sender
 
 
 @pytest.fixture
@@ -441,7 +442,7 @@ def test_a_reset_stands_in_the_audit_log_with_its_key_and_its_session(
     engine = Engine(Noop.from_config({}))
     engine.start()
     answered: queue.SimpleQueue[list[Reply]] = queue.SimpleQueue()
-    Dispatcher(engine, "http", "robot-1", connected=False, caller=caller).send([Request("reset", Obs())], answered.put)
+    send(Sender(engine, "http", "robot-1", connected=False, caller=caller), [Request("reset", Obs())], answered.put)
     [reply] = answered.get(timeout=30)
     engine.close()
     assert reply.error is None

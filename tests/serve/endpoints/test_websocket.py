@@ -28,7 +28,7 @@ from vlagents_ray.errors import (
     NotReset,
 )
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.protocol.frames import decode_reply, decode_requests, encode_request
+from vlagents_ray.protocol.frames import Decoded, decode_reply, decode_requests, encode_request
 from vlagents_ray.protocol.messages import (
     STREAM_BYTES,
     Budget,
@@ -233,7 +233,7 @@ def test_connections_that_say_nothing_make_way(endpoint: WebSocketServer) -> Non
 def test_what_nobody_foresaw_ends_the_connection_that_it_came_by_alone(
     endpoint: WebSocketServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def decode(frame: bytes, budget: Budget) -> list[Request | Reply]:
+    def decode(frame: bytes, budget: Budget) -> Decoded:
         if frame == b"surprise":
             raise RuntimeError
         return decode_requests(frame, budget)

@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 from asgi_server import served
 from eval_fakes import wait_for
+from in_flight import ask as ask_of
 from starlette.types import Receive, Scope, Send
 
 from vlagents_ray.client.transports.direct_websocket import Stream
@@ -33,8 +34,8 @@ from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.arrival import SPACE, PauseDetector, enable_timestamps, waited_s
-from vlagents_ray.serve.engine.dispatch import Dispatcher
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.sender import Sender
 
 DEADLINE_MS = 300.0
 
@@ -249,11 +250,11 @@ def test_a_request_that_serve_read_late_after_a_pause_is_not_acted_on() -> None:
     engine.pauses.stop()
     engine.pauses = PauseDetector(lambda: now)
     engine.pauses._checked = now
-    sender = Dispatcher(engine, "http", caller=NoKey.OPEN)
+    sender = Sender(engine, "http", caller=NoKey.OPEN)
 
     def ask(op: str) -> Reply:
         request = Request(op, Obs(), request_id="1", deadline_ms=60_000.0)
-        (reply,) = asyncio.run(sender.ask([request]))
+        (reply,) = asyncio.run(ask_of(sender, [request]))
         return reply
 
     assert ask("reset").error is None

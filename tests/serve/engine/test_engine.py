@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from in_flight import submit
 
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.errors import (
@@ -52,7 +53,7 @@ class Echo(Agent):
 
 def ask(engine: Engine, session: str, op: str, info: dict[str, Any] | None = None, **fields: Any) -> Reply:
     replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
-    engine.submit(session, Request(op, Obs(info=info or {}), **fields), replies.put)  # type: ignore[arg-type]
+    submit(engine, session, Request(op, Obs(info=info or {}), **fields), replies.put)  # type: ignore[arg-type]
     return replies.get(timeout=10)
 
 
@@ -190,7 +191,7 @@ def test_a_batch_goes_to_the_initialized_agent_in_one_call(serving: Callable[...
     replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
     for _ in range(20):
         for name in names:
-            engine.submit(name, Request("act", Obs(), request_id=name), replies.put)
+            submit(engine, name, Request("act", Obs(), request_id=name), replies.put)
     answers = [replies.get(timeout=10) for _ in range(160)]
     assert all(reply.act is not None and reply.act.info["instruction"] == reply.request_id for reply in answers)
     assert sum(agent.sizes) == 160

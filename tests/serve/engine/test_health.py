@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from in_flight import submit
 
 from vlagents_ray.errors import InvalidObservation, PolicyFailed, PolicyUnavailable
 from vlagents_ray.interface import Act, Agent, Obs
@@ -63,7 +64,7 @@ def engine(agent: Failing) -> Iterator[Engine]:
 def ask(engine: Engine) -> Callable[[Any], Exception | None]:
     def ask(op: Any) -> Exception | None:
         replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
-        engine.submit("a", Request(op, Obs()), replies.put)
+        submit(engine, "a", Request(op, Obs()), replies.put)
         return replies.get(timeout=10).error
 
     return ask

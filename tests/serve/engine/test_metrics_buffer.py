@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from eval_fakes import wait_for
+from in_flight import send, submit
 from starlette.testclient import TestClient
 
 from vlagents_ray.client.transports.shm import ShmTransport
@@ -30,14 +31,14 @@ from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.endpoints.shm import ShmServer
-from vlagents_ray.serve.engine.dispatch import Dispatcher
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.metrics_buffer import (
     SAMPLE,
-    LoadMeter,
     MetricsBuffer,
-    RequestTrace,
 )
+from vlagents_ray.serve.engine.sender import Sender
+from vlagents_ray.serve.queue.batch_queue import LoadMeter
+from vlagents_ray.serve.requests import Message
 
 OBS = Obs({"front": np.random.default_rng(0).integers(0, 255, (64, 64, 3), np.uint8)}, 0.5)
 
@@ -194,10 +195,10 @@ def test_all_are_counted_from_whatever_thread_and_a_fair_sample_is_kept() -> Non
 def test_a_request_leaves_nothing_to_the_garbage_collector(engine: Engine) -> None:
     """It would stop the policy for it, again and again."""
     engine.start()
-    sender, answered = Dispatcher(engine, "shm", caller=NoKey.OPEN), threading.Semaphore(0)
+    sender, answered = Sender(engine, "shm", caller=NoKey.OPEN), threading.Semaphore(0)
 
     def ask(op: Op) -> None:
-        sender.send([Request(op, Obs())], lambda _: answered.release())
+        send(sender, [Request(op, Obs())], lambda _: answered.release())
         assert answered.acquire(timeout=10)
 
     ask("reset")
@@ -217,7 +218,7 @@ def test_load_is_the_busy_share_and_the_mean_queue(engine: Engine) -> None:
     meter = LoadMeter(engine.queue)
     answered = threading.Semaphore(0)
     for name in ("a", "b", "c"):
-        engine.submit(name, Request("reset", Obs()), lambda _: answered.release() and None)
+        submit(engine, name, Request("reset", Obs()), lambda _: answered.release() and None)
     assert all(answered.acquire(timeout=10) for _ in range(3))
     meter.read()
     time.sleep(0.2)
@@ -225,10 +226,10 @@ def test_load_is_the_busy_share_and_the_mean_queue(engine: Engine) -> None:
     assert quiet.utilisation < 0.2
     assert quiet.waiting == 0
     Large.gate.clear()
-    engine.submit("a", Request("act", Obs(info={"wait": True})), lambda _: answered.release() and None)
+    submit(engine, "a", Request("act", Obs(info={"wait": True})), lambda _: answered.release() and None)
     wait_for(lambda: engine.queue.depth() == 0)  # it is in its batch
     for name in ("b", "c"):
-        engine.submit(name, Request("act", Obs()), lambda _: answered.release() and None)
+        submit(engine, name, Request("act", Obs()), lambda _: answered.release() and None)
     meter.read()
     time.sleep(0.2)
     loaded = meter.read()
@@ -251,10 +252,15 @@ def test_recording_costs_a_request_little() -> None:
             times.append(time.perf_counter() - begun)
         return sorted(times)[1000]
 
+    def encode() -> None:
+        message = Message(stats, "shm")
+        message.replies = [Reply("x", Act(np.zeros(7)))]
+        message.frame()
+
     rounds = [
         (
             median(lambda: stats.handled(KIND, (1.0, 0.1, 0.2, 0.3, 0.4))),
-            median(lambda: RequestTrace(stats, "shm").frame([Reply("x", Act(np.zeros(7)))])),
+            median(encode),
         )
         for _ in range(5)
     ]

@@ -14,7 +14,7 @@ from vlagents_ray.protocol.messages import Limits, Reply, Request
 from vlagents_ray.serve.config.deployment import LimitArgs
 from vlagents_ray.serve.engine import responses
 from vlagents_ray.serve.engine.responses import build_reply, require_serializable
-from vlagents_ray.serve.queue.batch_queue import PendingRequest
+from vlagents_ray.serve.requests import PendingRequest
 from vlagents_ray.serve.sessions import Session
 
 LIMIT = 1000

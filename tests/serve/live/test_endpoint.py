@@ -112,8 +112,8 @@ def test_errors_and_sessions_that_ended_are_told(server: LiveServer) -> None:
 def test_nothing_is_kept_once_nobody_looks(server: LiveServer) -> None:
     with server.viewer() as viewer:
         ask(viewer)
-        assert server.engine.watchers.one is server.view.tap
-    wait_for(lambda: server.engine.watchers.one is None)
+        assert server.engine.observers.any
+    wait_for(lambda: server.engine.observers.any is False)
 
 
 def test_the_document_is_there_without_a_websocket(server: LiveServer) -> None:
@@ -172,9 +172,9 @@ def test_a_viewer_who_asks_for_nothing_is_let_go(server: LiveServer, monkeypatch
 def test_another_sites_page_sees_nothing_and_does_not_start_the_tap(
     server: LiveServer, headers: dict[str, str]
 ) -> None:
-    wait_for(lambda: server.engine.watchers.one is None)
+    wait_for(lambda: server.engine.observers.any is False)
     assert get(f"{server.url}/v1/live", headers)[0] == 403
-    assert server.engine.watchers.one is None
+    assert server.engine.observers.any is False
     assert not server.fleet.watched
 
 

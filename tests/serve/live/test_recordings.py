@@ -42,7 +42,7 @@ def recorded(server: LiveServer, **targets: str) -> Iterator[None]:
     recordings = SessionRecordings(server.engine, server.view.tap, targets)
     recordings.open()
     try:
-        wait_for(lambda: server.engine.watchers.one is not None)
+        wait_for(lambda: server.engine.observers.any)
         yield
     finally:
         recordings.close()
@@ -110,5 +110,5 @@ def test_without_a_target_nothing_runs_and_nobody_looks() -> None:
         with RemoteAgent(server.url, transport="http") as agent:
             agent.reset(obs(0))
             agent.act(obs(0))
-            assert server.engine.watchers.one is None
+            assert server.engine.observers.any is False
         recordings.close()

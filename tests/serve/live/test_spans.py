@@ -59,7 +59,7 @@ def test_a_request_is_one_trace_from_the_program_to_the_batch(exporter: InMemory
             agent.reset(OBS, "stack")
             assert agent.act(OBS).info["traced"]
         spans.close()
-        assert server.engine.watchers.one is None
+        assert server.engine.observers.any is False
     found = list(exporter.get_finished_spans())
     assert {one.context.trace_id for one in found} == {mine.get_span_context().trace_id}
     [program] = [one for one in found if one.name == "my program"]
@@ -110,7 +110,7 @@ def test_a_client_that_states_no_trace_gets_one_of_the_server(
 def test_nothing_is_traced_unless_it_is_asked_for() -> None:
     with live_server(Picky()) as server, RemoteAgent(server.url, transport="http") as agent:
         assert open_spans(server.engine, "replica-1") is None
-        assert server.engine.watchers.one is None
+        assert server.engine.observers.any is False
         assert "_call" not in vars(agent)
         agent.reset(OBS, "stack")
         assert not agent.act(OBS).info["traced"]

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from in_flight import checked
 from numbered_checkpoints import begin
 
 from vlagents_ray import Act, Agent, Obs
@@ -86,7 +87,7 @@ def test_sessions_of_one_base_act_in_one_batch_and_say_what_acted(
     assert told(engine, "s2") == {"checkpoint": "/runs/a", "weights": "whole:/runs/a"}
     assert told(engine, "s3", checkpoint="late") == {"checkpoint": "/runs/b", "weights": "whole:/runs/b"}
     replies: list[queue.SimpleQueue[Reply]] = [queue.SimpleQueue() for _ in range(4)]
-    engine.queue.put(*(engine.ticket(f"s{i}", Request("act", Obs()), replies[i].put) for i in range(4)))
+    engine.queue.put(*(checked(engine, f"s{i}", Request("act", Obs()), replies[i].put) for i in range(4)))
     acts = [one.get(timeout=120).act for one in replies]
     assert [one.info[POLICY]["fingerprint"] for one in acts if one is not None][:2] == ["stack", "pour"]
     assert [agent.batches for agent in made] == [[["stack", "pour", ""]], [[""]]]

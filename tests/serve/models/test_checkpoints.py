@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from eval_fakes import wait_for
+from in_flight import checked, submit
 from in_process_replicas import Replicas, export
 from numbered_checkpoints import Library, act, ask, begin, reset
 
@@ -29,8 +30,7 @@ from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.models import model_cache
 from vlagents_ray.serve.models.checkpoints import Checkpoints
-from vlagents_ray.serve.queue.batch_queue import PendingRequest
-from vlagents_ray.serve.queue.fair_queue import CheckpointChoice
+from vlagents_ray.serve.requests import CheckpointChoice, PendingRequest
 from vlagents_ray.serve.sessions import Session
 
 
@@ -79,7 +79,7 @@ def test_a_batch_is_run_checkpoint_by_checkpoint(serving: Callable[..., Engine],
     for i in range(4):
         reset(engine, f"s{i}", checkpoint="b" if i % 2 else None)
     replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
-    tickets = [engine.ticket(f"s{i}", Request("act", Obs()), replies.put) for i in range(4)]
+    tickets = [checked(engine, f"s{i}", Request("act", Obs()), replies.put) for i in range(4)]
     engine.queue.put(*tickets)
     numbers = sorted(float(replies.get(timeout=10).act.action[0]) for _ in range(4))  # type: ignore[union-attr]
     assert numbers == [1, 1, 2, 2]
@@ -189,7 +189,7 @@ def test_ten_checkpoints_have_their_turns_with_room_for_two(
 
     def play(client: int) -> None:
         request = Request("reset", Obs(), kwargs={"checkpoint_step": client})
-        engine.submit(f"s{client}", request, lambda reply: replies.put((client, reply)))
+        submit(engine, f"s{client}", request, lambda reply: replies.put((client, reply)))
 
     for client in range(10):
         play(client)
@@ -277,7 +277,7 @@ def test_a_reset_that_is_given_up_once_its_checkpoint_is_there_keeps_none(
 
     def given_up(*tickets: PendingRequest) -> None:
         for ticket in tickets:
-            ticket.cancelled = True
+            ticket.over = True
         put(*tickets)
 
     gate = library.hold("b/2")

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
+from in_flight import submit
 from pydantic import ValidationError
 
 from vlagents_ray.errors import PolicyFailed
@@ -67,7 +68,7 @@ def ask(engine: Engine, session: str, op: Any, value: int = 0, **fields: Any) ->
     replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
     if op == "reset":
         fields |= {"instruction": session, "kwargs": {"env": "lab"}}
-    engine.submit(session, Request(op, Obs(info={"value": value}), **fields), replies.put)
+    submit(engine, session, Request(op, Obs(info={"value": value}), **fields), replies.put)
     return replies.get(timeout=10)
 
 
@@ -94,10 +95,10 @@ def test_a_batch_is_padded_up_to_the_next_size(serving: Callable[[Compiled], Eng
         ask(engine, name, "reset")
     replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
     busy, released = threading.Event(), threading.Event()
-    engine.submit("s0", Request("close"), lambda _: busy.set() or (released.wait(10) and None))
+    submit(engine, "s0", Request("close"), lambda _: busy.set() or (released.wait(10) and None))
     assert busy.wait(10)  # the policy's thread is in there while all come
     for name in names[1:]:
-        engine.submit(name, Request("act", Obs(info={"value": int(name[1:])})), replies.put)
+        submit(engine, name, Request("act", Obs(info={"value": int(name[1:])})), replies.put)
     released.set()
     answers = [replies.get(timeout=10) for _ in names[1:]]
     assert [len(batch) for batch in agent.batches] == [8, 2]
@@ -146,7 +147,7 @@ def test_without_padding_the_batch_runs_as_it_is(serving: Callable[[Compiled], E
 def test_a_refused_first_reset_is_not_what_padding_begins_with(serving: Callable[[Compiled], Engine]) -> None:
     engine = serving(Compiled())
     replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
-    engine.submit("bad", Request("reset", Obs(), "bad"), replies.put)  # lacks the `env` that it wants
+    submit(engine, "bad", Request("reset", Obs(), "bad"), replies.put)  # lacks the `env` that it wants
     assert isinstance(replies.get(timeout=10).error, PolicyFailed)
     ask(engine, "good", "reset")
     assert ask(engine, "good", "act").error is None

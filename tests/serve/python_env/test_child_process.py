@@ -15,6 +15,7 @@ import numpy as np
 import psutil
 import pytest
 from eval_fakes import wait_for
+from in_flight import checked, submit
 from in_process_replicas import export
 from virtual_environments import ended
 
@@ -82,7 +83,7 @@ def ask_all(engine: Engine, requests: list[tuple[str, Request]]) -> list[Reply]:
         if len(replies) == len(requests):
             over.set()
 
-    engine.queue.put(*[engine.ticket(session, request, done) for session, request in requests])
+    engine.queue.put(*[checked(engine, session, request, done) for session, request in requests])
     assert over.wait(30)
     return replies
 
@@ -143,7 +144,7 @@ def test_one_that_hangs_is_noticed_and_keeps_nobody_waiting() -> None:
     os.kill(pid, signal.SIGSTOP)
     wait_for(lambda: psutil.Process(pid).status() == psutil.STATUS_STOPPED, 30)  # else it may answer once more
     replies: list[Reply] = []
-    one.submit("a", Request("act", observation()), replies.append)
+    submit(one, "a", Request("act", observation()), replies.append)
     wait_for(lambda: not one.ready, 30)
     one.notice_hung()
     assert isinstance(replies[0].error, DeadlineExceeded)
@@ -185,7 +186,7 @@ def test_a_policys_error_is_its_sessions_alone_and_its_text_stays_in_the_log(
     assert "RuntimeError" in str(error)
     assert "/no/path" not in str(error)
     with pytest.raises(NotReset):
-        engine.ticket("bad", Request("act", observation()), lambda _: None)
+        checked(engine, "bad", Request("act", observation()), lambda _: None)
     assert info(ask(engine, "good", "act"))["acts"] == 1
     wait_for(lambda: "/no/path/of/ours" in capfd.readouterr().err, 10)
 

@@ -1,210 +1,119 @@
-"""The batch queue: work-conserving, ordered, and never stuck."""
+"""The batch queue: work-conserving and ordered; and the policy's thread, which nothing stops."""
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 
+import numpy as np
 import pytest
 from eval_fakes import wait_for
+from in_flight import pending
 
 from vlagents_ray.errors import DeadlineExceeded, PolicyFailed, PolicyUnavailable
+from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.messages import Reply, Request
-from vlagents_ray.serve.queue.batch_queue import BatchQueue, PendingRequest, Rank
-
-
-class Harness:
-    """A queue whose policy waits at a gate, so that a test decides what waits together."""
-
-    def __init__(self, max_batch_size: int = 4) -> None:
-        self.batches: list[list[str]] = []
-        self.replies: dict[str, Reply] = {}
-        self.gate = threading.Semaphore(0)
-        self.busy = threading.Semaphore(0)
-        self.answered = threading.Condition()
-        self.fail: BaseException | None = None
-        self.queue = BatchQueue(self._run, max_batch_size)
-        self.queue.start()
-
-    def _run(self, batch: Sequence[PendingRequest]) -> None:
-        self.batches.append([ticket.request.request_id for ticket in batch])
-        self.busy.release()
-        self.gate.acquire()
-        if self.fail is not None:
-            error, self.fail = self.fail, None
-            raise error
-        for ticket in batch:
-            ticket.answer(Reply(ticket.request.request_id))
-
-    def put(
-        self, name: str, session: str | None = None, rank: Rank = Rank.SIMULATION, **fields: float
-    ) -> PendingRequest:
-        def done(reply: Reply) -> None:
-            with self.answered:
-                self.replies[name] = reply
-                self.answered.notify_all()
-
-        ticket = PendingRequest(session or name, Request("act", request_id=name, **fields), done, rank)  # type: ignore[arg-type]
-        self.queue.put(ticket)
-        return ticket
-
-    def occupy(self) -> None:
-        """Make the policy busy with a request of its own."""
-        self.put("first")
-        assert self.busy.acquire(timeout=5)
-
-    def finish(self, *names: str) -> None:
-        """Open the gate until these have replies."""
-        with self.answered:
-            self.gate.release(100)
-            assert self.answered.wait_for(lambda: all(n in self.replies for n in names), timeout=5), self.replies
+from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.queue.batch_queue import BatchQueue
+from vlagents_ray.serve.requests import PendingRequest, Rank
 
 
 @pytest.fixture
-def harness() -> Iterator[Callable[..., Harness]]:
-    made: list[Harness] = []
+def queue() -> Iterator[Callable[[int], BatchQueue]]:
+    made: list[BatchQueue] = []
 
-    def make(**options: int) -> Harness:
-        made.append(Harness(**options))
+    def make(max_batch_size: int) -> BatchQueue:
+        made.append(BatchQueue(max_batch_size))
+        made[-1].bind()
         return made[-1]
 
     yield make
     for one in made:
-        one.gate.release(100)
-        one.queue.close(timeout_s=5)
-        assert not one.queue.alive()
+        one.release()
 
 
-def test_what_waits_is_taken_together_up_to_the_limit(harness: Callable[..., Harness]) -> None:
-    h = harness(max_batch_size=3)
-    h.occupy()
+def put(
+    queue: BatchQueue, name: str, session: str = "", rank: Rank = Rank.SIMULATION, **fields: float
+) -> PendingRequest:
+    one = pending(session or name, Request("act", request_id=name, **fields), lambda _: None)  # type: ignore[arg-type]
+    one.rank = rank
+    queue.put(one)
+    return one
+
+
+def batch(queue: BatchQueue) -> list[str]:
+    """The names of what the policy gets next."""
+    taken = queue.take()
+    assert taken is not None
+    return [one.request.request_id for one in taken.batch]
+
+
+def test_what_waits_is_taken_together_up_to_the_limit(queue: Callable[[int], BatchQueue]) -> None:
+    waiting = queue(3)
     for name in "abcd":
-        h.put(name)
-    h.finish(*"abcd")
-    assert h.batches == [["first"], ["a", "b", "c"], ["d"]]
+        put(waiting, name)
+    assert [batch(waiting), batch(waiting)] == [["a", "b", "c"], ["d"]]
 
 
-def test_a_lone_request_does_not_wait_for_others(harness: Callable[..., Harness]) -> None:
-    h = harness()
-    h.put("a")
-    h.finish("a")
-    assert h.batches == [["a"]]
+def test_a_lone_request_does_not_wait_for_others(queue: Callable[[int], BatchQueue]) -> None:
+    waiting = queue(4)
+    put(waiting, "a")
+    taken = waiting.next()
+    assert taken is not None
+    assert len(taken.batch) == 1
 
 
-def test_robots_go_before_simulations(harness: Callable[..., Harness]) -> None:
-    h = harness(max_batch_size=2)
-    h.occupy()
+def test_robots_go_before_simulations(queue: Callable[[int], BatchQueue]) -> None:
+    waiting = queue(2)
     for name in "abc":
-        h.put(name)
-    h.put("robot", rank=Rank.ROBOT)
-    h.finish(*"abc", "robot")
-    assert h.batches[1] == ["robot", "a"]
+        put(waiting, name)
+    put(waiting, "robot", rank=Rank.ROBOT)
+    assert batch(waiting) == ["robot", "a"]
 
 
-def test_a_session_is_in_a_batch_once_and_in_order(harness: Callable[..., Harness]) -> None:
-    h = harness()
-    h.occupy()
+def test_a_session_is_in_a_batch_once_and_in_order(queue: Callable[[int], BatchQueue]) -> None:
+    waiting = queue(4)
     for name in ("a1", "a2", "a3", "b1"):
-        h.put(name, session=name[0])
-    h.finish("a1", "a2", "a3", "b1")
-    assert h.batches[1:] == [["a1", "b1"], ["a2"], ["a3"]]
+        put(waiting, name, session=name[0])
+    assert [batch(waiting) for _ in range(3)] == [["a1", "b1"], ["a2"], ["a3"]]
 
 
-def test_an_expired_request_never_reaches_the_policy(harness: Callable[..., Harness]) -> None:
-    h = harness()
-    h.occupy()
-    ticket = h.put("late", deadline_ms=1.0)
-    ticket.arrived -= 1.0  # a second ago
-    h.put("good")
-    h.finish("late", "good")
-    assert isinstance(h.replies["late"].error, DeadlineExceeded)
-    assert h.batches[1:] == [["good"]]
+def test_an_expired_request_never_reaches_the_policy(queue: Callable[[int], BatchQueue]) -> None:
+    waiting = queue(4)
+    late = put(waiting, "late", deadline_ms=1.0)
+    late.deadline -= 1.0
+    put(waiting, "good")
+    taken = waiting.take()
+    assert taken is not None
+    assert [one.request.request_id for one in taken.batch] == ["good"]
+    assert taken.expired == [late]
 
 
-def test_a_cancelled_request_never_reaches_the_policy(harness: Callable[..., Harness]) -> None:
-    h = harness()
-    h.occupy()
-    h.put("gone").cancelled = True
-    h.put("good")
-    h.finish("good")
-    assert h.batches[1:] == [["good"]]
-    assert "gone" not in h.replies
+def test_a_request_that_is_over_never_reaches_the_policy(queue: Callable[[int], BatchQueue]) -> None:
+    waiting = queue(4)
+    waiting.withdraw(put(waiting, "gone"))
+    put(waiting, "good")
+    assert batch(waiting) == ["good"]
 
 
-@pytest.mark.parametrize("error", [RuntimeError("broken"), SystemExit(1)])
-def test_a_policy_that_breaks_fails_its_batch_and_goes_on(
-    harness: Callable[..., Harness], error: BaseException
-) -> None:
-    h = harness()
-    h.fail = error
-    h.put("bad")
-    h.finish("bad")
-    assert isinstance(h.replies["bad"].error, PolicyFailed)
-    h.put("good")
-    h.finish("good")
-    assert h.replies["good"].error is None
-
-
-def test_a_caller_that_cannot_take_its_reply_does_not_stop_the_queue(harness: Callable[..., Harness]) -> None:
-    h = harness()
-
-    def explode(_: Reply) -> None:
-        raise ValueError("gone")
-
-    h.queue.put(PendingRequest("x", Request("act", request_id="x"), explode))
-    h.put("good")
-    h.finish("good")
-    assert h.replies["good"].error is None
-
-
-def test_closing_answers_everyone(harness: Callable[..., Harness]) -> None:
-    h = harness()
-    h.occupy()
-    h.put("waiting")
-    closer = threading.Thread(target=h.queue.close)
-    closer.start()
-    wait_for(lambda: h.queue._closed)
-    h.finish("first", "waiting")
-    closer.join(5)
-    assert isinstance(h.replies["waiting"].error, PolicyUnavailable)
+def test_who_waits_when_it_closes_is_given_back(queue: Callable[[int], BatchQueue]) -> None:
+    waiting = queue(4)
+    one = put(waiting, "waiting")
+    assert waiting.close() == [one]
+    assert waiting.next() is None
     with pytest.raises(PolicyUnavailable):
-        h.put("after")
+        put(waiting, "after")
 
 
-def test_what_prepare_raises_is_raised_by_start() -> None:
-    def prepare() -> None:
-        raise FileNotFoundError("no weights")
-
-    with pytest.raises(FileNotFoundError, match="no weights"):
-        BatchQueue(lambda _: None, 1, prepare=prepare).start()
-
-
-def test_idle_is_called_when_nothing_comes() -> None:
-    called = threading.Event()
-    queue = BatchQueue(lambda _: None, 1, idle=called.set, idle_s=0.01)
-    queue.start()
-    assert called.wait(5)
-    queue.close(timeout_s=5)
+def test_nothing_comes_for_long_and_the_thread_is_told(queue: Callable[[int], BatchQueue]) -> None:
+    quiet = BatchQueue(1, idle_s=0.01)
+    quiet.bind()
+    assert quiet.next() == ([], [])
+    quiet.release()
 
 
-def test_prepare_runs_where_the_policy_runs() -> None:
-    threads: list[int] = []
-    done = threading.Event()
-
-    def run(batch: Sequence[PendingRequest]) -> None:
-        threads.append(threading.get_ident())
-        done.set()
-
-    queue = BatchQueue(run, 1, prepare=lambda: threads.append(threading.get_ident()))
-    queue.start()
-    queue.put(PendingRequest("s", Request("act"), lambda _: None))
-    assert done.wait(5)
-    queue.close(timeout_s=5)
-    assert threads[0] == threads[1] != threading.get_ident()
-
-
-def test_the_queue_costs_a_lone_request_little() -> None:
+def test_the_queue_costs_a_lone_request_little(queue: Callable[[int], BatchQueue]) -> None:
     """Against a bare hand-over to a thread and back, in the same run."""
 
     def median(run: Callable[[], None]) -> float:
@@ -215,12 +124,23 @@ def test_the_queue_costs_a_lone_request_little() -> None:
             times.append(time.perf_counter() - begun)
         return sorted(times)[150]
 
-    queue = BatchQueue(lambda batch: [t.answer(Reply()) for t in batch] and None, 16)
-    queue.start()
+    waiting = BatchQueue(16)
+
+    def serve() -> None:
+        waiting.bind()
+        while (taken := waiting.next()) is not None:
+            waiting.begin(taken.batch)
+            for one in taken.batch:
+                one.finish(Reply())
+            waiting.end()
+        waiting.release()
+
+    policy = threading.Thread(target=serve)
+    policy.start()
 
     def through_queue() -> None:
         done = threading.Event()
-        queue.put(PendingRequest("s", Request("act"), lambda _: done.set()))
+        waiting.put(PendingRequest("s", Request("act"), lambda _: done.set()))
         done.wait(5)
 
     there, back, stop = threading.Semaphore(0), threading.Semaphore(0), threading.Event()
@@ -242,5 +162,103 @@ def test_the_queue_costs_a_lone_request_little() -> None:
     stop.set()
     bare()
     thread.join(5)
-    queue.close(timeout_s=5)
+    waiting.close()
+    policy.join(5)
     assert queued_s < 10 * bare_s, (queued_s, bare_s)
+
+
+# The policy's thread.
+
+
+class Gated(Agent):
+    """A policy that waits at a gate, and breaks if it is told to."""
+
+    def __init__(self) -> None:
+        self.gate, self.busy = threading.Event(), threading.Semaphore(0)
+        self.threads: set[str] = set()
+
+    def initialize(self) -> None:
+        self.threads.add(threading.current_thread().name)
+
+    def act_batch(self, obs: list[Obs], sessions: list[Agent]) -> list[Act]:  # type: ignore[override]
+        self.threads.add(threading.current_thread().name)
+        self.busy.release()
+        assert self.gate.wait(10)
+        if error := obs[0].info.get("raise"):
+            raise SystemExit(1) if error == "exit" else RuntimeError("broken")
+        return [Act(np.zeros(1))] * len(obs)
+
+
+class Served:
+    def __init__(self) -> None:
+        self.policy = Gated()
+        self.policy.gate.set()
+        self.engine = Engine(self.policy, max_batch_size=4)
+        self.engine.start()
+        self.replies: dict[str, Reply] = {}
+        for session in ("a", "b"):
+            self.ask("reset", session)
+            self.answered(session)
+
+    def ask(self, op: str, session: str, done: Callable[[Reply], None] | None = None, **info: str) -> None:
+        self.replies.pop(session, None)
+        request = Request(op, Obs(info=info))  # type: ignore[arg-type]
+        self.engine.submit([PendingRequest(session, request, done or (lambda r: self.replies.update({session: r})))])
+
+    def answered(self, session: str) -> Reply:
+        wait_for(lambda: session in self.replies)
+        return self.replies[session]
+
+
+@pytest.fixture
+def served() -> Iterator[Served]:
+    one = Served()
+    yield one
+    one.policy.gate.set()
+    one.engine.close()
+    assert not one.engine.alive
+
+
+@pytest.mark.parametrize("kind", ["error", "exit"])
+def test_a_policy_that_breaks_fails_its_batch_and_goes_on(served: Served, kind: str) -> None:
+    served.ask("act", "a", **{"raise": kind})
+    assert isinstance(served.answered("a").error, PolicyFailed)
+    served.ask("act", "b")
+    assert served.answered("b").error is None
+    assert served.policy.threads == {"policy"}
+
+
+def test_a_caller_that_cannot_take_its_reply_does_not_stop_the_queue(served: Served) -> None:
+    def explode(_: Reply) -> None:
+        raise ValueError("gone")
+
+    served.ask("act", "a", explode)
+    served.ask("act", "b")
+    assert served.answered("b").error is None
+
+
+def test_closing_answers_everyone(served: Served) -> None:
+    served.policy.gate.clear()
+    served.ask("act", "a")
+    assert served.policy.busy.acquire(timeout=5)
+    served.ask("act", "b")
+    closer = threading.Thread(target=served.engine.close)
+    closer.start()
+    assert isinstance(served.answered("b").error, PolicyUnavailable)
+    served.policy.gate.set()
+    closer.join(5)
+    assert served.answered("a").error is None
+    served.ask("act", "b")
+    assert isinstance(served.answered("b").error, PolicyUnavailable | PolicyFailed)
+
+
+def test_a_deadline_that_passes_in_the_queue_is_answered(served: Served) -> None:
+    served.policy.gate.clear()
+    served.ask("act", "a")
+    assert served.policy.busy.acquire(timeout=5)
+    late = pending("b", Request("act", Obs(), deadline_ms=1.0), lambda reply: served.replies.update(b=reply))
+    served.replies.clear()
+    served.engine.submit([late])
+    late.deadline -= 1.0
+    served.policy.gate.set()
+    assert isinstance(served.answered("b").error, DeadlineExceeded)

@@ -9,10 +9,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import pytest
+from in_flight import pending
 
 from vlagents_ray.protocol.messages import Op, Request
 from vlagents_ray.serve.queue.batch_window import BatchCost, BatchWindow
-from vlagents_ray.serve.queue.fair_queue import FairQueue, PendingRequest, Rank
+from vlagents_ray.serve.queue.fair_queue import FairQueue
+from vlagents_ray.serve.requests import PendingRequest, Rank
 
 SIZE = 16
 Delay = Callable[[], float]
@@ -26,7 +28,9 @@ def fixed(size: int) -> float:
 def ticket(
     session: str, arrived: float, rank: Rank = Rank.SIMULATION, op: Op = "act", **fields: float
 ) -> PendingRequest:
-    return PendingRequest(session, Request(op, **fields), lambda _: None, rank, arrived)  # type: ignore[arg-type]
+    one = pending(session, Request(op, **fields), lambda _: None, arrived=arrived)  # type: ignore[arg-type]
+    one.rank = rank
+    return one
 
 
 @dataclass

@@ -15,6 +15,7 @@ import numpy as np
 import psutil
 import pytest
 from eval_fakes import wait_for
+from in_flight import submit
 from shm_client import call, client, request
 from starlette.testclient import TestClient
 
@@ -32,7 +33,7 @@ from vlagents_ray.serve.queue.call_limits import (
     PolicyCall,
     PolicyCalls,
 )
-from vlagents_ray.serve.queue.fair_queue import DEFAULT
+from vlagents_ray.serve.requests import DEFAULT
 
 LIMITS = CallLimits(act_s=10.0, warm_up_s=100.0, load_s=1000.0)
 
@@ -101,7 +102,7 @@ def engine(agent: Hanging, clock: Clock) -> Iterator[Engine]:
 
 def put(engine: Engine, session: str, op: Any, **kwargs: Any) -> queue.SimpleQueue[Reply]:
     replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
-    engine.submit(session, Request(op, Obs(), kwargs=kwargs), replies.put)
+    submit(engine, session, Request(op, Obs(), kwargs=kwargs), replies.put)
     return replies
 
 
@@ -236,7 +237,7 @@ def test_an_engine_whose_policy_hangs_ends_all_the_same(
 ) -> None:
     engine = Engine(agent)
     engine.start()
-    monkeypatch.setattr(engine.queue, "close", lambda **_: None)  # which waits for the batch, but not for ever
+    monkeypatch.setattr(engine, "stop", lambda **_: None)  # which waits for the batch, but not for ever
     monkeypatch.setattr("vlagents_ray.serve.models.model_manager._CLOSE_S", 0.05)
     ask(engine, "bad", "reset", hangs_at="act")
     put(engine, "bad", "act")

@@ -9,16 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vlagents_ray.protocol.messages import Request
-from vlagents_ray.serve.queue.fair_queue import (
-    PATIENCE_S,
-    FairQueue,
-    PendingRequest,
-    Rank,
-)
+from vlagents_ray.serve.queue.fair_queue import PATIENCE_S, FairQueue
+from vlagents_ray.serve.requests import Origin, PendingRequest, Rank
 
 
 def ticket(session: str, *, owner: str = "", rank: Rank = Rank.SIMULATION, arrived: float = 0.0) -> PendingRequest:
-    return PendingRequest(session, Request("act"), lambda _: None, rank, arrived, connection=owner)
+    return PendingRequest(session, Request("act"), lambda _: None, rank, arrived, origin=Origin(connection=owner))
 
 
 def filled(*tickets: PendingRequest) -> FairQueue:

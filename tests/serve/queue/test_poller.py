@@ -5,21 +5,44 @@ from __future__ import annotations
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 
+import numpy as np
 import pytest
 from eval_fakes import wait_for
 from process_resources import descriptors, running_threads
 
+from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.messages import Reply, Request
-from vlagents_ray.serve.queue.batch_queue import BatchQueue, PendingRequest, Rank
+from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.queue.poller import Poller
+from vlagents_ray.serve.requests import PendingRequest, Rank
 
 SLOW_S = 0.02  # a batch at least, so that the queue takes the policy for a slow one
 
 
+class _Policy(Agent):
+    def __init__(self, test: Slow) -> None:
+        self.test = test
+
+    def __deepcopy__(self, memo: object) -> _Policy:
+        return _Policy(self.test)
+
+    def act_batch(self, obs: list[Obs], sessions: list[Agent]) -> list[Act]:  # type: ignore[override]
+        gate = self.test.open
+        self.test.events.append("batch " + " ".join(sorted(one.info["name"] for one in obs)))
+        self.test.busy.set()
+        time.sleep(SLOW_S)
+        assert gate.wait(10)
+        return [Act(np.zeros(1))] * len(obs)
+
+
+NAMES = ("a", "b", "c", "d", "e", "f", "r", "robot", "heard", "other")
+
+
 class Slow:
-    """A queue whose policy takes at least `SLOW_S`, and then waits at a gate while that is closed."""
+    """A policy that takes at least `SLOW_S`, and then waits at a gate while that is closed; and what serves it."""
 
     def __init__(self, size: int = 2, patience: float = 0.0) -> None:
         self.events: list[str] = []
@@ -27,20 +50,15 @@ class Slow:
         self.open.set()
         self.busy = threading.Event()
         self.answered_by: dict[str, str] = {}  # the thread, by session
-        self.queue = BatchQueue(self._run, size, patience=patience)
+        self.engine = Engine(_Policy(self), max_batch_size=size, patience=patience)
+        self.queue = self.engine.queue
 
-    def _run(self, batch: Sequence[PendingRequest]) -> None:
-        gate = self.open
-        self.events.append("batch " + " ".join(sorted(ticket.session_id for ticket in batch)))
-        self.busy.set()
-        time.sleep(SLOW_S)
-        assert gate.wait(10)
-        for ticket in batch:
-            reply = Reply(ticket.request.request_id)
-            if self.queue.full_batch_waits() and ticket.rank is Rank.SIMULATION:
-                self.queue.answer_later([(ticket, reply)])
-            else:
-                ticket.answer(reply)
+    def start(self) -> None:
+        self.engine.start()
+        for name in NAMES:
+            done: Future[Reply] = Future()
+            self.engine.submit([PendingRequest(name, Request("reset", Obs()), done.set_result, Rank.SIMULATION)])
+            assert done.result(10).error is None
 
     def put(self, *sessions: str, rank: Rank = Rank.SIMULATION) -> None:
         """A request of each session, together."""
@@ -52,7 +70,7 @@ class Slow:
 
             return answered
 
-        self.queue.put(*(PendingRequest(s, Request("act", request_id=s), done(s), rank) for s in sessions))
+        self.engine.submit([PendingRequest(s, Request("act", Obs(info={"name": s})), done(s), rank) for s in sessions])
 
     def called(self, *events: str) -> bool:
         """Have these happened?"""
@@ -85,8 +103,8 @@ def slow() -> Iterator[Callable[..., Slow]]:
     yield make
     for one in made:
         one.open.set()
-        one.queue.close(timeout_s=5)
-        assert not one.queue.alive()
+        one.engine.close()
+        assert not one.engine.alive
 
 
 def test_messages_are_heard_beside_a_batch_and_never_on_two_threads_at_once(slow: Callable[..., Slow]) -> None:
@@ -102,7 +120,7 @@ def test_messages_are_heard_beside_a_batch_and_never_on_two_threads_at_once(slow
         inside.release()
 
     one.queue.watch(ours, ready)
-    one.queue.start()
+    one.start()
     one.learn("a", "b")
     theirs.send(b"x")
     wait_for(lambda: threads == ["policy"])
@@ -117,13 +135,13 @@ def test_messages_are_heard_beside_a_batch_and_never_on_two_threads_at_once(slow
             time.sleep(0.001)
     wait_for(lambda: len(threads) == 202)
     theirs.close()
-    one.queue.close(timeout_s=5)
+    one.engine.close()
     ours.close()
 
 
 def test_nobody_listens_beside_a_lone_session(slow: Callable[..., Slow]) -> None:
     one, before = slow(), threading.enumerate()
-    one.queue.start()
+    one.start()
     one.learn("robot")
     assert "policy-reader" not in {thread.name for thread in threading.enumerate() if thread not in before}
 
@@ -136,7 +154,7 @@ def test_timers_run_in_order_on_the_thread_that_polls_even_beside_a_batch(slow: 
         for delay_s in delays:
             one.queue.call_later(delay_s, lambda s=delay_s: ran.append((f"{s:g}", threading.current_thread().name)))
 
-    one.queue.start()
+    one.start()
     one.queue.call_soon(lambda: set_timers(0.1, 0.05))
     wait_for(lambda: ran == [("0.05", "policy"), ("0.1", "policy")])
     one.learn("a", "b")
@@ -162,7 +180,7 @@ def test_a_callback_may_end_its_watch_beside_a_batch(slow: Callable[..., Slow]) 
         ended.set()
 
     one.queue.watch(ours, ready)
-    one.queue.start()
+    one.start()
     one.learn("a", "b")
     one.hold("a", "b")
     theirs.close()
@@ -173,7 +191,7 @@ def test_a_callback_may_end_its_watch_beside_a_batch(slow: Callable[..., Slow]) 
 
 def test_where_a_full_batch_waits_simulations_are_answered_from_another_thread(slow: Callable[..., Slow]) -> None:
     one = slow()
-    one.queue.start()
+    one.start()
     one.learn("a", "b")
     assert set(one.answered_by.values()) == {"policy"}
     one.hold("a", "b")
@@ -185,7 +203,7 @@ def test_where_a_full_batch_waits_simulations_are_answered_from_another_thread(s
 
 def test_answers_come_while_the_next_batch_runs_and_when_the_queue_closes(slow: Callable[..., Slow]) -> None:
     one = slow()
-    one.queue.start()
+    one.start()
     one.learn("a", "b")
     one.hold("a", "b")
     one.put("c", "d")
@@ -196,7 +214,7 @@ def test_answers_come_while_the_next_batch_runs_and_when_the_queue_closes(slow: 
     wait_for(lambda: one.called("answer a", "answer b"))
     assert not one.called("answer c")
     one.put("e", "f")
-    closer = threading.Thread(target=one.queue.close)
+    closer = threading.Thread(target=one.engine.close)
     closer.start()
     wait_for(lambda: one.queue._closed)
     one.open.set()
@@ -206,7 +224,7 @@ def test_answers_come_while_the_next_batch_runs_and_when_the_queue_closes(slow: 
 
 def test_a_robot_is_answered_before_the_next_batch(slow: Callable[..., Slow]) -> None:
     one = slow()
-    one.queue.start()
+    one.start()
     one.learn("a", "b")
     one.open.clear()
     one.busy.clear()
@@ -224,7 +242,7 @@ ENDLESS = 1e6  # times the batch before: what waits, waits until something ends 
 
 def test_a_batch_waits_for_the_rest_of_its_group(slow: Callable[..., Slow]) -> None:
     one = slow(size=8, patience=ENDLESS)
-    one.queue.start()
+    one.start()
     one.learn("a", "b")
     one.put("a")
     wait_for(lambda: one.queue._gathering)
@@ -236,7 +254,7 @@ def test_a_batch_waits_for_the_rest_of_its_group(slow: Callable[..., Slow]) -> N
 
 def test_a_robot_ends_the_wait(slow: Callable[..., Slow]) -> None:
     one = slow(size=8, patience=ENDLESS)
-    one.queue.start()
+    one.start()
     one.learn("a", "b")
     one.put("a")
     wait_for(lambda: one.queue._gathering)
@@ -247,11 +265,11 @@ def test_a_robot_ends_the_wait(slow: Callable[..., Slow]) -> None:
 
 def test_closing_ends_the_wait(slow: Callable[..., Slow]) -> None:
     one = slow(size=8, patience=ENDLESS)
-    one.queue.start()
+    one.start()
     one.learn("a", "b")
     one.put("a")
     wait_for(lambda: one.queue._gathering)
-    one.queue.close(timeout_s=5)
+    one.engine.close()
     assert one.events == ["error a"]
 
 
@@ -312,7 +330,8 @@ def test_only_other_threads_wake_the_queue(slow: Callable[..., Slow], monkeypatc
         one.put("heard")
 
     one.queue.watch(ours, ready)
-    one.queue.start()
+    one.start()
+    woken.clear()
     theirs.send(b"x")
     wait_for(lambda: one.called("answer heard"))
     assert woken == []
@@ -320,7 +339,7 @@ def test_only_other_threads_wake_the_queue(slow: Callable[..., Slow], monkeypatc
     one.put("other")
     wait_for(lambda: one.called("answer other"))
     assert woken == [threading.current_thread().name]
-    one.queue.close(timeout_s=5)
+    one.engine.close()
     ours.close()
     theirs.close()
 

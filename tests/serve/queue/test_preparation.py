@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from eval_fakes import wait_for
+from in_flight import submit
 
 from vlagents_ray.errors import PolicyFailed, PolicyUnavailable
 from vlagents_ray.interface import Act, Agent, Obs
@@ -71,7 +72,7 @@ class Serving:
     def submit(self, session: str, op: str, instruction: str | None = None, **info: Any) -> Answer:
         replies: Answer = queue.SimpleQueue()
         info.setdefault("begun", threading.Event())
-        self.engine.submit(session, Request(op, Obs(info=info), instruction), replies.put)  # type: ignore[arg-type]
+        submit(self.engine, session, Request(op, Obs(info=info), instruction), replies.put)  # type: ignore[arg-type]
         return replies
 
 
@@ -154,8 +155,8 @@ def test_a_request_that_is_withdrawn_is_not_prepared(serving: Callable[[int], Se
     one = serving(16)
     begun = [threading.Event() for _ in one.names[1:]]
     for name, event in zip(one.names[1:], begun, strict=True):
-        ticket = one.engine.submit(name, Request("act", Obs(info={"begun": event})), lambda _: None)
-        ticket.answer(Reply(error=PolicyUnavailable("it is late")))
+        ticket = submit(one.engine, name, Request("act", Obs(info={"begun": event})), lambda _: None)
+        ticket.fail(PolicyUnavailable("it is late"))
     one.agent.gates["prepare"].set()
     one.agent.gates["act"].set()
     prepared(one.first)

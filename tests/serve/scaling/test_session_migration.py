@@ -11,14 +11,16 @@ from typing import Any
 import numpy as np
 import pytest
 from eval_fakes import wait_for
+from in_flight import ask as ask_of
+from in_flight import send
 from in_process_replicas import Replicas, export, version_of
 
 from vlagents_ray import Act, Agent, Obs
 from vlagents_ray.errors import DeadlineExceeded, OutcomeUnknown, UnknownSession
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.access.api_keys import NoKey
-from vlagents_ray.serve.engine.dispatch import Dispatcher
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.sender import Sender
 from vlagents_ray.serve.scaling import held_sessions, session_migration
 from vlagents_ray.serve.scaling.held_sessions import PEER_METHODS, Peer
 
@@ -61,19 +63,21 @@ def replicas() -> Iterator[Callable[[int], Replicas]]:
         each.close()
 
 
-def send(engine: Engine, op: Any, name: str = "robot-1", wait: bool = False, **fields: Any) -> queue.SimpleQueue[Reply]:
+def begin(
+    engine: Engine, op: Any, name: str = "robot-1", wait: bool = False, **fields: Any
+) -> queue.SimpleQueue[Reply]:
     """As a plain HTTP client; where the answer will come."""
     replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
     obs = Obs(info={"wait": True} if wait and op == "act" else {})
     if wait and op == "reset":
         fields["kwargs"] = {"wait": True}
-    sender = Dispatcher(engine, "http", name, connected=False, caller=NoKey.OPEN)
-    sender.send([Request(op, obs, **fields)], lambda answers: replies.put(answers[0]))
+    sender = Sender(engine, "http", name, connected=False, caller=NoKey.OPEN)
+    send(sender, [Request(op, obs, **fields)], lambda answers: replies.put(answers[0]))
     return replies
 
 
 def ask(engine: Engine, op: Any, name: str = "robot-1", **fields: Any) -> Reply:
-    return send(engine, op, name, **fields).get(timeout=20)
+    return begin(engine, op, name, **fields).get(timeout=20)
 
 
 def obeys(engine: Engine, name: str = "robot-1") -> tuple[str, int]:
@@ -131,7 +135,7 @@ def test_a_reset_under_way_is_not_overtaken_by_what_it_ends(replicas: Callable[[
     cut_off(served)
     a, b = served.engines
     ask(a, "reset", instruction="episode 1")
-    answers = send(b, "reset", instruction="episode 2", wait=True)
+    answers = begin(b, "reset", instruction="episode 2", wait=True)
     Counting.entered.get(timeout=20)
     state = export(a, "robot-1")
     assert state is not None
@@ -147,9 +151,9 @@ def test_a_reset_that_comes_late_ends_no_newer_episode(replicas: Callable[[int],
     cut_off(served)
     a, b = served.engines
     ask(b, "reset", "other")
-    busy = send(b, "act", "other", wait=True)
+    busy = begin(b, "act", "other", wait=True)
     Counting.entered.get(timeout=20)
-    late = send(b, "reset", instruction="given up")
+    late = begin(b, "reset", instruction="given up")
     ask(a, "reset", instruction="episode 2")
     state = export(a, "robot-1")
     assert state is not None
@@ -225,7 +229,7 @@ def test_a_session_whose_export_takes_too_long_stays(
     monkeypatch.setattr(session_migration, "EXPORT_S", 0.1)
     ask(a, "reset", instruction="episode 1")
     ask(a, "reset", "other")
-    busy = send(a, "act", "other", wait=True)
+    busy = begin(a, "act", "other", wait=True)
     Counting.entered.get(timeout=20)
     assert isinstance(ask(b, "act").error, UnknownSession)
     version = a.sessions.held(["robot-1"])["robot-1"]
@@ -347,7 +351,7 @@ def test_a_session_on_its_way_to_another_replica_is_waited_for(
     given = threading.Thread(target=served.hand_over, args=[0])
     given.start()
     assert on_its_way.wait(20)
-    answer = send(c, "act")
+    answer = begin(c, "act")
     threading.Timer(0.5, release.set).start()
     reply = answer.get(timeout=20)
     assert reply.error is None
@@ -373,11 +377,11 @@ def test_an_act_whose_deadline_passed_while_its_session_was_fetched_is_not_execu
 
     async def late(timed: bool) -> list[Reply]:
         request = Request("act", Obs(), deadline_ms=50)
-        sender = Dispatcher(b, "http", "robot-1", connected=False, caller=NoKey.OPEN)
+        sender = Sender(b, "http", "robot-1", connected=False, caller=NoKey.OPEN)
         if timed:  # as HTTP and the proxied WebSocket
-            return await sender.ask([request])
+            return await ask_of(sender, [request])
         answers: queue.SimpleQueue[list[Reply]] = queue.SimpleQueue()  # as shared memory and the replica's own port
-        sender.send([request], answers.put)
+        send(sender, [request], answers.put)
         await asyncio.sleep(0.1)
         release.set()
         return answers.get(timeout=20)
@@ -407,8 +411,8 @@ def test_an_act_whose_client_has_gone_while_its_session_was_fetched_is_not_execu
     monkeypatch.setattr(b.transfer, "prepare", slow)
 
     async def go() -> None:
-        sender = Dispatcher(b, "http", "robot-1", connected=False, caller=NoKey.OPEN)
-        asked = asyncio.create_task(sender.ask([Request("act", Obs())]))  # without a deadline
+        sender = Sender(b, "http", "robot-1", connected=False, caller=NoKey.OPEN)
+        asked = asyncio.create_task(ask_of(sender, [Request("act", Obs())]))  # without a deadline
         assert await asyncio.to_thread(adopting.wait, 20)
         asked.cancel()
         await asyncio.wait([asked])
@@ -425,7 +429,7 @@ def test_an_act_that_was_begun_before_its_deadline_is_said_to_be(replicas: Calla
 
     async def late(wait: bool) -> Reply:
         request = Request("act", Obs(info={"wait": wait}), deadline_ms=50)
-        [reply] = await Dispatcher(engine, "http", "robot-1", connected=False, caller=NoKey.OPEN).ask([request])
+        [reply] = await ask_of(Sender(engine, "http", "robot-1", connected=False, caller=NoKey.OPEN), [request])
         return reply
 
     while Counting.entered.empty():  # on a busy machine a deadline may be over before the policy begins
@@ -452,8 +456,9 @@ def test_made_up_sessions_keep_no_other_from_moving(
     monkeypatch.setattr(a.sessions, "held", counted)
     made_up = [Request("act", Obs(), session=f"none-{i}") for i in range(400)]
     answers: queue.SimpleQueue[list[Reply]] = queue.SimpleQueue()
-    Dispatcher(b, "websocket", "x", connected=True, caller=NoKey.OPEN).send(
-        [Request("reset", Obs()), *made_up], answers.put
+    sender = Sender(b, "websocket", "x", connected=True, caller=NoKey.OPEN)
+    send(
+        sender, [Request("reset", Obs()), *made_up], answers.put
     )  # its own session comes first, without which it may not act
     assert obeys(b) == ("episode 1", 1)
     replies = answers.get(timeout=20)

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
+from in_flight import submit
 
 from vlagents_ray.errors import InvalidInput, InvalidWeights, Overloaded, PolicyUnavailable, UnchangedWeights
 from vlagents_ray.interface import Act, Agent, Obs
@@ -52,9 +53,9 @@ class Replica(OwnWeights):
         """The version and the gain with which a simulation acts."""
         replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
         if reset:
-            self.engine.submit(session, Request("reset", Obs(), rank="simulation"), replies.put)
+            submit(self.engine, session, Request("reset", Obs(), rank="simulation"), replies.put)
             assert replies.get(timeout=30).error is None
-        self.engine.submit(session, Request("act", Obs()), replies.put)
+        submit(self.engine, session, Request("act", Obs()), replies.put)
         act = replies.get(timeout=30).act
         assert act is not None
         return act.info["policy"]["version"], float(act.action[0])

@@ -12,16 +12,16 @@ import pytest
 from eval_fakes import wait_for
 from hypothesis import given
 from hypothesis import strategies as st
+from in_flight import read_requests, send
 from manual_clock import Clock
 from shadowed_agents import Seeded
 
 from vlagents_ray.errors import PolicyUnavailable
 from vlagents_ray.interface import Act, Obs
-from vlagents_ray.protocol.frames import decode_requests
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Budget, Reply, Request
 from vlagents_ray.serve.access.api_keys import NoKey
-from vlagents_ray.serve.engine.dispatch import Dispatcher
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.sender import Sender
 from vlagents_ray.serve.shadow.sender import PER_SESSION, ShadowSender, Turn, chosen
 
 SESSIONS = [f"session-{number}" for number in range(4000)]
@@ -49,7 +49,7 @@ class Candidate:
         return self.unknown
 
     def asked(self, op: str = "act") -> list[Request]:
-        requests = [decode_requests(turn.frame, Budget(DEFAULT_LIMITS))[0] for turn in self.turns]
+        requests = [read_requests(turn.frame, Budget(DEFAULT_LIMITS))[0] for turn in self.turns]
         return [one for one in requests if isinstance(one, Request) and one.op == op]
 
 
@@ -253,12 +253,12 @@ def test_sessions_that_end_are_closed_at_the_candidate(followed: Followed) -> No
 def episode(engine: Engine) -> bytes:
     """The actions of an episode, to the bit."""
     actions = b""
-    sender = Dispatcher(engine, "test", "a", caller=NoKey.INSIDE)
+    sender = Sender(engine, "test", "a", caller=NoKey.INSIDE)
     rng = np.random.default_rng(5)
 
     def ask(request: Request) -> Reply:
         found: list[Reply] = []
-        sender.send([request], found.extend)
+        send(sender, [request], found.extend)
         wait_for(lambda: bool(found), every_s=0.0005)
         assert found[0].error is None
         return found[0]
@@ -290,9 +290,9 @@ def test_the_live_actions_are_the_same_to_the_bit(kind: str) -> None:
     sender.start()
     try:
         alone = episode(engine)
-        engine.watchers.add(sender)
+        engine.observers.add(sender)
         beside = episode(engine)
-        engine.watchers.remove(sender)
+        engine.observers.remove(sender)
     finally:
         release.set()
         sender.close()

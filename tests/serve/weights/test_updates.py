@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
+from in_flight import submit
 
 from vlagents_ray.errors import (
     InvalidInput,
@@ -80,7 +81,7 @@ class Served:
 
     def ask(self, session: str, request: Request) -> Reply:
         replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
-        self.engine.submit(session, request, replies.put)
+        submit(self.engine, session, request, replies.put)
         reply = replies.get(timeout=30)
         if reply.error is not None:
             raise reply.error
@@ -156,7 +157,7 @@ def test_with_wait_no_episode_begins_until_all_have_ended_and_robots_are_not_hel
     assert served.learn.number == 0
     waiting: queue.SimpleQueue[Reply] = queue.SimpleQueue()
     for session in ("a", "new"):
-        served.engine.submit(session, Request("reset", Obs(), rank="simulation"), waiting.put)
+        submit(served.engine, session, Request("reset", Obs(), rank="simulation"), waiting.put)
     assert served.act("b") == (0, 0.0)
     served.reset("robot", "robot")
     assert served.act("robot") == (0, 0.0)

@@ -19,6 +19,7 @@ from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.messages import RankName, Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.models.agent_copies import AgentCopies
+from vlagents_ray.serve.requests import RANKS, PendingRequest
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -126,7 +127,8 @@ class MeasuredPolicy:
         def ask(i: int, op: Any, **given: Any) -> None:
             asked[i] = time.perf_counter()
             request = Request(op, views[i], rank=rank, **given)
-            self.engine.submit(f"bench-{i}", request, lambda reply: answers.put((i, reply)))
+            done = lambda reply: answers.put((i, reply))  # noqa: E731 - of this request
+            self.engine.submit([PendingRequest(f"bench-{i}", request, done, RANKS[rank])])
 
         def answer() -> tuple[int, Reply, float]:
             i, reply = answers.get(timeout=_LATE_S)

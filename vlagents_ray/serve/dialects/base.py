@@ -63,10 +63,10 @@ from vlagents_ray.serve.config.dialects import DialectConfig, KeylessPortConfig,
 from vlagents_ray.serve.dialects.implicit_session import ImplicitSession
 from vlagents_ray.serve.endpoints.http_messages import LONG_BYTES, problem_response
 from vlagents_ray.serve.engine.admission import Admission, MessageAdmission
-from vlagents_ray.serve.engine.dispatch import Dispatcher
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.engine.metrics_buffer import RequestTrace
+from vlagents_ray.serve.engine.sender import Sender
 from vlagents_ray.serve.ports import LOOPBACK
+from vlagents_ray.serve.requests import Message
 
 T = TypeVar("T")
 Stream = Callable[[WebSocket], Awaitable[None]]
@@ -180,29 +180,29 @@ class RouteDialect(Dialect):
         """Serve WebSockets at the server's root for all dialects that speak this protocol there, this one first."""
         raise NotImplementedError(f"{self.name} states a root and does not serve it")
 
-    def sender(self, session_id: str = "") -> Dispatcher:
-        """Return a dispatcher for a connection or, with a session's name, for a request.
+    def sender(self, session_id: str = "") -> Sender:
+        """Return the sender of a connection or, with a session's name, of a request.
 
         It does not count requests for the key, as `decoded` has counted them.
         """
         caller, connected = current_caller(), not session_id
-        return Dispatcher(self.context.engine, self.name, session_id, caller=caller, connected=connected, counted=True)
+        return Sender(self.context.engine, self.name, session_id, caller=caller, connected=connected, counted=True)
 
-    def gate(self, *, counted: bool = False) -> Dispatcher:
-        """Return a dispatcher whose `admission` provides the budget for decoding messages.
+    def gate(self, *, counted: bool = False) -> Sender:
+        """Return a sender whose `admission` provides the budget for decoding messages.
 
         Args:
             counted: Whether each message was counted for the key when it arrived.
         """
-        return Dispatcher(self.context.engine, self.name, caller=current_caller(), connected=False, counted=counted)
+        return Sender(self.context.engine, self.name, caller=current_caller(), connected=False, counted=counted)
 
-    def session(self, sender: Dispatcher, name: str = "") -> ImplicitSession:
+    def session(self, sender: Sender, name: str = "") -> ImplicitSession:
         """Return a session of that sender, its own if `name` is empty, which begins without a reset by the client."""
-        return ImplicitSession(self.context.engine, sender, self.name, self.rank, name)
+        return ImplicitSession(self.context.engine, sender, self.rank, name)
 
-    def trace(self) -> RequestTrace:
-        """Start the timing of an observation."""
-        return RequestTrace(self.context.engine.stats, self.name, "act", self.rank)
+    def arrived(self) -> Message:
+        """Return the message of an observation that has just arrived."""
+        return Message(self.context.engine.stats, self.name, "act", self.rank)
 
 
 class PortDialect(Dialect):

@@ -48,33 +48,33 @@ class HttpDialect(RouteDialect):
             media_type: The media type of the reply.
         """
         name = request_id(http)
-        trace = self.trace()
+        message = self.arrived()
         admission = self.gate(counted=True).admission(self.context.limits, rank=self.rank)
         try:
             self.context.engine.require_ready()
             body = await self._requests.body(http, admission)
-            trace.arrive()
+            message.arrive()
             theirs = await decoded(read, body, admission)
             obs, instruction = self.read(theirs)
-            trace.decoded_alike()
+            message.decoded_alike()
             session = self._kept_session(session_id(http)) if SESSION_HEADER in http.headers else None
             if session is None or not session.episode.begun:
                 self.mapping.warn_of_unread_cameras(theirs, self.name)
             if session is not None:
-                reply = await session.act(obs, instruction, name)
+                reply = await session.act(message, obs, instruction, name)
             else:
                 sender = self.sender()
                 try:
-                    reply = await self.session(sender).act(obs, instruction, name)
+                    reply = await self.session(sender).act(message, obs, instruction, name)
                 finally:
                     sender.release(for_good=True)
-            return Response(trace.written(reply, lambda: write(self.rows(reply))), media_type=media_type)
+            return Response(message.written(lambda: write(self.rows(reply))), media_type=media_type)
         except ClientDisconnect:
-            trace.refused("disconnected")
+            message.refused("disconnected")
             return Response(status_code=499)
         except Exception as error:  # noqa: BLE001 - the error is the reply to the client
             problem = public_problem(error, self.name, name)
-            trace.refused(problem.code)
+            message.refused(problem.code)
             return problem_response(problem, name)
         finally:
             admission.release()

@@ -9,15 +9,16 @@ from typing import Any, NamedTuple
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import InvalidObservation, UnknownSession
 from vlagents_ray.interface import Obs
+from vlagents_ray.protocol.frames import Decoded
 from vlagents_ray.protocol.messages import (
     Op,
     RankName,
     Reply,
     Request,
 )
-from vlagents_ray.serve.engine.dispatch import Dispatcher
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.engine.metrics_buffer import RequestTrace
+from vlagents_ray.serve.engine.sender import Sender
+from vlagents_ray.serve.requests import Message
 
 logger = logging.getLogger(__name__)
 
@@ -57,30 +58,26 @@ class ImplicitSession:
 
     Args:
         engine: The engine that serves it.
-        sender: The dispatcher of the client.
-        transport: The dialect's name, for the statistics.
+        sender: The sender of the client's requests.
         rank: Class of its requests.
         name: Name of the session, unique in the replica; empty for the sender's own.
     """
 
-    def __init__(
-        self, engine: Engine, sender: Dispatcher, transport: str, rank: RankName = "robot", name: str = ""
-    ) -> None:
+    def __init__(self, engine: Engine, sender: Sender, rank: RankName = "robot", name: str = "") -> None:
         self.episode = ImplicitEpisode()
         self._engine = engine
         self._sender = sender
-        self._transport = transport
         self._rank: RankName = rank
         self._name = name
 
-    async def act(self, obs: Obs, instruction: str | None, request_id: str, **kwargs: Any) -> Reply:
+    async def act(self, message: Message, obs: Obs, instruction: str | None, request_id: str, **kwargs: Any) -> Reply:
         """Return the policy's action; see `act_together`."""
-        (reply,) = await act_together([SessionObs(self, obs, instruction)], request_id, **kwargs)
+        (reply,) = await act_together(message, [SessionObs(self, obs, instruction)], request_id, **kwargs)
         return reply
 
     async def close(self) -> None:
         """End the session."""
-        await self._sender.ask([self._request("close", None, None, "", {})])
+        await self._sender.ask(self._sender.message("close"), Decoded([self._request("close", None, None, "", {})], {}))
 
     def _request(
         self, op: Op, obs: Obs | None, instruction: str | None, request_id: str, kwargs: dict[str, Any]
@@ -104,8 +101,8 @@ class SessionObs(NamedTuple):
     instruction: str | None
 
 
-async def act_together(seen: Sequence[SessionObs], request_id: str, **kwargs: Any) -> list[Reply]:
-    """Return the policy's action for each observation of one client; their acts are queued at once.
+async def act_together(message: Message, seen: Sequence[SessionObs], request_id: str, **kwargs: Any) -> list[Reply]:
+    """Return the policy's action for each observation in a client's message; their acts are queued at once.
 
     A session whose episode begins is reset first, with `kwargs`. One that was removed because it was idle is reset
     again, which is safe since the observation was not acted on.
@@ -114,12 +111,13 @@ async def act_together(seen: Sequence[SessionObs], request_id: str, **kwargs: An
         VLAgentsError: The first error among the replies.
     """
     await _reset([one for one in seen if one.session.episode.begins(one.instruction)], request_id, kwargs)
-    replies = await _ask("act", seen, [None] * len(seen), request_id, {})
+    replies = await _ask(message, "act", seen, [None] * len(seen), request_id, {})
     if forgotten := [i for i, reply in enumerate(replies) if isinstance(reply.error, UnknownSession)]:
-        logger.info("%s: a session was forgotten; it begins again (request %s)", seen[0].session._transport, request_id)
+        logger.info("%s: a session was forgotten; it begins again (request %s)", message.transport, request_id)
         again = [seen[i] for i in forgotten]
         await _reset(again, request_id, kwargs)
-        for i, reply in zip(forgotten, await _ask("act", again, [None] * len(again), request_id, {}), strict=True):
+        repeated = await _ask(seen[0].session._sender.message(), "act", again, [None] * len(again), request_id, {})
+        for i, reply in zip(forgotten, repeated, strict=True):
             replies[i] = reply
     _raise_first(replies)
     return replies
@@ -129,30 +127,32 @@ async def _reset(seen: Sequence[SessionObs], request_id: str, kwargs: dict[str, 
     if not seen:
         return
     openings = [one.session.episode.opening(one.instruction, one.session._engine.contract) for one in seen]
-    traces = []
     for session, _, _ in seen:
         session.episode.end()
-        traces.append(RequestTrace(session._engine.stats, session._transport, "reset", session._rank))
-    replies = await _ask("reset", seen, openings, request_id, kwargs)
-    for one, opening, trace, reply in zip(seen, openings, traces, replies, strict=True):
-        if reply.error is not None:
-            trace.refused(reply.error.code)
-        else:
-            trace.written(reply, lambda: None)
+    resets = seen[0].session._sender.message("reset", seen[0].session._rank)
+    resets.decoded_alike(len(seen))
+    replies = await _ask(resets, "reset", seen, openings, request_id, kwargs)
+    resets.written(lambda: None)
+    for one, opening, reply in zip(seen, openings, replies, strict=True):
+        if reply.error is None:
             one.session.episode.began(opening)
     _raise_first(replies)
 
 
 async def _ask(
-    op: Op, seen: Sequence[SessionObs], instructions: Sequence[str | None], request_id: str, kwargs: dict[str, Any]
+    message: Message,
+    op: Op,
+    seen: Sequence[SessionObs],
+    instructions: Sequence[str | None],
+    request_id: str,
+    kwargs: dict[str, Any],
 ) -> list[Reply]:
     names = [request_id] if len(seen) == 1 else [f"{request_id}-{place}" for place in range(len(seen))]
-    return await seen[0].session._sender.ask(
-        [
-            one.session._request(op, one.obs, instruction, name, kwargs)
-            for one, instruction, name in zip(seen, instructions, names, strict=True)
-        ]
-    )
+    requests = [
+        one.session._request(op, one.obs, instruction, name, kwargs)
+        for one, instruction, name in zip(seen, instructions, names, strict=True)
+    ]
+    return await seen[0].session._sender.ask(message, Decoded(requests, {}))
 
 
 def _raise_first(replies: Sequence[Reply]) -> None:

@@ -39,8 +39,8 @@ from vlagents_ray.serve.dialects.base import (
     public_problem,
 )
 from vlagents_ray.serve.dialects.implicit_session import ImplicitSession, SessionObs, act_together
-from vlagents_ray.serve.engine.dispatch import REFUSED, Dispatcher
-from vlagents_ray.serve.engine.metrics_buffer import RequestTrace
+from vlagents_ray.serve.engine.sender import REFUSED, Sender
+from vlagents_ray.serve.requests import Message
 from vlagents_ray.wire import openpi
 from vlagents_ray.wire.openpi import PRESETS
 
@@ -185,7 +185,7 @@ class MapConnection:
 
     def __init__(self, dialect: MapDialect) -> None:
         self.dialect = dialect
-        self.sender: Dispatcher = dialect.sender()
+        self.sender: Sender = dialect.sender()
         self.session: ImplicitSession = dialect.session(self.sender)
         self.episode: str | None = None  # the client's name of the episode
         self._batched: list[ImplicitSession] = []  # the session of each place in a batch
@@ -197,9 +197,7 @@ class MapConnection:
         for session in (self.session, *self._batched):
             session.episode.end()
 
-    async def answer(
-        self, message: dict[str, Any], trace: RequestTrace, request_id: str, gate: Dispatcher
-    ) -> bytes | str:
+    async def answer(self, message: dict[str, Any], incoming: Message, request_id: str, gate: Sender) -> bytes | str:
         """Return the reply to one message; `gate` counts the observations of a batch after the first for the key."""
         dialect = self.dialect
         if (answer := dialect.begins(message, self)) is not None:
@@ -216,10 +214,10 @@ class MapConnection:
         begins = any(session.episode.begins(instruction) for session, _, instruction in seen)
         if number is not None and not begins and self._rows.has(number, stacked=batched):
             return openpi.encode(self._rows.take(number))
-        trace.decoded_alike(len(observations))
-        replies = await act_together(seen, request_id, **dialect.reset_arguments(message))
-        data = trace.written(replies, lambda: openpi.encode(self._said(replies, number, batched=batched)))
-        self._before_ms = (time.perf_counter() - trace.arrived) * 1e3
+        incoming.decoded_alike(len(observations))
+        replies = await act_together(incoming, seen, request_id, **dialect.reset_arguments(message))
+        data = incoming.written(lambda: openpi.encode(self._said(replies, number, batched=batched)))
+        self._before_ms = (time.perf_counter() - incoming.arrived) * 1e3
         return data
 
     def _said(self, replies: Sequence[Reply], number: int | None, *, batched: bool) -> Any:
@@ -274,10 +272,10 @@ class MapEndpoint:
                 connection.sender.release(for_good=True)
 
     async def _answer(
-        self, socket: WebSocket, data: bytes | None, connections: dict[str, MapConnection], gate: Dispatcher
+        self, socket: WebSocket, data: bytes | None, connections: dict[str, MapConnection], gate: Sender
     ) -> bool:
         """Reply to one message; return False if the connection was closed."""
-        trace, request_id = self._dialects[0].trace(), uuid.uuid4().hex
+        incoming, request_id = self._dialects[0].arrived(), uuid.uuid4().hex
         admission = gate.admission(self._context.limits, 0 if data is None else len(data), self._dialects[0].rank)
         try:
             admission.begin_message()
@@ -285,13 +283,13 @@ class MapEndpoint:
                 raise MalformedMessage("message: got text, want a binary map")
             message = await decoded(lambda data, budget: openpi.decode(data, budget.limits), data, admission)
             dialect = next((dialect for dialect in self._dialects if dialect.speaks(message)), self._dialects[0])
-            arrived, trace = trace.arrived, dialect.trace()
-            trace.arrived = arrived
+            arrived, incoming = incoming.arrived, dialect.arrived()
+            incoming.arrived = arrived
             connection = connections.get(dialect.name) or connections.setdefault(dialect.name, MapConnection(dialect))
-            answer = await connection.answer(message, trace, request_id, gate)
+            answer = await connection.answer(message, incoming, request_id, gate)
         except Exception as error:  # noqa: BLE001 - the error is the reply to the client
-            problem = public_problem(error, trace.transport, request_id)
-            trace.refused(problem.code)
+            problem = public_problem(error, incoming.transport, request_id)
+            incoming.refused(problem.code)
             text = f"{problem} (request {request_id})"
             failure = self._dialects[0].failure(text)
             await (socket.send_text(text) if failure is None else socket.send_bytes(failure))

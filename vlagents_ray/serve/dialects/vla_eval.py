@@ -36,7 +36,7 @@ from vlagents_ray.serve.dialects.base import (
 from vlagents_ray.serve.dialects.implicit_session import ImplicitSession
 from vlagents_ray.serve.endpoints.http_messages import problem_response
 from vlagents_ray.serve.engine.admission import MessageAdmission
-from vlagents_ray.serve.engine.dispatch import REFUSED, Dispatcher
+from vlagents_ray.serve.engine.sender import REFUSED, Sender
 from vlagents_ray.wire import vla_eval
 from vlagents_ray.wire.vla_eval import PRESETS
 
@@ -134,7 +134,7 @@ class VlaEvalDialect(RouteDialect):
     async def _act(
         self, message: vla_eval.Message, admission: MessageAdmission, connection: _Connection
     ) -> vla_eval.Message:
-        trace = self.trace()
+        incoming = self.arrived()
         request_id = uuid.uuid4().hex
         try:
             payload = await admission.decoded(partial(vla_eval.decode_images, message.payload))
@@ -142,14 +142,14 @@ class VlaEvalDialect(RouteDialect):
             if not connection.session.episode.begun:
                 self.mapping.warn_of_unread_cameras(payload, self.name)
             if connection.chunk.next is None or connection.session.episode.begins(instruction):
-                trace.decoded_alike()
-                reply = await connection.session.act(obs, instruction, request_id)
-                rows = trace.written(reply, lambda: self.rows(reply))
+                incoming.decoded_alike()
+                reply = await connection.session.act(incoming, obs, instruction, request_id)
+                rows = incoming.written(lambda: self.rows(reply))
                 connection.chunk.replace(rows[: self.config.execute])
             return vla_eval.Message("action", {"actions": connection.chunk.take().action}, message.seq)
         except Exception as error:  # noqa: BLE001 - the client is answered with it
             problem = public_problem(error, self.name, request_id)
-            trace.refused(problem.code)
+            incoming.refused(problem.code)
             return _error(problem, message.seq, request_id)
         finally:
             admission.release()
@@ -195,7 +195,7 @@ class _Inbox:
             await self._there.wait()
         return self._messages.popleft()
 
-    async def fill(self, socket: WebSocket, gate: Dispatcher, dialect: VlaEvalDialect) -> None:
+    async def fill(self, socket: WebSocket, gate: Sender, dialect: VlaEvalDialect) -> None:
         """Receive messages until the client is gone, or too many of its messages wait for replies."""
         try:
             while not gate.refused_too_often:

@@ -88,8 +88,9 @@ class AccessMiddleware:
                 if (wait_s := key.throttled_s()) > 0:  # bounds how often the key's requests are refused
                     await asyncio.sleep(wait_s)
                     key.require_unthrottled()
-                key.admit()  # opening a WebSocket counts: its first message is in memory before the rate can stop it
-                if scope["type"] == "websocket":
+                if scope["type"] == "http":
+                    key.admit()
+                else:
                     key.hold()
                 key.note("let in by", scope["type"])
         except VLAgentsError as error:

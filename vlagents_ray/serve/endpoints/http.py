@@ -41,7 +41,6 @@ from vlagents_ray.protocol.messages import (
     Limits,
     Op,
     Reply,
-    Request,
 )
 from vlagents_ray.serve.access.api_keys import current_caller
 from vlagents_ray.serve.endpoints.docs_page import STYLE, docs_page
@@ -54,9 +53,9 @@ from vlagents_ray.serve.endpoints.http_messages import (
     request_id,
     session_id,
 )
-from vlagents_ray.serve.engine.dispatch import REFUSED, Dispatcher
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.engine.metrics_buffer import RequestTrace
+from vlagents_ray.serve.engine.sender import REFUSED, Sender
+from vlagents_ray.serve.requests import Message as Incoming
 
 logger = logging.getLogger(__name__)
 
@@ -143,7 +142,7 @@ class _HttpEndpoint:
 
     async def probe(self, http: HttpRequest) -> Response:
         """Reply to a probe, without a session and without the policy."""
-        sender = Dispatcher(self._engine, "http", caller=current_caller(), connected=False)
+        sender = Sender(self._engine, "http", caller=current_caller(), connected=False)
         admission = sender.admission(self._limits, rank="simulation")
         try:
             message = await self._requests.body(http, admission)
@@ -165,30 +164,30 @@ class _HttpEndpoint:
         """Return the handler of `POST /v1/<op>`."""
 
         async def handle(http: HttpRequest) -> Response:
-            trace = RequestTrace(self._engine.stats, "http", op)
+            incoming = Incoming(self._engine.stats, "http", op)
             name, headers = request_id(http), headers_of(http.scope)
             try:
-                sender = Dispatcher(self._engine, "http", session_id(http), caller=current_caller(), connected=False)
+                sender = Sender(self._engine, "http", session_id(http), caller=current_caller(), connected=False)
                 admission = sender.admission(self._limits, rank=headers.get(RANK_HEADER, "robot"))
-                requests = await self._requests.read(op, _timed(http, trace), admission)
-                trace.decoded(requests)
-                if isinstance(requests[0], Request):
-                    name = requests[0].request_id = requests[0].request_id or name
-                replies = await sender.ask(requests, admission)
+                decoded = await self._requests.read(op, _timed(http, incoming), admission, name)
+                incoming.decoded(decoded)
+                if decoded.requests:
+                    name = decoded.requests[0].request_id
+                replies = await sender.ask(incoming, decoded, admission)
                 if len(replies) == 1 and (error := replies[0].error) is not None:
                     raise error
                 if CONTENT_TYPE in headers.get("accept", "") or len(replies) > 1:
-                    return Response(trace.frame(replies), media_type=CONTENT_TYPE)
+                    return Response(incoming.frame(), media_type=CONTENT_TYPE)
                 step = {} if replies[0].step is None else {STEP_HEADER: str(replies[0].step)}
-                return Response(trace.document(replies[0]), headers=step, media_type="application/json")
+                return Response(incoming.document(), headers=step, media_type="application/json")
             except ClientDisconnect:
-                trace.refused("disconnected")
+                incoming.refused("disconnected")
                 return Response(status_code=499)
             except Exception as error:
                 if not isinstance(error, VLAgentsError):
                     logger.exception("%s failed (request %s)", op, name)
                     error = VLAgentsError("internal error; the server's log has the details")
-                trace.refused(error.code)
+                incoming.refused(error.code)
                 return problem_response(error, name)
 
         return handle
@@ -201,7 +200,7 @@ class _HttpEndpoint:
             await socket.send_bytes(encode_replies([Reply(error=full)]))
             await socket.close(_TRY_AGAIN_LATER, str(full)[:120])
             return
-        sender = Dispatcher(self._engine, "websocket", caller=current_caller())
+        sender = Sender(self._engine, "websocket", caller=current_caller())
         try:
             while not sender.refused_too_often:
                 await sender.wait_unthrottled()
@@ -215,44 +214,44 @@ class _HttpEndpoint:
         finally:
             sender.release()
 
-    async def _reply(self, socket: WebSocket, sender: Dispatcher, message: bytes | None) -> None:
+    async def _reply(self, socket: WebSocket, sender: Sender, message: bytes | None) -> None:
         if message is not None and is_probe(message):
             await socket.send_bytes(self._probed(sender, message))
             return
-        trace = RequestTrace(self._engine.stats, "websocket")
-        replies = await self._answer(sender, message, trace)
-        await socket.send_bytes(trace.frame(replies))
+        incoming = sender.message()
+        await self._answer(sender, message, incoming)
+        await socket.send_bytes(incoming.frame())
 
-    def _probed(self, sender: Dispatcher, message: bytes) -> bytes:
+    def _probed(self, sender: Sender, message: bytes) -> bytes:
         try:
             read_probe(message, sender.admission(self._limits, len(message), "simulation"))
             return answer(len(message))
         except VLAgentsError as error:
             return encode_replies([Reply(error=error)])
 
-    async def _answer(self, sender: Dispatcher, frame: bytes | None, trace: RequestTrace) -> list[Reply]:
+    async def _answer(self, sender: Sender, frame: bytes | None, incoming: Incoming) -> None:
         admission = sender.admission(self._limits, 0 if frame is None else len(frame))
         try:
             admission.begin_message()
             if frame is None:
                 raise MalformedMessage("stream: got a text message, want a binary frame")
-            requests = await self._requests.decode(frame, admission)
-            trace.decoded(requests)
-            return await sender.ask(requests, admission)
+            decoded = await self._requests.decode(frame, admission)
+            incoming.decoded(decoded)
+            await sender.ask(incoming, decoded, admission)
         except VLAgentsError as error:
-            return [Reply(error=error)]
+            incoming.refuse(error)
         except Exception:
             name = uuid.uuid4().hex
             logger.exception("stream failed (request %s)", name)
-            return [Reply(name, error=VLAgentsError("internal error; the server's log has the details"))]
+            incoming.refuse(VLAgentsError("internal error; the server's log has the details"), name)
 
 
-def _timed(http: HttpRequest, trace: RequestTrace) -> HttpRequest:
-    """Return a request whose trace starts when its body has arrived, so that the upload counts as network time."""
+def _timed(http: HttpRequest, incoming: Incoming) -> HttpRequest:
+    """Return a request whose times start when its body has arrived, so that the upload counts as network time."""
 
     async def receive() -> Message:
         message = await http.receive()
-        trace.arrived = time.perf_counter()
+        incoming.arrived = time.perf_counter()
         return message
 
     return HttpRequest(http.scope, receive)

@@ -7,8 +7,9 @@ import hashlib
 import math
 import uuid
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
-from typing import cast
+from typing import Any
 
 from starlette.exceptions import HTTPException
 from starlette.formparsers import MultiPartException
@@ -25,7 +26,7 @@ from vlagents_ray.errors import (
     TooManyRequests,
     VLAgentsError,
 )
-from vlagents_ray.protocol.frames import CONTENT_TYPE, check_request, decode_requests
+from vlagents_ray.protocol.frames import CONTENT_TYPE, Decoded, check_request, decode_requests
 from vlagents_ray.protocol.json_messages import CAMERA_PREFIX, PROBLEM_TYPE, problem, request_from_parts
 from vlagents_ray.protocol.messages import (
     DEADLINE_HEADER,
@@ -36,8 +37,6 @@ from vlagents_ray.protocol.messages import (
     STEP_HEADER,
     Limits,
     Op,
-    RankName,
-    Reply,
     Request,
     is_name,
 )
@@ -63,8 +62,8 @@ class RequestDecoder:
     def __init__(self, limits: Limits) -> None:
         self._limits = limits
 
-    async def read(self, op: Op, http: HttpRequest, admission: MessageAdmission) -> list[Request | Reply]:
-        """Return the requests of a POST to the path of `op`, with an error reply in place of each refused one."""
+    async def read(self, op: Op, http: HttpRequest, admission: MessageAdmission, name: str) -> Decoded:
+        """Return the requests of a POST to the path of `op`; the first gets the id `name` if it has none."""
         headers = headers_of(http.scope)
         kind = headers.get("content-type", "").partition(";")[0].strip().lower()
         declared = headers.get("content-length", "")
@@ -77,7 +76,7 @@ class RequestDecoder:
         else:
             body = await self.body(http, admission)
             if kind == CONTENT_TYPE:
-                return self._checked(op, await self.decode(body, admission), http)
+                return self._checked(op, await self.decode(body, admission), http, name)
             if kind == "application/json":
                 request = await admission.decoded(
                     partial(request_from_parts, op, body, {}), long=len(body) > LONG_BYTES
@@ -87,9 +86,10 @@ class RequestDecoder:
                     f"content-type: got {kind or 'none'!r}, "
                     f"want multipart/form-data, application/json or {CONTENT_TYPE}"
                 )
-        return self._checked(op, [request], http)
+        return self._checked(op, Decoded([request], {}), http, name)
 
-    def _checked(self, op: Op, requests: list[Request | Reply], http: HttpRequest) -> list[Request | Reply]:
+    def _checked(self, op: Op, decoded: Decoded, http: HttpRequest, name: str) -> Decoded:
+        """Return the requests with what the headers say about them."""
         headers = headers_of(http.scope)
         stated = headers.get(REQUEST_ID_HEADER, "")
         if not is_name(stated):
@@ -97,19 +97,21 @@ class RequestDecoder:
                 f"header {REQUEST_ID_HEADER}: got {stated[:40]!r}, want 1 to 128 visible ASCII characters"
             )
         deadline, rank, step = headers.get(DEADLINE_HEADER), headers.get(RANK_HEADER), headers.get(STEP_HEADER)
-        for request in requests:
-            if not isinstance(request, Request):
-                continue
+        stated_by_headers: dict[str, Any] = {}
+        for place, request in enumerate(decoded.requests):
             if request.op != op:
                 raise MalformedMessage(f"op: the frame says {request.op!r}, the path says {op!r}")
             if deadline:
-                request.deadline_ms = _positive(deadline)
+                stated_by_headers["deadline_ms"] = _positive(deadline)
             if step:
-                request.step = _whole(step)
+                stated_by_headers["step"] = _whole(step)
             if rank:
-                request.rank = cast(RankName, rank)
-                check_request(request, self._limits)
-        return requests
+                stated_by_headers["rank"] = rank
+            request_id = request.request_id or ("" if place else name)
+            decoded.requests[place] = replace(request, request_id=request_id, **stated_by_headers)
+            if rank:
+                check_request(decoded.requests[place], self._limits)
+        return decoded
 
     async def _read_form(self, op: Op, http: HttpRequest, admission: MessageAdmission) -> Request:
         _require_uncompressed(http)
@@ -183,7 +185,7 @@ class RequestDecoder:
             raise MalformedMessage("body: got gzip, want it uncompressed; send it as it is")
         return b"".join(chunks)
 
-    async def decode(self, frame: bytes, admission: MessageAdmission) -> list[Request | Reply]:
+    async def decode(self, frame: bytes, admission: MessageAdmission) -> Decoded:
         """Return the requests of a frame."""
         return await admission.decoded(partial(decode_requests, frame))
 

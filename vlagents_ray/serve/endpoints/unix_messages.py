@@ -27,16 +27,16 @@ import numpy as np
 from vlagents_ray.client.transports.unix_messages import peer_uid
 from vlagents_ray.errors import PolicyUnavailable, VLAgentsError
 from vlagents_ray.protocol import shm_layout
-from vlagents_ray.protocol.frames import decode_requests, encode_replies
-from vlagents_ray.protocol.messages import OPS, Limits, LocalAddress, Op, Reply, Request
+from vlagents_ray.protocol.frames import Decoded, decode_requests, encode_replies
+from vlagents_ray.protocol.messages import OPS, Limits, LocalAddress, Op, Reply
 from vlagents_ray.serve.access.api_keys import Caller, Identity, NoKey
 from vlagents_ray.serve.endpoints.acceptor import Acceptor
 from vlagents_ray.serve.engine import arrival
-from vlagents_ray.serve.engine.admission import MessageAdmission, NeedsDecodingThread, decode_in_background
-from vlagents_ray.serve.engine.dispatch import REFUSED, Dispatcher
+from vlagents_ray.serve.engine.admission import NeedsDecodingThread, decode_in_background
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.engine.metrics_buffer import RequestTrace
+from vlagents_ray.serve.engine.sender import REFUSED, Sender
 from vlagents_ray.serve.periodic import each_half_second
+from vlagents_ray.serve.requests import Message
 
 logger = logging.getLogger(__name__)
 
@@ -155,10 +155,10 @@ class UnixConnection:
         self._connected_at = time.monotonic()
         self.caller: Identity | None = None  # None until the client has sent its key
         self._key: bytes | None = None  # the key as sent
-        self._sender: Dispatcher | None = None
+        self._sender: Sender | None = None
         if isinstance(server.admit, NoKey):
             self.caller = server.admit
-            self._sender = Dispatcher(server.engine, server.name, caller=server.admit)
+            self._sender = Sender(server.engine, server.name, caller=server.admit)
         self._sending = threading.Lock()  # the connection may end during a batch, whose replies are still to be sent
         self._ended = False
         self._pauses = 0  # number of reasons not to poll it: a frame is decoded elsewhere, the key is over its rate
@@ -174,7 +174,7 @@ class UnixConnection:
     def _read(self) -> None:
         if self._sender is not None and self._sender.rated and self._is_throttled():
             return
-        trace = RequestTrace(self._engine.stats, self._server.name)
+        message = Message(self._engine.stats, self._server.name)
         buffer = _buffers.bytes
         try:
             size, control, _, _ = self._connection.recvmsg_into([buffer], _CONTROL)
@@ -195,9 +195,10 @@ class UnixConnection:
                 return
             sender = self._sender or self._authenticate(bytes(buffer[: min(size, _KEY_BYTES)]))
             if sender is not None:
-                self._receive(sender, trace, arrival.waited_s(control), memoryview(buffer)[:size], descriptors)
+                self._receive(sender, message, arrival.waited_s(control), memoryview(buffer)[:size], descriptors)
         except VLAgentsError as error:
-            self._answer(trace, [Reply(error=error)])
+            message.refuse(error)
+            self._answer(message)
             if self._sender is not None and self._sender.refused_too_often:
                 self.end(REFUSED)
         finally:
@@ -207,19 +208,21 @@ class UnixConnection:
             self._is_throttled()
 
     def _receive(
-        self, sender: Dispatcher, trace: RequestTrace, waited_s: float, message: memoryview, descriptors: list[int]
+        self, sender: Sender, message: Message, waited_s: float, data: memoryview, descriptors: list[int]
     ) -> None:
         try:  # only locates the memory; a new memory file of the client is taken even if the message is refused
-            memory, compact_form, text = self._payload.read(message, descriptors)
+            memory, compact_form, text = self._payload.read(data, descriptors)
         except VLAgentsError:
             sender.count_message()
             raise
         if not compact_form:
-            self._decode(sender, trace, waited_s, memory)
+            self._decode(sender, message, waited_s, memory)
             return
         if sender.rated:
             sender.count_message()
-        self._dispatch(sender, None, trace, waited_s, self._reader.read(text, memory))
+        decoded = Decoded(self._reader.read(text, memory), {})
+        message.decoded(decoded)
+        sender.send(message, decoded, self._answer, waited_s=waited_s)
 
     def _is_throttled(self) -> bool:
         """Whether the key of the client is over its rate; if so, the connection is read again later."""
@@ -239,42 +242,34 @@ class UnixConnection:
         self._is_throttled()
         self._resume()
 
-    def _decode(self, sender: Dispatcher, trace: RequestTrace, waited_s: float, frame: np.ndarray) -> None:
+    def _decode(self, sender: Sender, message: Message, waited_s: float, frame: np.ndarray) -> None:
         """Decode the requests of a frame, in another thread if that is slow, and send them to the engine."""
         admission = sender.admission(self._server.limits)
         read = partial(decode_requests, frame.data, ops=self._server.ops)
 
-        def decoded(result: Callable[[], list[Request | Reply]]) -> None:
+        def send(decoded: Decoded, waited_s: float) -> None:
+            message.decoded(decoded)
+            sender.send(message, decoded, self._answer, admission=admission, waited_s=waited_s)
+
+        def on_decoded(result: Callable[[], Decoded]) -> None:
             try:
                 if not self._ended:
-                    self._dispatch(sender, admission, trace, waited_s + time.perf_counter() - trace.arrived, result())
+                    send(result(), waited_s + time.perf_counter() - message.arrived)
             except VLAgentsError as error:
-                self._answer(trace, [Reply(error=error)])
+                message.refuse(error)
+                self._answer(message)
             except Exception:
                 logger.exception("local client: disconnected after an error")
                 self._disconnect()
             self._resume()
 
         try:
-            requests = read(admission)
+            decoded = read(admission)
         except NeedsDecodingThread:
             self._pause()
-            decode_in_background(self._engine.queue, admission, read, decoded)
+            decode_in_background(self._engine.queue, admission, read, on_decoded)
         else:
-            self._dispatch(sender, admission, trace, waited_s, requests)
-
-    def _dispatch(
-        self,
-        sender: Dispatcher,
-        admission: MessageAdmission | None,
-        trace: RequestTrace,
-        waited_s: float,
-        requests: Sequence[Request | Reply],
-    ) -> None:
-        trace.decoded(requests)
-        if waited_s:
-            arrival.count_wait(requests, waited_s)
-        sender.send(requests, lambda replies: self._answer(trace, replies), admission=admission)
+            send(decoded, waited_s)
 
     def _pause(self) -> None:
         """Stop polling the client until `_resume` was called as many times."""
@@ -287,7 +282,7 @@ class UnixConnection:
         if not self._pauses and not self._ended:
             self._engine.queue.watch(self._connection, self.ready)
 
-    def _authenticate(self, message: bytes) -> Dispatcher | None:
+    def _authenticate(self, message: bytes) -> Sender | None:
         """Take the first message for the client's key; if that is refused, each later message tries that key again."""
         if isinstance(self._server.admit, NoKey):
             raise TypeError(f"a key, although none is asked for: {self._server.admit.value}")
@@ -295,7 +290,7 @@ class UnixConnection:
         caller = self._server.admit(self._key.decode(errors="replace"))
         caller.hold()
         caller.note("let in by", self._server.name)
-        self.caller, self._sender = caller, Dispatcher(self._engine, self._server.name, caller=caller)
+        self.caller, self._sender = caller, Sender(self._engine, self._server.name, caller=caller)
         return None if first else self._sender
 
     def overdue(self, now: float, refusal: Callable[[Caller], str | None]) -> str | None:
@@ -332,10 +327,9 @@ class UnixConnection:
         if isinstance(self.caller, Caller):
             self.caller.hold(-1)
 
-    def _answer(self, trace: RequestTrace, replies: list[Reply]) -> None:
-        frame, compact_form = trace.packed(replies)
-        self._send(frame, compact_form)
-        trace.record(replies)
+    def _answer(self, message: Message) -> None:
+        self._send(*message.packed())
+        message.record()
 
     def _send(self, frame: bytes, compact_form: bool) -> None:
         flags = LocalAddress.COMPACT if compact_form else 0

@@ -8,7 +8,7 @@ import socket
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import ClassVar, NamedTuple
 
@@ -20,15 +20,15 @@ from websockets.server import ServerProtocol
 
 from vlagents_ray.client.transports.probe import answer, is_probe, read_probe
 from vlagents_ray.errors import MalformedMessage, Overloaded, PolicyUnavailable, TooManyRequests, VLAgentsError
-from vlagents_ray.protocol.frames import decode_requests
-from vlagents_ray.protocol.messages import STREAM_BYTES, Limits, Reply, Request
+from vlagents_ray.protocol.frames import Decoded, decode_requests
+from vlagents_ray.protocol.messages import STREAM_BYTES, Limits
 from vlagents_ray.serve.access.api_keys import Caller, Identity
 from vlagents_ray.serve.endpoints.buffers import READ_BYTES, ReceiveBuffer, SendBuffer, receive
 from vlagents_ray.serve.engine import arrival
 from vlagents_ray.serve.engine.admission import MessageAdmission, NeedsDecodingThread, decode_in_background, image_bytes
-from vlagents_ray.serve.engine.dispatch import REFUSED, Dispatcher
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.engine.metrics_buffer import RequestTrace
+from vlagents_ray.serve.engine.sender import REFUSED, Sender
+from vlagents_ray.serve.requests import Message
 
 logger = logging.getLogger(__name__)
 
@@ -67,7 +67,7 @@ class WebSocketConnection:
         self._protocol = ServerProtocol(max_size=STREAM_BYTES)
         self._head = b""  # received part of the handshake
         self._refused_for_s = 0.0  # time after which the handshake would not be over the rate of its key
-        self._sender: Dispatcher | None = None  # None until the handshake is accepted
+        self._sender: Sender | None = None  # None until the handshake is accepted
         self.caller: Identity | None = None  # None until the handshake is accepted
         self._sending = threading.Lock()  # guards the protocol and the sending: other threads send replies
         self._received = ReceiveBuffer()
@@ -152,7 +152,7 @@ class WebSocketConnection:
         if self._paused or self._decoding or self._throttled:
             self._stop_polling()
 
-    def _hold_partial(self, sender: Dispatcher) -> None:
+    def _hold_partial(self, sender: Sender) -> None:
         """Count a message of which a part is here for its key, before the rest is read, and its bytes as they come."""
         try:
             if self._partial is None:
@@ -259,7 +259,7 @@ class WebSocketConnection:
         with self._sending:
             self._flush()
         self._received.attach(self._protocol)
-        self._sender = Dispatcher(self._engine, self.name, caller=self.caller)
+        self._sender = Sender(self._engine, self.name, caller=self.caller)
         return True
 
     def _refuse_handshake(self) -> None:
@@ -310,13 +310,12 @@ class WebSocketConnection:
     def _process(self, frame: Frame, arrived: float, admission: MessageAdmission | None) -> None:
         if self._sender is None:  # nothing is read before the handshake is accepted
             raise VLAgentsError("stream: a message before the handshake was accepted")
-        trace = RequestTrace(self._engine.stats, "websocket")
         if frame.opcode is Opcode.CONT or not frame.fin:
             with self._sending:
                 self._protocol.fail(_UNSUPPORTED_DATA, "messages in fragments; send each in one frame")
                 self._flush()
             return
-        sender = self._sender
+        sender, message = self._sender, self._sender.message()
         admission = admission or sender.admission(self._limits)
         admission.size = len(frame.data)
         try:
@@ -328,49 +327,55 @@ class WebSocketConnection:
                 read_probe(data, admission)
                 self._send(answer(len(data)))
             else:
-                self._decode(_Message(sender, admission, trace, len(data), arrived), data)
+                self._decode(_Received(sender, admission, message, len(data), arrived), data)
         except VLAgentsError as error:
-            self._send(trace.frame([Reply(error=error)]))
+            message.refuse(error)
+            self._send(message.frame())
             if sender.refused_too_often:
                 self.end(_POLICY_VIOLATION, REFUSED)
         if sender.rated:
             self._is_throttled()
 
-    def _decode(self, message: _Message, data: bytes) -> None:
+    def _decode(self, received: _Received, data: bytes) -> None:
         read = partial(decode_requests, data)
         try:
-            self._dispatch(message, read(message.admission))
+            self._submit(received, read(received.admission))
         except NeedsDecodingThread:
             self._decoding = True
-            decode_in_background(self._engine.queue, message.admission, read, partial(self._decoded, message))
+            decode_in_background(self._engine.queue, received.admission, read, partial(self._decoded, received))
 
-    def _dispatch(self, message: _Message, requests: Sequence[Request | Reply]) -> None:
+    def _submit(self, received: _Received, decoded: Decoded) -> None:
         """Send the requests of a message to the engine; their deadlines count from the arrival of the message."""
-        trace = message.trace
-        trace.decoded(requests)
-        if (waited_s := time.perf_counter() - message.arrived) > arrival.LEAST_S:
-            arrival.count_wait(requests, waited_s)
-        size = message.size + sum(map(image_bytes, requests))
+        received.message.decoded(decoded)
+        waited_s = time.perf_counter() - received.arrived
+        size = received.size + sum(map(image_bytes, decoded.requests))
         with self._sending:
             self._unanswered += 1
             self._unanswered_bytes += size
-        message.sender.send(requests, lambda replies: self._answer(trace, replies, size), admission=message.admission)
+        received.sender.send(
+            received.message,
+            decoded,
+            partial(self._answer, size),
+            admission=received.admission,
+            waited_s=waited_s if waited_s > arrival.LEAST_S else 0.0,
+        )
 
-    def _decoded(self, message: _Message, result: Callable[[], Sequence[Request | Reply]]) -> None:
+    def _decoded(self, received: _Received, result: Callable[[], Decoded]) -> None:
         """Take a message that another thread has decoded; called on the thread that polls."""
         if self._ended:
             return
         try:
-            self._dispatch(message, result())
+            self._submit(received, result())
         except VLAgentsError as error:
-            self._send(message.trace.frame([Reply(error=error)]))
+            received.message.refuse(error)
+            self._send(received.message.frame())
         except Exception:
             logger.exception("stream client: disconnected after an error")
             self.disconnect()
         self._decoding = False
         self._continue()
 
-    def _answer(self, trace: RequestTrace, replies: list[Reply], size: int) -> None:
+    def _answer(self, size: int, message: Message) -> None:
         with self._sending:
             self._unanswered -= 1
             self._unanswered_bytes -= size
@@ -378,12 +383,12 @@ class WebSocketConnection:
             self._paused = self._paused and not resume
         if resume:
             self._engine.queue.call_soon(self._resume_polling)
-        self._send(trace.frame(replies))
+        self._send(message.frame())
 
-    def _send(self, message: bytes) -> None:
+    def _send(self, data: bytes) -> None:
         with self._sending:
             if not self._ended and self._protocol.state is State.OPEN:
-                self._protocol.send_binary(message)
+                self._protocol.send_binary(data)
                 self._flush()
 
     def _flush(self) -> None:
@@ -392,11 +397,11 @@ class WebSocketConnection:
         self._out.send(b"".join(pieces), last=b"" in pieces)
 
 
-class _Message(NamedTuple):
+class _Received(NamedTuple):
     """A complete message of a client, and the objects that process it."""
 
-    sender: Dispatcher
+    sender: Sender
     admission: MessageAdmission
-    trace: RequestTrace
+    message: Message
     size: int  # bytes
     arrived: float  # s, of `time.perf_counter`

@@ -21,7 +21,7 @@ from typing import Protocol, TypeVar
 
 from vlagents_ray.errors import MessageTooLarge, Overloaded, PolicyUnavailable, VLAgentsError
 from vlagents_ray.images import thread_map
-from vlagents_ray.protocol.messages import Budget, Limits, Reply, Request
+from vlagents_ray.protocol.messages import Budget, Limits, Request
 
 T = TypeVar("T")
 
@@ -246,9 +246,7 @@ class MessageAdmission(Budget):
         return None
 
 
-def image_bytes(request: Request | Reply) -> int:
-    """Return the decoded size of all images of a request, including its history, in bytes; 0 for a reply."""
-    if isinstance(request, Reply):
-        return 0
+def image_bytes(request: Request) -> int:
+    """Return the decoded size of all images of a request, including its history, in bytes."""
     seen = request.history if request.obs is None else [request.obs, *request.history]
     return sum(image.nbytes for obs in seen for image in obs.cameras.values())

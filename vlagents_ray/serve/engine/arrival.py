@@ -19,7 +19,6 @@ from collections.abc import Callable, Mapping, Sequence
 from contextvars import ContextVar
 from typing import Any
 
-from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.periodic import Periodic
 
 _TIMESTAMP = 35  # SO_TIMESTAMPNS of Linux, which Python's socket does not name
@@ -56,13 +55,6 @@ def has_unread(connection: socket.socket) -> bool:
     waiting = array("i", [0])
     fcntl.ioctl(connection, termios.FIONREAD, waiting)
     return waiting[0] > 0
-
-
-def count_wait(requests: Sequence[Request | Reply], seconds: float) -> None:
-    """Count the time that the requests have waited, s, towards their deadlines."""
-    for request in requests:
-        if isinstance(request, Request):
-            request.waited_ms = seconds * 1e3
 
 
 # Ports of both ends of the TCP connection on which the current HTTP request came, the server's first.

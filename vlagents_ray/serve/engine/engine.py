@@ -1,14 +1,17 @@
 """The core of a replica, without Ray: one policy, its sessions and its batch queue.
 
-Every endpoint (HTTP, WebSocket, a Serve handle, …) decodes a message into `Request`s and queues them;
-a callback on a thread of the batch queue receives the reply.
+Every endpoint (HTTP, WebSocket, a Serve handle, …) decodes a message, and its `Sender` submits the requests to the
+engine. The engine has the policy's thread: it takes batches from the queue, runs them, and finishes their requests.
 """
 
 from __future__ import annotations
 
 import logging
+import threading
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import (
@@ -20,20 +23,21 @@ from vlagents_ray.errors import (
     VLAgentsError,
 )
 from vlagents_ray.interface import Act, Agent
-from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Reply, Request
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Reply
 from vlagents_ray.serve.engine.admission import Admission
 from vlagents_ray.serve.engine.arrival import PauseDetector
 from vlagents_ray.serve.engine.metrics_buffer import MetricsBuffer
 from vlagents_ray.serve.engine.resets import Resets
-from vlagents_ray.serve.engine.responses import Watchers, build_reply, public_error, raised_at, timing
+from vlagents_ray.serve.engine.responses import Observers, build_reply, public_error, raised_at, timing
 from vlagents_ray.serve.engine.session_transfer import DrainList, SessionTransfer
 from vlagents_ray.serve.models.checkpoints import Checkpoints
 from vlagents_ray.serve.models.loaded_model import LoadedModel, Loader
 from vlagents_ray.serve.models.model_manager import ModelManager
-from vlagents_ray.serve.queue.batch_queue import BatchQueue, PendingRequest, Rank
+from vlagents_ray.serve.queue.batch_queue import BatchQueue, Taken
 from vlagents_ray.serve.queue.call_limits import CallLimits, PolicyCall, PolicyCalls
 from vlagents_ray.serve.queue.poller import Poller
 from vlagents_ray.serve.queue.preparation import Preparations
+from vlagents_ray.serve.requests import Opening, PendingRequest, Rank
 from vlagents_ray.serve.sessions import Session, SessionFinder, SessionTable
 from vlagents_ray.serve.weights.updates import WeightUpdates, follows
 from vlagents_ray.serve.weights.versions import WeightsVersion
@@ -88,32 +92,48 @@ class Engine:
         self._loading = self.models.loading()
         self._unready: VLAgentsError | None = self._loading  # for clients
         self._failure: PolicyFailed | None = None  # why the policy did not load, for the operator
+        self._not_started: BaseException | None = None  # the error itself, from the policy's thread
         self._hung: PolicyCall | None = None  # overdue call that `notice_hung` found
         self.draining = False  # whether the replica will stop, so that replies ask clients to reconnect elsewhere
         self.drain_list = DrainList()  # connections asked to reconnect only because others hold fewer sessions
         self.queue = BatchQueue(
-            self._run,
             max_batch_size,
-            prepare=self.models.start,
-            idle=self.sessions.drop_idle,
             idle_s=session_idle_s / 10,
             patience=patience,
             is_open=self.sessions.__contains__,
             clock=clock,
             poller=poller,
         )
+        self._thread = threading.Thread(target=self._serve, name="policy", daemon=True)
+        self._started = threading.Event()  # set when the policy was loaded, or was not
+        self._alive = False  # whether something takes batches from the queue
+        self._unsent: list[tuple[PendingRequest, Reply]] = []  # answers for another thread, while the next batch runs
+        self._answers = ThreadPoolExecutor(1, "policy-answers")
         self.weights = WeightUpdates(lambda: self.models.own_weights, self.sessions.all)
         self.transfer = SessionTransfer(self.sessions, self.models, self.require_ready)
         self._resets = Resets(self.sessions, self.models, self.queue, finder, clock, reply_bytes)
-        self.watchers = Watchers()
+        self.observers = Observers()
 
     def start(self, *, threaded: bool = True) -> None:
-        """Initialize the agent, and return when it can act; raises `PolicyFailed` if it does not load.
+        """Load the policy on its thread, and return when it can act.
 
-        See `BatchQueue.start` for `threaded`.
+        Args:
+            threaded: False if the calling thread is the policy's thread, and calls `queue.take` and `run` in turns.
+
+        Raises:
+            PolicyFailed: It does not load, or not in time.
         """
         try:
-            self.queue.start(self.calls.limits.load_s, threaded=threaded)
+            self._alive = True
+            if threaded:
+                self._thread.start()
+                if not self._started.wait(limit_s := self.calls.limits.load_s):
+                    raise TimeoutError(f"not loaded within {limit_s:g} s, its limit")
+                if self._not_started is not None:
+                    raise self._not_started
+            else:
+                self.models.start()
+                self.queue.bind(driven=True)
         except Exception as error:
             failed = f"the policy did not load: {type(error).__name__}"
             self._unready = PolicyFailed(f"{failed}; the server's log says why")
@@ -123,6 +143,30 @@ class Engine:
             self._preparations = Preparations()
             self.pauses.start()
         self._unready = None
+
+    def _serve(self) -> None:
+        """Run the policy's thread, on which it is loaded and acts."""
+        try:
+            self.models.start()
+        except BaseException as error:  # noqa: BLE001 - raised again by start(), on the caller's thread
+            self._not_started = error
+            self._alive = False
+            self.queue.release()
+            return
+        finally:
+            self.queue.bind()
+            self._started.set()
+        try:
+            while (taken := self.queue.next()) is not None:
+                if self._unsent:
+                    unsent, self._unsent = self._unsent, []
+                    self._answers.submit(_send, unsent)
+                self.run(taken)
+            _send(self._unsent)
+            self._answers.shutdown()
+            self.queue.release()
+        finally:
+            self._alive = False
 
     @property
     def ready(self) -> bool:
@@ -137,7 +181,7 @@ class Engine:
         """Raise `PolicyUnavailable` while the policy loads, `PolicyFailed` if it did not load or its thread ended."""
         if self._unready is not None:
             raise self.models.loading() if self._unready is self._loading else self._unready
-        if not self.queue.alive():
+        if not self._alive:
             raise PolicyFailed("the policy's thread has ended")
         if self.calls.broken is not None:
             self.calls.require_device()
@@ -173,7 +217,11 @@ class Engine:
         self.stats.hung(call.op)
         self._unready = PolicyUnavailable(f"{said}; the session begins again at another replica")
         # The policy may still act on the running batch, so its requests must not be sent again; waiting ones may be.
-        self.queue.fail(DeadlineExceeded(said), self._unready)
+        running, waiting = self.queue.clear()
+        for pending in running:
+            pending.fail(DeadlineExceeded(said))
+        for pending in waiting:
+            self._fail(pending, self._unready)
 
     def drain(self) -> None:
         """Ask all clients, with their next replies, to reconnect to other replicas, since this one will stop."""
@@ -183,10 +231,24 @@ class Engine:
         """Answer waiting requests with 503, finish the running batch, and close the agents."""
         self.pauses.stop()
         self.admission.close()
-        self.queue.close(timeout_s=30)
+        self.stop(timeout_s=30)
         if self._preparations is not None:
             self._preparations.close()
         self.models.close()
+
+    def stop(self, timeout_s: float) -> None:
+        """Refuse all requests but those of the running batch, and wait at most `timeout_s` for its end."""
+        for pending in self.queue.close():
+            self._fail(pending, PolicyUnavailable("the replica is stopping; connect again"))
+        if self._thread.ident is None:
+            self.queue.release()
+        elif self._thread is not threading.current_thread():
+            self._thread.join(timeout_s)
+
+    @property
+    def alive(self) -> bool:
+        """Whether the policy's thread takes requests."""
+        return self._alive
 
     @property
     def contract(self) -> Contract | None:
@@ -198,91 +260,134 @@ class Engine:
         """Version of the policy; replicas of equal versions can take over each other's sessions."""
         return self.models.version
 
-    def ticket(
-        self,
-        session_id: str,
-        request: Request,
-        done: Callable[[Reply], None],
-        *,
-        owner: str = "",
-        connection: str = "",
-        transport: str = "",
-        quota: tuple[str, int | None] | None = None,
-        arrived: float | None = None,
-    ) -> PendingRequest:
-        """Check a request, raising its errors, and return its ticket for the queue; `done` receives the reply.
+    def submit(self, requests: Sequence[PendingRequest]) -> None:
+        """Check requests, and queue them together; those that cannot be queued are finished with their error."""
+        ready: list[PendingRequest] = []
+        for pending in requests:
+            try:
+                self.check(pending)
+                ready.append(pending)
+            except VLAgentsError as error:
+                if not self._seek(pending, error):
+                    self._fail(pending, error)
+        try:
+            if ready:
+                self.queue.put(*ready)
+        except VLAgentsError as error:
+            for pending in ready:
+                self._fail(pending, error)
 
-        `owner` is the connection with which the session ends; empty for a caller without one. `connection` is
-        the source whose turn it is in the queue, if that carries several sessions. See `SessionTable.open` for
-        `quota`. `arrived` is the time at which the deadline begins, s of `clock`; by default now.
-        """
+    def check(self, pending: PendingRequest) -> None:
+        """Check a request before it is queued, and note what the server decides about it; raises its errors."""
         self.require_ready()
-        rank = Rank.SIMULATION if request.rank == "simulation" else Rank.ROBOT
-        arrived = self.clock() if arrived is None else arrived
-        ticket = PendingRequest(
-            session_id, request, done, rank, arrived, connection=connection, owner=owner, transport=transport
-        )
+        request, origin = pending.request, pending.origin
         if request.op == "act":
-            session = self.sessions.get(session_id)
+            pending.session = session = self.sessions.get(pending.session_id)
             if session.agent is None:
-                raise NotReset(f"session {session_id!r}: act before a successful reset; reset first")
+                raise NotReset(f"session {pending.session_id!r}: act before a successful reset; reset first")
             if (step := request.step) is not None and step > session.steps and step > session.expected:
                 raise session.wrong_step(step)
-            session.owner, session.transport, session.connection = owner, transport, connection
+            session.origin = origin
             if (model := session.model) is not None:  # another thread may set it to None
                 model.check(request)
             if self._preparations is not None and self.queue.window.overlaps:
-                ticket.preparation = self._preparations.begin(session.agent, request.obs)
+                pending.preparation = self._preparations.begin(session.agent, request.obs)
         elif request.op == "reset":
-            ticket.choice, request.kwargs = self._source.split_options(request.kwargs)
-            ticket.follows = follows(request.kwargs, by_default=rank is not Rank.ROBOT)
-            if (model := self.models.loaded(ticket.choice)) is not None:  # otherwise it is checked after loading
+            choice, kwargs = self._source.split_options(request.kwargs)
+            opening = Opening(choice, kwargs, follows(kwargs, by_default=pending.rank is not Rank.ROBOT))
+            if (model := self.models.loaded(choice)) is not None:  # otherwise it is checked after loading
                 model.check(request)
-            session = self.sessions.open(session_id, owner, transport, connection, quota)
-            ticket.first = self.sessions.begin(session, request.step)
-        return ticket
+            session = self.sessions.open(pending.session_id, origin)
+            opening.first = self.sessions.begin(session, request.step)
+            pending.opening = opening
+        if origin.owner:
+            if request.op == "close":
+                origin.sessions.discard(pending.session_id)
+            else:
+                origin.sessions.add(pending.session_id)
 
-    def submit(self, session_id: str, request: Request, done: Callable[[Reply], None]) -> PendingRequest:
-        """Queue a request, and return its ticket; `done` receives the reply."""
-        ticket = self.ticket(session_id, request, done)
-        self.queue.put(ticket)
-        return ticket
+    def withdraw(self, *requests: PendingRequest) -> None:
+        """End requests without an answer as `BatchQueue.withdraw` does, and undo resets that have not begun."""
+        self.queue.withdraw(*requests)
+        for pending in requests:
+            self._undo(pending)
 
-    def withdraw(self, *tickets: PendingRequest) -> None:
-        """Cancel requests as `BatchQueue.withdraw` does, and undo resets that have not begun."""
-        self.queue.withdraw(*tickets)
-        for ticket in tickets:
-            if ticket.request.op == "reset" and not ticket.begun:
-                self.sessions.undo(ticket.session_id, ticket.first)
+    def _undo(self, pending: PendingRequest) -> None:
+        if pending.opening is not None and not pending.begun:
+            self.sessions.undo(pending.session_id, pending.opening.first)
+
+    def _fail(self, pending: PendingRequest, error: VLAgentsError) -> None:
+        """Finish a request with an error, and undo a reset that has not begun."""
+        self._undo(pending)
+        pending.fail(error)
+
+    def _seek(self, pending: PendingRequest, error: VLAgentsError) -> bool:
+        """Queue an act again once its session was fetched from another replica; False if that is of no use.
+
+        Args:
+            pending: The act, which fails if its session is not found.
+            error: The error with which it fails.
+        """
+        if self.finder is None or pending.sought or pending.request.op != "act":
+            return False
+        if not isinstance(error, UnknownSession):
+            return False
+        pending.sought, pending.begun = True, False
+
+        def retry() -> None:
+            try:
+                self.check(pending)
+                if not pending.over:  # otherwise the caller no longer waits
+                    self.queue.put(pending)
+            except VLAgentsError as again:
+                pending.fail(error if type(again) is type(error) else again)
+
+        origin = pending.origin
+        if self.finder.fetch(pending.session_id, retry, origin.owner if origin.caller is None else origin.caller.name):
+            return True
+        if self.draining:  # the replica has handed over its sessions
+            pending.fail(PolicyUnavailable("the replica is stopping; connect again, or send the same request again"))
+            return True
+        return False
 
     def _session_ended(self, session: Session[LoadedModel]) -> None:
         self.models.release(session)
 
+    def run(self, taken: Taken) -> None:
+        """Answer what the queue gave: expired requests, and a batch. Called on the policy's thread."""
+        for pending in taken.expired:
+            deadline_ms = pending.request.deadline_ms
+            self._fail(pending, DeadlineExceeded(f"no action within {deadline_ms:g} ms: dropped before inference"))
+        if not taken.batch:
+            self.sessions.drop_idle()
+            return
+        self.queue.begin(taken.batch)
+        try:
+            self._run(taken.batch)
+        except BaseException as error:  # a policy that calls sys.exit() must not end the replica's only thread
+            logger.exception("the batch failed")
+            for pending in taken.batch:
+                pending.fail(PolicyFailed(f"the policy raised {type(error).__name__}"))
+        self.queue.end()
+
     def _run(self, batch: Sequence[PendingRequest]) -> None:
-        """Answer every ticket of a batch. Called on the policy's thread."""
         acting: dict[tuple[LoadedModel, WeightsVersion], list[Acting]] = {}
-        for ticket in batch:
+        for pending in batch:
             try:
-                if ticket.request.op == "act":
-                    session, model, weights = self._ready(ticket)
-                    acting.setdefault((model, weights), []).append((ticket, session))
-                elif ticket.request.op == "reset":
-                    self._resets.run(ticket)
-                elif ticket.request.op == "export":
-                    self.transfer.export(ticket)
-                elif ticket.request.op == "release":
-                    self.transfer.release(ticket)
-                elif ticket.request.op == "observe":
-                    self._observe(ticket)
+                if pending.request.op == "act":
+                    session, model, weights = self._ready(pending)
+                    acting.setdefault((model, weights), []).append((pending, session))
+                elif pending.opening is not None:
+                    self._resets.run(pending, pending.opening)
                 else:
-                    if ticket.request.op == "adopt":
-                        self.transfer.adopt(ticket.session_id, ticket.request.kwargs)
-                    else:
-                        self.sessions.close(ticket.session_id)
-                    ticket.answer(Reply(ticket.request.request_id, info={}))
+                    pending.finish(Reply(pending.request.request_id, info=self._other(pending)))
             except Exception as error:  # noqa: BLE001 - becomes the reply
-                ticket.begun = ticket.begun and ticket.request.op != "act"  # the policy has not received this act
-                ticket.answer(Reply(ticket.request.request_id, error=public_error(error, ticket)))
+                public = public_error(error, pending)
+                if pending.request.op == "act":
+                    pending.begun = False  # the policy has not received it
+                    if pending.session_id not in self.sessions and self._seek(pending, public):
+                        continue
+                self._fail(pending, public)
         for (model, weights), group in acting.items():
             prepared_s = 0.0
             if self.queue.window.slow:
@@ -290,27 +395,43 @@ class Engine:
             if group:
                 self._act(model, weights, group, prepared_s)
 
-    def _ready(self, ticket: PendingRequest) -> tuple[Session[LoadedModel], LoadedModel, WeightsVersion]:
-        session = self.sessions.get(ticket.session_id)
+    def _other(self, pending: PendingRequest) -> dict[str, Any]:
+        """Return the info of the answer to a request that is neither an act nor a reset."""
+        session_id, request = pending.session_id, pending.request
+        if request.op == "export":
+            return self.transfer.export(session_id)
+        if request.op == "release":
+            return {"released": self.sessions.release(session_id, request.kwargs["version"])}
+        if request.op == "adopt":
+            self.transfer.adopt(session_id, request.kwargs)
+        elif request.op == "observe":
+            self._observe(pending)
+        else:
+            self.sessions.close(session_id)
+        return {}
+
+    def _ready(self, pending: PendingRequest) -> tuple[Session[LoadedModel], LoadedModel, WeightsVersion]:
+        session = pending.session
+        if session is None or session.over:  # it has ended, or came here from another replica, since it was looked up
+            session = self.sessions.get(pending.session_id)
         model, weights = session.model, session.weights
         if session.agent is None:  # an earlier reset in the queue failed, or waits for its checkpoint
-            raise NotReset(f"session {ticket.session_id!r}: its last reset failed; reset again")
-        step = ticket.request.step
+            raise NotReset(f"session {pending.session_id!r}: its last reset failed; reset again")
+        step = pending.request.step
         if step is not None and step != session.steps:
             raise session.wrong_step(step)
         if model is None or weights is None:
-            raise UnknownSession(f"session {ticket.session_id!r}: has just been closed; reset it")
+            raise UnknownSession(f"session {pending.session_id!r}: has just been closed; reset it")
         return session, model, weights
 
-    def _observe(self, ticket: PendingRequest) -> None:
-        session, model, weights = self._ready(ticket)
-        if session.agent is not None and ticket.request.obs is not None:  # `_ready` and the decoder ensure both
+    def _observe(self, pending: PendingRequest) -> None:
+        session, model, weights = self._ready(pending)
+        if session.agent is not None and pending.request.obs is not None:  # `_ready` and the decoder ensure both
             with model.busy, model.uncaptured, model.call("observe"):
                 model.require_open()
                 model.parameters.use(weights)
-                session.agent.observe(ticket.request.obs)
-        ticket.request.obs = None
-        ticket.answer(Reply(ticket.request.request_id, info={}))
+                session.agent.observe(pending.request.obs)
+        pending.request.drop_observations()
 
     def _prepared(self, model: LoadedModel, acting: list[Acting]) -> tuple[list[Acting], float]:
         """Finish the preparations of observations, and answer the requests whose preparation failed.
@@ -318,20 +439,20 @@ class Engine:
         Returns:
             The other requests, and the time that this took, s, which counts as inference.
         """
-        preparations = [(ticket.preparation, session.agent) for ticket, session in acting]
+        preparations = [(pending.preparation, session.agent) for pending, session in acting]
         if all(preparation is None for preparation, _ in preparations):
             return acting, 0.0
         with model.busy, model.uncaptured, model.call("act", "prepare") as call:
             errors = {} if model.closed else Preparations.finish(preparations)
         for place, error in errors.items():
-            ticket = acting[place][0]
-            ticket.request.obs = None
-            ticket.answer(Reply(ticket.request.request_id, error=public_error(error, ticket)))
+            pending = acting[place][0]
+            pending.request.drop_observations()
+            pending.fail(public_error(error, pending))
         return [one for place, one in enumerate(acting) if place not in errors], call.ended - call.began
 
     def _act(self, model: LoadedModel, weights: WeightsVersion, acting: Sequence[Acting], prepared_s: float) -> None:
         """Answer the act requests of sessions with one version of one model's weights."""
-        observations = [ticket.request.obs for ticket, _ in acting]
+        observations = [pending.request.obs for pending, _ in acting]
         agents = [session.agent for _, session in acting]
         padding = model.pad(observations, agents) if self._batch_sizes else 0
         rows = len(observations)
@@ -349,21 +470,27 @@ class Engine:
         if len(acting) > 1 or isinstance(results[0], Exception) or model.calls.failed_batches:
             model.calls.record_batch(results[: len(acting)])
         del observations  # they may lie in memory that their sender needs back
-        for ticket, _ in acting:
-            ticket.request.obs = None
+        for pending, _ in acting:
+            pending.request.drop_observations()
         if padding:
             model.padding.check_results(results[len(acting) :])
             results = results[: len(acting)]
         defer = self.queue.full_batch_waits()
         unsent = []
-        for (ticket, session), result in zip(acting, results, strict=True):
-            reply = build_reply(ticket, session, result, model.contract, self._reply_bytes, weights.info)
-            reply.timing = timing(ticket.arrived, call.began - prepared_s, call.ended)
-            reply.timing["batch_size"] = len(acting)
-            if defer and ticket.rank is not Rank.ROBOT:
-                unsent.append((ticket, reply))
+        for (pending, session), result in zip(acting, results, strict=True):
+            reply = build_reply(pending, session, result, model.contract, self._reply_bytes, weights.info)
+            if reply.error is None:
+                reply.timing = timing(pending.arrived, call.began - prepared_s, call.ended)
+                reply.timing["batch_size"] = len(acting)
+            if defer and pending.rank is not Rank.ROBOT:
+                unsent.append((pending, reply))
             else:
-                ticket.answer(reply)
+                pending.finish(reply)
         if unsent:
-            self.queue.answer_later(unsent)
+            self._unsent.extend(unsent)
         self.stats.batch(len(acting), rows)
+
+
+def _send(answers: Sequence[tuple[PendingRequest, Reply]]) -> None:
+    for pending, reply in answers:
+        pending.finish(reply)

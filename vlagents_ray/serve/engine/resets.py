@@ -15,7 +15,8 @@ from vlagents_ray.serve.engine.responses import require_serializable, timing
 from vlagents_ray.serve.models.loaded_model import LoadedModel
 from vlagents_ray.serve.models.model_cache import too_late
 from vlagents_ray.serve.models.model_manager import ModelManager
-from vlagents_ray.serve.queue.batch_queue import BatchQueue, PendingRequest
+from vlagents_ray.serve.queue.batch_queue import BatchQueue
+from vlagents_ray.serve.requests import Opening, PendingRequest
 from vlagents_ray.serve.sessions import Session, SessionFinder, SessionTable
 
 
@@ -48,76 +49,73 @@ class Resets:
         self._clock = clock
         self._reply_bytes = reply_bytes
 
-    def run(self, ticket: PendingRequest) -> None:
-        """Begin the episode that the ticket requests and answer it, or queue it again after its checkpoint loaded."""
-        if ticket.loaded is None:
-            if self._sessions.is_past(ticket.session_id, ticket.first):
-                raise UnknownSession(
-                    f"session {ticket.session_id!r}: reset elsewhere, or ended, while this reset waited"
-                )
-            session = self._sessions.open(ticket.session_id, ticket.owner, ticket.transport, ticket.connection)
+    def run(self, pending: PendingRequest, opening: Opening) -> None:
+        """Begin the episode that a reset asks for and finish it, or queue it again after its checkpoint was loaded."""
+        session_id = pending.session_id
+        if pending.loaded is None:
+            if self._sessions.is_past(session_id, opening.first):
+                raise UnknownSession(f"session {session_id!r}: reset elsewhere, or ended, while this reset waited")
+            session = self._sessions.open(session_id, pending.origin)
             if session.told_to_follow is not None:
-                ticket.follows = session.told_to_follow
-            session.agent, session.weights, session.follows = None, None, ticket.follows
-            session.steps, session.resetting = ticket.first, ticket
-            session.first, session.moves = ticket.first, 0
-            session.expected = max(session.expected, ticket.first)
-            is_abandoned = partial(self._is_abandoned, ticket, session)
-            if self._models.hold(session, ticket.choice, partial(self._requeue, ticket), is_abandoned) is None:
+                opening.follows = session.told_to_follow
+            session.agent, session.weights, session.follows = None, None, opening.follows
+            session.steps, session.resetting = opening.first, pending
+            session.first, session.moves = opening.first, 0
+            session.expected = max(session.expected, opening.first)
+            is_abandoned = partial(self._is_abandoned, pending, session)
+            if self._models.hold(session, opening.choice, partial(self._requeue, pending), is_abandoned) is None:
                 return  # `_requeue` queues it again
         else:
-            session = self._sessions.get(ticket.session_id)
-            if session.resetting is not ticket:
-                raise UnknownSession(f"session {ticket.session_id!r}: reset anew, or closed, while this reset waited")
-            if self._is_abandoned(ticket, session):
+            session = self._sessions.get(session_id)
+            if session.resetting is not pending:
+                raise UnknownSession(f"session {session_id!r}: reset anew, or closed, while this reset waited")
+            if self._is_abandoned(pending, session):
                 self._models.release_model(session)
-                raise too_late(ticket.choice)
+                raise too_late(opening.choice)
         session.resetting = None
         try:
-            self._begin(ticket, session)
+            self._begin(pending, opening, session)
         except BaseException:
-            self._models.release_model(
-                session
-            )  # otherwise the session might hold the model for long without an episode
+            self._models.release_model(session)  # else the session might hold the model for long without an episode
             raise
 
-    def _begin(self, ticket: PendingRequest, session: Session[LoadedModel]) -> None:
-        """Begin an episode on the model that the session holds, and answer the ticket."""
-        request, model = ticket.request, session.model
+    def _begin(self, pending: PendingRequest, opening: Opening, session: Session[LoadedModel]) -> None:
+        """Begin an episode on the model that the session holds, and answer the request."""
+        request, model = pending.request, session.model
         if model is None or request.obs is None:  # the decoder ensures the second
-            raise UnknownSession(f"session {ticket.session_id!r}: closed before its reset was over")
+            raise UnknownSession(f"session {pending.session_id!r}: closed before its reset was over")
         model.check(request)
         with model.busy, model.uncaptured, model.call("reset") as call:
             model.require_open()
-            model.parameters.use(model.parameters.begin(session, follows=ticket.follows))
+            model.parameters.use(model.parameters.begin(session, follows=opening.follows))
             agent = model.copies.make()
-            info = agent.reset(request.obs, request.instruction, **request.kwargs)
+            info = agent.reset(request.obs, request.instruction, **opening.kwargs)
             if not isinstance(info, dict):
                 raise PolicyFailed(f"reset: the policy returned {type(info).__name__}, want a dict")
             for obs in request.history:
                 agent.observe(obs)
         info = {**model.identity, **info}  # a session with an adapter states both by itself
-        spent = timing(ticket.arrived, call.began, call.ended)
+        spent = timing(pending.arrived, call.began, call.ended)
         require_serializable(info, self._reply_bytes)
         session.agent, session.instruction = agent, request.instruction or ""
-        model.padding.record_reset(request)
-        request.obs, request.history = None, []
+        model.padding.record_reset(request, opening.kwargs)
+        request.drop_observations()
         if not session.announced and self._finder is not None:
             session.announced = True
             self._finder.announce(session.id, session.steps)
-        ticket.answer(Reply(request.request_id, info=info, step=session.steps, timing=spent))
+        pending.finish(Reply(request.request_id, info=info, step=session.steps, timing=spent))
 
-    def _requeue(self, ticket: PendingRequest, error: VLAgentsError | None) -> None:
+    def _requeue(self, pending: PendingRequest, error: VLAgentsError | None) -> None:
         """Queue a reset again whose checkpoint was loaded, or answer it with the error."""
-        ticket.loaded = self._clock()
+        pending.loaded = self._clock()
         try:
             if error is not None:
                 raise error
-            self._queue.put(ticket)
+            self._queue.put(pending)
         except VLAgentsError as reason:
-            ticket.request.obs, ticket.request.history = None, []  # the session may still refer to the ticket
-            ticket.answer(Reply(ticket.request.request_id, error=reason))
+            pending.request.drop_observations()  # the session may still refer to the request
+            pending.fail(reason)
 
-    def _is_abandoned(self, ticket: PendingRequest, session: Session[LoadedModel]) -> bool:
+    def _is_abandoned(self, pending: PendingRequest, session: Session[LoadedModel]) -> bool:
         """Return whether the caller no longer waits for that reset, or the session was reset again."""
-        return ticket.cancelled or ticket.expired(self._clock()) or session.resetting is not ticket
+        return pending.over or pending.expired(self._clock()) or session.resetting is not pending

@@ -1,4 +1,4 @@
-"""Replies from a policy's results and errors: checked, bounded, and collected for the frame that holds them."""
+"""Replies from a policy's results and errors, checked and bounded."""
 
 from __future__ import annotations
 
@@ -14,20 +14,13 @@ from typing import Any, Protocol
 import numpy as np
 
 from vlagents_ray.contract import Contract
-from vlagents_ray.errors import (
-    DeadlineExceeded,
-    InvalidInput,
-    MessageTooLarge,
-    OutcomeUnknown,
-    PolicyFailed,
-    VLAgentsError,
-)
+from vlagents_ray.errors import InvalidInput, MessageTooLarge, PolicyFailed, VLAgentsError
 from vlagents_ray.images.codecs import DecodedFiles
 from vlagents_ray.interface import Act
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Reply, Request
 from vlagents_ray.protocol.values import ValueWriter
 from vlagents_ray.serve.models.loaded_model import LoadedModel
-from vlagents_ray.serve.queue.batch_queue import PendingRequest
+from vlagents_ray.serve.requests import PendingRequest
 from vlagents_ray.serve.sessions import Session
 from vlagents_ray.validation import check_action
 
@@ -52,37 +45,46 @@ class Watcher(Protocol):
         ...
 
 
-class Watchers:
-    """The watchers of an engine, which are themselves one. Thread-safe."""
+class Observers:
+    """The watchers of an engine. Thread-safe."""
 
     def __init__(self) -> None:
-        self.one: Watcher | None = None  # sees all messages; None while nobody watches, which costs one comparison
+        self.any = False  # while nobody watches, a request costs one look at this
         self._all: tuple[Watcher, ...] = ()
+        self._seen: dict[tuple[PendingRequest, Watcher], Done] = {}
         self._lock = threading.Lock()
 
     def add(self, watcher: Watcher) -> None:
         """Let it see the messages from now on."""
         with self._lock:
-            self._set((*self._all, watcher))
+            self._all = (*self._all, watcher)
+            self.any = True
 
     def remove(self, watcher: Watcher) -> None:
         """Let it see no further messages; does nothing if it was not added."""
         with self._lock:
-            self._set(tuple(one for one in self._all if one is not watcher))
+            self._all = tuple(one for one in self._all if one is not watcher)
+            self.any = bool(self._all)
 
-    def note(self, sessions: Sequence[str], items: Sequence[Request | Reply], files: DecodedFiles, done: Done) -> Done:
-        """See `Watcher`."""
-        for watcher in self._all:
-            done = watcher.note(sessions, items, files, done)
-        return done
+    def on_request(self, pending: PendingRequest) -> None:
+        for one in self._all:
+            self._seen[pending, one] = one.note([pending.session_id], [pending.request], pending.files or {}, _ignore)
 
-    def _set(self, watchers: tuple[Watcher, ...]) -> None:
-        self._all = watchers
-        self.one = watchers[0] if len(watchers) == 1 else self if watchers else None
+    def before_answer(self, pending: PendingRequest, reply: Reply) -> None:
+        for one in self._all:
+            if (done := self._seen.pop((pending, one), None)) is not None:
+                done([reply])
+
+    def on_answer(self, pending: PendingRequest, reply: Reply) -> None:
+        pass
+
+
+def _ignore(replies: list[Reply]) -> None:
+    pass
 
 
 def build_reply(
-    ticket: PendingRequest,
+    pending: PendingRequest,
     session: Session[LoadedModel],
     result: Act | Exception,
     contract: Contract | None,
@@ -92,7 +94,7 @@ def build_reply(
     """Build the reply to an act request, and count the step of its session if the result is valid.
 
     Args:
-        ticket: The act request.
+        pending: The act.
         session: Its session.
         result: The policy's result, or the error that it raised.
         contract: The policy's contract, if it has one; the action is checked against it.
@@ -102,7 +104,7 @@ def build_reply(
     Returns:
         The reply; with an error if the policy raised one, or if its result is invalid or too large.
     """
-    request_id = ticket.request.request_id
+    request_id = pending.request.request_id
     try:
         if isinstance(result, Exception):
             raise result
@@ -117,18 +119,18 @@ def build_reply(
             require_serializable(act.info, limit - act.action.nbytes)
         act.info = {**policy, **(act.info or {})}  # the session's own; policies without info may say None
     except Exception as error:  # noqa: BLE001 - becomes the reply
-        return Reply(request_id, error=public_error(error, ticket))
+        return Reply(request_id, error=public_error(error, pending))
     session.steps += 1
     return Reply(request_id, act=act, step=session.steps)
 
 
-def public_error(error: Exception, ticket: PendingRequest) -> VLAgentsError:
+def public_error(error: Exception, pending: PendingRequest) -> VLAgentsError:
     """Return the error for the caller; details of an error that the policy raised are only logged."""
     if isinstance(error, VLAgentsError):
         return error
-    request = ticket.request
+    request = pending.request
     logger.error(
-        "%s failed (session %s, request %s)", request.op, ticket.session_id, request.request_id, exc_info=error
+        "%s failed (session %s, request %s)", request.op, pending.session_id, request.request_id, exc_info=error
     )
     return PolicyFailed(
         f"{request.op}: the policy raised {type(error).__name__}{raised_at(error)}; "
@@ -203,77 +205,3 @@ class _BoundedWriter(ValueWriter):
 
 def _too_large(what: str, got: int, limit: int) -> str:
     return f"{what}: got {got} bytes, want {limit} at most (`limits.reply_bytes`); return less"
-
-
-class ReplyCollector:
-    """Collects the replies to the requests of one frame, and passes them to `done` once all are there."""
-
-    __slots__ = (
-        "_asks_to_reconnect",
-        "_done",
-        "_items",
-        "_lock",
-        "_missing",
-        "_replies",
-        "_withdraw",
-        "over",
-        "tickets",
-    )
-
-    def __init__(
-        self,
-        items: Sequence[Request | Reply],
-        done: Done,
-        asks_to_reconnect: Callable[[], bool],
-        withdraw: Callable[..., None],
-    ) -> None:
-        """Create the collector of one frame.
-
-        Args:
-            items: The requests of the frame, and the replies to unreadable ones.
-            done: Called once with all replies.
-            asks_to_reconnect: Returns whether the replies ask the client to reconnect.
-            withdraw: `Engine.withdraw`.
-        """
-        self.tickets: dict[int, PendingRequest] = {}  # the latest ticket of each request, by the request's identity
-        self.over = False  # whether the caller no longer waits, so that nothing more is queued
-        self._withdraw = withdraw
-        self._items = items
-        self._replies: list[Reply | None] = [None] * len(items)
-        self._missing = len(items)
-        self._done = done
-        self._asks_to_reconnect = asks_to_reconnect
-        self._lock = threading.Lock()
-
-    def put(self, index: int, reply: Reply) -> None:
-        """Store the reply to one of the requests; a second reply to it is ignored."""
-        with self._lock:
-            if self._replies[index] is not None:
-                return
-            self._replies[index] = reply
-            self._missing -= 1
-            if self._missing:
-                return
-        self.tickets.clear()  # each refers to this: a reference cycle would make the garbage collector pause the policy
-        asks_to_reconnect = self._asks_to_reconnect()
-        for each in self._replies:
-            each.draining = asks_to_reconnect  # type: ignore[union-attr]
-        self._done(self._replies)  # type: ignore[arg-type]
-
-    def expire(self) -> None:
-        """Answer the requests without a reply: their deadlines have passed, and those not begun are withdrawn."""
-        self.over = True  # set before the tickets are copied: a concurrent new ticket is either copied, or not queued
-        tickets = dict(self.tickets)
-        self._withdraw(*tickets.values())
-        for index, item in enumerate(self._items):
-            if isinstance(item, Request) and self._replies[index] is None:
-                late = DeadlineExceeded(f"no action within {item.deadline_ms:g} ms: not acted on, and never will be")
-                if id(item) in tickets and tickets[id(item)].begun:
-                    late = OutcomeUnknown(f"no action within {item.deadline_ms:g} ms, but the policy is at work on it")
-                self.put(index, Reply(item.request_id, error=late))
-
-    def cancel(self) -> None:
-        """Cancel all requests, since the caller no longer waits for the replies."""
-        self.over = True
-        for ticket in list(self.tickets.values()):
-            ticket.cancelled = True

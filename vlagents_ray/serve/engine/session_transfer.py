@@ -11,11 +11,9 @@ from collections.abc import Callable
 from typing import Any
 
 from vlagents_ray.errors import UnknownSession
-from vlagents_ray.protocol.messages import Reply
 from vlagents_ray.serve.models.loaded_model import LoadedModel
 from vlagents_ray.serve.models.model_manager import ModelManager
-from vlagents_ray.serve.queue.batch_queue import PendingRequest
-from vlagents_ray.serve.queue.fair_queue import CheckpointChoice
+from vlagents_ray.serve.requests import CheckpointChoice
 from vlagents_ray.serve.sessions import Session, SessionTable
 
 
@@ -78,16 +76,16 @@ class SessionTransfer:
         """Discard a prepared session, and release its model."""
         self._models.release(arriving)
 
-    def export(self, ticket: PendingRequest) -> None:
-        """Answer with the state that another replica needs to continue the session after its release here."""
-        session = self._sessions.get(ticket.session_id)
+    def export(self, session_id: str) -> dict[str, Any]:
+        """Return the state that another replica needs to continue the session after its release here."""
+        session = self._sessions.get(session_id)
         model = session.model
         weights = session.weights
         if session.agent is None or model is None or weights is None:
-            raise UnknownSession(f"session {ticket.session_id!r}: not reset yet")
+            raise UnknownSession(f"session {session_id!r}: not reset yet")
         with model.call("export"):
             agent = model.copies.dump(session.agent)
-        state = {
+        return {
             "agent": agent,
             "steps": session.steps,
             "first": session.first,
@@ -100,12 +98,6 @@ class SessionTransfer:
             "told_to_follow": session.told_to_follow,
             "instruction": session.instruction,
         }
-        ticket.answer(Reply(ticket.request.request_id, info=state))
-
-    def release(self, ticket: PendingRequest) -> None:
-        """Release the session unless its state has changed since the export; the reply says whether it was released."""
-        released = self._sessions.release(ticket.session_id, ticket.request.kwargs["version"])
-        ticket.answer(Reply(ticket.request.request_id, info={"released": released}))
 
 
 class DrainList:

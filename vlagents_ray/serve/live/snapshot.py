@@ -14,12 +14,13 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.protocol.json_messages import plain_values
 from vlagents_ray.serve.config.deployment import LiveArgs
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.engine.metrics_buffer import SAMPLE, STAGES, LoadMeter
+from vlagents_ray.serve.engine.metrics_buffer import SAMPLE, STAGES
 from vlagents_ray.serve.live.commands import CommandBoard
 from vlagents_ray.serve.live.ring import Ring
 from vlagents_ray.serve.live.tap import ENCODING_SHARE, RATE, ROWS, VALUES, Answer, LiveTap, Played, Seen
 from vlagents_ray.serve.models.loaded_model import LoadedModel
 from vlagents_ray.serve.periodic import each_half_second
+from vlagents_ray.serve.queue.batch_queue import LoadMeter
 from vlagents_ray.serve.sessions import Session
 
 _SESSIONS = 256  # most sessions of a replica that are described
@@ -75,7 +76,7 @@ class ReplicaView:
         if self.ring is not None:
             self.ring.close()
         each_half_second.remove(self.tap.expire)
-        self._engine.watchers.remove(self.tap)
+        self._engine.observers.remove(self.tap)
 
     def read(self, since: int, shown: Collection[str]) -> Snapshot:
         """Return what happened since the snapshot with the number `since`, with pictures of the sessions `shown`.
@@ -128,9 +129,9 @@ class ReplicaView:
 
     def _show(self, tap: LiveTap | None) -> None:
         if tap is None:
-            self._engine.watchers.remove(self.tap)
+            self._engine.observers.remove(self.tap)
         else:
-            self._engine.watchers.add(tap)
+            self._engine.observers.add(tap)
         self._pictured = {}
         self._meter = None if tap is None else LoadMeter(self._engine.queue)
 
@@ -159,7 +160,7 @@ def _session(session: Session[LoadedModel], last: Answer | None, played: list[Pl
     weights = session.weights
     described = {
         "id": session.id,
-        "transport": session.transport,
+        "transport": session.origin.transport,
         "step": session.steps - session.first,
         "instruction": session.instruction[:_INSTRUCTION],
         "silent_s": round(time.monotonic() - session.used, 2),

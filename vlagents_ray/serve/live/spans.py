@@ -49,12 +49,12 @@ class RequestSpans:
 
     def open(self) -> None:
         """Begin to see requests."""
-        self._engine.watchers.add(self)
+        self._engine.observers.add(self)
         each_half_second.add(self.export)
 
     def close(self) -> None:
         """See no more, and export the last spans."""
-        self._engine.watchers.remove(self)
+        self._engine.observers.remove(self)
         each_half_second.remove(self.export)
         self.export()
         tracing.flush()

@@ -16,7 +16,7 @@ from vlagents_ray.errors import ConfigError, UnknownCheckpoint
 from vlagents_ray.interface import Agent
 from vlagents_ray.policies.adapters import ADAPTER
 from vlagents_ray.policies.base.checkpoint import at_step
-from vlagents_ray.serve.queue.fair_queue import DEFAULT, CheckpointChoice
+from vlagents_ray.serve.requests import DEFAULT, CheckpointChoice
 
 CHOICE, STEP = "checkpoint", "checkpoint_step"  # options of a reset, and settings of a policy
 _ADAPTERS = "adapters"  # setting of a policy: its adapters by name

@@ -26,7 +26,7 @@ from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.serve.models.checkpoints import CHOICE, Checkpoints, resolved
 from vlagents_ray.serve.models.padding import Padding, powers_up_to
 from vlagents_ray.serve.queue.call_limits import LOAD, PolicyCall, PolicyCalls
-from vlagents_ray.serve.queue.fair_queue import CheckpointChoice
+from vlagents_ray.serve.requests import CheckpointChoice
 from vlagents_ray.serve.weights.versions import DIGITS, ModelWeights
 from vlagents_ray.validation import check_observation
 

@@ -18,7 +18,7 @@ from typing import Any
 from vlagents_ray.errors import CheckpointFailed, DeadlineExceeded, UnknownSession, VLAgentsError
 from vlagents_ray.serve.models.checkpoints import Checkpoints, resolved
 from vlagents_ray.serve.models.loaded_model import LoadedModel, key_of
-from vlagents_ray.serve.queue.fair_queue import DEFAULT, CheckpointChoice
+from vlagents_ray.serve.requests import DEFAULT, CheckpointChoice
 from vlagents_ray.serve.sessions import Session
 
 PATIENCE_S = 10.0  # waiting time for a slot after which a checkpoint in use accepts no further episodes

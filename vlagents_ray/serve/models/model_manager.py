@@ -34,7 +34,7 @@ from vlagents_ray.serve.models.model_cache import (
     OnLoaded,
     Waiter,
 )
-from vlagents_ray.serve.queue.fair_queue import DEFAULT, CheckpointChoice
+from vlagents_ray.serve.requests import DEFAULT, CheckpointChoice
 from vlagents_ray.serve.sessions import Session, SessionTable
 from vlagents_ray.serve.weights.versions import ModelWeights
 

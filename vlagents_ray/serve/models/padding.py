@@ -45,11 +45,11 @@ class Padding:
         self._first: tuple[Obs, str | None, dict[str, Any]] | None = None
         self._rows: list[_DummySession] = []
 
-    def record_reset(self, request: Request) -> None:
-        """Store the first reset request that the policy accepted, with which padding sessions are reset."""
+    def record_reset(self, request: Request, kwargs: dict[str, Any]) -> None:
+        """Store the first reset that the policy accepted, with which padding sessions are reset."""
         if self._first is None and self._sizes and request.obs is not None:
             # The request is copied, since the observation may lie in memory that its sender needs back.
-            self._first = copy.deepcopy((request.obs, request.instruction, request.kwargs))
+            self._first = copy.deepcopy((request.obs, request.instruction, kwargs))
 
     def sessions(self, rows: int) -> list[Agent]:
         """Return the dummy sessions that pad a batch of `rows` to the next size; none beyond the largest size."""

@@ -19,7 +19,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 
-from vlagents_ray.serve.queue.fair_queue import FairQueue, PendingRequest, Rank
+from vlagents_ray.serve.queue.fair_queue import FairQueue
+from vlagents_ray.serve.requests import PendingRequest, Rank
 
 _KEPT = 0.95  # factor by which the weight of a batch decreases with each later batch
 _SPREAD = 0.01  # variance of the batch sizes below which the fixed cost cannot be estimated
@@ -35,12 +36,12 @@ class _AnsweredBatch:
 
     def __init__(self, batch: Sequence[PendingRequest]) -> None:
         self.returns = {
-            ticket.session_id: ticket.return_s
-            for ticket in batch
-            if ticket.rank is Rank.SIMULATION and ticket.request.op in ("act", "reset")
+            pending.session_id: pending.return_s
+            for pending in batch
+            if pending.rank is Rank.SIMULATION and pending.request.op in ("act", "reset")
         }
         self.lone = batch[0].session_id if len(batch) == 1 else ""
-        self.acts = len(batch) if all(ticket.request.op == "act" for ticket in batch) else 0
+        self.acts = len(batch) if all(pending.request.op == "act" for pending in batch) else 0
         self.ended = math.inf  # s
 
 
@@ -104,16 +105,16 @@ class BatchWindow:
         if self._last.acts:
             self._cost.add(self._last.acts, duration)
 
-    def record_arrival(self, ticket: PendingRequest) -> None:
+    def record_arrival(self, pending: PendingRequest) -> None:
         """Estimate the return time of the session that sent the request.
 
         The estimate rises to a longer time at once, and falls to a shorter one by half the difference.
         """
         for answered in (self._last, self._previous):
-            if ticket.session_id in answered.returns:
-                usual = answered.returns.pop(ticket.session_id)
-                took = max(0.0, ticket.arrived - answered.ended)
-                ticket.return_s = took if usual is None or took > usual else (took + usual) / 2
+            if pending.session_id in answered.returns:
+                usual = answered.returns.pop(pending.session_id)
+                took = max(0.0, pending.arrived - answered.ended)
+                pending.return_s = took if usual is None or took > usual else (took + usual) / 2
                 return
 
     def wait_s(self, now: float, waiting: FairQueue) -> float:
@@ -130,23 +131,20 @@ class BatchWindow:
             and self._is_open(session_id)
         }
         self._until = now + bound
-        if not self._missing or any(self._risks_deadline(ticket) for ticket in waiting.heads()):
+        if not self._missing or any(self._risks_deadline(pending) for pending in waiting.heads()):
             return 0.0
         return bound
 
-    def ends_wait(self, ticket: PendingRequest, waiting: FairQueue) -> bool:
+    def ends_wait(self, pending: PendingRequest, waiting: FairQueue) -> bool:
         """Return whether the wait ends with the arrival of this request."""
-        self._missing.discard(ticket.session_id)
+        self._missing.discard(pending.session_id)
         return (
             not self._missing
-            or ticket.rank is Rank.ROBOT
+            or pending.rank is Rank.ROBOT
             or waiting.sessions >= self._size
-            or self._risks_deadline(ticket)
+            or self._risks_deadline(pending)
         )
 
-    def _risks_deadline(self, ticket: PendingRequest) -> bool:
+    def _risks_deadline(self, pending: PendingRequest) -> bool:
         """Return whether the deadline may pass if the policy waits, and then takes as long as for the last batch."""
-        if (deadline_ms := ticket.request.deadline_ms) is None:
-            return False
-        left_ms = deadline_ms - ticket.request.waited_ms
-        return ticket.arrived + left_ms / 1e3 < self._until + self._duration
+        return pending.deadline < self._until + self._duration

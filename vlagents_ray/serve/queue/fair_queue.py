@@ -1,4 +1,4 @@
-"""The order in which waiting requests enter batches; uses no threads and no clock but the tickets' arrival times.
+"""The order in which waiting requests enter batches; uses no threads and no clock but the requests' arrival times.
 
 Robots go before simulations. Within a class the *sources* take turns (round-robin): a connection that sends 512
 observations at once gets one slot, then the next source gets one, and so on until the batch is full. So a client with
@@ -11,91 +11,11 @@ simulation has waited for longer than `PATIENCE_S`, it gets a slot in every seco
 
 from __future__ import annotations
 
-import logging
-import time
 from collections import deque
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from enum import IntEnum
 
-from vlagents_ray.protocol.messages import Reply, Request
-from vlagents_ray.serve.queue.preparation import Preparation
-
-logger = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, slots=True)
-class CheckpointChoice:
-    """The checkpoint that a session asked for: by default the deployment's own."""
-
-    name: str | None = None  # name of one of the deployment's `choices`; None for the deployment's own
-    step: int | None = None  # training step of the checkpoint; None for the step that the settings name
-
-    def __str__(self) -> str:
-        if self == DEFAULT:
-            return "the deployment's own checkpoint"
-        step = "" if self.step is None else f"step {self.step}"
-        return f"checkpoint {' at '.join(filter(None, ('' if self.name is None else repr(self.name), step)))}"
-
-
-DEFAULT = CheckpointChoice()
-
+from vlagents_ray.serve.requests import PendingRequest, Rank
 
 PATIENCE_S = 1.0  # time after which a simulation gets a slot although robots' requests keep arriving
-
-
-class Rank(IntEnum):
-    """Classes of requests, the most urgent first."""
-
-    ROBOT = 0
-    SIMULATION = 1
-
-
-@dataclass(slots=True)
-class PendingRequest:
-    """A queued request and its callbacks. `done` is called once, on one of the queue's threads."""
-
-    session_id: str
-    request: Request
-    done: Callable[[Reply], None]
-    rank: Rank = Rank.ROBOT
-    arrived: float = field(default_factory=time.perf_counter)  # arrival time, s
-    cancelled: bool = False  # whether it was answered, or its caller no longer waits
-    connection: str = ""  # connection that carries several sessions, as the source of the turns; empty: the session
-    owner: str = ""  # connection with which its session ends; empty if the caller has none
-    transport: str = ""  # transport of the request, for the metrics
-    choice: CheckpointChoice = DEFAULT  # checkpoint for the episode, if the request is a reset
-    follows: bool = True  # whether the episode takes the newest version of the weights, if the request is a reset
-    loaded: float | None = None  # time at which the checkpoint was loaded, s, if the reset had to wait for it
-    begun: bool = False  # whether it is in a batch, so that the policy acts on it; guarded by the queue's lock
-    first: int = 0  # step at which the episode begins, if the request is a reset
-    preparation: Preparation | None = None  # of its observation, on another thread
-    return_s: float | None = None  # recent time from an answer to the session's next request, s, if known
-
-    def answer(self, reply: Reply) -> None:
-        """Deliver the reply, unless the request was answered or cancelled already."""
-        if self.cancelled:
-            return
-        self.cancelled = True
-        if self.preparation is not None:
-            self.preparation.cancel()
-            self.preparation = None
-        # The callback refers to this ticket: a reference cycle would make the garbage collector pause the policy.
-        done, self.done = self.done, _ignore_reply
-        try:
-            done(reply)
-        except Exception:
-            logger.exception("request %s: its caller could not take the reply", self.request.request_id)
-
-    def expired(self, now: float) -> bool:
-        """Return whether the deadline has passed at `now`, s."""
-        deadline_ms = self.request.deadline_ms
-        return deadline_ms is not None and (now - self.arrived) * 1e3 > deadline_ms - self.request.waited_ms
-
-
-def _ignore_reply(reply: Reply) -> None:
-    """Ignore a second reply to a request."""
-
 
 _SessionQueue = deque[PendingRequest]  # requests of one session, in order; never empty while the session waits
 
@@ -110,7 +30,7 @@ class _ClassQueue:
         self.queues: dict[str, deque[_SessionQueue]] = {}
 
     def add(self, queue: _SessionQueue) -> None:
-        source = queue[0].connection or queue[0].session_id
+        source = queue[0].origin.connection or queue[0].session_id
         queues = self.queues.get(source)
         if queues is None:
             self.queues[source] = deque((queue,))
@@ -135,15 +55,15 @@ class _ClassQueue:
 
 
 class FairQueue:
-    """Waiting tickets. Adding and taking one takes constant time, whatever the number of others. Not thread-safe."""
+    """Waiting requests. Adding and taking one takes constant time, whatever the number of others. Not thread-safe."""
 
     def __init__(self) -> None:
         self._rank_queues = [_ClassQueue() for _ in Rank]
         self._sessions: dict[str, _SessionQueue] = {}
-        self._lone: PendingRequest | None = None  # the only waiting ticket, which is in no other queue
+        self._lone: PendingRequest | None = None  # the only waiting request, which is in no other queue
         self._yielded = False  # whether the last batch had a slot for an impatient simulation
-        self.depth = [0] * len(Rank)  # waiting tickets by rank, including cancelled ones
-        self.size = 0  # waiting tickets of all ranks
+        self.depth = [0] * len(Rank)  # waiting requests by rank, including those that are over
+        self.size = 0  # waiting requests of all ranks
 
     def __contains__(self, session_id: str) -> bool:
         self._enqueue_lone()
@@ -151,46 +71,46 @@ class FairQueue:
 
     @property
     def sessions(self) -> int:
-        """Number of sessions with waiting tickets."""
+        """Number of sessions with waiting requests."""
         return len(self._sessions) + (self._lone is not None)
 
     def heads(self) -> list[PendingRequest]:
-        """Return the next ticket of each session."""
+        """Return the next request of each session."""
         self._enqueue_lone()
         return [queue[0] for queue in self._sessions.values()]
 
-    def add(self, ticket: PendingRequest) -> None:
-        """Add a ticket behind the other tickets of its session."""
-        self.depth[ticket.rank] += 1
+    def add(self, pending: PendingRequest) -> None:
+        """Add a request behind the others of its session."""
+        self.depth[pending.rank] += 1
         self.size += 1
         if self.size == 1:
-            self._lone = ticket
+            self._lone = pending
             return
         self._enqueue_lone()
-        self._append(ticket)
+        self._append(pending)
 
     def _enqueue_lone(self) -> None:
-        """Move the lone ticket to the queue of its session."""
+        """Move the lone request to the queue of its session."""
         if self._lone is not None:
             lone, self._lone = self._lone, None
             self._append(lone)
 
-    def _append(self, ticket: PendingRequest) -> None:
-        queue = self._sessions.get(ticket.session_id)
+    def _append(self, pending: PendingRequest) -> None:
+        queue = self._sessions.get(pending.session_id)
         if queue is not None:
-            queue.append(ticket)
+            queue.append(pending)
             return
-        queue = self._sessions[ticket.session_id] = deque((ticket,))
-        self._rank_queues[ticket.rank].add(queue)
+        queue = self._sessions[pending.session_id] = deque((pending,))
+        self._rank_queues[pending.rank].add(queue)
 
     def take(self, size: int, now: float) -> tuple[list[PendingRequest], list[PendingRequest]]:
-        """Take the next batch of at most `size` tickets.
+        """Take the next batch of at most `size` requests.
 
         Returns:
-            The batch, and the expired tickets that were removed on the way. Cancelled tickets are dropped.
+            The batch, and the expired requests that were removed on the way. Requests that are over are dropped.
         """
         lone = self._lone
-        if lone is not None and not lone.cancelled and not lone.expired(now):
+        if lone is not None and not lone.over and now <= lone.deadline:
             self._lone = None
             lone.begun = True
             self.depth[lone.rank] = self.size = 0
@@ -213,9 +133,9 @@ class FairQueue:
         return batch, expired
 
     def clear(self) -> list[PendingRequest]:
-        """Remove and return all waiting tickets."""
+        """Remove and return all waiting requests."""
         self._enqueue_lone()
-        left = [ticket for queue in self._sessions.values() for ticket in queue]
+        left = [pending for queue in self._sessions.values() for pending in queue]
         self._sessions.clear()
         self._rank_queues = [_ClassQueue() for _ in Rank]
         self.depth = [0] * len(Rank)
@@ -230,20 +150,20 @@ class FairQueue:
         expired: list[PendingRequest],
         again: list[_SessionQueue],
     ) -> None:
-        """Move the session's first live ticket to the batch, and drop cancelled and expired ones before it."""
+        """Move the session's first live request to the batch, and drop those that are over or expired before it."""
         session_id = queue[0].session_id
         while queue:
-            ticket = queue.popleft()
-            self.depth[ticket.rank] -= 1
+            pending = queue.popleft()
+            self.depth[pending.rank] -= 1
             self.size -= 1
-            if ticket.loaded is None:  # otherwise it must run, to release the checkpoint that its session holds
-                if ticket.cancelled:
+            if pending.loaded is None:  # otherwise it must run, to release the checkpoint that its session holds
+                if pending.over:
                     continue
-                if ticket.expired(now):
-                    expired.append(ticket)
+                if pending.expired(now):
+                    expired.append(pending)
                     continue
-            ticket.begun = True
-            batch.append(ticket)
+            pending.begun = True
+            batch.append(pending)
             break
         if queue:
             again.append(queue)

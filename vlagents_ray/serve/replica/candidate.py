@@ -15,7 +15,6 @@ from vlagents_ray.protocol.frames import decode_replies
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.dialects.gateway import wait_for_policy
-from vlagents_ray.serve.engine.metrics_buffer import RequestTrace
 from vlagents_ray.serve.replica.engine_replica import EngineReplica
 from vlagents_ray.serve.replica.metrics import ShadowExporter, tags_of
 from vlagents_ray.serve.shadow.comparison import Comparer, ComparisonLog, require_comparable
@@ -76,10 +75,9 @@ class CandidateReplica(EngineReplica):
         return await asyncio.to_thread(self._comparer.add, asked, decode_replies(memoryview(live)), replies, dropped)
 
     async def _act(self, session: str, frame: Any) -> tuple[Request, Reply]:
-        requests, [reply] = await self._ask(session, frame, RequestTrace(self._engine.stats, "handle"))
-        if requests and isinstance(requests[0], Request):
-            return requests[0], reply
-        return Request("reset", session=session), reply  # it could not be read: the episode is lost
+        requests, message = await self._ask(session, frame)
+        request = requests[0] if requests else Request("reset", session=session)  # unreadable: the episode is lost
+        return request, message.replies[0]
 
     async def __del__(self) -> None:
         if hasattr(self, "_metrics"):

@@ -14,15 +14,15 @@ import ray
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import PolicyFailed, VLAgentsError
 from vlagents_ray.policies.base.accelerator import VISIBLE
-from vlagents_ray.protocol.frames import decode_requests
-from vlagents_ray.protocol.messages import Reply, Request
+from vlagents_ray.protocol.frames import Decoded, decode_requests
+from vlagents_ray.protocol.messages import Request
 from vlagents_ray.ray_tools.private import gpus_here
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.config.deployment import ServerArgs
-from vlagents_ray.serve.engine.dispatch import Dispatcher
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.engine.metrics_buffer import RequestTrace
+from vlagents_ray.serve.engine.sender import Sender
 from vlagents_ray.serve.python_env.child_agent import make_agent, version_of
+from vlagents_ray.serve.requests import Message
 from vlagents_ray.serve.sessions import SessionFinder
 
 logger = logging.getLogger(__name__)
@@ -84,17 +84,18 @@ class EngineReplica:
             # Errors of this package say what to do: `serve status` would show the tracebacks of both before it.
             raise PolicyFailed(str(error)) from None
 
-    async def _ask(self, session_id: str, frame: Any, trace: RequestTrace) -> tuple[list[Request | Reply], list[Reply]]:
-        """Execute a frame of requests from inside the cluster; return the requests, and their replies."""
-        requests: list[Request | Reply] = []
-        sender = Dispatcher(self._engine, "handle", session_id, caller=NoKey.INSIDE, connected=False)
+    async def _ask(self, session_id: str, frame: Any) -> tuple[list[Request], Message]:
+        """Execute a frame of requests from inside the cluster; return the requests, and the answered message."""
+        sender = Sender(self._engine, "handle", session_id, caller=NoKey.INSIDE, connected=False)
+        message, decoded = sender.message(), Decoded([], {})
         try:
             admission = sender.admission(self._limits)  # the frame is in plasma
-            requests = await admission.decoded(partial(decode_requests, memoryview(frame)))
-            trace.decoded(requests)
-            return requests, await sender.ask(requests, admission)
+            decoded = await admission.decoded(partial(decode_requests, memoryview(frame)))
+            message.decoded(decoded)
+            await sender.ask(message, decoded, admission)
         except VLAgentsError as error:
-            return requests, [Reply(error=error)]
+            message.refuse(error)
+        return decoded.requests, message
 
     async def check_health(self) -> None:
         """Raise if the policy died or hangs; Serve calls this once the policy has loaded, and replaces the replica."""

@@ -44,8 +44,9 @@ from ray.util.metrics import Counter, Gauge, Histogram
 
 from vlagents_ray.serve.access.api_keys import Keys
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.engine.metrics_buffer import STAGES, Collected, LoadMeter
+from vlagents_ray.serve.engine.metrics_buffer import STAGES, Collected
 from vlagents_ray.serve.periodic import Periodic
+from vlagents_ray.serve.queue.batch_queue import LoadMeter
 from vlagents_ray.serve.recording.recorder import SessionRecorder
 from vlagents_ray.serve.shadow.comparison import Comparer
 

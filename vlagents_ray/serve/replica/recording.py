@@ -59,5 +59,5 @@ def open_recorder(
         describe=metadata,
     )
     recorder = SessionRecorder(writer, engine.sessions.ids, find, share=args.share)
-    engine.watchers.add(recorder)
+    engine.observers.add(recorder)
     return recorder

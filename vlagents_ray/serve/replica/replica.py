@@ -36,10 +36,10 @@ from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.endpoints.unix_messages import Admit
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.endpoints.weights import weights_routes
-from vlagents_ray.serve.engine.metrics_buffer import LoadMeter, RequestTrace
 from vlagents_ray.serve.live.endpoint import live_routes
 from vlagents_ray.serve.models.checkpoints import resolved
 from vlagents_ray.serve.ports import EVERYWHERE, HOST, LOOPBACK
+from vlagents_ray.serve.queue.batch_queue import LoadMeter
 from vlagents_ray.serve.replica.engine_replica import EngineReplica
 from vlagents_ray.serve.replica.live import ReplicaLive
 from vlagents_ray.serve.replica.metrics import Exporter, tags_of
@@ -238,9 +238,8 @@ class PolicyReplica(EngineReplica, ReplicaWeights, ReplicaLive, ReplicaShadow, C
 
     async def call(self, session_id: str, frame: Any) -> bytes:
         """Execute a frame of requests from inside the cluster, a buffer that is read in place from plasma."""
-        trace = RequestTrace(self._engine.stats, "handle")
-        _, replies = await self._ask(session_id, frame, trace)
-        return trace.frame(replies)
+        _, message = await self._ask(session_id, frame)
+        return message.frame()
 
     async def peer(self, method: str, *args: Any) -> Any:
         """Call one of `PEER_METHODS` for another replica, about sessions that migrate."""

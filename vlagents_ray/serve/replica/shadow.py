@@ -57,8 +57,8 @@ class ReplicaShadow:
                 CandidateLink(candidate), args.share, args.queue, is_open=engine.sessions.__contains__
             )
             self._shadow.start()
-            engine.watchers.add(self._shadow)
-        self._followed = engine.watchers
+            engine.observers.add(self._shadow)
+        self._followed = engine.observers
 
     def _shadow_drops(self) -> int:
         """Return the number of observations since the last call that the candidate did not get."""

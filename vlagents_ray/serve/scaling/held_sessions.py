@@ -16,6 +16,7 @@ from typing import Any, Concatenate, ParamSpec, TypeVar
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.protocol.messages import Op, Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.requests import PendingRequest
 from vlagents_ray.serve.sessions import Outdated, Version
 
 logger = logging.getLogger(__name__)
@@ -167,14 +168,12 @@ class HeldSessions:
         def done(reply: Reply) -> None:
             self._loop.call_soon_threadsafe(_settle, answered, reply)
 
-        try:
-            ticket = self._engine.submit(session_id, Request(op, kwargs=kwargs), done)
-        except VLAgentsError:
-            return None
+        pending = PendingRequest(session_id, Request(op, kwargs=kwargs), done)
+        self._engine.submit([pending])
         await asyncio.wait([answered], timeout=timeout_s)
         if not answered.done():
-            self._engine.queue.withdraw(ticket)
-            if not ticket.begun:
+            self._engine.withdraw(pending)
+            if not pending.begun:
                 return None
             await answered
         reply = answered.result()

@@ -162,7 +162,7 @@ class SessionMigrator:
             if not here:  # sessions are still being fetched for earlier requests
                 await asyncio.sleep(ON_ITS_WAY_S)
         self._closed = True
-        self._engine.queue.close(0.0)  # later requests are refused, so that clients send them to the new replica
+        self._engine.stop(0.0)  # later requests are refused, so that clients send them to the new replica
         return taken
 
     async def _responsive_first(self) -> list[Peer]:

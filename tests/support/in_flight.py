@@ -1,0 +1,61 @@
+"""Requests to an engine without an endpoint."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from vlagents_ray.protocol.frames import Decoded, decode_requests
+from vlagents_ray.protocol.messages import Reply, Request
+from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.sender import Sender
+from vlagents_ray.serve.requests import RANKS, PendingRequest
+
+Done = Callable[[Reply], Any]
+
+
+def pending(session_id: str, request: Request, done: Done, **fields: Any) -> PendingRequest:
+    """A request in flight with the class and the deadline that it states."""
+    one = PendingRequest(session_id, request, done, RANKS[request.rank], **fields)
+    if request.deadline_ms is not None:
+        one.deadline = one.arrived + request.deadline_ms / 1e3
+    return one
+
+
+def checked(engine: Engine, session_id: str, request: Request, done: Done) -> PendingRequest:
+    """A request that the engine has checked, which raises its errors, and that is not queued yet."""
+    one = pending(session_id, request, done)
+    engine.check(one)
+    return one
+
+
+def submit(engine: Engine, session_id: str, request: Request, done: Done) -> PendingRequest:
+    """Queue a request; what is wrong with it is raised here."""
+    one = checked(engine, session_id, request, done)
+    engine.queue.put(one)
+    return one
+
+
+def send(sender: Sender, requests: Sequence[Request], done: Callable[[list[Reply]], Any]) -> list[PendingRequest]:
+    """Send the requests of a message; `done` gets all replies."""
+    message, decoded = sender.message(), Decoded(list(requests), {})
+    message.decoded(decoded)
+    return sender.send(message, decoded, lambda message: done(message.replies))
+
+
+async def ask(sender: Sender, requests: Sequence[Request]) -> list[Reply]:
+    """Send the requests of a message, and wait for the replies."""
+    return await sender.ask(sender.message(), Decoded(list(requests), {}))
+
+
+def in_order(decoded: Decoded) -> list[Request | Reply]:
+    """The requests of a message, with the answers to unreadable ones in their places."""
+    found: list[Request | Reply] = list(decoded.requests)
+    for place in sorted(decoded.refused):
+        found.insert(place, decoded.refused[place])
+    return found
+
+
+def read_requests(*arguments: Any) -> list[Request | Reply]:
+    """What `decode_requests` reads, in order."""
+    return in_order(decode_requests(*arguments))

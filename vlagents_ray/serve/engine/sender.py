@@ -1,0 +1,296 @@
+"""From a decoded message to the engine: the sessions and the key of a sender, and the answers of its messages."""
+
+from __future__ import annotations
+
+import asyncio
+import uuid
+from collections.abc import Sequence
+from functools import partial
+from typing import TYPE_CHECKING
+
+from vlagents_ray.errors import DeadlineExceeded, NotReset, OutcomeUnknown, TooManyRequests, VLAgentsError
+from vlagents_ray.protocol.frames import Decoded
+from vlagents_ray.protocol.messages import Limits, Reply
+from vlagents_ray.serve.access.api_keys import Caller, Identity, NoKey
+from vlagents_ray.serve.engine.admission import MessageAdmission
+from vlagents_ray.serve.requests import RANKS, Answered, Message, Origin, PendingRequest, Rank
+
+if TYPE_CHECKING:
+    from vlagents_ray.serve.engine.engine import Engine
+
+
+REFUSALS = 8  # of messages over the rate of the sender's key, one after the other, after which a connection ends
+REFUSED = f"over the rate of its key {REFUSALS} times in a row; send less, or raise the rate"
+
+
+class Sender:
+    """Submits the requests of a connection, with which its sessions end, or of a caller without one.
+
+    A request names its session; without a name it is for `session_id`, the sender's own session. If the server has
+    API keys, a caller cannot reach sessions of other keys: the key's name is part of the session ids in the engine.
+    """
+
+    def __init__(
+        self,
+        engine: Engine,
+        transport: str,
+        session_id: str = "",
+        *,
+        caller: Identity,
+        connected: bool = True,
+        counted: bool | None = None,
+    ) -> None:
+        """Create a sender.
+
+        Args:
+            engine: The engine that serves the requests.
+            transport: Name of the transport, for the metrics.
+            session_id: Name of the sender's own session; a random one by default.
+            caller: The authenticated caller, or the reason why none is needed. It has no default, so that an endpoint
+                without authentication fails.
+            connected: Whether the sender has a connection, with which its sessions end.
+            counted: Whether the first request of each message was counted for the key on arrival, and the others, of
+                a message that is sent without an admission, by `count`; by default for senders without a connection.
+
+        Raises:
+            TypeError: `caller` is neither a `Caller` nor a `NoKey`.
+        """
+        if not isinstance(caller, Caller | NoKey):
+            raise TypeError(f"caller: got {caller!r}, want a Caller, or a NoKey where none is asked for")
+        self._engine = engine
+        self._session_id = session_id or uuid.uuid4().hex
+        self._counted = not connected if counted is None else counted
+        self._asked_to_reconnect = False  # whether the client was asked to reconnect, so that its sessions move
+        self._caller = caller if isinstance(caller, Caller) else None
+        self.rated = self._caller is not None  # whether its key may be over a rate
+        self._paid = False  # whether a message without an admission was counted, and with it its first request
+        self._refused = 0  # number of messages that were refused one after the other
+        self._prefix = f"{caller.name}/" if isinstance(caller, Caller) else ""  # of its session ids in the engine
+        owner = uuid.uuid4().hex if connected else ""
+        self._origin = Origin(transport, owner, self._session_id, self._caller, self._prefix)
+
+    def message(self, op: str = "unknown", rank: str = "robot") -> Message:
+        """Return a message that has just arrived from the sender, see `Message`."""
+        return Message(self._engine.stats, self._origin.transport, op, rank)
+
+    def admission(self, limits: Limits, size: int = 0, rank: str = "robot") -> MessageAdmission:
+        """Return the admission of a message of `size` bytes; its first request counts unless the sender's `counted`."""
+        robot, caller, counted = rank != "simulation", self._caller, self._counted
+        keep = self._engine.observers.any
+        if caller is None:
+            return MessageAdmission(self._engine.admission, limits, None, size, robot=robot, keep_files=keep)
+
+        def admit(op: object) -> bool:
+            nonlocal counted
+            free, counted = counted, False
+            return self._count_message(caller) if op == "message" and not free else self._count(caller, op, free)
+
+        return MessageAdmission(self._engine.admission, limits, admit, size, robot=robot, keep_files=keep)
+
+    def count(self, requests: int) -> None:
+        """Count requests for the key before any of them is sent; raise `TooManyRequests` over its rate."""
+        if self._caller is not None:
+            for _ in range(requests):
+                self._count(self._caller, "act", counted=False)
+
+    def count_message(self) -> None:
+        """Count a message that is sent without an admission, before it is parsed; raise `TooManyRequests`."""
+        if self._caller is not None:
+            self._paid = False
+            self._count_message(self._caller)
+            self._paid = True
+
+    def throttled_s(self) -> float:
+        """Return for how long the server must not read from the sender, s; 0 if its key kept within its rate limit.
+
+        It slows down the senders of a key whose messages are refused anyway.
+        """
+        return 0.0 if self._caller is None else self._caller.throttled_s()
+
+    async def wait_unthrottled(self) -> None:
+        """Wait until the server may read from the sender."""
+        while (wait_s := self.throttled_s()) > 0:
+            await asyncio.sleep(wait_s)
+
+    @property
+    def refused_too_often(self) -> bool:
+        """Whether so many messages were refused one after the other that the connection has to end."""
+        return self._refused >= REFUSALS
+
+    def send(
+        self,
+        message: Message,
+        decoded: Decoded,
+        then: Answered,
+        *,
+        admission: MessageAdmission | None = None,
+        waited_s: float = 0.0,
+    ) -> list[PendingRequest]:
+        """Submit the requests of a message.
+
+        Args:
+            message: The message.
+            decoded: Its requests.
+            then: Called with the message when it has all its answers, on the thread that brings the last one.
+            admission: Admission of the message, which has already counted the requests for the key.
+            waited_s: Time that counts towards the deadlines, as the message has waited before it was read, s.
+
+        Returns:
+            The requests in flight.
+        """
+        engine, now, (requests, refused) = self._engine, self._engine.clock(), decoded
+        watched = engine.observers.any
+        sent: list[PendingRequest] = []
+        message.expect(len(requests) + len(refused), partial(self._answered, then, admission, sent if watched else ()))
+        place = 0
+        for request in requests:
+            while place in refused:
+                place += 1
+            pending = PendingRequest(
+                self._prefix + (request.session or self._session_id),
+                request,
+                partial(message.put, place),
+                RANKS[request.rank],
+                now,
+                origin=self._origin,
+                place=place,
+            )
+            if request.deadline_ms is not None:
+                pending.deadline = now + request.deadline_ms / 1e3 - waited_s
+            sent.append(pending)
+            place += 1
+        if watched:
+            for pending in sent:
+                pending.files = None if admission is None else admission.files
+                engine.observers.on_request(pending)
+        engine.submit(self._admitted(sent, admission is not None or self._counted))
+        for place, reply in refused.items():
+            message.put(place, reply)
+        return sent
+
+    def _admitted(self, requests: list[PendingRequest], counted: bool) -> list[PendingRequest]:
+        """Return the requests that the key and the connection allow; the others are finished with their error."""
+        owner, known = self._origin.owner, self._origin.sessions
+        if self._caller is None and not owner:
+            return requests
+        allowed = []
+        for pending in requests:
+            try:
+                if self._caller is not None:
+                    self._admit(self._caller, pending, counted=counted or self._paid)
+                    self._paid = False
+                if (
+                    pending.request.op == "act"
+                    and not pending.request.session
+                    and owner
+                    and pending.session_id not in known
+                ):
+                    raise NotReset("act before reset: this connection has no session yet; reset first")
+                allowed.append(pending)
+            except VLAgentsError as error:
+                pending.fail(error)
+        return allowed
+
+    def _admit(self, caller: Caller, pending: PendingRequest, *, counted: bool) -> None:
+        """Apply the limits and the class of the caller's key to a request.
+
+        The guard of the HTTP server has already counted the first request of a message.
+        """
+        if not self._count(caller, pending.request.op, counted):
+            pending.rank = Rank.SIMULATION
+        if pending.request.op == "reset":
+            caller.note("reset session", repr(pending.request.session or self._session_id))
+
+    def _answered(
+        self, then: Answered, admission: MessageAdmission | None, watched: Sequence[PendingRequest], message: Message
+    ) -> None:
+        if self._engine.drain_list.ask(self._session_id):
+            self._asked_to_reconnect = True
+        if self._asked_to_reconnect or self._engine.draining:
+            for reply in message.replies:
+                reply.draining = True  # the client connects again, and its sessions move to another replica
+        if admission is not None and admission.holds:
+            admission.release()
+        observers = self._engine.observers
+        for pending in watched:
+            observers.before_answer(pending, message.replies[pending.place])
+        then(message)
+        for pending in watched:
+            observers.on_answer(pending, message.replies[pending.place])
+
+    async def ask(
+        self,
+        message: Message,
+        decoded: Decoded,
+        admission: MessageAdmission | None = None,
+    ) -> list[Reply]:
+        """Submit the requests of a message, and wait for the replies until the requests' deadlines.
+
+        The time that a request may have waited during a pause of the process counts towards its deadline.
+        When the caller stops waiting (deadline, disconnect), its requests are cancelled, unless their batch is
+        running.
+        """
+        loop = asyncio.get_running_loop()
+        future: asyncio.Future[list[Reply]] = loop.create_future()
+        waited_s = self._engine.pauses.waited_s()
+        then = partial(_deliver, loop, future)
+        sent = self.send(message, decoded, then, admission=admission, waited_s=waited_s)
+        timer = None
+        if sent and all(request.deadline_ms is not None for request in decoded.requests):
+            last_s = max(pending.deadline for pending in sent) - sent[0].arrived
+            timer = loop.call_later(last_s, self._expire, message, sent)
+        try:
+            return await future
+        finally:
+            for pending in sent:
+                pending.over = True
+            if timer is not None:
+                timer.cancel()
+
+    def _expire(self, message: Message, sent: Sequence[PendingRequest]) -> None:
+        """Answer the requests without an answer: their deadlines have passed, and those not begun are withdrawn."""
+        self._engine.withdraw(*sent)
+        for pending in sent:
+            after = f"no action within {pending.request.deadline_ms:g} ms"
+            late: VLAgentsError = DeadlineExceeded(f"{after}: not acted on, and never will be")
+            if pending.begun:
+                late = OutcomeUnknown(f"{after}, but the policy is at work on it")
+            pending.done(Reply(pending.request.request_id, error=late))  # ignored if it has its answer
+
+    def release(self, *, for_good: bool = False) -> None:
+        """End the sessions of a closed connection, unless its client was asked to reconnect elsewhere.
+
+        The sessions of such a client are kept, for another replica to fetch. `for_good` ends them in any case, for
+        protocols that cannot ask a client to reconnect.
+        """
+        owner = self._origin.owner
+        if owner and (for_good or not (self._asked_to_reconnect or self._engine.draining)):
+            self._engine.sessions.close_owned(owner, tuple(self._origin.sessions))  # a migrator's thread may add one
+
+    @property
+    def session_id(self) -> str:
+        """Id of the sender's own session in the engine."""
+        return self._prefix + self._session_id
+
+    def _count(self, caller: Caller, op: object, counted: bool) -> bool:
+        """Count a request for the key, unless it is `counted` or a close. False if the key has the simulation class."""
+        caller.admit(free=counted or op == "close")
+        return caller.rank != "simulation"
+
+    def _count_message(self, caller: Caller) -> bool:
+        try:
+            caller.admit()
+        except TooManyRequests:
+            self._refused += 1
+            raise
+        self._refused = 0
+        return caller.rank != "simulation"
+
+
+def _deliver(loop: asyncio.AbstractEventLoop, future: asyncio.Future[list[Reply]], message: Message) -> None:
+    loop.call_soon_threadsafe(_settle, future, message.replies)
+
+
+def _settle(future: asyncio.Future[list[Reply]], replies: list[Reply]) -> None:
+    if not future.done():
+        future.set_result(replies)

@@ -1,0 +1,279 @@
+"""Requests in flight: the message that brought them, and each of them from the endpoint to its answer.
+
+An endpoint makes a `Message` when its last byte is there, decodes it, and has a `Sender` turn its requests into
+`PendingRequest`s. The engine finishes each of these once; when the last one is finished, the endpoint writes all
+answers of the message. What was decoded, a `Request`, is not changed on the way: what the server decides stands in the
+`PendingRequest`. Only the observations are removed once they were used, since they may lie in the sender's memory.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from vlagents_ray.errors import VLAgentsError
+from vlagents_ray.images.codecs import DecodedFiles
+from vlagents_ray.protocol.frames import Decoded, encode_replies
+from vlagents_ray.protocol.json_messages import reply_to_json
+from vlagents_ray.protocol.messages import Reply, Request
+from vlagents_ray.protocol.shm_layout import write_answers
+from vlagents_ray.serve.queue.preparation import Preparation
+
+if TYPE_CHECKING:
+    from vlagents_ray.serve.access.api_keys import Caller
+    from vlagents_ray.serve.engine.metrics_buffer import MetricsBuffer
+    from vlagents_ray.serve.models.loaded_model import LoadedModel
+    from vlagents_ray.serve.sessions import Session
+
+T = TypeVar("T")
+Answered = Callable[["Message"], None]
+
+logger = logging.getLogger(__name__)
+
+_NOT_MEASURED = (0.0,) * 4  # stages of a request that failed
+
+
+class Rank(IntEnum):
+    """Classes of requests, the most urgent first."""
+
+    ROBOT = 0
+    SIMULATION = 1
+
+
+RANKS: Mapping[str, Rank] = {"robot": Rank.ROBOT, "simulation": Rank.SIMULATION}  # by the names on the wire
+
+
+@dataclass(frozen=True, slots=True)
+class CheckpointChoice:
+    """The checkpoint that a session asked for: by default the deployment's own."""
+
+    name: str | None = None  # name of one of the deployment's `choices`; None for the deployment's own
+    step: int | None = None  # training step of the checkpoint; None for the step that the settings name
+
+    def __str__(self) -> str:
+        if self == DEFAULT:
+            return "the deployment's own checkpoint"
+        step = "" if self.step is None else f"step {self.step}"
+        return f"checkpoint {' at '.join(filter(None, ('' if self.name is None else repr(self.name), step)))}"
+
+
+DEFAULT = CheckpointChoice()
+
+
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """Where the requests of one sender come from."""
+
+    transport: str = ""  # for the metrics
+    owner: str = ""  # connection with which its sessions end; empty if it has none
+    connection: str = ""  # that carries several sessions, as the source of the queue's turns; empty: the session itself
+    caller: Caller | None = None  # None if no key is asked for
+    prefix: str = ""  # of the session ids of the caller's key
+    sessions: set[str] = field(default_factory=set)  # those of the owner, as the engine names them
+
+
+NOWHERE = Origin()
+
+
+@dataclass(slots=True)
+class Opening:
+    """What the server decides about the episode that a reset begins."""
+
+    choice: CheckpointChoice
+    kwargs: dict[str, Any]  # those of the request that are for the policy
+    follows: bool  # whether the episode takes the newest version of the weights
+    first: int = 0  # step at which the episode begins
+
+
+@dataclass(slots=True, eq=False)
+class PendingRequest:
+    """One request in flight, from its message to its answer. `done` receives that, once, on any thread."""
+
+    session_id: str  # as the engine names it
+    request: Request
+    done: Callable[[Reply], None]
+    rank: Rank = Rank.ROBOT
+    arrived: float = field(default_factory=time.perf_counter)  # s of the engine's clock
+    deadline: float = math.inf  # after which no answer is of use, s of the engine's clock
+    origin: Origin = NOWHERE
+    over: bool = False  # whether it was answered, or its caller no longer waits
+    begun: bool = False  # whether it is in a batch, so that the policy acts on it; guarded by the queue's lock
+    sought: bool = False  # whether its session was looked for at other replicas
+    session: Session[LoadedModel] | None = None  # of an act, as it was when the request came
+    opening: Opening | None = None  # of a reset
+    loaded: float | None = None  # time at which the checkpoint was loaded, s, if a reset had to wait for it
+    preparation: Preparation | None = None  # of its observation, on another thread
+    return_s: float | None = None  # recent time from an answer to the session's next request, s, if known
+    place: int = 0  # among the requests of its message
+    files: DecodedFiles | None = None  # those of the message's images, for observers
+
+    def finish(self, reply: Reply) -> None:
+        """Deliver the answer, unless the request is over."""
+        if self.over:
+            return
+        self.over = True
+        if self.preparation is not None:
+            self.preparation.cancel()
+            self.preparation = None
+        try:
+            self.done(reply)
+        except Exception:
+            logger.exception("request %s: its caller could not take the reply", self.request.request_id)
+
+    def fail(self, error: VLAgentsError) -> None:
+        """Deliver an error, unless the request is over."""
+        self.finish(Reply(self.request.request_id, error=error))
+
+    def expired(self, now: float) -> bool:
+        """Return whether the deadline has passed at `now`, s."""
+        return now > self.deadline
+
+
+class Message:
+    """The requests of one message, from the arrival of its last byte until their answers are written.
+
+    It collects the answers, encodes them with their times, and records them for the metrics.
+
+    Args:
+        stats: Buffer for the metrics.
+        transport: Name of the transport.
+        op: Operation of its one request, if it is known before decoding.
+        rank: Class of that request.
+    """
+
+    __slots__ = ("_asked", "_decoded", "_lock", "_missing", "_stats", "_then", "arrived", "replies", "transport")
+
+    def __init__(self, stats: MetricsBuffer, transport: str, op: str = "unknown", rank: str = "robot") -> None:
+        self._stats = stats
+        self._asked: list[tuple[str, str]] = [(op, rank)]
+        self.transport = transport
+        self.arrived = self._decoded = time.perf_counter()  # s
+        self.replies: list[Reply] = []  # complete when `then` of `expect` is called
+        self._missing = 0
+        self._then: Answered | None = None
+        self._lock = threading.Lock()
+
+    def arrive(self) -> None:
+        """Record that the last byte has arrived."""
+        self.arrived = self._decoded = time.perf_counter()
+
+    def decoded(self, decoded: Decoded) -> None:
+        """Record that the requests are decoded, and which they are."""
+        self._decoded = time.perf_counter()
+        self._asked = [(request.op, request.rank) for request in decoded.requests]
+        for place in sorted(decoded.refused):
+            self._asked.insert(place, ("unknown", "robot"))
+
+    def decoded_alike(self, requests: int = 1) -> None:
+        """Record that the requests, all of the `op` and `rank` given before, are decoded."""
+        self._decoded = time.perf_counter()
+        self._asked = [self._asked[0]] * requests
+
+    def expect(self, requests: int, then: Answered) -> None:
+        """Expect an answer to each of so many requests by `put`, and call `then` once all are there."""
+        self.replies = [None] * requests  # type: ignore[list-item]  # until they are there
+        self._missing = requests
+        self._then = then
+
+    def put(self, place: int, reply: Reply) -> None:
+        """Take the answer to one of the requests; a second answer to it is ignored."""
+        if reply.error is not None:
+            reply.error.__traceback__ = None  # its frames would keep this message and its bytes
+        with self._lock:
+            if self.replies[place] is not None:
+                return
+            self.replies[place] = reply
+            self._missing -= 1
+            if self._missing:
+                return
+        if self._then is not None:
+            self._then(self)
+
+    def refuse(self, error: VLAgentsError, request_id: str = "") -> None:
+        """Answer the message as a whole with an error, as it could not be read."""
+        error.__traceback__ = None  # as in `put`
+        self.replies = [Reply(request_id, error=error)]
+
+    def frame(self) -> bytes:
+        """Encode and record the replies as a frame with complete `timing`."""
+        self._set_decode_ms()
+        data = encode_replies(self.replies, arrived=self.arrived)
+        self.record()
+        return data
+
+    def packed(self) -> tuple[bytes, bool]:
+        """Encode the replies with complete `timing`; call `record` after they are sent.
+
+        Returns:
+            The replies in compact form if they fit into that, otherwise as a frame; and whether they are compact.
+        """
+        self._set_decode_ms()
+        compact = write_answers(self.replies, arrived=self.arrived)
+        data = encode_replies(self.replies, arrived=self.arrived) if compact is None else compact
+        return data, compact is not None
+
+    def document(self) -> bytes:
+        """Encode and record the only reply, which must not be an error, as JSON with complete `timing`."""
+        begun = time.perf_counter()
+        document = reply_to_json(self.replies[0])
+        document.pop("timing")
+        text = _json(document)
+        self._written(begun)
+        return f'{text[:-1]},"timing":{_json(self.replies[0].timing)}}}'.encode()
+
+    def written(self, write: Callable[[], T]) -> T:
+        """Encode the replies with `write` for a client of another system, and record them.
+
+        The `timing` of a reply is complete only afterwards.
+        """
+        begun = time.perf_counter()
+        data = write()
+        self._written(begun)
+        return data
+
+    def refused(self, code: str) -> None:
+        """Record all requests as failed with this error code, also if the caller no longer waits."""
+        total_ms = (time.perf_counter() - self.arrived) * 1e3
+        for op, rank in self._asked:
+            self._stats.handled((op, self.transport, rank, code), (total_ms, *_NOT_MEASURED))
+
+    def _written(self, begun: float) -> None:
+        ended = time.perf_counter()
+        self._set_decode_ms()
+        for reply in self.replies:
+            reply.timing["encode_ms"] = (ended - begun) * 1e3
+            reply.timing["total_ms"] = (ended - self.arrived) * 1e3
+        self.record()
+
+    def _set_decode_ms(self) -> None:
+        decode_ms = (self._decoded - self.arrived) * 1e3
+        for reply in self.replies:
+            if reply.error is None:
+                reply.timing["decode_ms"] = decode_ms
+
+    def record(self) -> None:
+        """Record the requests; called after the replies are sent where possible, so that the client does not wait."""
+        if len(self.replies) != len(self._asked):  # the message was unreadable as a whole
+            self._asked = self._asked[:1]
+        for (op, rank), reply in zip(self._asked, self.replies, strict=True):
+            if reply.error is None:
+                timing = reply.timing
+                decode_ms, queue_ms = timing.get("decode_ms", 0.0), timing.get("queue_ms", 0.0)
+                inference_ms, encode_ms = timing.get("inference_ms", 0.0), timing.get("encode_ms", 0.0)
+                times = (timing["total_ms"], decode_ms, queue_ms, inference_ms, encode_ms)  # in the order of `STAGES`
+                self._stats.handled((op, self.transport, rank, "ok"), times)
+            else:
+                total_ms = (time.perf_counter() - self.arrived) * 1e3
+                code = reply.error.code
+                self._stats.handled((op, self.transport, rank, code), (total_ms, *_NOT_MEASURED))
+
+
+def _json(value: dict[str, Any]) -> str:
+    return json.dumps(value, allow_nan=False, separators=(",", ":"))
