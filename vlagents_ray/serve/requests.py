@@ -29,8 +29,6 @@ from vlagents_ray.serve.queue.preparation import Preparation
 if TYPE_CHECKING:
     from vlagents_ray.serve.access.api_keys import Caller
     from vlagents_ray.serve.engine.metrics_buffer import MetricsBuffer
-    from vlagents_ray.serve.models.loaded_model import LoadedModel
-    from vlagents_ray.serve.sessions import Session
 
 T = TypeVar("T")
 Answered = Callable[["Message"], None]
@@ -106,7 +104,7 @@ class PendingRequest:
     over: bool = False  # whether it was answered, or its caller no longer waits
     begun: bool = False  # whether it is in a batch, so that the policy acts on it; guarded by the queue's lock
     sought: bool = False  # whether its session was looked for at other replicas
-    session: Session[LoadedModel] | None = None  # of an act, as it was when the request came
+    session: Any = None  # the `Session` of an act, as it was when the request came
     opening: Opening | None = None  # of a reset
     loaded: float | None = None  # time at which the checkpoint was loaded, s, if a reset had to wait for it
     preparation: Preparation | None = None  # of its observation, on another thread

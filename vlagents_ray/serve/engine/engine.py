@@ -411,7 +411,7 @@ class Engine:
         return {}
 
     def _ready(self, pending: PendingRequest) -> tuple[Session[LoadedModel], LoadedModel, WeightsVersion]:
-        session = pending.session
+        session: Session[LoadedModel] | None = pending.session
         if session is None or session.over:  # it has ended, or came here from another replica, since it was looked up
             session = self.sessions.get(pending.session_id)
         model, weights = session.model, session.weights
