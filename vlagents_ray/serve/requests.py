@@ -191,8 +191,9 @@ class Message:
             self._missing -= 1
             if self._missing:
                 return
-        if self._then is not None:
-            self._then(self)
+        then, self._then = self._then, None  # it may refer to the requests, which refer to this message
+        if then is not None:
+            then(self)
 
     def refuse(self, error: VLAgentsError, request_id: str = "") -> None:
         """Answer the message as a whole with an error, as it could not be read."""
