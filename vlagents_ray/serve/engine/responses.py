@@ -38,7 +38,7 @@ _LIBRARIES = (str(Path(__file__).parents[2]), sysconfig.get_path("stdlib"))  # t
 
 
 class Watcher(Protocol):
-    """Sees messages and their answers: `vlagents_ray.serve.live.tap.LiveTap`."""
+    """Sees messages and their answers: `vlagents_ray.serve.observers.base`."""
 
     def note(self, sessions: Sequence[str], items: Sequence[Request | Reply], files: DecodedFiles, done: Done) -> Done:
         """Return `done`, or a function that calls it with the answers.
