@@ -144,3 +144,28 @@ def test_a_replica_warns_of_keys_that_come_unencrypted_unless_tls_ends_elsewhere
     with pytest.raises(RayServeException, match="no engine"):
         asyncio.run(Bare.__init__(object.__new__(Bare), {"policy": "noop", "access": access}))
     assert ("host 0.0.0.0: API keys come unencrypted" in caplog.text) == (not plain)
+
+
+def test_a_replica_answers_what_waits_before_its_observers_and_its_ways_in_close() -> None:
+    closed: list[str] = []
+
+    def part(name: str, **more: Any) -> Any:
+        return SimpleNamespace(close=lambda: closed.append(name), **more)
+
+    async def ended(name: str) -> None:
+        closed.append(name)
+
+    async def close() -> None:
+        one = object.__new__(Bare)
+        vars(one).update(
+            _tasks=[asyncio.ensure_future(asyncio.sleep(60))],
+            _engine=part("engine", draining=True),
+            _migrator=SimpleNamespace(hand_over=lambda: ended("sessions"), close=lambda: ended("migrator")),
+            **{f"_{name}": part(name) for name in ("rebalancer", "observers", "metrics", "local", "stream")},
+            _plasma=None,
+        )
+        await one.close()
+        assert await asyncio.gather(*one._tasks, return_exceptions=True)
+
+    asyncio.run(close())
+    assert closed == ["sessions", "rebalancer", "migrator", "engine", "observers", "metrics", "local", "stream"]

@@ -81,12 +81,7 @@ class CommandBoard:
         self._lock = threading.Lock()
 
     def press(self, session_id: str, do: str, by: str) -> dict[str, Any]:
-        """Accept a command for a session, and return it as `of` does.
-
-        Args:
-            session_id: Id of the session in the engine.
-            do: One of `COMMANDS`.
-            by: Name of the key whose holder commands.
+        """Accept the command `do`, one of `COMMANDS`, of the holder of the key `by`, and return it as `of` does.
 
         Raises:
             UnknownSession: The session is not here.

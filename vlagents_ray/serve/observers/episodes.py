@@ -96,15 +96,10 @@ class EpisodeWriter:
         most_bytes: float,
         describe: Callable[[], Mapping[str, Any]] | None = None,
     ) -> None:
-        """Create a writer, which makes no file before the first frame.
+        """Create a writer, which makes no file before the first frame; its datasets are `folder`/`name`-0 and so on.
 
-        Args:
-            folder: The folder of all datasets.
-            name: The beginning of the names of this replica's datasets.
-            fps: The rate of the frames, Hz, which their timestamps assume.
-            lossless: Whether the videos keep each pixel.
-            most_bytes: The largest size of the folder, above which nothing more is recorded.
-            describe: Returns the metadata of the policy, which a trace states; None if the frames make no trace.
+        Timestamps of frames assume a rate of `fps`, Hz. Above `most_bytes` in the folder nothing more is recorded.
+        `describe` returns the metadata of the policy, which a trace states; None if the frames make no trace.
         """
         self.saved = 0  # frames of complete episodes
         self.lost = 0  # frames of episodes that could not be written

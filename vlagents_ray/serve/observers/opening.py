@@ -42,13 +42,8 @@ def open_observers(
 ) -> ReplicaObservers:
     """Observe the requests of an engine from now on.
 
-    Args:
-        engine: The engine.
-        args: The settings of the deployment.
-        replica: Ray's name of the replica, which no other has or will have.
-        node: Name of its node, for viewers.
-        metadata: Returns the metadata of the replica.
-        ask_candidate: Sends to the candidate, if the deployment has a shadow.
+    `replica` is Ray's name of the replica, which no other has or will have. Viewers see the name of its `node`. With a
+    shadow, `ask_candidate` sends to the candidate.
 
     Raises:
         ConfigError: A folder cannot be written to, or a viewer is not there.

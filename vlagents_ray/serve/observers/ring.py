@@ -83,11 +83,8 @@ class Ring:
     def save(self, session: str) -> str:
         """Write the session's frames as an episode, and return the path of its dataset.
 
-        Raises:
-            InvalidInput: Nothing of the session is held.
-            Overloaded: Another session is being saved.
-            StorageFailed: The folder is full.
-            VLAgentsError: The episode cannot be written.
+        Raises `InvalidInput` if nothing of the session is held, `Overloaded` while another one is saved, and
+        `StorageFailed` if the folder is full.
         """
         if not self._saving.acquire(blocking=False):
             raise Overloaded("save: another session is being saved; press again when that is done")

@@ -37,13 +37,7 @@ class CandidateReplica:
     async def __init__(  # type: ignore[misc]  # Serve awaits it
         self, args: dict[str, Any], record: str | None, record_mb: int
     ) -> None:
-        """Create the replica of the candidate.
-
-        Args:
-            args: Its settings.
-            record: The folder of the comparisons; None records none.
-            record_mb: Most MB of them.
-        """
+        """Create the replica of the candidate; `record` is the folder of at most `record_mb` MB of comparisons."""
         settings, context = ServerArgs(**args), serve.get_replica_context()
         self._live: Contract | None = None
         self._policy = ReplicaEngine.from_args(settings, lambda contract: require_comparable(self._live, contract))
@@ -73,13 +67,9 @@ class CandidateReplica:
     async def follow(
         self, sessions: Sequence[str], frames: Sequence[Any], live: Any, dropped: Sequence[int]
     ) -> list[str]:
-        """Act on requests of different sessions as the live policy did, and compare.
+        """Act on requests of different sessions as the live policy did, and compare; see `Comparer.add`.
 
-        Args:
-            sessions: The session of each request, as the live engine names it.
-            frames: A frame of each request.
-            live: One frame of the live policy's replies.
-            dropped: See `Comparer.add`.
+        A frame of each request, and one of all replies of the live policy, are read in place.
 
         Returns:
             The sessions that are unknown here, and cannot be followed before their next reset.

@@ -72,13 +72,9 @@ class Exporter:
         keys: Keys | None = None,
         observers: ReplicaObservers | None = None,
     ) -> None:
-        """Create the series.
+        """Create the series, with these tags: application, deployment, replica, policy.
 
-        Args:
-            engine: The engine whose stats are exported.
-            tags: The tags of every series: application, deployment, replica, policy.
-            keys: The API keys of the server; None if it has none.
-            observers: The observers of the replica, of which a shadow and a recording are exported.
+        How long the file of `keys` was unreadable, and numbers of the `observers`, are exported if there are any.
         """
         make = partial(_series, tags)
         self._engine = engine
