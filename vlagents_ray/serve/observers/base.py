@@ -49,8 +49,8 @@ class Observer:
         """Write or export what is kept, and end."""
 
 
-class Observers:
-    """The observers of an engine. Thread-safe.
+class Observers(Observer):
+    """The observers of an engine, which are themselves one. Thread-safe.
 
     Without an observer it is no watcher of the engine, and a message costs one comparison.
     """
@@ -74,27 +74,37 @@ class Observers:
             if not self._all:
                 self._watchers.remove(self)
 
+    def on_request(self, pending: Pending) -> None:
+        """See `Observer`."""
+        for observer in self._all:
+            observer.on_request(pending)
+
+    def before_answer(self, pending: Pending, reply: Reply) -> None:
+        """See `Observer`."""
+        for observer in self._all:
+            observer.before_answer(pending, reply)
+
+    def on_answer(self, pending: Pending, reply: Reply) -> None:
+        """See `Observer`."""
+        for observer in self._all:
+            observer.on_answer(pending, reply)
+
     def note(self, sessions: Sequence[str], items: Sequence[Request | Reply], files: DecodedFiles, done: Done) -> Done:
         """Adapt the engine's `Watcher` to observers: return `done`, around which they see the answers."""
-        observers = self._all
-        pending = [
-            None if isinstance(item, Reply) else _Pending(session, item, files)
-            for session, item in zip(sessions, items, strict=True)
-        ]
-        for observer in observers:
-            for one in pending:
-                if one is not None:
-                    observer.on_request(one)
+        pending = {
+            place: _Pending(session, item, files)
+            for place, (session, item) in enumerate(zip(sessions, items, strict=True))
+            if isinstance(item, Request)
+        }
+        for one in pending.values():
+            self.on_request(one)
 
         def answer(replies: list[Reply]) -> None:
-            answered = [(one, reply) for one, reply in zip(pending, replies, strict=True) if one is not None]
-            for observer in observers:
-                for one, reply in answered:
-                    observer.before_answer(one, reply)
+            for place, one in pending.items():
+                self.before_answer(one, replies[place])
             done(replies)
-            for observer in observers:
-                for one, reply in answered:
-                    observer.on_answer(one, reply)
+            for place, one in pending.items():
+                self.on_answer(one, replies[place])
 
         return answer
 

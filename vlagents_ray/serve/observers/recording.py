@@ -14,14 +14,14 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from vlagents_ray.errors import ConfigError, PolicyFailed, UnknownSession
 from vlagents_ray.interface import CAPTURED, POLICY, Obs, copied
-from vlagents_ray.protocol.messages import Reply, Request
+from vlagents_ray.protocol.messages import Reply
 from vlagents_ray.protocol.values import to_text
 from vlagents_ray.registry import require
 from vlagents_ray.serve.config.deployment import RecordArgs
@@ -40,18 +40,19 @@ _OTHER_BYTES = 16 * 2**10  # counted for an act beside its pictures and the byte
 _CLOSING_S = 30.0  # time that the threads get to write what waits
 
 
+@dataclass(slots=True, eq=False)
 class _Recorded:
     """A request that is to be recorded; its memory counts as held until nothing refers to it."""
 
-    __slots__ = ("_recorder", "at", "info", "instruction", "obs", "op", "options", "session", "size")
-
-    def __init__(self, recorder: SessionRecorder, session: str, request: Request, obs: Obs | None, size: int) -> None:
-        self._recorder = recorder
-        self.session, self.op, self.at, self.size = session, request.op, time.time(), size
-        self.obs = obs
-        self.instruction = request.instruction or ""
-        self.options: Any = request.kwargs  # before the queue removes some of them; text once it is copied
-        self.info = ""  # the observation's, as text
+    recorder: SessionRecorder
+    session: str
+    op: str
+    at: float  # s since 1970
+    obs: Obs | None  # of an act
+    instruction: str
+    options: Any  # of the reset, before the queue removes some of them; text once they are copied
+    size: int  # bytes that it holds
+    info: str = ""  # the observation's, as text
 
     def copy(self) -> None:
         """Copy what may lie in the client's memory."""
@@ -64,10 +65,10 @@ class _Recorded:
             self.obs = copied(replace(obs, info={CAPTURED: captured_at}, prepared=None))
         texts = len(self.options) + len(self.info)
         self.size += texts
-        self._recorder.count_held(texts)
+        self.recorder.count_held(texts)
 
     def __del__(self) -> None:
-        self._recorder.count_held(-self.size)
+        self.recorder.count_held(-self.size)
 
 
 class SessionRecorder(Observer):
@@ -123,8 +124,9 @@ class SessionRecorder(Observer):
             if not self._hold(size):
                 self.dropped += 1
                 return
-        recorded = _Recorded(self, pending.session_id, request, obs, size)
-        pending.kept[self] = recorded
+        recorded = pending.kept[self] = _Recorded(
+            self, pending.session_id, request.op, time.time(), obs, request.instruction or "", request.kwargs, size
+        )
         self._copier.put(partial(self._copy, recorded))
 
     def on_answer(self, pending: Pending, reply: Reply) -> None:
