@@ -41,7 +41,7 @@ from vlagents_ray.policies.noop import Noop
 from vlagents_ray.serve.engine import sender
 from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.serve.launch.server import running_server
-from vlagents_ray.serve.live.tap import LEASE_S
+from vlagents_ray.serve.observers.live import LEASE_S
 
 ABSENT, NOBODY, RING = "tap absent", "nobody", "nobody, 30 s held"
 HZ, SATURATED_HZ = 50.0, 1e9

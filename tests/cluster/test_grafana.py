@@ -13,8 +13,8 @@ import ray
 from vlagents_ray.errors import BY_CODE
 from vlagents_ray.interface import Agent
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.observers.comparison import Comparer
 from vlagents_ray.serve.replica import metrics
-from vlagents_ray.serve.shadow.comparison import Comparer
 
 ROOT = Path(__file__).parents[2]
 DASHBOARD = json.loads((ROOT / "cluster/grafana/policy_server.json").read_text())

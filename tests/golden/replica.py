@@ -8,7 +8,6 @@ import threading
 from collections import deque
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -194,11 +193,9 @@ class Server:
         return UnixLine(f"\0{self._own.address.socket}")
 
     def _handle(self, engine: Engine, name: str) -> Line:
-        from vlagents_ray.serve.replica.replica import PolicyReplica
+        from vlagents_ray.serve.replica.engine_replica import ReplicaEngine
 
-        replica: Any = SimpleNamespace(_engine=engine, _limits=LIMITS)
-        replica._ask = partial(PolicyReplica._ask, replica)
-        call = partial(PolicyReplica.call, replica, f"session-{name}")
+        call = partial(ReplicaEngine(engine, LIMITS, {}).call, f"session-{name}")
         return CallLine(lambda data, _: ("binary", masked(asyncio.run(call(data)))))
 
     def _open_gateway(self, name: str) -> None:

@@ -31,7 +31,7 @@ from vlagents_ray.open_loop.report import line_chart, write_files
 from vlagents_ray.policies.random import Random
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.recording import episodes
+from vlagents_ray.serve.observers import episodes
 
 
 class Follow(Agent):

@@ -16,12 +16,14 @@ from ray.serve._private.api import call_user_app_builder_with_args_if_necessary
 from ray.serve.exceptions import RayServeException
 
 from vlagents_ray.errors import MissingDependency, PolicyFailed
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS
 from vlagents_ray.serve.access.key_store import new_key
 from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.launch.deployment_file import IMPORT_PATH
 from vlagents_ray.serve.ports import HOST
 from vlagents_ray.serve.replica import replica as module
 from vlagents_ray.serve.replica.app import build
+from vlagents_ray.serve.replica.engine_replica import ReplicaEngine
 from vlagents_ray.serve.replica.replica import PolicyReplica
 
 
@@ -34,15 +36,15 @@ class Bare(PolicyReplica):
 
 def replica(start: Any) -> Bare:
     """A replica with what starting touches."""
+    engine: Any = SimpleNamespace(start=start, models=SimpleNamespace(configure=lambda _: None))
     one = object.__new__(Bare)
     vars(one).update(
-        _args=ServerArgs(policy="noop"),
-        _configured=False,
+        _policy=ReplicaEngine(engine, DEFAULT_LIMITS, {}),
         _gateway=None,
-        _engine=SimpleNamespace(start=start, models=SimpleNamespace(configure=lambda _: None)),
         _rebalancer=SimpleNamespace(start=lambda: None),
-        _follow_others=lambda: asyncio.sleep(0),
+        _pusher=SimpleNamespace(catch_up=lambda: asyncio.sleep(0)),
         _watch_shutdown=lambda: asyncio.sleep(0),
+        _keep_catching_up=lambda: asyncio.sleep(0),
     )
     return one
 
@@ -57,7 +59,7 @@ def test_a_replica_runs_when_its_policy_has_loaded() -> None:
         before = running.done()
         loaded.set()
         await running
-        await one._shutdown_watch
+        await asyncio.gather(*one._tasks)
         return [before, running.done()]
 
     assert asyncio.run(start()) == [False, True]
@@ -85,7 +87,7 @@ def test_only_the_traceback_of_a_policys_own_bug_is_shown(
 
     one = replica(fail)
     with pytest.raises(PolicyFailed, match="the policy did not load: no jax") as failed:
-        asyncio.run(one._start())
+        asyncio.run(one._policy.load())
     lines = traceback.format_exception(failed.value)
     assert ("direct cause" in "".join(lines)) == shown
     assert ("in fail" in "".join(lines)) == shown
@@ -142,3 +144,28 @@ def test_a_replica_warns_of_keys_that_come_unencrypted_unless_tls_ends_elsewhere
     with pytest.raises(RayServeException, match="no engine"):
         asyncio.run(Bare.__init__(object.__new__(Bare), {"policy": "noop", "access": access}))
     assert ("host 0.0.0.0: API keys come unencrypted" in caplog.text) == (not plain)
+
+
+def test_a_replica_answers_what_waits_before_its_observers_and_its_ways_in_close() -> None:
+    closed: list[str] = []
+
+    def part(name: str, **more: Any) -> Any:
+        return SimpleNamespace(close=lambda: closed.append(name), **more)
+
+    async def ended(name: str) -> None:
+        closed.append(name)
+
+    async def close() -> None:
+        one = object.__new__(Bare)
+        vars(one).update(
+            _tasks=[asyncio.ensure_future(asyncio.sleep(60))],
+            _engine=part("engine", draining=True),
+            _migrator=SimpleNamespace(hand_over=lambda: ended("sessions"), close=lambda: ended("migrator")),
+            **{f"_{name}": part(name) for name in ("rebalancer", "observers", "metrics", "local", "stream")},
+            _plasma=None,
+        )
+        await one.close()
+        assert await asyncio.gather(*one._tasks, return_exceptions=True)
+
+    asyncio.run(close())
+    assert closed == ["sessions", "rebalancer", "migrator", "engine", "observers", "metrics", "local", "stream"]

@@ -64,9 +64,8 @@ from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.endpoints.weights import weights_routes
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.live.endpoint import live_routes
-from vlagents_ray.serve.live.fleet import Fleet
-from vlagents_ray.serve.live.snapshot import ReplicaView
+from vlagents_ray.serve.observers.live_page import live_routes
+from vlagents_ray.serve.observers.live_view import Fleet, ReplicaView
 from vlagents_ray.serve.ports import free_port, reserve
 from vlagents_ray.serve.weights.updates import PushResult
 from vlagents_ray.weights.safetensors import ValueSpec, header_of, read_header
@@ -171,7 +170,8 @@ class KeyedReplica:
             each.open()
         self.engine.start()
         routes = dialect_routes(DialectArgs(**ALL), ReplicaContext(self.engine, lambda: METADATA, LIMITS))
-        view = ReplicaView(self.engine, "this", "here", lambda: METADATA | {"policy_version": None, "weights": None})
+        metadata = METADATA | {"policy_version": None, "weights": None}
+        view = ReplicaView(self.engine, self.engine.observers, "this", "here", lambda: metadata)
         live = live_routes(Fleet(view), open_to_network=False)
         others = [*weights_routes(_Receiving(self), 30.0, open_to_network=False), *live]
         inside = build_http_app(self.engine, lambda: METADATA, LIMITS, dialects=routes, others=others)
@@ -463,13 +463,11 @@ def over_plasma(visitor: Visitor, _when: str) -> str:
 
 def over_handle(visitor: Visitor, _when: str) -> str:
     """The actor's own entry point, as a Serve handle calls it."""
-    from vlagents_ray.serve.replica.replica import PolicyReplica
+    from vlagents_ray.serve.replica.engine_replica import ReplicaEngine
 
     visitor.become()
-    replica: Any = SimpleNamespace(_engine=visitor.replica.engine, _limits=LIMITS)
-    replica._ask = partial(PolicyReplica._ask, replica)
     frame = encode_request(Request("reset", Obs(), visitor.mark))
-    [reply] = decode_replies(asyncio.run(PolicyReplica.call(replica, visitor.name, frame)))
+    [reply] = decode_replies(asyncio.run(ReplicaEngine(visitor.replica.engine, LIMITS, {}).call(visitor.name, frame)))
     return "done" if reply.error is None else str(reply.error.status)
 
 

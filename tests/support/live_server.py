@@ -19,13 +19,13 @@ from vlagents_ray.interface import Agent
 from vlagents_ray.policies.noop import Noop
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, PROTOCOL_VERSION
 from vlagents_ray.serve.access.api_keys import Keys
-from vlagents_ray.serve.config.deployment import LiveArgs
+from vlagents_ray.serve.config.deployment import LiveArgs, ServerArgs
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.live.endpoint import live_routes
-from vlagents_ray.serve.live.fleet import Fleet, OtherReplicas
-from vlagents_ray.serve.live.snapshot import ReplicaView
+from vlagents_ray.serve.observers.live_page import live_routes
+from vlagents_ray.serve.observers.live_view import Fleet, OtherReplicas, ReplicaView
+from vlagents_ray.serve.observers.opening import open_observers
 from vlagents_ray.serve.ports import free_port
 
 METADATA = {
@@ -106,14 +106,15 @@ def live_server(
     """A replica of `agent`, by default `noop`, until the end of the context."""
     engine = Engine(agent or Noop.from_config({}))
     engine.start()
-    view = ReplicaView(engine, "this", "here", lambda: METADATA, settings)
+    args = ServerArgs(policy="noop", live=settings)
+    observers = open_observers(engine, args, "SERVE_REPLICA::app#Policy#this", "here", lambda: METADATA)
+    view = observers.view
     fleet = Fleet(view, others)
     routes = live_routes(fleet, open_to_network=insecure)
     inside = build_http_app(engine, lambda: METADATA, DEFAULT_LIMITS, others=routes)
     with ExitStack() as stack:
+        stack.callback(observers.close)
         stack.callback(engine.close)
-        view.open()
-        stack.callback(view.close)
         yield LiveServer(engine, view, fleet, stack.enter_context(served(AccessMiddleware(inside, keys, "app"))))
 
 

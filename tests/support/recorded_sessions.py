@@ -17,11 +17,11 @@ from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.access.api_keys import NoKey
-from vlagents_ray.serve.config.deployment import RecordArgs
+from vlagents_ray.serve.config.deployment import RecordArgs, ServerArgs
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import Sender
-from vlagents_ray.serve.recording.recorder import SessionRecorder
-from vlagents_ray.serve.replica.recording import open_recorder
+from vlagents_ray.serve.observers.opening import open_observers
+from vlagents_ray.serve.observers.recording import SessionRecorder
 
 HEIGHT, WIDTH = 33, 48
 
@@ -104,12 +104,11 @@ def recorded(folder: Path, agent: Agent | None = None, **settings: Any) -> Itera
         assert engine.contract is not None
         return {"policy": "brightness", "contract": engine.contract.to_json()}
 
-    recorder = open_recorder(
-        engine, RecordArgs(folder=str(folder), **settings), "SERVE_REPLICA::app#Policy#a1", metadata
-    )
-    assert recorder is not None
+    args = ServerArgs(policy="noop", record=RecordArgs(folder=str(folder), **settings))
+    observers = open_observers(engine, args, "SERVE_REPLICA::app#Policy#a1", "here", metadata)
+    assert observers.recorder is not None
     try:
-        yield Recorded(engine, recorder)
+        yield Recorded(engine, observers.recorder)
     finally:
         engine.close()
-        recorder.close()
+        observers.close()

@@ -160,7 +160,7 @@ def _models(annotation: Any) -> Iterator[Any]:
 
 def paths() -> Iterator[str]:
     http = importlib.import_module("vlagents_ray.serve.endpoints.http")
-    live = importlib.import_module("vlagents_ray.serve.live.endpoint")
+    live = importlib.import_module("vlagents_ray.serve.observers.live_page")
     weights = importlib.import_module("vlagents_ray.serve.endpoints.weights")
     watched = live.live_routes(None, open_to_network=False)
     pushed = weights.weights_routes(None, 0.0, open_to_network=False)

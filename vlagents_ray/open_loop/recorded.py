@@ -20,7 +20,7 @@ from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Budget
 from vlagents_ray.protocol.values import from_text
 from vlagents_ray.registry import require
 from vlagents_ray.robot.episode import ACTION, ENVIRONMENT, IMAGES, STATE
-from vlagents_ray.serve.recording.episodes import CHUNK, ROWS, SESSION, TRACE
+from vlagents_ray.serve.observers.episodes import CHUNK, ROWS, SESSION, TRACE
 
 _PICTURES = ("video", "image")  # dtypes
 

@@ -110,7 +110,8 @@ class PendingRequest:
     preparation: Preparation | None = None  # of its observation, on another thread
     return_s: float | None = None  # recent time from an answer to the session's next request, s, if known
     place: int = 0  # among the requests of its message
-    files: DecodedFiles | None = None  # those of the message's images, for observers
+    files: DecodedFiles = None  # type: ignore[assignment]  # those of its message's images, where somebody observes
+    kept: dict[Any, Any] = None  # type: ignore[assignment]  # what observers keep for the answer, by observer
 
     def finish(self, reply: Reply) -> None:
         """Deliver the answer, unless the request is over."""

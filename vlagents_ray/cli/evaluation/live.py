@@ -16,8 +16,8 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.report.progress import Progress
 from vlagents_ray.evaluate.report.results_document import ProgressDocument, ResultsDocument
 from vlagents_ray.serve.access.api_keys import load_keys
-from vlagents_ray.serve.live.endpoint import page_server, require_watch_keys
-from vlagents_ray.serve.live.fleet import Fleet
+from vlagents_ray.serve.observers.live_page import page_server, require_watch_keys
+from vlagents_ray.serve.observers.live_view import Fleet
 from vlagents_ray.serve.ports import LOOPBACK, is_free
 from vlagents_ray.serve.scaling.replica_views import ReplicaViews
 

@@ -28,7 +28,7 @@ from vlagents_ray.viewers.targets import is_live, require_no_server
 
 
 class LiveArgs(BaseModel):
-    """The last seconds of each session, which a press on the live page saves; see `vlagents_ray.serve.live.ring`."""
+    """The last seconds of each session, which a press on the live page saves; see `vlagents_ray.serve.observers`."""
 
     model_config = ConfigDict(extra="forbid", hide_input_in_errors=True)
 
@@ -286,7 +286,7 @@ class StreamArgs(_DeploymentModel):
 
 
 class RecordArgs(_DeploymentModel):
-    """The recording of sessions as LeRobotDatasets, see `vlagents_ray.serve.recording`."""
+    """The recording of sessions as LeRobotDatasets, see `vlagents_ray.serve.observers.recording`."""
 
     folder: str = Field(
         description="folder of the datasets, on each replica's own node or shared; each replica writes its own below it"

@@ -31,7 +31,7 @@ from vlagents_ray.serve.engine.arrival import note_connection
 
 logger = logging.getLogger(__name__)
 
-LIVE_PAGE = "/live"  # see `vlagents_ray.serve.live.endpoint`
+LIVE_PAGE = "/live"  # see `vlagents_ray.serve.observers.live_page`
 
 _TICK_S = 0.5  # period at which a WebSocket's key and time limits are checked
 _DROPPED_BYTES = 2**20  # a refused request with a longer body loses its connection

@@ -4,7 +4,7 @@
     POST /v1/probe                       answered at once, for measuring the link
     WS   /v1/stream                      sessions that end with the connection; binary frames or probes
     WS   /v1/weights                     new weights from a learner, see `vlagents_ray.serve.endpoints.weights`
-    GET  /live, /v1/live, WS /v1/live    what the sessions do, see `vlagents_ray.serve.live.endpoint`
+    GET  /live, /v1/live, WS /v1/live    what the sessions do, see `vlagents_ray.serve.observers.live_page`
     GET  /healthz, /v1/metadata, /docs
 
 Errors over HTTP are problem+json with a stable code; over WebSocket they are reply frames.
@@ -83,7 +83,7 @@ def build_http_app(
         machine_metadata: Returns the metadata for a caller on the machine with the given boot id.
         dialects: The routes of other systems' clients, see `vlagents_ray.serve.dialects`.
         others: The routes of learners and viewers, see `vlagents_ray.serve.endpoints.weights` and
-            `vlagents_ray.serve.live`.
+            `vlagents_ray.serve.observers.live_page`.
     """
     server = _HttpEndpoint(engine, metadata, limits, machine_metadata)
     app = Starlette(

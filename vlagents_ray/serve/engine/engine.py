@@ -27,8 +27,9 @@ from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Reply
 from vlagents_ray.serve.engine.admission import Admission
 from vlagents_ray.serve.engine.arrival import PauseDetector
 from vlagents_ray.serve.engine.metrics_buffer import MetricsBuffer
+from vlagents_ray.serve.engine.observer import Observers
 from vlagents_ray.serve.engine.resets import Resets
-from vlagents_ray.serve.engine.responses import Observers, build_reply, public_error, raised_at, timing
+from vlagents_ray.serve.engine.responses import build_reply, public_error, raised_at, timing
 from vlagents_ray.serve.engine.session_transfer import DrainList, SessionTransfer
 from vlagents_ray.serve.models.checkpoints import Checkpoints
 from vlagents_ray.serve.models.loaded_model import LoadedModel, Loader

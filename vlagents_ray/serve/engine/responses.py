@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import logging
 import sysconfig
-import threading
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import InvalidInput, MessageTooLarge, PolicyFailed, VLAgentsError
-from vlagents_ray.images.codecs import DecodedFiles
 from vlagents_ray.interface import Act
-from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Reply, Request
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Reply
 from vlagents_ray.protocol.values import ValueWriter
 from vlagents_ray.serve.models.loaded_model import LoadedModel
 from vlagents_ray.serve.requests import PendingRequest
@@ -26,61 +24,7 @@ from vlagents_ray.validation import check_action
 
 logger = logging.getLogger(__name__)
 
-Done = Callable[[list[Reply]], None]
 _LIBRARIES = (str(Path(__file__).parents[2]), sysconfig.get_path("stdlib"))  # this package's own, and Python's
-
-
-class Watcher(Protocol):
-    """Sees messages and their answers: `vlagents_ray.serve.live.tap.LiveTap`."""
-
-    def note(self, sessions: Sequence[str], items: Sequence[Request | Reply], files: DecodedFiles, done: Done) -> Done:
-        """Return `done`, or a function that calls it with the answers.
-
-        Args:
-            sessions: The session of each of `items`, as the engine names it.
-            items: The requests of a message, and the replies to unreadable ones.
-            files: The files of its images.
-            done: Sends the answers.
-        """
-        ...
-
-
-class Observers:
-    """The watchers of an engine. Thread-safe."""
-
-    def __init__(self) -> None:
-        self.any = False  # while nobody watches, a request costs one look at this
-        self._all: tuple[Watcher, ...] = ()
-        self._seen: dict[tuple[PendingRequest, Watcher], Done] = {}
-        self._lock = threading.Lock()
-
-    def add(self, watcher: Watcher) -> None:
-        """Let it see the messages from now on."""
-        with self._lock:
-            self._all = (*self._all, watcher)
-            self.any = True
-
-    def remove(self, watcher: Watcher) -> None:
-        """Let it see no further messages; does nothing if it was not added."""
-        with self._lock:
-            self._all = tuple(one for one in self._all if one is not watcher)
-            self.any = bool(self._all)
-
-    def on_request(self, pending: PendingRequest) -> None:
-        for one in self._all:
-            self._seen[pending, one] = one.note([pending.session_id], [pending.request], pending.files or {}, _ignore)
-
-    def before_answer(self, pending: PendingRequest, reply: Reply) -> None:
-        for one in self._all:
-            if (done := self._seen.pop((pending, one), None)) is not None:
-                done([reply])
-
-    def on_answer(self, pending: PendingRequest, reply: Reply) -> None:
-        pass
-
-
-def _ignore(replies: list[Reply]) -> None:
-    pass
 
 
 def build_reply(

@@ -161,7 +161,7 @@ class Sender:
             place += 1
         if watched:
             for pending in sent:
-                pending.files = None if admission is None else admission.files
+                pending.files, pending.kept = (admission and admission.files) or {}, {}
                 engine.observers.on_request(pending)
         engine.submit(self._admitted(sent, admission is not None or self._counted))
         for place, reply in refused.items():

@@ -20,9 +20,9 @@ from vlagents_ray.registry import names, policy_class
 from vlagents_ray.serve.config.deployment import POLICY, ServerArgs, ShadowArgs, candidate_of
 from vlagents_ray.serve.dialects.routes import require_fit, require_packages
 from vlagents_ray.serve.models.checkpoints import CHOICE, STEP
+from vlagents_ray.serve.observers.comparison import require_comparable
 from vlagents_ray.serve.python_env.child_main import unloaded_contract
 from vlagents_ray.serve.python_env.probe import check_policy, with_process
-from vlagents_ray.serve.shadow.comparison import require_comparable
 from vlagents_ray.settings import wrong_settings
 
 IMPORT_PATH = "vlagents_ray.serve.app:build"

@@ -20,11 +20,9 @@ _FAILURES = 3  # number of consecutive failed health checks after which Serve re
 _LEAST_ANSWER_S = 5.0  # minimum time limit of a health check, for a busy machine
 _HEAD = "node:__internal_head__"  # a resource that Ray assigns to the head node of any cluster
 # A replica gets neither these settings nor the dialects of the gateway, and does not restart when they change.
-_OUTSIDE: Any = {
-    "replicas": True,
-    "autoscaling": True,
-    "resources": True,
-}
+_OUTSIDE: Any = {"replicas": True, "autoscaling": True, "resources": True}
+# Of deployments for which no Serve request waits: of a shadow, and of the gateway, whose clients use its own ports.
+_ALONE: Any = {"num_replicas": 1, "graceful_shutdown_timeout_s": 10, "graceful_shutdown_wait_loop_s": 0.1}
 
 
 def build(args: ServerArgs) -> Application:
@@ -88,12 +86,7 @@ def _options(args: ServerArgs, name: str) -> dict[str, Any]:
 def _shadow(candidate: ServerArgs, shadow: ShadowArgs) -> Application:
     """Build the deployment of the candidate: one replica, which only the live policy's replicas call."""
     args = candidate.model_copy(update={"environment": with_process(candidate.environment), "dialects": DialectArgs()})
-    options = {
-        **_options(args, SHADOW),
-        "num_replicas": 1,
-        "graceful_shutdown_timeout_s": 10,
-        "graceful_shutdown_wait_loop_s": 0.1,  # the live policy does not wait for a comparison
-    }
+    options = _options(args, SHADOW) | _ALONE
     settings = args.model_dump(mode="json", exclude=_OUTSIDE)
     return serve.deployment(**options)(CandidateReplica).bind(settings, shadow.record, shadow.record_mb)
 
@@ -101,10 +94,8 @@ def _shadow(candidate: ServerArgs, shadow: ShadowArgs) -> Application:
 def _gateway(args: ServerArgs) -> Application:
     """Build the process of the dialects that have their own port; it runs on the head node, where clients connect."""
     options: dict[str, Any] = {
+        **_ALONE,
         "name": GATEWAY,
-        "num_replicas": 1,
-        "graceful_shutdown_timeout_s": 10,
-        "graceful_shutdown_wait_loop_s": 0.1,  # no Serve request waits here: clients use the dialects' ports
         "health_check_period_s": 5,
         "ray_actor_options": {"num_cpus": 0, "resources": {_HEAD: 0.001}},
     }

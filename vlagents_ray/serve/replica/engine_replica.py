@@ -1,4 +1,4 @@
-"""A Serve replica around an engine: the settings of its policy, loading, requests through a handle, and health."""
+"""The engine of a Serve replica: the settings of its policy, loading, requests through a handle, and health."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vlagents_ray.contract import Contract
 from vlagents_ray.errors import PolicyFailed, VLAgentsError
 from vlagents_ray.policies.base.accelerator import VISIBLE
 from vlagents_ray.protocol.frames import Decoded, decode_requests
-from vlagents_ray.protocol.messages import Request
+from vlagents_ray.protocol.messages import Limits, Request
 from vlagents_ray.ray_tools.private import gpus_here
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.config.deployment import ServerArgs
@@ -28,21 +28,29 @@ from vlagents_ray.serve.sessions import SessionFinder
 logger = logging.getLogger(__name__)
 
 
-class EngineReplica:
-    """Loads the policy in its first `reconfigure`, so that Serve reports RUNNING only when the policy can act.
+class ReplicaEngine:
+    """The engine of a replica, which is loaded after the first `configure`.
 
-    A policy that does not load therefore makes the start fail, with the reason in `serve status`.
+    A replica loads it in its own `reconfigure`, so that Serve reports RUNNING only when the policy can act. A policy
+    that does not load therefore makes the start fail, with the reason in `serve status`.
     """
 
-    def _open_engine(
-        self, args: ServerArgs, check: Callable[[Contract | None], None], finder: SessionFinder | None = None
-    ) -> None:
+    def __init__(self, engine: Engine, limits: Limits, config: dict[str, Any]) -> None:
+        """Serve `engine` within the `limits` of the decoders; `config` are the deployment's settings of the policy."""
+        self.engine = engine
+        self.limits = limits
+        self._config = config
+        self._configured = False
+
+    @classmethod
+    def from_args(
+        cls, args: ServerArgs, check: Callable[[Contract | None], None], finder: SessionFinder | None = None
+    ) -> ReplicaEngine:
         """Make the engine, without loading the policy; see `Engine` for the last two arguments."""
-        self._args = args
         if VISIBLE not in args.environment.env_vars:
             hide_gpus(ray.get_runtime_context().get_accelerator_ids().get("GPU", []))
-        self._limits = args.limits.limits()
-        self._engine = Engine(
+        limits = args.limits.limits()
+        engine = Engine(
             args.checkpoints.of(partial(make_agent, args), args.config),
             max_batch_size=args.batch.max_size,
             patience=args.batch.patience,
@@ -52,31 +60,29 @@ class EngineReplica:
             version=version_of(args),
             check=check,
             limits=args.limits.call_limits(),
-            reply_bytes=self._limits.reply_bytes,
-            in_flight_bytes=self._limits.in_flight_bytes,
+            reply_bytes=limits.reply_bytes,
+            in_flight_bytes=limits.in_flight_bytes,
             finder=finder,
         )
-        self._configured = False
+        return cls(engine, limits, args.config)
 
-    async def reconfigure(self, settings: dict[str, Any] | None, rank: Any) -> None:
-        """Apply the file's `user_config`; called by Serve before the replica is ready, and when the settings change.
+    def configure(self, settings: dict[str, Any] | None) -> bool:
+        """Apply the file's `user_config`, and return whether it is the first, after which the replica has to start.
 
-        An error of the first call makes the start of the replica fail. Later calls return at once and raise nothing, as
-        an error would end the replica: the metadata and the log show the result of the swap. `rank` is not used, but
-        Serve calls a method with this parameter also without a `user_config`.
+        Later calls return at once and raise nothing, as an error would end the replica: the metadata and the log show
+        the result of the swap.
         """
-        config = {**self._args.config, **(settings or {})}
+        config = {**self._config, **(settings or {})}
         if self._configured:
             logger.info("new settings, to be loaded beside the present ones: %s", config)
-        self._engine.models.configure(config)
-        if not self._configured:
-            self._configured = True
-            await self._start()
+        self.engine.models.configure(config)
+        first, self._configured = not self._configured, True
+        return first
 
-    async def _start(self) -> None:
+    async def load(self) -> None:
         """Load the policy."""
         try:
-            await asyncio.to_thread(self._engine.start)
+            await asyncio.to_thread(self.engine.start)
         except PolicyFailed as error:
             if not isinstance(error.__cause__, VLAgentsError):
                 raise
@@ -84,12 +90,12 @@ class EngineReplica:
             # Errors of this package say what to do: `serve status` would show the tracebacks of both before it.
             raise PolicyFailed(str(error)) from None
 
-    async def _ask(self, session_id: str, frame: Any) -> tuple[list[Request], Message]:
+    async def ask(self, session_id: str, frame: Any) -> tuple[list[Request], Message]:
         """Execute a frame of requests from inside the cluster; return the requests, and the answered message."""
-        sender = Sender(self._engine, "handle", session_id, caller=NoKey.INSIDE, connected=False)
+        sender = Sender(self.engine, "handle", session_id, caller=NoKey.INSIDE, connected=False)
         message, decoded = sender.message(), Decoded([], {})
         try:
-            admission = sender.admission(self._limits)  # the frame is in plasma
+            admission = sender.admission(self.limits)  # the frame is in plasma
             decoded = await admission.decoded(partial(decode_requests, memoryview(frame)))
             message.decoded(decoded)
             await sender.ask(message, decoded, admission)
@@ -97,9 +103,14 @@ class EngineReplica:
             message.refuse(error)
         return decoded.requests, message
 
+    async def call(self, session_id: str, frame: Any) -> bytes:
+        """Execute a frame of requests from inside the cluster, and return the frame of the replies."""
+        _, message = await self.ask(session_id, frame)
+        return message.frame()
+
     async def check_health(self) -> None:
-        """Raise if the policy died or hangs; Serve calls this once the policy has loaded, and replaces the replica."""
-        await asyncio.to_thread(self._engine.check_health)  # includes the policy's own check
+        """Raise if the policy died or hangs; includes the policy's own check."""
+        await asyncio.to_thread(self.engine.check_health)
 
 
 def hide_gpus(given: Sequence[str]) -> None:

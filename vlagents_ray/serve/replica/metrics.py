@@ -33,9 +33,9 @@ values per second for each kind of request and for the batches. The candidate of
 from __future__ import annotations
 
 import logging
-import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections import Counter as Counts
+from collections.abc import Iterable, Iterator, Mapping
 from functools import partial
 from typing import Any, TypeVar
 
@@ -45,10 +45,10 @@ from ray.util.metrics import Counter, Gauge, Histogram
 from vlagents_ray.serve.access.api_keys import Keys
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.metrics_buffer import STAGES, Collected
+from vlagents_ray.serve.observers.comparison import Comparer
+from vlagents_ray.serve.observers.opening import ReplicaObservers
 from vlagents_ray.serve.periodic import Periodic
 from vlagents_ray.serve.queue.batch_queue import LoadMeter
-from vlagents_ray.serve.recording.recorder import SessionRecorder
-from vlagents_ray.serve.shadow.comparison import Comparer
 
 logger = logging.getLogger(__name__)
 
@@ -71,17 +71,11 @@ class Exporter:
         engine: Engine,
         tags: dict[str, str],
         keys: Keys | None = None,
-        shadow_drops: Callable[[], int] = lambda: 0,
-        recorder: SessionRecorder | None = None,
+        observers: ReplicaObservers | None = None,
     ) -> None:
-        """Create the series.
+        """Create the series, with these tags: application, deployment, replica, policy.
 
-        Args:
-            engine: The engine whose stats are exported.
-            tags: The tags of every series: application, deployment, replica, policy.
-            keys: The API keys of the server; None if it has none.
-            shadow_drops: Returns the number of observations since the last call that the candidate did not get.
-            recorder: Records the sessions; None if nothing does.
+        How long the file of `keys` was unreadable, and numbers of the `observers`, are exported if there are any.
         """
         make = partial(_series, tags)
         self._engine = engine
@@ -102,34 +96,25 @@ class Exporter:
         self._uncompiled = make(Gauge, "uncompiled", "Batch sizes that run without the compilation that is set.")
         self._unreadable = make(Gauge, "keys_unreadable_s", "Time in which the key file could not be read.")
         self._dropped = make(Counter, "shadow_dropped", "Observations that the candidate did not get.")
-        self._shadow_drops = shadow_drops
         self._recorded = make(Counter, "recorded_frames", "Acts of recorded sessions.", "outcome")
         self._recording = make(Gauge, "recording", "Whether sessions are recorded.")
-        self._keys, self._recorder = keys, recorder
-        self._counted = {"saved": 0, "lost": 0}  # frames that were exported
+        self._keys, self._observers = keys, observers
+        self._counted = Counts[str]()  # what was exported of the observers' numbers
         self._meter = LoadMeter(engine.queue)
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._loop, name="metrics", daemon=True)
+        self._periodic = Periodic(PERIOD_S)
 
     def start(self) -> None:
         """Let the engine record its stats, and start to export them."""
         self._engine.stats.enable()
-        self._thread.start()
+        self._periodic.add(self.export)
 
     def close(self) -> None:
         """Export the remaining stats and end the thread."""
-        self._stop.set()
-        if self._thread.ident is not None:
-            self._thread.join()
-
-    def _loop(self) -> None:
-        stopped = False
-        while not stopped:
-            stopped = self._stop.wait(PERIOD_S)
-            try:
-                self.export()
-            except Exception:
-                logger.exception("metrics were not exported")
+        self._periodic.remove(self.export)
+        try:
+            self.export()
+        except Exception:
+            logger.exception("the last metrics were not exported")
 
     def export(self) -> None:
         """Export the stats since the last call."""
@@ -144,20 +129,21 @@ class Exporter:
             self._pushes.observe(took_ms)
         self._version.set(self._engine.weights.number)
         self._uncompiled.set(len(self._engine.models.uncompiled))
-        if dropped := self._shadow_drops():
-            self._dropped.inc(dropped)
         self._unreadable.set(0.0 if self._keys is None else self._keys.unreadable_s)
-        self._export_recording()
-
-    def _export_recording(self) -> None:
-        recorder = self._recorder
+        shadow = None if self._observers is None else self._observers.shadow
+        if shadow is not None:
+            self._increase(self._dropped, "dropped", shadow.dropped)
+        recorder = None if self._observers is None else self._observers.recorder
         self._recording.set(float(recorder is not None and recorder.ended is None))
-        if recorder is None:
-            return
-        for outcome, frames in (("saved", recorder.saved), ("lost", recorder.lost)):
-            if new := frames - self._counted[outcome]:
-                self._recorded.inc(new, {"outcome": outcome})
-                self._counted[outcome] = frames
+        if recorder is not None:
+            self._increase(self._recorded, "saved", recorder.saved, {"outcome": "saved"})
+            self._increase(self._recorded, "lost", recorder.lost, {"outcome": "lost"})
+
+    def _increase(self, counter: Any, name: str, total: int, tags: dict[str, str] | None = None) -> None:
+        """Bring a counter to `total`."""
+        if new := total - self._counted[name]:
+            counter.inc(new, tags)
+            self._counted[name] = total
 
     def _export_collected(self, collected: Collected) -> None:
         for (op, transport, kind, code), sample in collected.requests.items():

@@ -14,8 +14,7 @@ import ray
 from vlagents_ray.client.transports.serve_handle import call_replica
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.serve.config.deployment import POLICY
-from vlagents_ray.serve.live.fleet import Other, OtherReplicas
-from vlagents_ray.serve.live.snapshot import Snapshot
+from vlagents_ray.serve.observers.live_view import OtherReplicas, Snapshot, SnapshotReader
 from vlagents_ray.serve.scaling.sibling_replicas import SiblingApi, replica_actors
 
 logger = logging.getLogger(__name__)
@@ -32,10 +31,10 @@ class ReplicaViews(OtherReplicas):
         """Read those of the replicas of `apps`, apart from the replica whose full name is `but`."""
         self._apps = apps
         self._but = but
-        self._views: dict[str, Other] = {}  # found last
+        self._views: dict[str, SnapshotReader] = {}  # found last
         self._found = float("-inf")
 
-    async def views(self) -> dict[str, Other]:
+    async def views(self) -> dict[str, SnapshotReader]:
         """Return the reader of the snapshots of each, by name."""
         if time.monotonic() - self._found > _VIEW_S:
             self._found = time.monotonic()

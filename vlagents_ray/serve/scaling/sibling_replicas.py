@@ -13,7 +13,7 @@ from ray import serve
 
 from vlagents_ray.client.transports.serve_handle import call_replica
 from vlagents_ray.errors import VLAgentsError
-from vlagents_ray.serve.live.snapshot import Snapshot
+from vlagents_ray.serve.observers.live_view import Snapshot
 from vlagents_ray.serve.scaling.held_sessions import HeldSessions, Peer, PeerEnded, PeerUnreachable
 from vlagents_ray.serve.scaling.replica_selection import ReplicaLoad
 from vlagents_ray.serve.scaling.weight_push import Values, WeightsReplica

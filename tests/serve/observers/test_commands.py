@@ -1,0 +1,315 @@
+"""Commands from the live page to sessions: who may give them, and what becomes of them."""
+
+from __future__ import annotations
+
+import json
+import logging
+import threading
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import pytest
+from eval_fakes import wait_for
+from in_memory_keys import ChangingKeys
+from live_server import LiveServer, ask, live_server
+from manual_clock import Clock
+
+from vlagents_ray import Obs, RemoteAgent
+from vlagents_ray.chunking.player import ChunkPlayer
+from vlagents_ray.cli.robot import main
+from vlagents_ray.client.commands import COMMAND, COMMANDED, CommandInbox
+from vlagents_ray.errors import InvalidInput, Overloaded, UnknownSession
+from vlagents_ray.interface import Act
+from vlagents_ray.policies.noop import Noop
+from vlagents_ray.protocol.messages import Reply, Request
+from vlagents_ray.robot.loop import LoopReport, run_loop
+from vlagents_ray.serve.access import api_keys
+from vlagents_ray.serve.observers import live_page
+from vlagents_ray.serve.observers.commands import CommandBoard
+from vlagents_ray.serve.sessions import SessionTable
+
+
+class Board:
+    """A board with the session "arm"."""
+
+    def __init__(self) -> None:
+        self.clock = Clock()
+        self.sessions: SessionTable[Any] = SessionTable(10, 60.0)
+        self.sessions.open("arm")
+        self.board = CommandBoard(self.sessions, clock=self.clock)
+
+    def press(self, do: str) -> str:
+        return str(self.board.press("arm", do, "lab")["id"])
+
+    def answered(self, **info: Any) -> dict[str, Any] | None:
+        """Answer a request that says this, and return the command in the answer."""
+        self.board.read_outcomes("arm", Request("act", Obs(info=info)))
+        reply = Reply(act=Act(np.zeros(2, np.float32)))
+        self.board.send("arm", reply)
+        found: dict[str, Any] | None = reply.act.info.get(COMMAND) if reply.act else None
+        return found
+
+    @property
+    def states(self) -> list[str]:
+        return [one["state"] for one in self.board.of("arm")]
+
+
+@pytest.fixture
+def board() -> Board:
+    return Board()
+
+
+def test_a_command_goes_into_one_answer_and_the_next_request_says_what_became_of_it(board: Board) -> None:
+    assert board.answered() is None
+    first, second = board.press("pause"), board.press("success")
+    assert board.answered() == {"id": first, "do": "pause", "by": "lab"}
+    assert board.states == ["sent", "waiting"]
+    assert board.answered(**{COMMANDED: {first: ""}}) == {"id": second, "do": "success", "by": "lab"}
+    assert board.answered(**{COMMANDED: {second: "no hands"}}) is None
+    assert board.states == ["done", "refused"]
+    assert board.board.of("arm")[1]["why"] == "no hands"
+
+
+def test_a_stop_overtakes_what_waits(board: Board) -> None:
+    board.press("pause")
+    stop = board.press("stop")
+    said = board.answered()
+    assert said is not None
+    assert said["id"] == stop
+
+
+def test_a_robot_that_does_not_answer_ignores_it(board: Board) -> None:
+    pressed = board.press("pause")
+    for _ in range(4):
+        board.answered()
+    assert board.states == ["ignored"]
+    board.answered(**{COMMANDED: {pressed: ""}})  # it was only slow
+    assert board.states == ["done"]
+
+
+def test_a_command_that_waited_for_too_long_never_reaches_the_robot(board: Board) -> None:
+    board.press("pause")
+    board.clock.now += 6.0
+    assert board.answered() is None
+    assert board.states == ["too late"]
+
+
+@pytest.mark.parametrize("do", ["resume", "instruct", "take over", "restart", "dance", "", "x" * 10_000])
+def test_what_would_make_a_robot_move_is_refused_with_the_cure(board: Board, do: str) -> None:
+    with pytest.raises(InvalidInput, match="at the robot") as refused:
+        board.press(do)
+    assert f"got {do[:40]!r}, want one of ['pause', 'stop', 'success', 'failure'," in str(refused.value)
+    assert board.answered() is None
+
+
+def test_a_stop_is_accepted_however_many_commands_wait(board: Board) -> None:
+    with pytest.raises(UnknownSession):
+        board.board.press("leg", "pause", "")
+    for _ in range(5):
+        board.press("pause")
+    with pytest.raises(Overloaded):
+        board.press("pause")
+    stop = board.press("stop")
+    said = board.answered()
+    assert said is not None
+    assert said["id"] == stop
+
+
+def test_ended_sessions_are_forgotten(board: Board) -> None:
+    board.press("pause")
+    board.board.forget_others([])
+    assert board.states == []
+
+
+def post(server: LiveServer, stated: object, key: str = "", **headers: str) -> tuple[int, dict[str, Any]]:
+    data = stated if isinstance(stated, bytes) else json.dumps(stated).encode()
+    given = {"content-type": "application/json", **headers} | ({"authorization": f"Bearer {key}"} if key else {})
+    request = urllib.request.Request(f"{server.url}/v1/live/command", data, given)
+    try:
+        with urllib.request.urlopen(request, timeout=10) as answer:
+            return answer.status, json.load(answer)
+    except urllib.error.HTTPError as refused:
+        return refused.code, json.load(refused)
+
+
+class Arm:
+    """A robot that counts what it is told to do."""
+
+    simulated = True
+
+    def __init__(self) -> None:
+        self.applied = 0
+        self.stops = 0
+
+    def observe(self) -> Obs:
+        return Obs(state={"joints": np.zeros(2, np.float32)})
+
+    def apply(self, action: np.ndarray) -> None:
+        self.applied += 1
+
+    def stop(self) -> None:
+        self.stops += 1
+
+
+@contextmanager
+def robot(server: LiveServer, *, obeys: bool = True) -> Iterator[tuple[Arm, str, list[LoopReport]]]:
+    """A robot that is driven over the server; with the name of its session."""
+    arm, over, reports = Arm(), threading.Event(), []
+    commands = CommandInbox() if obeys else None
+    with RemoteAgent(server.url, commands=commands) as agent:
+        player = ChunkPlayer(agent, mode="async", deadline_s=0.01, safe="hold")
+        thread = threading.Thread(
+            target=lambda: reports.append(
+                run_loop(arm, player, hz=100, instruction="hold", commands=commands, until=over.is_set)
+            )
+        )
+        thread.start()
+        try:
+            wait_for(lambda: arm.applied, 30)
+            [session] = server.engine.sessions.ids()
+            yield arm, session, reports
+        finally:
+            over.set()
+            thread.join()
+            player.close()
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[LiveServer]:
+    with live_server(Noop.from_config({"action_dim": 7, "chunk": 8})) as one:
+        yield one
+
+
+def states(server: LiveServer, session: str) -> list[str]:
+    return [f"{one['do']} {one['state']}" for one in server.view.commands.of(session)]
+
+
+def test_a_robot_pauses_and_is_marked(server: LiveServer) -> None:
+    with robot(server) as (arm, session, reports):
+        assert post(server, {"session": session, "do": "pause"})[0] == 200
+        wait_for(lambda: states(server, session) == ["pause done"], 30)
+        wait_for(lambda: arm.stops, 30)
+        assert post(server, {"session": session, "do": "success"})[0] == 200
+        wait_for(lambda: reports, 30)
+        assert reports[0].outcome == "success"
+
+
+def test_nothing_moves_while_it_is_paused(server: LiveServer) -> None:
+    with robot(server) as (arm, session, _):
+        post(server, {"session": session, "do": "pause"})
+        wait_for(lambda: states(server, session) == ["pause done"], 30)
+        applied, steps = arm.applied, server.engine.sessions.get(session).steps
+        wait_for(lambda: server.engine.sessions.get(session).steps > steps + 10, 30)  # the policy goes on
+        assert arm.applied == applied
+
+
+def test_nothing_that_comes_over_the_network_lets_a_paused_robot_go_on(server: LiveServer) -> None:
+    with robot(server) as (arm, session, reports):
+        post(server, {"session": session, "do": "pause"})
+        wait_for(lambda: states(server, session) == ["pause done"], 30)
+        applied = arm.applied
+        for do in ("resume", "instruct"):
+            status, said = post(server, {"session": session, "do": do, "text": "go on"})
+            assert (status, "at the robot" in said["detail"]) == (400, True)
+        steps = server.engine.sessions.get(session).steps
+        wait_for(lambda: server.engine.sessions.get(session).steps > steps + 10, 30)
+        assert (arm.applied, reports) == (applied, [])
+
+
+def test_a_marked_episode_ends_the_robots_command(server: LiveServer, capsys: pytest.CaptureFixture[str]) -> None:
+    options = ["--hz", "50", "--seconds", "30", "--baseline", "0", "--instruction", "fold", "--operate"]
+    status: list[int] = []
+    thread = threading.Thread(target=lambda: status.append(main([server.url, *options])))
+    thread.start()
+    wait_for(lambda: [one.instruction for one in server.engine.sessions.all()] == ["fold"], 30)
+    [session] = server.engine.sessions.ids()
+    assert post(server, {"session": session, "do": "failure"})[0] == 200
+    thread.join(30)
+    assert status in ([0], [1])  # safe actions while it connected
+    assert "marked as a failure on the live page" in capsys.readouterr().out
+
+
+def test_a_robot_that_has_not_opted_in_goes_on(server: LiveServer) -> None:
+    with robot(server, obeys=False) as (arm, session, _):
+        post(server, {"session": session, "do": "stop"})
+        wait_for(lambda: states(server, session) == ["stop ignored"], 30)
+        applied = arm.applied
+        wait_for(lambda: arm.applied > applied, 30)
+        assert arm.stops == 0
+
+
+def test_a_session_is_pinned_until_it_is_told_to_follow_again(server: LiveServer) -> None:
+    with RemoteAgent(server.url, rank="simulation") as agent:
+        agent.reset(Obs())
+        [session] = server.engine.sessions.ids()
+        for do, follows in (("pin", False), ("follow", True)):
+            assert post(server, {"session": session, "do": do})[1]["state"] == "done"
+            assert server.engine.sessions.get(session).follows is follows
+            agent.reset(Obs(), weights="pinned" if follows else "follow")  # the robot's own wish comes second
+            assert server.engine.sessions.get(session).follows is follows
+
+
+def test_viewers_see_the_commands_and_whether_they_may_give_some(server: LiveServer) -> None:
+    with RemoteAgent(server.url) as agent, server.viewer() as viewer:
+        agent.reset(Obs())
+        [session] = server.engine.sessions.ids()
+        post(server, {"session": session, "do": "pause"})
+        shown: list[dict[str, Any]] = []
+        while not shown:
+            document, _ = ask(viewer)
+            assert document["may_operate"] is True
+            shown = document["replicas"][-1]["sessions"]
+        assert [(one["do"], one["state"]) for one in shown[0]["commands"]] == [("pause", "waiting")]
+
+
+@pytest.mark.parametrize("body", [b"", b"[]", b"{", b'{"session": 1, "do": "stop"}', b'{"do": "stop"}', b"[" * 10_000])
+def test_malformed_commands_are_refused(server: LiveServer, body: bytes) -> None:
+    assert post(server, body)[0] == 400
+
+
+def test_a_long_command_is_not_read(server: LiveServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live_page, "_COMMAND_BYTES", 100)
+    assert post(server, {"session": "x" * 200, "do": "stop"})[0] == 413
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [{"origin": "http://evil.example"}, {"origin": "null"}, {"host": "evil.example"}, {"content-type": "text/plain"}],
+)
+def test_another_sites_page_cannot_press(server: LiveServer, headers: dict[str, str]) -> None:
+    with RemoteAgent(server.url) as agent:
+        agent.reset(Obs())
+        [session] = server.engine.sessions.ids()
+        assert post(server, {"session": session, "do": "stop"}, **headers)[0] in (400, 403)
+        assert states(server, session) == []
+
+
+def test_a_server_open_to_the_network_accepts_no_command() -> None:
+    with live_server(insecure=True) as server:
+        status, said = post(server, {"session": "x", "do": "stop"})
+        assert status == 403
+        assert "--scope operate" in said["detail"]
+
+
+def test_a_key_needs_the_scope_and_each_press_is_logged(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(api_keys, "_CHECK_S", 0.0)
+    keys = ChangingKeys()
+    watching, operating = keys.add("watching", scopes=["watch"]), keys.add("lab", scopes=["watch", "operate"])
+    with live_server(keys=keys.keys) as server, RemoteAgent(server.url, api_key=watching) as agent:
+        agent.reset(Obs())
+        [session] = server.engine.sessions.ids()
+        pause = {"session": session, "do": "pause"}
+        assert post(server, pause, watching)[0] == 403
+        for key, may in ((watching, False), (operating, True)):
+            with server.viewer(key) as viewer:
+                assert ask(viewer)[0]["may_operate"] is may
+        with caplog.at_level(logging.INFO, "vlagents_ray.serve.audit"):
+            for _ in range(2):
+                assert post(server, pause, operating)[1]["by"] == "lab"
+        assert caplog.messages.count(f"key lab: pressed 'pause' for session {session!r}") == 2

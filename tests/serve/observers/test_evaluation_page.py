@@ -1,0 +1,161 @@
+"""The live page of an evaluation and of a training, in a browser."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from browser import Page, browser
+from eval_fakes import wait_for
+from in_memory_keys import ChangingKeys
+from live_server import Address
+from recorded_results import record, runs
+
+from vlagents_ray.evaluate.plan.cases import EvalCase, cells
+from vlagents_ray.evaluate.report.results_document import ProgressDocument
+from vlagents_ray.serve.access.api_keys import Keys
+from vlagents_ray.serve.observers.live_page import page_server
+from vlagents_ray.serve.observers.live_view import Fleet
+
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
+
+STATE = "document.getElementById('evaluation-state').textContent"
+CARDS = "document.querySelectorAll('#failures article').length"
+PLAYING = "[...document.querySelectorAll('#failures video')].filter((one) => one.videoWidth === 48).length"
+SCROLL = "document.getElementById('failures').scrollIntoView()"
+POINTS = "document.querySelectorAll('#curve .dot').length"
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    with browser(tmp_path_factory.mktemp("profile")) as opened:
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A sweep of a policy beside another one, with videos of failures, an error and a lost episode."""
+    out = tmp_path_factory.mktemp("results") / "sweep"
+    record(runs(out, episodes=5), videos=True, troubles=True)
+    return out
+
+
+@contextmanager
+def served(read: Callable[[], dict[str, Any]], videos: Any = {}.get, keys: Keys | None = None) -> Iterator[str]:
+    """The address of the page of such a document."""
+    with page_server(Fleet(None, more=read), ("127.0.0.1", 0), keys, name="eval", videos=videos) as url:
+        yield url
+
+
+def show(page: Page, url: str, *, width: int = 1400, scheme: str = "light") -> None:
+    page.open(Address("about:blank"), width=width, scheme=scheme)  # type: ignore[arg-type]
+    page.said.clear()  # of the page before, whose server has ended
+    page.asked.clear()
+    page.open(Address(url), width=width, scheme=scheme)  # type: ignore[arg-type]
+
+
+def until(page: Page, expression: str, want: object) -> None:
+    wait_for(lambda: page.value(expression) == want, 30)
+
+
+def begun(out: Path, **options: bool) -> ProgressDocument:
+    """An evaluation that runs."""
+    document = ProgressDocument(out, **options)
+    planned = cells(runs(out, episodes=5))
+    document.begin(planned, {}, sum(cell.planned for cell in planned))
+    return document
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [360, 1400, 3840])
+def test_it_fits_without_errors_or_requests_outside(page: Page, results: Path, width: int, scheme: str) -> None:
+    document = begun(results)
+    with served(document.read, document.video) as url:
+        show(page, url, width=width, scheme=scheme)
+        until(page, STATE, "Running")
+        until(page, "document.querySelectorAll('#cells .cell').length", 9)
+        assert page.value("document.documentElement.scrollWidth") <= width
+        assert page.value("document.querySelectorAll('.of-server:not([hidden])').length") == 0
+        assert page.said == []
+        own = f"{url.removesuffix('/live')}/"
+        assert all(address.startswith(("blob:", "data:", own)) for address in page.asked)
+
+
+def test_cells_fill_with_their_intervals_and_failures_come_with_video(page: Page, results: Path) -> None:
+    document = begun(results)
+    with served(document.read, document.video) as url:
+        show(page, url)
+        until(page, f"{CARDS} >= 10", want=True)
+        page.value(SCROLL)
+        until(page, f"{PLAYING} >= 1", want=True)  # those that can be seen
+        assert page.value(f"{PLAYING} < {CARDS} - 1")
+        cell = "document.querySelector('#cells .cell').innerText"
+        assert "5 of 5" in page.value(cell)
+        assert " to " in page.value(cell)
+        text = page.value("document.getElementById('failures').innerText")
+        assert "lost to infrastructure" in text
+        assert "error of the policy" in text
+        assert "policy_failed: </script><img" in text  # as text
+        until(page, POINTS, 2)
+        assert "learner: " in page.value("document.getElementById('curve').getAttribute('aria-label')")
+        assert page.said == []
+
+
+def test_it_says_how_it_ends_and_keeps_what_was_seen(page: Page, results: Path) -> None:
+    document = begun(results)
+    with served(document.read, document.video) as url:
+        show(page, url)
+        until(page, STATE, "Running")
+        document.fail("StorageFailed: the disk is full")
+        until(page, STATE, "Stopped by an error: StorageFailed: the disk is full")
+    until(page, "document.getElementById('connection').textContent", "Ended")
+    assert page.value("document.querySelectorAll('#cells .cell').length") == 9
+
+
+def test_a_training_grows_its_curve_by_the_version(page: Page, tmp_path: Path) -> None:
+    def learner(versions: int) -> None:
+        policies = [{"name": "learner", "url": "http://localhost:1", "steps": [1000 * versions]}]
+        record(runs(tmp_path, policies=policies, resume=versions > 1), better)
+
+    def better(cell: EvalCase, seed: int) -> int | None:
+        return 5 if seed % 20 < (cell.step or 0) / 1000 else None
+
+    document = ProgressDocument(tmp_path, goes_on=True)
+    with served(document.read, document.video) as url:
+        show(page, url)
+        until(page, STATE, "Starting: the workers make their environments")
+        for versions in range(1, 4):
+            document.begin([], {}, 36)
+            learner(versions)
+            document.end()
+            until(page, POINTS, versions)
+        until(page, STATE, "Waiting for the next version of the weights")
+        assert "Training: " in page.value("document.getElementById('policy').textContent")
+        assert page.value("document.getElementById('last-step').textContent") == "3,000"
+
+
+def test_the_time_left_is_told(page: Page) -> None:
+    said = begun(Path("none")).read()["evaluation"]
+    with served(lambda: {"evaluation": said | {"done": 3, "planned": 12, "ends": time.time() + 600}}) as url:
+        show(page, url)
+        until(page, "document.getElementById('episode-count').textContent", "3 of 12 episodes, about 10 min left")
+
+
+def test_videos_are_requested_with_the_key(page: Page, results: Path) -> None:
+    keys = ChangingKeys()
+    token = keys.add("watching", scopes=["watch"])
+    document = begun(results)
+    with served(document.read, document.video, keys.keys) as url:
+        show(page, url)
+        until(page, "document.getElementById('key').hidden", want=False)
+        page.value(
+            f"(() => {{ document.getElementById('key-text').value = '{token}';"
+            "document.querySelector('#key button').click(); })()"
+        )
+        until(page, f"{CARDS} >= 10", want=True)
+        page.value(SCROLL)
+        until(page, f"{PLAYING} >= 1", want=True)

@@ -1,0 +1,356 @@
+"""What a server keeps of its sessions, whatever becomes of the disk or of its memory."""
+
+from __future__ import annotations
+
+import errno
+import json
+import shutil
+import stat
+import threading
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import av
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from eval_fakes import wait_for
+from recorded_sessions import Brightness, Recorded, recorded, reply_of, seen
+
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.interface import Obs
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Budget, Request
+from vlagents_ray.protocol.values import from_text
+from vlagents_ray.robot.dataset import Dataset
+from vlagents_ray.serve.config.deployment import ServerArgs
+from vlagents_ray.serve.observers import episodes, recording
+from vlagents_ray.serve.observers.recording import SessionRecorder
+
+
+def rows(root: Path, episode: int = 0) -> dict[str, list]:
+    found: dict[str, list] = pq.read_table(root / f"data/chunk-000/file-{episode:03d}.parquet").to_pydict()
+    return found
+
+
+def pending(request: Request) -> Any:
+    return SimpleNamespace(session_id="a", request=request, files={}, kept={})
+
+
+def taken(server: Recorded, request: Request) -> list[bool]:
+    """Which of three such requests the recorder has room for, while they all wait."""
+    waiting = [pending(request) for _ in range(3)]
+    for one in waiting:
+        server.recorder.on_request(one)
+    return [bool(one.kept) for one in waiting]
+
+
+def only(folder: Path) -> Path:
+    [root] = folder.iterdir()
+    return root
+
+
+def test_each_act_is_a_frame_with_its_whole_chunk(tmp_path: Path) -> None:
+    with recorded(tmp_path) as server:
+        chunks = server.robot().play(5, seed=7)
+    frames = rows(only(tmp_path))
+    assert frames["chunk"] == [chunk.ravel().tolist() for chunk in chunks]
+    assert frames["action"] == [chunk[0].tolist() for chunk in chunks]
+    assert frames["chunk_rows"] == [4] * 5
+    assert frames["tick"] == [0, 1, 2, 3, 4]
+    assert frames["captured_at"] == [1e9 + i for i in range(5)]
+    assert frames["observation.state"] == [[i, -i, 0.5] for i in range(5)]
+    assert frames["policy_version"] == [0] * 5
+    assert all(ms > 0 for ms in frames["inference_ms"])
+    budget = Budget(DEFAULT_LIMITS)
+    assert [from_text(text, budget) for text in frames["request"]] == [{"offset": i / 4} for i in range(5)]
+    assert {from_text(text, budget)["subtask"] for text in frames["answer"]} == {"reach"}
+    assert [from_text(text, budget) if text else None for text in frames["reset"]] == [{"seed": 7}, *[None] * 4]
+
+
+def test_the_first_frame_names_the_weights_that_act_in_this_episode(tmp_path: Path) -> None:
+    agent = Brightness()
+    agent.weights_id = {"digest": "sampled-sha256:9f2c", "revision": "c0ffee"}
+    with recorded(tmp_path, agent) as server:
+        server.robot().play(3)
+    budget = Budget(DEFAULT_LIMITS)
+    found = [from_text(text, budget) if text else None for text in rows(only(tmp_path))["weights"]]
+    assert found == [{"weights": "sampled-sha256:9f2c", "revision": "c0ffee"}, None, None]
+
+
+def test_pictures_are_those_of_the_policy_to_the_bit(tmp_path: Path) -> None:
+    with recorded(tmp_path) as server:
+        server.robot().play(3)
+    [file] = tmp_path.rglob("*.mp4")
+    with av.open(str(file)) as video:
+        frames = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
+    for i, frame in enumerate(frames):
+        np.testing.assert_array_equal(frame, seen(i).cameras["front"])
+
+
+def test_small_pictures_are_ordinary_videos(tmp_path: Path) -> None:
+    with recorded(tmp_path, pictures="small") as server:
+        server.robot().play(3)
+    with av.open(str(next(tmp_path.rglob("*.mp4")))) as video:
+        assert video.streams.video[0].codec_context.pix_fmt == "yuv420p"
+
+
+def test_an_observation_is_copied_before_its_answer_is_kept(tmp_path: Path) -> None:
+    with recorded(tmp_path) as server:
+        robot = server.robot()
+        robot.play(1)
+        obs = seen(3)
+        robot.act(obs)
+        wait_for(server.recorder._copier._calls.empty)
+        obs.cameras["front"][:] = 0  # its memory is the client's again
+        obs.state["joints"][:] = 9
+    assert rows(only(tmp_path))["observation.state"][1] == [3, -3, 0.5]
+
+
+def test_sessions_at_once_have_episodes_of_their_own(tmp_path: Path) -> None:
+    with recorded(tmp_path) as server:
+        one, other = server.robot(), server.robot()
+        one.play(1, seed=1, instruction="stack")
+        other.play(1, seed=2, instruction="sort")
+        for i in range(1, 4):
+            one.act(seen(i))
+            other.act(seen(10 + i))
+    both = [rows(only(tmp_path), i) for i in range(2)]
+    assert [one["tick"] for one in both] == [[0, 1, 2, 3]] * 2
+    assert {one["session"][0]: one["observation.state"][2][0] for one in both} == {0: 2, 1: 12}
+    assert not (only(tmp_path) / "unfinished").exists() or not any((only(tmp_path) / "unfinished").iterdir())
+
+
+def test_a_session_that_has_gone_is_complete(tmp_path: Path) -> None:
+    with recorded(tmp_path) as server:
+        robot = server.robot()
+        robot.play(2)
+        robot.sender.release(for_good=True)
+        wait_for(lambda: server.recorder.saved == 2)
+        assert len(rows(only(tmp_path))["tick"]) == 2
+
+
+def test_a_new_episode_completes_the_one_before(tmp_path: Path) -> None:
+    with recorded(tmp_path) as server:
+        robot = server.robot()
+        robot.play(2)
+        robot.play(3)
+        wait_for(lambda: server.recorder.saved == 2)
+    assert [len(rows(only(tmp_path), i)["tick"]) for i in range(2)] == [2, 3]
+
+
+def test_other_cameras_go_into_a_dataset_of_their_own(tmp_path: Path) -> None:
+    with recorded(tmp_path) as server:
+        robot = server.robot()
+        robot.play(1)
+        robot.act(seen(1, side=64))
+    names = sorted(tmp_path.iterdir())
+    assert [name.name[-2:] for name in names] == ["-0", "-1"]
+    assert [rows(name)["tick"] for name in names] == [[0], [1]]
+
+
+def test_a_long_session_goes_on_in_the_next_episode(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(episodes, "_FRAMES", 3)
+    with recorded(tmp_path) as server:
+        server.robot().play(7)
+    frames = [rows(only(tmp_path), i) for i in range(3)]
+    assert [one["tick"] for one in frames] == [[0, 1, 2], [3, 4, 5], [6]]
+    assert [set(one["session"]) for one in frames] == [{0}] * 3
+
+
+def test_an_act_that_failed_is_not_kept(tmp_path: Path) -> None:
+    with recorded(tmp_path) as server:
+        robot = server.robot()
+        robot.play(1)
+        failed = robot.ask(Request("act", Obs(seen(1).cameras, 0.5, seen(1).state, {"fail": True})))
+        assert failed.error is not None
+        robot.act(seen(2))
+    assert rows(only(tmp_path))["tick"] == [0, 1]
+    assert rows(only(tmp_path))["observation.state"][1][0] == 2
+
+
+def test_shorter_chunks_are_filled_up_and_longer_ones_get_another_dataset(tmp_path: Path) -> None:
+    with recorded(tmp_path) as server:
+        robot = server.robot()
+        chunks = robot.play(1)
+        for number in (2, 6, 4):
+            obs = seen(number)
+            obs.info["rows"] = number
+            chunks.append(robot.act(obs))
+    first, second = sorted(tmp_path.iterdir())
+    assert (rows(first)["chunk_rows"], rows(second)["chunk_rows"]) == ([4, 2], [6, 4])
+    assert rows(first)["chunk"][1] == [*chunks[1].ravel().tolist(), *chunks[1][-1].tolist() * 2]
+    assert rows(second)["chunk"][0] == chunks[2].ravel().tolist()
+
+
+def test_a_share_of_the_episodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    draws = iter([0.9, 0.1])
+    monkeypatch.setattr(recording, "random", SimpleNamespace(random=lambda: next(draws)))
+    with recorded(tmp_path, share=0.5) as server:
+        server.robot().play(2, instruction="left out")
+        server.robot().play(3, instruction="kept")
+    tasks = pq.read_table(only(tmp_path) / "meta/tasks.parquet").to_pydict()
+    assert tasks["__index_level_0__"] == ["kept"]
+
+
+def test_a_session_that_ends_while_its_acts_wait_is_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    go_on = threading.Event()
+    add = episodes.EpisodeWriter.add
+
+    def slow(*args: Any) -> None:
+        go_on.wait(10)
+        add(*args)
+
+    monkeypatch.setattr(episodes.EpisodeWriter, "add", slow)
+    with recorded(tmp_path) as server:
+        robot = server.robot()
+        robot.play(5)
+        robot.sender.release(for_good=True)
+        wait_for(lambda: not server.engine.sessions.ids())
+        go_on.set()
+        wait_for(lambda: server.recorder.saved == 5)
+        assert server.recorder.lost == 0
+
+
+def test_a_time_that_is_no_number_is_that_of_the_arrival(tmp_path: Path) -> None:
+    with recorded(tmp_path) as server:
+        robot = server.robot()
+        robot.play(1)
+        robot.act(replace(seen(1), info={"captured_at": "noon"}))
+    frames = rows(only(tmp_path))
+    assert frames["captured_at"][1] == frames["received_at"][1]
+
+
+def test_an_observation_that_cannot_be_kept_is_a_gap(tmp_path: Path) -> None:
+    with recorded(tmp_path) as server:
+        robot = server.robot()
+        robot.play(1)
+        robot.act(replace(seen(1), info={"object": object()}))  # as only a caller in this process may send it
+        robot.act(seen(2))
+    assert rows(only(tmp_path))["tick"] == [0, 2]
+
+
+def test_more_sessions_than_there_are_encoders_for_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(episodes, "_SESSIONS", 1)
+    with recorded(tmp_path) as server:
+        server.robot().play(2)
+        server.robot().play(3)
+        wait_for(lambda: server.recorder.lost == 3)
+    assert len(rows(only(tmp_path))["tick"]) == 2
+
+
+def test_requests_without_pictures_are_bounded_too(tmp_path: Path) -> None:
+    with recorded(tmp_path) as server:
+        robot = server.robot()
+        robot.play(1)
+        wait_for(lambda: server.recorder._held == 0)
+        server.recorder._held_bytes = 2 * recording._OTHER_BYTES
+        request = Request("act", Obs(state={"joints": np.zeros(2, np.float32)}))
+        assert taken(server, request) == [True, True, False]
+
+
+def test_bytes_beside_pictures_count_too(tmp_path: Path) -> None:
+    with recorded(tmp_path) as server:
+        robot = server.robot()
+        robot.play(1)
+        wait_for(lambda: server.recorder._held == 0)
+        server.recorder._held_bytes = 10**6
+        request = Request("act", Obs(info={"a": [{"b": bytes(600_000)}], "c": np.zeros(10)}))
+        assert taken(server, request) == [True, False, False]
+
+
+def test_what_does_not_fit_into_memory_is_dropped_and_counted(tmp_path: Path) -> None:
+    with recorded(tmp_path) as server:
+        robot = server.robot()
+        robot.play(1)
+        wait_for(lambda: server.recorder._held == 0)
+        server.recorder._held_bytes = 10
+        robot.act(seen(1))
+        server.recorder._held_bytes = 10**6
+        robot.act(seen(2))
+        assert server.recorder.lost == 1
+    assert rows(only(tmp_path))["tick"] == [0, 2]
+
+
+def test_memory_of_requests_that_nobody_waits_for_is_free_again(tmp_path: Path) -> None:
+    with recorded(tmp_path) as server:
+        server.recorder.on_request(pending(Request("act", seen(0))))
+        wait_for(lambda: server.recorder._held == 0)
+
+
+def test_a_full_folder_ends_the_recording_and_no_session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(episodes, "_LOOK_S", 0.0)
+    with recorded(tmp_path, most_gb=1e-9) as server:
+        robot = server.robot()
+        robot.play(2)
+        robot.play(1)
+        wait_for(lambda: server.recorder.ended is not None)
+        assert "GB" in str(server.recorder.ended)
+        assert robot.act(seen(2)).shape == (4, 2)
+    assert len(rows(only(tmp_path))["tick"]) == 2, "what was recorded before is complete"
+
+
+def test_a_full_disk_ends_the_recording_and_no_session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with recorded(tmp_path) as server:
+        robot = server.robot()
+        robot.play(2)
+        monkeypatch.setattr(Dataset, "save", full)
+        robot.play(2)
+        wait_for(lambda: server.recorder.ended is not None)
+        assert robot.act(seen(2)).shape == (4, 2)
+        assert server.recorder.lost >= 2
+
+
+def test_little_room_on_the_disk_ends_it_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=10))
+    with recorded(tmp_path) as server:
+        server.robot().play(1)
+        wait_for(lambda: server.recorder.ended is not None)
+
+
+def test_a_folder_that_cannot_be_written_to_is_told_at_the_start(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match=r"record\.folder"), recorded(tmp_path / "file"):
+        pass
+
+
+def test_nobody_else_may_look(tmp_path: Path) -> None:
+    folder = tmp_path / "traces"
+    with recorded(folder) as server:
+        server.robot().play(1)
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+    assert stat.S_IMODE(only(folder).stat().st_mode) == 0o700
+
+
+def test_the_dataset_says_whose_answers_these_are(tmp_path: Path) -> None:
+    with recorded(tmp_path) as server:
+        server.robot().play(1)
+    info = json.loads((only(tmp_path) / "meta/info.json").read_text())
+    assert info["trace"]["policy"] == "brightness"
+    assert info["vlagents_ray"]["contract"]["action"]["space"] == "joint"
+    assert info["features"]["chunk"] == {"dtype": "float32", "shape": [8], "names": None}
+
+
+def test_nothing_watches_unless_it_is_told_to() -> None:
+    assert ServerArgs(policy="noop").record is None
+
+
+def test_two_recorders_see_the_same(tmp_path: Path) -> None:
+    with recorded(tmp_path / "one") as server:
+        second = SessionRecorder(
+            episodes.EpisodeWriter(tmp_path / "two", "second", 10, lossless=True, most_bytes=1e9),
+            server.engine.sessions,
+        )
+        others = server.engine.observers
+        others.add(second)
+        server.robot().play(2)
+        others.remove(second)
+        reply_of(server.robot().ask(Request("reset", seen(0), "alone")))
+        second.close()
+    one, two = only(tmp_path / "one"), only(tmp_path / "two")
+    assert rows(one)["chunk"] == rows(two)["chunk"]

@@ -1,0 +1,19 @@
+"""A request and its answer, as an observer sees them."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+from vlagents_ray.images.codecs import DecodedFiles
+from vlagents_ray.protocol.messages import Reply, Request
+from vlagents_ray.serve.engine.observer import Observer
+
+
+def observe(
+    observer: Observer, session: str, request: Request, reply: Reply, files: DecodedFiles | None = None
+) -> None:
+    pending = SimpleNamespace(session_id=session, request=request, files=files or {}, kept={})
+    observer.on_request(pending)
+    request.obs = None  # as the engine does once the policy has acted
+    observer.before_answer(pending, reply)
+    observer.on_answer(pending, reply)

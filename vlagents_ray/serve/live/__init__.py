@@ -1,1 +1,0 @@
-"""The live page: what the sessions of a server do now, in a browser."""

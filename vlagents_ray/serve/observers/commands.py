@@ -1,0 +1,176 @@
+"""Commands to the sessions of a replica, from keys that may operate them on the live page.
+
+From a network a robot can only be made to stop: it is paused, stopped, or its episode is marked. What makes it move
+(resuming, another instruction, a human's motion) is done at the robot. A command travels in the answer to the next
+request of the robot, within `_WAITS_S` or never, since a late one would surprise the person beside it; a later request
+states the outcome. The server itself executes `HERE` and `SAVE`.
+"""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import threading
+import time
+import uuid
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from vlagents_ray.client.commands import COMMAND, COMMANDED
+from vlagents_ray.errors import InvalidInput, Overloaded, UnknownSession, VLAgentsError
+from vlagents_ray.protocol.messages import Reply, Request
+from vlagents_ray.serve.models.loaded_model import LoadedModel
+from vlagents_ray.serve.sessions import SessionTable
+
+logger = logging.getLogger(__name__)
+
+TO_ROBOT = ("pause", "stop", "success", "failure")
+"""The commands that are sent to a robot. None of them makes it move."""
+HERE = {"follow": True, "pin": False}
+"""The commands that the server executes: whether a session's later episodes take the newest weights."""
+SAVE = "save"
+"""The command that saves the session's last seconds, which the server does as well."""
+COMMANDS = (*TO_ROBOT, *HERE, SAVE)
+
+TRACKED_S = 15.0  # time for which the outcome of a command is awaited
+_WAITS_S = 5.0  # time within which a command has to reach the robot
+_SHOWN = 5  # last commands of a session that are shown
+_UNANSWERED = 3  # requests without the outcome of a command, after which it counts as ignored
+_REFUSAL = 200  # most characters of a reason
+
+State = Literal["waiting", "sent", "saving", "done", "refused", "ignored", "too late"]
+
+
+@dataclass(slots=True)
+class Press:
+    """A button that was pressed."""
+
+    id: str
+    do: str
+    by: str  # name of the key; empty without keys
+    pressed: float  # s, of the board's clock
+    state: State = "waiting"
+    why: str = ""  # it was refused; or the folder into which the session was saved
+    requests: int = 0  # of the session since it was sent
+
+    def describe(self) -> dict[str, Any]:
+        """Return it for viewers."""
+        return {"id": self.id, "do": self.do, "by": self.by, "state": self.state, "why": self.why}
+
+
+class CommandBoard:
+    """The commands to the sessions of one replica. Thread-safe."""
+
+    def __init__(
+        self,
+        sessions: SessionTable[LoadedModel],
+        save: Callable[[str], str] = lambda _: "",
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Create a board without commands.
+
+        `save` writes the last seconds of a session, and returns where to; it may take long, and raise errors.
+        """
+        self._save = save
+        self._sessions = sessions
+        self._clock = clock
+        self._numbers = itertools.count(1)
+        self._prefix = uuid.uuid4().hex[:8]
+        self._presses: dict[str, list[Press]] = {}  # by session, oldest first
+        self._lock = threading.Lock()
+
+    def press(self, session_id: str, do: str, by: str) -> dict[str, Any]:
+        """Accept the command `do`, one of `COMMANDS`, of the holder of the key `by`, and return it as `of` does.
+
+        Raises:
+            UnknownSession: The session is not here.
+            InvalidInput: There is no such command.
+            Overloaded: Too many commands wait for the session's next request.
+        """
+        if do not in COMMANDS:
+            raise InvalidInput(
+                f"do: got {do[:40]!r}, want one of {list(COMMANDS)}; resume a robot, change its instruction or move "
+                f"it at the robot"
+            )
+        session = next((one for one in self._sessions.all() if one.id == session_id), None)  # `get` would mark it used
+        if session is None:
+            raise UnknownSession(f"session {session_id[:80]!r}: is not here; it ended, or has begun again elsewhere")
+        pressed = Press(f"{self._prefix}-{next(self._numbers)}", do, by, self._clock())
+        self.forget_others(self._sessions.ids())
+        with self._lock:
+            held = self._presses.setdefault(session_id, [])
+            self._expire(held)
+            if len(held) == _SHOWN:
+                over = next((one for one in held if one.state not in ("waiting", "saving")), None)
+                if over is None and do == "stop":  # is never refused for commands that matter less
+                    over = next((one for one in held if one.state == "waiting" and one.do != "stop"), None)
+                if over is None:
+                    raise Overloaded(f"session {session_id!r}: {_SHOWN} commands wait already for its robot's request")
+                held.remove(over)
+            held.append(pressed)
+        if do in HERE:
+            session.told_to_follow = session.follows = HERE[do]
+            pressed.state = "done"
+        elif do == SAVE:
+            pressed.state = "saving"
+            threading.Thread(target=self._save_now, args=(session_id, pressed), daemon=True).start()
+        return pressed.describe()
+
+    def read_outcomes(self, session_id: str, request: Request) -> None:
+        """Read the outcomes of earlier commands that a session's request states."""
+        held = self._presses.get(session_id)
+        if not held or request.obs is None:
+            return
+        stated = request.obs.info.get(COMMANDED)
+        outcomes = stated if isinstance(stated, dict) else {}
+        with self._lock:
+            for one in held:
+                if one.state not in ("sent", "ignored"):
+                    continue
+                if isinstance(why := outcomes.get(one.id), str):
+                    one.state, one.why = ("refused", why[:_REFUSAL]) if why else ("done", "")
+                elif request.op == "act":
+                    one.requests += 1
+                    one.state = "ignored" if one.requests >= _UNANSWERED else one.state
+
+    def send(self, session_id: str, reply: Reply) -> None:
+        """Put the oldest command that waits into the answer to a session's act; "stop" goes first."""
+        held = self._presses.get(session_id)
+        if not held or reply.act is None:
+            return
+        with self._lock:
+            self._expire(held)
+            for one in sorted(held, key=lambda one: one.do != "stop"):
+                if one.state == "waiting":
+                    reply.act.info[COMMAND] = {"id": one.id, "do": one.do, "by": one.by}
+                    one.state = "sent"
+                    return
+
+    def of(self, session_id: str) -> list[dict[str, Any]]:
+        """Return the last commands to a session, oldest first: `id`, `do`, `by`, `state` and `why` of each."""
+        with self._lock:
+            held = self._presses.get(session_id, [])
+            self._expire(held)
+            return [one.describe() for one in held]
+
+    def forget_others(self, sessions: Collection[str]) -> None:
+        """Drop the commands to all sessions but these, since those have ended."""
+        with self._lock:
+            for session in self._presses.keys() - set(sessions):
+                del self._presses[session]
+
+    def _save_now(self, session_id: str, pressed: Press) -> None:
+        try:
+            pressed.why, pressed.state = self._save(session_id), "done"
+        except Exception as error:
+            if not isinstance(error, VLAgentsError):
+                logger.exception("session %s was not saved", session_id)
+            pressed.why, pressed.state = str(error)[:_REFUSAL], "refused"
+
+    def _expire(self, held: Collection[Press]) -> None:
+        """Give up the commands that have waited for too long; the caller holds the lock."""
+        oldest = self._clock() - _WAITS_S
+        for one in held:
+            if one.state == "waiting" and one.pressed < oldest:
+                one.state = "too late"

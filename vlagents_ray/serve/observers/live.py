@@ -1,0 +1,288 @@
+"""The latest answers and observations of a replica's sessions, kept while something reads them, and only then.
+
+Clients choose what is kept, so all of it is bounded in bytes: of an answer, numbers and short texts; of observations,
+the latest of each session, at most `RATE` times a second; and of both, the oldest are dropped beyond `ANSWER_BYTES` and
+`OBSERVATION_BYTES`. The live page, the last seconds of each session and the viewers read them on threads of their own.
+"""
+
+from __future__ import annotations
+
+import itertools
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from vlagents_ray.chunking.execution import PLAYED, WATCHED
+from vlagents_ray.images.codecs import JPEG
+from vlagents_ray.protocol.messages import Reply, Request
+from vlagents_ray.serve.engine.observer import Observer, Observers
+from vlagents_ray.serve.observers.commands import CommandBoard
+from vlagents_ray.serve.requests import PendingRequest
+
+ENCODING_SHARE = 0.04  # of a core, for encoding pictures
+RATE = 10.0  # observations a second and session that are kept
+LEASE_S = 2.0  # time after the last reading at which nothing is kept any more
+ANSWER_BYTES = 2**25  # most bytes of the answers that are kept
+OBSERVATION_BYTES = 2**28  # most bytes of the observations: 70 sessions of four unencoded VGA cameras
+VALUES = 64  # most numbers of one part of a state, or of one action
+ROWS = 128  # most actions of a chunk, or executed before a request
+TEXT = 200  # most characters of a text
+SHOWN_OPS = ("act", "reset")
+_ACTION = 4096  # an action of more numbers is not kept with its observation
+_PARTS = 64  # an observation with more cameras, or parts of its state, is not kept
+_INFO = 24  # most entries of an act's info
+_OWN = (WATCHED, "timing", "policy", "behaviour", "distribution")  # of an act's info: shown elsewhere, or our own
+_NUMBERS = ("step", "age_ms", "safe_ticks", "safe_spells", "late", "reconnects")  # that a client states
+_MOST = 2**53  # largest number that JSON keeps
+_OBJECTS = 1000  # bytes of an answer or an observation besides its arrays, files and texts, estimated
+_ENCODING = threading.Lock()
+_KEPT_S = 1.0  # time for which pixels are kept for a reader
+
+
+class Executed(NamedTuple):
+    """What a client states of the actions that it executed: `vlagents_ray.chunking.execution`."""
+
+    steps: np.ndarray  # (n,) int64, the steps of the rows
+    rows: np.ndarray  # (n, D) float32
+    numbers: dict[str, float | str]  # `step`, `age_ms`, … as far as they are numbers, and the text `safe`
+
+    @classmethod
+    def from_request(cls, request: Request) -> Executed | None:
+        """Return a copy of what a request states; None if that is nothing, or has another form."""
+        stated = None if request.obs is None else request.obs.info.get(PLAYED)
+        if not isinstance(stated, dict):
+            return None
+        steps, rows = stated.get("steps"), stated.get("rows")
+        if not isinstance(steps, np.ndarray) or not isinstance(rows, np.ndarray) or rows.ndim != 2:
+            return None
+        if steps.shape != rows.shape[:1] or steps.dtype.kind not in "iu" or rows.dtype.kind != "f":
+            return None
+        numbers: dict[str, float | str] = {name: stated[name] for name in _NUMBERS if _is_number(stated.get(name))}
+        if isinstance(safe := stated.get("safe"), str):
+            numbers["safe"] = safe[:TEXT]
+        return cls(steps[:ROWS].astype(np.int64), rows[:ROWS, :VALUES].astype(np.float32), numbers)
+
+
+class Answer(NamedTuple):
+    """What is kept of the answer to one request."""
+
+    number: int  # increases with every answer of the replica
+    session: str
+    op: str
+    rank: str
+    timing: Mapping[str, float]  # ms by stage; still completed when the answer was sent
+    error: str = ""  # its code; empty if there is none
+    detail: str = ""
+    rows: int = 0  # of the chunk
+    action: np.ndarray | None = None  # (rows, D) float32, as far as `ROWS` and `VALUES` reach; None without an act
+    done: bool = False
+    info: Mapping[str, Any] = MappingProxyType({})  # the numbers and short texts that the policy says
+    executed: Executed | None = None  # before this request
+
+    @property
+    def size(self) -> int:
+        """The memory that it takes, bytes."""
+        arrays = 0 if self.action is None else self.action.nbytes
+        if self.executed is not None:
+            arrays += self.executed.steps.nbytes + self.executed.rows.nbytes
+        texts = (self.session, self.detail, *self.info, *self.info.values())
+        return _OBJECTS + arrays + sum(4 * len(text) for text in texts if isinstance(text, str))
+
+
+@dataclass(slots=True)
+class KeptObservation:
+    """An observation as the policy got it."""
+
+    number: int
+    time: float  # s, of `time.monotonic`
+    state: dict[str, np.ndarray]  # (D,) float32, with the gripper as a part
+    cameras: dict[str, np.ndarray]  # (H, W, 3) uint8 RGB; empty once they are encoded
+    files: dict[str, bytes]  # JPEG or PNG files by camera: those that the client sent, or encoded by the reader
+    action: np.ndarray | None = None  # (D,) float32, the first row of its answer, once that was sent
+    counted: int = 0  # bytes, in the observer's sum
+
+    @property
+    def size(self) -> int:
+        """The memory that it takes, bytes."""
+        arrays = sum(part.nbytes for part in self.state.values()) + (0 if self.action is None else self.action.nbytes)
+        pixels = {id(owner): size for owner, size in map(_owner, self.cameras.values())}
+        return _OBJECTS + arrays + sum(pixels.values()) + sum(len(file) for file in self.files.values())
+
+    def pictures(self) -> dict[str, bytes]:
+        """Return the files of all cameras; those that came as pixels are encoded now, which may take milliseconds."""
+        with _ENCODING:  # several may read
+            for camera, image in self.cameras.items():
+                self.files[camera] = JPEG.file(image)
+            self.cameras = {}
+            return dict(self.files)
+
+
+class LiveObserver(Observer):
+    """Keeps the latest answers and observations of a replica, from `renew` to the end of the lease. Thread-safe."""
+
+    def __init__(
+        self, observers: Observers, commands: CommandBoard | None = None, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        """Create an inactive observer, which `renew` adds to `observers`; `commands` are sent in the answers."""
+        self._observers = observers
+        self._commands = commands
+        self._clock = clock
+        self._until = float("-inf")  # end of the lease, s
+        self._viewed_until = float("-inf")  # end of that of the last viewer
+        self._active = False
+        self._numbers = itertools.count(1)
+        self._answers: deque[Answer] = deque()
+        self._observations: dict[str, KeptObservation] = {}  # by session, the oldest first
+        self._answer_bytes = self._observation_bytes = 0
+        self._lock = threading.Lock()
+
+    def renew(self, lease_s: float = LEASE_S, *, viewer: bool = False) -> None:
+        """Keep what happens for `lease_s` more seconds.
+
+        `viewer`: a person watches. Executed actions are collected for people only: stating them costs a client time.
+        """
+        until = self._clock() + lease_s
+        self._until = max(self._until, until)
+        if viewer:
+            self._viewed_until = until
+        if not self._active:
+            self._active = True
+            self._observers.add(self)
+
+    def expire(self) -> None:
+        """Drop everything after the last lease, and pixels that were not read; called every half second."""
+        if self._active and self._clock() >= self._until:
+            self.close()
+        with self._lock:
+            if not self._active:
+                self._answers.clear()
+                self._observations.clear()
+                self._answer_bytes = 0
+            for kept in self._observations.values():
+                if kept.time < self._clock() - _KEPT_S:
+                    kept.cameras = {}
+                kept.counted = kept.size  # pictures were encoded meanwhile
+            self._observation_bytes = sum(kept.counted for kept in self._observations.values())
+
+    def close(self) -> None:
+        """End the lease."""
+        self._active = False
+        self._observers.remove(self)
+
+    def on_request(self, pending: PendingRequest) -> None:
+        """See `Observer`."""
+        pending.kept[self] = Executed.from_request(pending.request), self._keep(pending)
+        if self._commands is not None:
+            self._commands.read_outcomes(pending.session_id, pending.request)
+
+    def before_answer(self, pending: PendingRequest, reply: Reply) -> None:
+        """Add a command, and state whether a viewer watches, so that a player states what it executed."""
+        if reply.act is not None and self._clock() < self._viewed_until:
+            reply.act.info[WATCHED] = True
+        if self._commands is not None:
+            self._commands.send(pending.session_id, reply)
+
+    def on_answer(self, pending: PendingRequest, reply: Reply) -> None:
+        """See `Observer`."""
+        executed, observation = pending.kept.pop(self, (None, None))
+        if observation is not None and reply.act is not None and (row := reply.act.rows()[0]).size <= _ACTION:
+            observation.action = np.array(row)
+        answer = _answer(next(self._numbers), pending, reply, executed)
+        with self._lock:
+            self._answers.append(answer)
+            self._answer_bytes += answer.size
+            while self._answer_bytes > ANSWER_BYTES:
+                self._answer_bytes -= self._answers.popleft().size
+
+    def answers(self, since: int) -> list[Answer]:
+        """Return the answers with numbers above `since`, oldest first."""
+        with self._lock:
+            held = self._answers.copy()
+        return list(itertools.takewhile(lambda one: one.number > since, reversed(held)))[::-1]
+
+    def observation(self, session: str) -> KeptObservation | None:
+        """Return the session's latest observation that was kept; None if there is none."""
+        return self._observations.get(session)
+
+    def forget_others(self, sessions: Collection[str]) -> None:
+        """Drop the observations of all sessions but these, since those have ended."""
+        with self._lock:
+            for session in self._observations.keys() - set(sessions):
+                self._observation_bytes -= self._observations.pop(session).counted
+
+    def _keep(self, pending: PendingRequest) -> KeptObservation | None:
+        """Keep a request's observation, unless one was kept just before."""
+        session, obs, now = pending.session_id, pending.request.obs, self._clock()
+        before = self._observations.get(session)
+        if obs is None or (before is not None and now - before.time < 1 / RATE):
+            return None
+        names = (*obs.state, *obs.cameras)
+        if len(names) > _PARTS or any(len(name) > TEXT for name in names):
+            return None
+        state = {name: np.array(part) for name, part in obs.state.items()}
+        if obs.gripper is not None:
+            state["gripper"] = np.array([obs.gripper], np.float32)
+        files = pending.files
+        sent = {name: bytes(files[id(image)][1]) for name, image in obs.cameras.items() if id(image) in files}
+        cameras = {name: image for name, image in obs.cameras.items() if name not in sent}
+        kept = KeptObservation(next(self._numbers), now, state, cameras, sent)
+        kept.counted = kept.size
+        with self._lock:
+            if (old := self._observations.pop(session, None)) is not None:
+                self._observation_bytes -= old.counted
+            self._observations[session] = kept
+            self._observation_bytes += kept.counted
+            while self._observation_bytes > OBSERVATION_BYTES:
+                self._observation_bytes -= self._observations.pop(next(iter(self._observations))).counted
+        return kept
+
+
+def _answer(number: int, pending: PendingRequest, reply: Reply, executed: Executed | None) -> Answer:
+    request, act, error = pending.request, reply.act, reply.error
+    answer = Answer(number, pending.session_id, request.op, request.rank, reply.timing, executed=executed)
+    if error is not None:
+        return answer._replace(error=error.code, detail=str(error)[:TEXT])
+    if act is None:
+        return answer
+    rows = act.rows()
+    kept = np.array(rows[:ROWS, :VALUES], np.float32)
+    return answer._replace(rows=len(rows), action=kept, done=bool(act.done), info=_info(act.info))
+
+
+def _info(info: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the entries of an act's info that are numbers or texts, of those the first characters."""
+    kept: dict[str, Any] = {}
+    for name, stated in info.items():
+        if len(kept) == _INFO:
+            break
+        if name in _OWN:
+            continue
+        value = stated.item() if isinstance(stated, np.generic) else stated
+        if isinstance(value, str):
+            kept[name[:TEXT]] = value[:TEXT]
+        elif isinstance(value, (float, bool)) or _is_number(value):
+            kept[name[:TEXT]] = value
+    return kept
+
+
+def _is_number(value: object) -> bool:
+    """Whether it is a number of bounded size, and no NaN."""
+    return type(value) in (int, float) and -_MOST <= value <= _MOST  # type: ignore[operator]
+
+
+def _owner(image: np.ndarray) -> tuple[object, int]:
+    """Return the object whose memory an image keeps, and its bytes: a small image may be a part of a large message.
+
+    Of memory that a client shares only the image itself counts, as the rest is the client's in any case.
+    """
+    owner: Any = image
+    while (further := getattr(owner, "base" if isinstance(owner, np.ndarray) else "obj", None)) is not None:
+        owner = further
+    size = len(owner) if isinstance(owner, (bytes, bytearray)) else getattr(owner, "nbytes", 0)
+    return owner, max(size, image.nbytes)

@@ -1,0 +1,282 @@
+"""The live page, and the WebSocket that feeds it.
+
+    GET /live      the page: it holds no data, and needs no key
+    GET /v1/live   what the replicas do now, as JSON without pictures; keys need the scope "watch"
+    WS  /v1/live   the same with pictures, at most ten times a second
+    POST /v1/live/command   {"session": …, "do": "pause"}: see `CommandBoard.press`; keys need the scope "operate"
+
+A process that is no replica, such as the driver of an evaluation, serves them by `page_server`. Its page offers no
+commands, but videos:
+
+    GET /v1/live/videos/7   a video to which the document refers by its number
+
+The viewer asks for each message, with the sessions whose pictures it shows: {"shown": ["arm-1", …]}. So a slow viewer
+misses old messages, and delays no other. The answer is the length of a JSON document (32 bits, little-endian), the
+document, and the files to which it refers by their index in `files`, the list of their lengths.
+
+A page in a browser cannot set a header: it states its key among the WebSocket's subprotocols, as "vlagents.key.KEY".
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import struct
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from functools import cache
+from importlib.resources import files as package_files
+from pathlib import Path
+from socket import AF_INET, AF_INET6, create_server
+from typing import Any
+
+import uvicorn
+from pydantic import BaseModel, ValidationError
+from starlette.applications import Starlette
+from starlette.requests import ClientDisconnect
+from starlette.requests import Request as HttpRequest
+from starlette.responses import FileResponse, JSONResponse, Response
+from starlette.routing import BaseRoute, Route, WebSocketRoute
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from vlagents_ray.client.credentials import is_loopback
+from vlagents_ray.errors import ConfigError, MalformedMessage, MessageTooLarge, Overloaded, VLAgentsError
+from vlagents_ray.protocol.json_messages import problem
+from vlagents_ray.serve.access.api_keys import Caller, Keys, ScopeCheck, caller_name, current_caller
+from vlagents_ray.serve.access.audit import log_pressed
+from vlagents_ray.serve.access.origin_check import require_same_origin
+from vlagents_ray.serve.endpoints.access_middleware import LIVE_PAGE, AccessMiddleware
+from vlagents_ray.serve.endpoints.http_messages import deny, html_response, problem_response, request_id
+from vlagents_ray.serve.observers.live_view import Fleet, Viewer
+
+PATH = "/v1/live"
+_PROTOCOL = "vlagents.live"
+_COMMAND = f"{PATH}/command"
+_WATCH, _OPERATE = "watch", "operate"  # scopes of keys
+_COMMAND_BYTES = 2**14  # longest command
+_VIEWERS = 32  # most viewers at once
+_SILENT_S = 30.0  # longest time between two messages of a viewer
+_SCRIPTS = ("evaluation.js", "live.js")
+_CHARACTERS = 2**16  # longest message of a viewer
+_POLICY_VIOLATION = 1008  # WebSocket close code
+_LAST_S = 0.5  # time for viewers to be sent how an evaluation ended
+_END_S = 1  # time limit for their connections to close, s
+_LEAVE_S = 5.0  # time limit for all of it
+
+VideoFiles = Callable[[int], Path | None]
+"""Returns the file of the video with a number; None if there is none."""
+
+
+def live_routes(fleet: Fleet, *, open_to_network: bool, videos: VideoFiles | None = None) -> list[BaseRoute]:
+    """Return the routes of the live page.
+
+    Args:
+        fleet: Gathers what the page shows.
+        open_to_network: Whether other machines reach this server without a key; watching is then refused, as the
+            pictures of all robots would be public.
+        videos: Finds the videos to which the document of an evaluation refers; None on a policy's server.
+    """
+    endpoint = _LiveEndpoint(fleet, open_to_network, videos)
+    routes: list[BaseRoute] = [
+        Route(LIVE_PAGE, _page),
+        Route(PATH, endpoint.show),
+        WebSocketRoute(PATH, endpoint.watch),
+    ]
+    if videos is None:
+        return [*routes, Route(_COMMAND, endpoint.press, methods=["POST"])]
+    return [*routes, Route(f"{PATH}/videos/{{number:int}}", endpoint.video)]
+
+
+class _LiveEndpoint:
+    def __init__(self, fleet: Fleet, open_to_network: bool, videos: VideoFiles | None) -> None:
+        self._fleet = fleet
+        self._scopes = ScopeCheck("live", open_to_network=open_to_network)
+        self._videos = videos
+        self._watching = 0
+
+    async def show(self, http: HttpRequest) -> Response:
+        if (refused := self._refused(http)) is not None:
+            return refused
+        viewer = self._fleet.add()
+        try:
+            document, _ = await viewer.next()
+            return JSONResponse(document)
+        finally:
+            self._fleet.remove(viewer)
+
+    async def video(self, http: HttpRequest) -> Response:
+        if (refused := self._refused(http)) is not None:
+            return refused
+        path = None if self._videos is None else self._videos(http.path_params["number"])
+        return Response(status_code=404) if path is None else FileResponse(path, media_type="video/mp4")
+
+    def _refused(self, http: HttpRequest) -> Response | None:
+        try:
+            require_same_origin(http.headers)
+            self._scopes.require(_WATCH)
+        except VLAgentsError as error:
+            return problem_response(error, request_id(http))
+        return None
+
+    async def press(self, http: HttpRequest) -> Response:
+        try:
+            self._scopes.require(_OPERATE)
+            command, by = await _command(http), caller_name()
+            pressed = await self._fleet.press(command.session, command.do, by)
+        except ClientDisconnect:
+            return Response(status_code=499)
+        except VLAgentsError as error:
+            return problem_response(error, request_id(http))
+        log_pressed(by, f"{command.do!r} for session {command.session!r}")
+        return JSONResponse(pressed)
+
+    async def watch(self, socket: WebSocket) -> None:
+        offered = socket.scope.get("subprotocols") or []
+        try:
+            self._scopes.require(_WATCH)
+            if self._watching >= _VIEWERS:
+                raise Overloaded(f"live: {_VIEWERS} viewers watch already; close one")
+        except VLAgentsError as error:
+            await deny(socket, error)
+            return
+        await socket.accept(_PROTOCOL if _PROTOCOL in offered else None)
+        caller = current_caller()
+        if isinstance(caller, Caller):
+            caller.note("watches", "the sessions")
+        viewer = self._fleet.add()
+        self._watching += 1
+        try:
+            await self._feed(socket, viewer)
+        except WebSocketDisconnect:
+            return
+        except VLAgentsError as error:
+            with suppress(WebSocketDisconnect, RuntimeError):  # the viewer has gone meanwhile
+                await socket.send_text(json.dumps(problem(error)))
+                await socket.close(_POLICY_VIOLATION)
+        finally:
+            self._watching -= 1
+            self._fleet.remove(viewer)
+
+    async def _feed(self, socket: WebSocket, viewer: Viewer) -> None:
+        while True:
+            viewer.shown = frozenset(await self._asked(socket))
+            document, files = await viewer.next()
+            self._scopes.require(_WATCH)
+            may_operate = self._videos is None and self._scopes.may(_OPERATE)
+            await socket.send_bytes(_message({**document, "may_operate": may_operate}, files))
+
+    async def _asked(self, socket: WebSocket) -> list[str]:
+        try:
+            message = await asyncio.wait_for(socket.receive(), _SILENT_S)
+        except asyncio.TimeoutError:
+            raise MalformedMessage(f"live: asked for nothing within {_SILENT_S:g} s; watch again") from None
+        if message["type"] == "websocket.disconnect":
+            raise WebSocketDisconnect(message["code"])
+        text = message.get("text") or (message.get("bytes") or b"").decode(errors="replace")
+        try:
+            return _Viewed.model_validate_json(text[:_CHARACTERS]).shown
+        except ValidationError as error:
+            raise MalformedMessage(f'live: got {text[:80]!r}, want {{"shown": ["SESSION", ...]}}') from error
+
+
+class _Viewed(BaseModel):
+    shown: list[str]  # sessions
+
+
+class _Command(BaseModel):
+    session: str
+    do: str
+
+
+async def _command(http: HttpRequest) -> _Command:
+    """Return the command in a body; of a longer one no more is read."""
+    kind = http.headers.get("content-type", "").partition(";")[0].strip().lower()
+    if kind != "application/json":  # which no other site's page can send unasked
+        raise MalformedMessage(f"content-type: got {kind or 'none'!r}, want application/json")
+    body = b""
+    async for part in http.stream():
+        body += part
+        if len(body) > _COMMAND_BYTES:
+            raise MessageTooLarge(f"live: a command of more than {_COMMAND_BYTES} bytes")
+    try:
+        return _Command.model_validate_json(body)
+    except ValidationError as error:
+        raise MalformedMessage(f'live: got {body[:80]!r}, want {{"session": ..., "do": ...}}') from error
+
+
+def _message(document: dict[str, Any], files: list[bytes]) -> bytes:
+    text = json.dumps({**document, "files": [len(file) for file in files]}, allow_nan=False, separators=(",", ":"))
+    data = text.encode()
+    return b"".join([struct.pack("<I", len(data)), data, *files])
+
+
+async def _page(_: HttpRequest) -> Response:
+    html, style, *scripts = live_page()
+    more = "connect-src 'self'; img-src blob: data:; media-src blob:"
+    return html_response(html, styles=[style], scripts=scripts, more=more)
+
+
+@cache
+def live_page() -> list[str]:
+    """Return the page with its style and scripts in it, and these: the style first."""
+    folder = package_files("vlagents_ray.serve.observers") / "page"
+    parts = {name: folder.joinpath(name).read_text(encoding="utf-8") for name in ("live.css", *_SCRIPTS)}
+    html = folder.joinpath("live.html").read_text(encoding="utf-8")
+    for name, part in parts.items():
+        html = html.replace(f"/* {name} */", part)
+    return [html, *parts.values()]
+
+
+def require_watch_keys(host: str, keys: Keys | None) -> None:
+    """Raise `ConfigError` if other machines would reach a page on `host` without a key."""
+    if keys is None and not is_loopback(host):
+        raise ConfigError(
+            f"live page on {host}: without keys all cameras would be public. Make a key (`vlagents-ray keys new NAME "
+            f"--scope watch --file keys.json`) and set VLAGENTS_RAY_KEYS_FILE=keys.json; or stay on loopback, and look "
+            f"at it through `ssh -L`"
+        )
+
+
+@contextmanager
+def page_server(
+    fleet: Fleet, address: tuple[str, int], keys: Keys | None, *, name: str, videos: VideoFiles
+) -> Iterator[str]:
+    """Serve the live page of an evaluation on a thread for the length of the context.
+
+    Args:
+        fleet: Gathers what the page shows.
+        address: (host, port) to listen on; port 0 is any that is free.
+        keys: The keys of viewers; None admits all, which only loopback allows.
+        name: What the keys call this server, where they are for some applications alone.
+        videos: As for `live_routes`.
+
+    Yields:
+        The address of the page.
+
+    Raises:
+        ConfigError: Other machines would reach the page without a key, or the address is not free.
+    """
+    host, port = address
+    require_watch_keys(host, keys)
+    try:
+        listening = create_server((host, port), family=AF_INET6 if ":" in host else AF_INET)
+    except OSError as error:
+        raise ConfigError(
+            f"live page: cannot listen on {host}:{port} ({error.strerror}); choose another port"
+        ) from error
+    app = AccessMiddleware(Starlette(routes=live_routes(fleet, open_to_network=False, videos=videos)), keys, name)
+    config = uvicorn.Config(
+        app, log_config=None, lifespan="off", ws="websockets-sansio", timeout_graceful_shutdown=_END_S
+    )
+    server = uvicorn.Server(config)
+    thread = threading.Thread(target=lambda: asyncio.run(server.serve([listening])), name="live-page", daemon=True)
+    thread.start()
+    try:
+        yield f"http://{f'[{host}]' if ':' in host else host}:{listening.getsockname()[1]}{LIVE_PAGE}"
+    finally:
+        if fleet.watched:
+            time.sleep(_LAST_S)
+        server.should_exit = True
+        thread.join(_LEAVE_S)  # it may wait for a Ray that is lost

@@ -1,0 +1,376 @@
+"""What viewers see: the snapshots of a replica, numbers as a JSON document and pictures as files, and those of a fleet.
+
+The snapshots of all replicas, and what is shown beside them, are gathered once for all viewers of one page.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections import Counter, deque
+from collections.abc import Awaitable, Callable, Collection, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any, Protocol
+
+import numpy as np
+
+from vlagents_ray.errors import ConfigError, UnknownSession
+from vlagents_ray.protocol.json_messages import plain_values
+from vlagents_ray.serve.config.deployment import LiveArgs
+from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.metrics_buffer import SAMPLE, STAGES
+from vlagents_ray.serve.engine.observer import Observers
+from vlagents_ray.serve.models.loaded_model import LoadedModel
+from vlagents_ray.serve.observers.commands import TRACKED_S, CommandBoard
+from vlagents_ray.serve.observers.live import (
+    ENCODING_SHARE,
+    RATE,
+    ROWS,
+    SHOWN_OPS,
+    VALUES,
+    Answer,
+    Executed,
+    KeptObservation,
+    LiveObserver,
+)
+from vlagents_ray.serve.observers.ring import Ring
+from vlagents_ray.serve.periodic import each_half_second
+from vlagents_ray.serve.queue.batch_queue import LoadMeter
+from vlagents_ray.serve.sessions import Session
+
+logger = logging.getLogger(__name__)
+
+_SESSIONS = 256  # most sessions of a replica that are described
+_INSTRUCTION = 1000  # most characters of an instruction
+PICTURES = 2**24  # most bytes of the pictures in a snapshot; further sessions have none
+_STATE_S = 0.5  # time for which slow things are not looked up again
+_BEHIND = 20  # most gathered snapshots that wait for a slow viewer; it misses the oldest
+_WAITING_BYTES = 2**26  # most bytes of pictures that wait for it
+
+
+@dataclass(slots=True)
+class Snapshot:
+    """One replica since the snapshot before."""
+
+    number: int  # of the last answer or observation in it
+    document: dict[str, Any]
+    files: list[bytes] = field(default_factory=list)  # which `document` refers to by their index
+
+
+class ReplicaView:
+    """Makes the snapshots of one replica; each viewer of another process states how far it has read."""
+
+    def __init__(
+        self,
+        engine: Engine,
+        observers: Observers,
+        name: str,
+        node: str,
+        metadata: Callable[[], Mapping[str, Any]],
+        settings: LiveArgs | None = None,
+    ) -> None:
+        """Create the view of the replica `name` on `node`, whose `engine` acts as `metadata` describes.
+
+        With `settings`, the last seconds of each session are held, from `open` on.
+        """
+        self._engine = engine
+        self._about = {"name": name, "node": node, "ring_s": None if settings is None else settings.ring_s}
+        self._metadata = metadata
+        self.commands = CommandBoard(engine.sessions, self._save)
+        self.live = LiveObserver(observers, self.commands)
+        self.ring = None if settings is None else Ring(self.live, engine.sessions, settings, name)
+        self._meter = LoadMeter(engine.queue)
+        self._slow: dict[str, Any] = {}
+        self._measured = float("-inf")
+        self._pictured: dict[str, int] = {}  # number of the observation whose pictures were read last, by session
+
+    def open(self) -> None:
+        """Begin to end the leases of viewers that no longer look."""
+        each_half_second.add(self.live.expire)
+        if self.ring is not None:
+            self.ring.open()
+
+    def close(self) -> None:
+        """Keep nothing any more."""
+        if self.ring is not None:
+            self.ring.close()
+        each_half_second.remove(self.live.expire)
+        self.live.close()
+
+    def press(self, session: str, do: str, by: str) -> dict[str, Any]:
+        """Give a command to a session, see `CommandBoard.press`; its outcome is awaited for a while."""
+        pressed = self.commands.press(session, do, by)
+        self.live.renew(TRACKED_S)
+        return pressed
+
+    def read(self, since: int, shown: Collection[str]) -> Snapshot:
+        """Return what happened since the snapshot with the number `since`, with pictures of the sessions `shown`.
+
+        It may take milliseconds, so it does not belong on an event loop or the policy's thread.
+        """
+        engine, live = self._engine, self.live
+        live.renew(viewer=True)
+        answers = live.answers(since)
+        snapshot = Snapshot(answers[-1].number if answers else since, {})
+        last = {one.session: one for one in answers if one.op in SHOWN_OPS}
+        executed: dict[str, list[Executed]] = {}
+        for one in answers:
+            if one.executed is not None:
+                executed.setdefault(one.session, []).append(one.executed)
+        ids = engine.sessions.ids()
+        live.forget_others(ids)
+        self.commands.forget_others(ids)
+        held = sorted(engine.sessions.all(), key=lambda one: one.id)[:_SESSIONS]
+        sessions = {one.id: _session(one, last.get(one.id), executed.get(one.id, [])) for one in held}
+        begun = time.thread_time()
+        self._pictured = {name: self._pictured.get(name, 0) for name in sessions}
+        for name in sorted(sessions, key=self._pictured.__getitem__):  # longest without first
+            kept, described = live.observation(name), sessions[name]
+            described["commands"] = self.commands.of(name)
+            if kept is None or kept.number <= since:
+                continue
+            snapshot.number = max(snapshot.number, kept.number)
+            described["state"] = {part: _numbers(values[:VALUES]) for part, values in kept.state.items()}
+            if name in shown and time.thread_time() - begun < ENCODING_SHARE / RATE:
+                described["pictures"] = _pictures(kept, snapshot.files)
+                if described["pictures"]:
+                    self._pictured[name] = kept.number
+        snapshot.document = {
+            **self._about,
+            **self._state(),
+            **_counted(answers),
+            "waiting": {rank.name.lower(): depth for rank, depth in engine.queue.depth_by_rank().items()},
+            "sessions": list(sessions.values()),
+            "sessions_held": len(engine.sessions),
+        }
+        return snapshot
+
+    def _save(self, session: str) -> str:
+        if self.ring is None:
+            raise ConfigError("save: this server keeps nothing; state `live: {folder: ...}` in its deployment file")
+        return self.ring.save(session)
+
+    def _state(self) -> dict[str, Any]:
+        """Return what changes slowly, and takes long to find out."""
+        engine, now = self._engine, time.monotonic()
+        if now - self._measured > _STATE_S:
+            metadata = self._metadata()
+            self._slow = {
+                "policy": metadata["policy"],
+                "checkpoint": metadata["checkpoint"],
+                "digest": (metadata["weights"] or {}).get("digest"),
+                "weights": metadata["policy_version"],
+                "devices": engine.models.devices,
+                "ready": engine.ready,
+                "step": engine.models.step,
+                "session_limit": engine.sessions.limit,
+                "utilisation": round(self._meter.read().utilisation, 3),
+            }
+            self._measured = now
+        return self._slow
+
+
+def _session(session: Session[LoadedModel], last: Answer | None, executed: list[Executed]) -> dict[str, Any]:
+    """Return a session as a viewer needs it, with its last answer and what it executed, if there is something new."""
+    weights = session.weights
+    described = {
+        "id": session.id,
+        "transport": session.origin.transport,
+        "step": session.steps - session.first,
+        "instruction": session.instruction[:_INSTRUCTION],
+        "silent_s": round(time.monotonic() - session.used, 2),
+        "version": None if weights is None else weights.number,
+        "follows": session.follows,
+        "pictures": {},
+    }
+    if executed:
+        numbers: dict[str, Any] = plain_values(executed[-1].numbers)
+        steps = [step for one in executed for step in one.steps.tolist()]
+        rows = [row for one in executed for row in _numbers(one.rows)]
+        described["played"] = numbers | {"steps": steps[-ROWS:], "rows": rows[-ROWS:]}
+    return described if last is None else described | {"rank": last.rank, "last": _act(last)}
+
+
+def _pictures(kept: KeptObservation, files: list[bytes]) -> dict[str, int]:
+    """Add the pictures of an observation to `files`, encoding those that came as pixels; return their indices."""
+    found = kept.pictures()
+    if sum(map(len, files)) + sum(map(len, found.values())) > PICTURES:
+        return {}
+    files += found.values()
+    return dict(zip(found, range(len(files) - len(found), len(files)), strict=True))
+
+
+def _act(answer: Answer) -> dict[str, Any]:
+    """Return an answer as a viewer needs it."""
+    ms = {name: round(value, 3) for name, value in answer.timing.items()}
+    found: dict[str, Any] = {"n": answer.number, "op": answer.op, "ms": ms}
+    if answer.error:
+        return found | {"error": answer.error, "detail": answer.detail}
+    if answer.action is not None:
+        found |= {"rows": answer.rows, "action": _numbers(answer.action), "done": answer.done}
+        found["info"] = plain_values(answer.info)
+        if answer.executed is not None:
+            found["at"] = answer.executed.numbers.get("step")
+    return found
+
+
+def _numbers(values: np.ndarray) -> list[Any]:
+    """Return the values, rounded to the digits that a page shows."""
+    found: list[Any] = plain_values(np.round(values.astype(float), 4))
+    return found
+
+
+def _counted(answers: list[Answer]) -> dict[str, Any]:
+    """Return the acts and errors among the answers, the sizes of the acts' batches, and times of all acts, ms."""
+    acts = [one.timing for one in answers if one.op == "act" and not one.error]
+    sample = acts[:: max(1, len(acts) // SAMPLE)]
+    return {
+        "acts": len(acts),
+        "errors": dict(Counter(one.error for one in answers if one.error)),
+        "batch_sizes": [int(timing.get("batch_size", 1)) for timing in sample],
+        "ms": {name: [round(timing.get(f"{name}_ms", 0.0), 3) for timing in sample] for name in (*STAGES, "total")},
+    }
+
+
+SnapshotReader = Callable[[int, Collection[str]], Awaitable[Snapshot]]
+"""Returns another replica's snapshot: since which, and the sessions whose pictures are wanted."""
+
+
+class OtherReplicas(Protocol):
+    """The other replicas of the application."""
+
+    async def views(self) -> dict[str, SnapshotReader]:
+        """Return the reader of the snapshots of each, by name."""
+        ...
+
+    async def press(self, session: str, do: str, by: str) -> dict[str, Any] | None:
+        """Give a command to a session of one of them, see `CommandBoard.press`; None if none has the session."""
+        ...
+
+
+class Viewer:
+    """What one viewer is still to be sent."""
+
+    def __init__(self) -> None:
+        self.shown: frozenset[str] = frozenset()  # the sessions whose pictures it shows
+        self._waiting: deque[list[Snapshot]] = deque()
+        self._came = asyncio.Event()
+        self._more: dict[str, Any] = {}  # what was last to be sent beside the snapshots
+        self._sent = self._more
+
+    def put(self, snapshots: list[Snapshot], more: dict[str, Any] | None = None) -> None:
+        """Add what is to be sent, and drop the oldest of too much; `more` is sent if it is another than before."""
+        self._waiting.append(snapshots)
+        self._came.set()
+        while len(self._waiting) > 1 and (len(self._waiting) > _BEHIND or self._waiting_bytes() > _WAITING_BYTES):
+            self._waiting.popleft()
+        self._more = more or self._more
+
+    async def next(self) -> tuple[dict[str, Any], list[bytes]]:
+        """Wait for snapshots; return all that wait as one document and the files that it refers to."""
+        await self._came.wait()
+        self._came.clear()
+        gathered, self._waiting = self._waiting, deque()
+        files: list[bytes] = []
+        replicas = [_with_files(one, files, self.shown) for snapshots in gathered for one in snapshots]
+        document = {"time": time.time(), "replicas": replicas}
+        if self._more is not self._sent:
+            self._sent = self._more
+            document |= self._more
+        return document, files
+
+    def _waiting_bytes(self) -> int:
+        return sum(len(file) for snapshots in self._waiting for one in snapshots for file in one.files)
+
+
+class Fleet:
+    """Gathers while there are viewers."""
+
+    def __init__(
+        self,
+        own: ReplicaView | None,
+        others: OtherReplicas | None = None,
+        more: Callable[[], dict[str, Any]] | None = None,
+    ) -> None:
+        """Gather snapshots of `own`, if this process is a replica, and of the `others`.
+
+        `more` returns further entries of the document; the same object as before if nothing in them has changed.
+        """
+        self._own = own
+        self._others = others
+        self._more = more
+        self._viewers: set[Viewer] = set()
+        self._gathering: asyncio.Task[None] | None = None
+        self._read: dict[str, int] = {}  # number of the last snapshot, by replica; "" is the own one
+
+    @property
+    def watched(self) -> bool:
+        """Whether there are viewers."""
+        return bool(self._viewers)
+
+    def add(self) -> Viewer:
+        """Begin to gather for a new viewer."""
+        viewer = Viewer()
+        self._viewers.add(viewer)
+        if self._gathering is None:
+            self._gathering = asyncio.ensure_future(self._gather())
+        return viewer
+
+    def remove(self, viewer: Viewer) -> None:
+        """Stop to gather for a viewer."""
+        self._viewers.discard(viewer)
+        if not self._viewers and self._gathering is not None:
+            self._gathering.cancel()
+            self._gathering = None
+
+    async def press(self, session: str, do: str, by: str) -> dict[str, Any]:
+        """Give a command to a session of any replica, see `CommandBoard.press`, and return it."""
+        if self._own is not None:
+            with suppress(UnknownSession):
+                return self._own.press(session, do, by)
+        pressed = None if self._others is None else await self._others.press(session, do, by)
+        if pressed is None:
+            raise UnknownSession(f"session {session[:80]!r}: no replica has it; it has ended")
+        return pressed
+
+    async def _gather(self) -> None:
+        while True:
+            begun = time.monotonic()
+            try:
+                snapshots = await self._snapshots()
+                more = None if self._more is None else await asyncio.to_thread(self._more)
+            except Exception:
+                logger.exception("the live view was not read; tried again")
+            else:
+                for viewer in self._viewers:
+                    viewer.put(snapshots, more)
+            await asyncio.sleep(max(1 / RATE / 2, 1 / RATE - (time.monotonic() - begun)))
+
+    async def _snapshots(self) -> list[Snapshot]:
+        shown = frozenset[str]().union(*(viewer.shown for viewer in self._viewers))
+        readers: dict[str, SnapshotReader] = {} if self._others is None else dict(await self._others.views())
+        if self._own is not None:
+            readers[""] = partial(asyncio.to_thread, self._own.read)
+        results = await asyncio.gather(
+            *(read(self._read.get(name, 0), shown) for name, read in readers.items()), return_exceptions=True
+        )
+        found = {name: one for name, one in zip(readers, results, strict=True) if isinstance(one, Snapshot)}
+        self._read = {name: found[name].number if name in found else self._read.get(name, 0) for name in readers}
+        if self._own is not None and isinstance(error := results[-1], BaseException):
+            raise error
+        return list(found.values())
+
+
+def _with_files(snapshot: Snapshot, files: list[bytes], shown: Collection[str]) -> dict[str, Any]:
+    """Return the document of a snapshot, whose references lead into `files`, with pictures of `shown` alone."""
+    sessions = []
+    for session in snapshot.document["sessions"]:
+        pictures: dict[str, int] = {}
+        for camera, index in session["pictures"].items() if session["id"] in shown else ():
+            pictures[camera] = len(files)
+            files.append(snapshot.files[index])
+        sessions.append(session | {"pictures": pictures})
+    return snapshot.document | {"sessions": sessions}

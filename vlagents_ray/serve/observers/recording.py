@@ -1,0 +1,296 @@
+"""Records what sessions request and get as LeRobotDatasets, while other threads copy, encode and write it.
+
+The thread that handles a message only puts references into a queue. A second thread copies the observations, since they
+may lie in memory that their client wants back, and a third one encodes and writes. If these fall behind, or the disk is
+full, frames are dropped and counted; no answer waits for them.
+"""
+
+from __future__ import annotations
+
+import logging
+import random
+import re
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from vlagents_ray.errors import ConfigError, PolicyFailed, UnknownSession
+from vlagents_ray.interface import CAPTURED, POLICY, Obs, copied
+from vlagents_ray.protocol.messages import Reply
+from vlagents_ray.protocol.values import to_text
+from vlagents_ray.registry import require
+from vlagents_ray.serve.config.deployment import RecordArgs
+from vlagents_ray.serve.engine.metrics_buffer import STAGES
+from vlagents_ray.serve.engine.observer import Observer
+from vlagents_ray.serve.models.loaded_model import LoadedModel
+from vlagents_ray.serve.observers.episodes import EpisodeWriter, RecordedAct, RecordingEnded
+from vlagents_ray.serve.observers.worker import Worker, be_nice
+from vlagents_ray.serve.periodic import each_half_second
+from vlagents_ray.serve.requests import PendingRequest
+from vlagents_ray.serve.sessions import SessionTable
+
+logger = logging.getLogger(__name__)
+
+NO_VERSION = -1  # of an answer whose policy names no version of its weights
+_HELD_BYTES = 256 * 2**20  # most bytes of observations that wait to be written
+_OTHER_BYTES = 16 * 2**10  # counted for an act beside its pictures and the bytes in its `info`
+_CLOSING_S = 30.0  # time that the threads get to write what waits
+
+
+@dataclass(slots=True, eq=False)
+class _Recorded:
+    """A request that is to be recorded; its memory counts as held until nothing refers to it."""
+
+    recorder: SessionRecorder
+    session: str
+    op: str
+    at: float  # s since 1970
+    obs: Obs | None  # of an act
+    instruction: str
+    options: Any  # of the reset, before the queue removes some of them; text once they are copied
+    size: int  # bytes that it holds
+    info: str = ""  # the observation's, as text
+
+    def copy(self) -> None:
+        """Copy what may lie in the client's memory."""
+        self.options = to_text(self.options) if self.op == "reset" else ""
+        if (obs := self.obs) is not None:
+            info = dict(obs.info)
+            captured = info.pop(CAPTURED, None)
+            self.info = to_text(info) if info else ""
+            captured_at = float(captured) if isinstance(captured, (int, float)) else self.at
+            self.obs = copied(replace(obs, info={CAPTURED: captured_at}, prepared=None))
+        texts = len(self.options) + len(self.info)
+        self.size += texts
+        self.recorder.count_held(texts)
+
+    def __del__(self) -> None:
+        self.recorder.count_held(-self.size)
+
+
+class SessionRecorder(Observer):
+    """Records a share of the sessions of one replica until `close`."""
+
+    def __init__(
+        self,
+        writer: EpisodeWriter,
+        sessions: SessionTable[LoadedModel],
+        *,
+        share: float = 1.0,
+        held_bytes: int = _HELD_BYTES,
+    ) -> None:
+        """Create a recorder of a `share` of the episodes, drawn at each reset, and start its threads.
+
+        At most `held_bytes` of requests wait to be written.
+        """
+        self.dropped = 0  # acts for which there was no memory, or which came in an episode that could not be written
+        self.ended: str | None = None  # why nothing more is recorded
+        self._writer = writer
+        self._sessions = sessions
+        self._share = share
+        self._held_bytes = held_bytes
+        self._held = 0
+        self._lock = threading.RLock()  # of `_held`, which the garbage collector may lower at any time
+        self._looking = False  # whether the sessions that are here wait to be compared with `_first`
+        self._missing: set[str] = set()  # sessions in `_first` that were not here when they were looked up
+        self._first: dict[str, int | None] = {}  # step at the reset of each session; None if it is not recorded
+        self._copier, self._worker = Worker("record-copy"), Worker("record-write")
+        for worker in (self._copier, self._worker):
+            worker.put(be_nice)
+        each_half_second.add(self._look)
+
+    @property
+    def saved(self) -> int:
+        """The number of frames in complete episodes."""
+        return self._writer.saved
+
+    @property
+    def lost(self) -> int:
+        """The number of acts that are missing in the recording."""
+        return self.dropped + self._writer.lost
+
+    def on_request(self, pending: PendingRequest) -> None:
+        """See `Observer`."""
+        request = pending.request
+        if self.ended is not None or request.op not in ("act", "reset", "close"):
+            return
+        obs, size = None, 0
+        if request.op == "act" and request.obs is not None:
+            obs = request.obs
+            size = _OTHER_BYTES + sum(image.nbytes for image in obs.cameras.values()) + _bytes_in(obs.info)
+            if not self._hold(size):
+                self.dropped += 1
+                return
+        recorded = pending.kept[self] = _Recorded(
+            self, pending.session_id, request.op, time.time(), obs, request.instruction or "", request.kwargs, size
+        )
+        self._copier.put(partial(self._copy, recorded))
+
+    def on_answer(self, pending: PendingRequest, reply: Reply) -> None:
+        """See `Observer`."""
+        recorded = pending.kept.pop(self, None)
+        if recorded is not None and reply.error is None:
+            self._write_later(partial(self._handle, recorded, reply))
+
+    def close(self) -> None:
+        """Write what waits, and complete all episodes, as far as the disk is fast enough."""
+        each_half_second.remove(self._look)
+        until = time.monotonic() + _CLOSING_S
+        self._copier.close(_CLOSING_S)
+        self._worker.put(self._complete)
+        self._worker.close(max(0.0, until - time.monotonic()))
+
+    def count_held(self, size: int) -> None:
+        """Count so many bytes more of requests that wait."""
+        with self._lock:
+            self._held += size
+
+    def _hold(self, size: int) -> bool:
+        with self._lock:
+            if self._held + size > self._held_bytes:
+                return False
+            self._held += size
+            return True
+
+    def _copy(self, recorded: _Recorded) -> None:
+        try:
+            recorded.copy()
+        except Exception as error:  # noqa: BLE001 - of this request alone
+            logger.warning("recording: an act of session %s is left out: %s", recorded.session, error)
+            self.dropped += 1
+            recorded.obs, recorded.options = None, ""
+
+    def _write_later(self, write: Callable[[], None]) -> None:
+        """Write after all that was requested before."""
+        self._copier.put(lambda: self._worker.put(partial(self._write, write)))
+
+    def _write(self, write: Callable[[], None]) -> None:
+        if self.ended is not None:
+            return
+        try:
+            write()
+        except (OSError, RecordingEnded) as error:
+            self._end(error)
+
+    def _end(self, error: Exception) -> None:
+        """End the recording, but no session."""
+        self.ended = str(error)
+        logger.error("recording has ended, and the sessions go on: %s", error)
+        self._writer.close()
+
+    def _complete(self) -> None:
+        if self.ended is None:
+            self._writer.close()
+
+    def _handle(self, recorded: _Recorded, reply: Reply) -> None:
+        session, op = recorded.session, recorded.op
+        try:
+            if op == "reset":
+                self._first[session] = reply.step if random.random() < self._share else None
+                if self._first[session] is None:
+                    self._writer.end(session)
+                else:
+                    weights = to_text(reply.identity) if reply.identity else ""
+                    self._writer.begin(session, recorded.instruction, recorded.options, weights)
+            elif op == "close":
+                self._first.pop(session, None)
+                self._writer.end(session)
+            elif recorded.obs is not None and self._records(session):
+                if session in self._writer:
+                    self._writer.add(session, _frame(recorded, recorded.obs, reply, self._first[session] or 0))
+                else:  # too many sessions at once
+                    self.dropped += 1
+        except (OSError, RecordingEnded):
+            raise
+        except UnknownSession:  # it has ended meanwhile, as has its episode
+            self.dropped += 1
+        except Exception as error:  # noqa: BLE001 - one session's episode
+            logger.warning("recording: the episode of session %s is lost: %s", session, error)
+            self._first[session] = None
+            self._writer.drop(session)
+
+    def _records(self, session: str) -> bool:
+        """Return whether the session is recorded; one that came from another replica is drawn here."""
+        if session not in self._first:
+            self._first[session] = None
+            if random.random() < self._share:
+                found = self._sessions.get(session)
+                self._first[session] = found.first
+                self._writer.begin(session, found.instruction)
+        return self._first[session] is not None
+
+    def _look(self) -> None:
+        """Look for sessions that have ended; called twice a second."""
+        if not self._looking:
+            self._looking = True
+            self._write_later(partial(self._end_others, frozenset(self._sessions.ids())))
+
+    def _end_others(self, held: frozenset[str]) -> None:
+        """End the episodes of sessions that are no longer here; new ones may be missing once."""
+        self._looking = False
+        missing = self._first.keys() - held
+        for session in missing & self._missing:
+            del self._first[session]
+            self._writer.end(session)
+        self._missing = missing
+
+
+def open_recorder(
+    sessions: SessionTable[LoadedModel], args: RecordArgs, replica: str, metadata: Callable[[], Mapping[str, Any]]
+) -> SessionRecorder:
+    """Return a recorder of the sessions of the replica that Ray calls `replica`; `metadata` describes it.
+
+    Raises:
+        ConfigError: The folder cannot be written to.
+        MissingDependency: The extra "record" is not installed.
+    """
+    for module in ("av", "pyarrow"):
+        require(module)
+    folder = Path(args.folder)
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        raise ConfigError(f"record.folder: {folder} cannot be written to ({error})") from error
+    name = re.sub(r"[^A-Za-z0-9]+", "-", replica.removeprefix("SERVE_REPLICA::"))
+    writer = EpisodeWriter(
+        folder,
+        f"{time.strftime('%Y%m%d-%H%M%S', time.gmtime())}-{name}",
+        args.fps,
+        lossless=args.pictures == "exact",
+        most_bytes=args.most_gb * 1e9,
+        describe=metadata,
+    )
+    return SessionRecorder(writer, sessions, share=args.share)
+
+
+def _frame(recorded: _Recorded, obs: Obs, reply: Reply, first: int) -> RecordedAct:
+    act = reply.act
+    if act is None:
+        raise PolicyFailed("the answer has no action")
+    info = {key: value for key, value in act.info.items() if key != "timing"}
+    version = info.get(POLICY) or {}
+    columns: dict[str, Any] = {
+        "received_at": recorded.at,
+        **{f"{name}_ms": float(reply.timing.get(f"{name}_ms", 0.0)) for name in (*STAGES, "total")},
+        "batch_size": int(reply.timing.get("batch_size", 1)),
+        "policy_version": int(version.get("version", NO_VERSION)),
+        "policy_done": bool(act.done),
+        "request": recorded.info,
+        "answer": to_text(info) if info else "",
+    }
+    return RecordedAct(obs, act.rows(), float(obs.info[CAPTURED]), (reply.step or 0) - first - 1, columns)
+
+
+def _bytes_in(value: Any) -> int:
+    """Return about how many bytes the texts and arrays in a value take."""
+    if isinstance(value, dict):
+        return sum(map(_bytes_in, value.values()))
+    if isinstance(value, list):
+        return sum(map(_bytes_in, value))
+    return len(value) if isinstance(value, (str, bytes)) else int(getattr(value, "nbytes", 8))

@@ -1,0 +1,138 @@
+"""The last seconds of each session, of which a press on the live page makes an episode of a LeRobotDataset.
+
+A thread reads the live observer ten times a second, as a viewer does, and keeps pictures as files: those that clients
+sent as they came, others encoded with at most 4 % of a core, for which frames are left out. All sessions together hold
+at most `memory_mb`; beyond that the oldest frames go first. One session is saved at a time, and one frame of it decoded
+at a time, until the folder holds `most_gb`.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from pathlib import Path
+
+import numpy as np
+
+from vlagents_ray.dataset_contract import GRIPPER
+from vlagents_ray.errors import InvalidInput, Overloaded, StorageFailed
+from vlagents_ray.images.jpeg_png import decode
+from vlagents_ray.interface import Obs
+from vlagents_ray.registry import require
+from vlagents_ray.serve.config.deployment import LiveArgs
+from vlagents_ray.serve.models.loaded_model import LoadedModel
+from vlagents_ray.serve.observers.episodes import EpisodeWriter, RecordedAct, RecordingEnded
+from vlagents_ray.serve.observers.live import ENCODING_SHARE, RATE, KeptObservation, LiveObserver
+from vlagents_ray.serve.periodic import Periodic
+from vlagents_ray.serve.sessions import SessionTable
+
+_PIXELS = 2**25  # most of all pictures of a frame
+
+
+class Ring:
+    """The last seconds of the sessions of one replica, from `open` to `close`."""
+
+    def __init__(self, live: LiveObserver, sessions: SessionTable[LoadedModel], settings: LiveArgs, name: str) -> None:
+        """Create an empty ring; its episodes go to datasets whose names begin with `name`, the replica's.
+
+        Raises:
+            MissingDependency: The extra "record" is not installed.
+        """
+        for module in ("av", "pyarrow"):
+            require(module)
+        self.bytes = 0  # that are held now
+        self._live = live
+        self._sessions = sessions
+        self._settings = settings
+        folder, most_bytes = Path(settings.folder), settings.most_gb * 1e9
+        self._writer = EpisodeWriter(folder, name, RATE, lossless=False, most_bytes=most_bytes)
+        self._frames: dict[str, deque[KeptObservation]] = {}  # by session
+        self._lock = threading.Lock()  # of `_frames`
+        self._saving = threading.Lock()  # of `_writer`
+        self._periodic = Periodic(1 / RATE)
+
+    def open(self) -> None:
+        """Begin to keep frames."""
+        self._periodic.add(self.read)
+
+    def close(self) -> None:
+        """Keep no more."""
+        self._periodic.remove(self.read)
+
+    def read(self) -> None:
+        """Keep the live observer's latest observations, and drop what is too old or too much."""
+        self._live.renew()
+        held = self._sessions.ids()
+        self._live.forget_others(held)
+        begun = time.thread_time()
+        longest_without = sorted(held, key=self._newest)
+        for name in longest_without:
+            kept = self._live.observation(name)
+            if kept is None or kept.action is None or kept.number == self._newest(name):
+                continue
+            if kept.cameras and time.thread_time() - begun >= ENCODING_SHARE / RATE:
+                continue
+            kept.pictures()
+            with self._lock:
+                self._frames.setdefault(name, deque()).append(kept)
+                self.bytes += kept.size
+        with self._lock:
+            self._drop(held)
+
+    def save(self, session: str) -> str:
+        """Write the session's frames as an episode, and return the path of its dataset.
+
+        Raises `InvalidInput` if nothing of the session is held, `Overloaded` while another one is saved, and
+        `StorageFailed` if the folder is full.
+        """
+        if not self._saving.acquire(blocking=False):
+            raise Overloaded("save: another session is being saved; press again when that is done")
+        try:
+            return self._save(session)
+        except RecordingEnded as error:
+            raise StorageFailed(f"live.folder: {error}; make room there") from error
+        finally:
+            self._writer.drop(session)  # what an error has left
+            self._saving.release()
+
+    def _save(self, session: str) -> str:
+        self._writer.require_room()
+        with self._lock:
+            frames = deque(self._frames.get(session, ()))
+        if not frames:
+            raise InvalidInput(f"session {session!r}: nothing to save yet; it has acted on nothing")
+        found = next((one for one in self._sessions.all() if one.id == session), None)
+        self._writer.begin(session, "" if found is None else found.instruction)
+        while frames:
+            self._writer.add(session, _recorded(frames.popleft()))
+        return str(self._writer.end(session))
+
+    def _newest(self, session: str) -> int:
+        frames = self._frames.get(session)
+        return frames[-1].number if frames else 0
+
+    def _drop(self, held: list[str]) -> None:
+        """Drop ended sessions, old frames, and the oldest ones beyond the memory; the caller holds the lock."""
+        for name in self._frames.keys() - set(held):
+            self.bytes -= sum(frame.size for frame in self._frames.pop(name))
+        oldest = time.monotonic() - self._settings.ring_s
+        for frames in self._frames.values():
+            while frames and frames[0].time < oldest:
+                self.bytes -= frames.popleft().size
+        while self.bytes > self._settings.memory_mb * 1e6:
+            first = min((frames for frames in self._frames.values() if frames), key=lambda frames: frames[0].time)
+            self.bytes -= first.popleft().size
+
+
+def _recorded(frame: KeptObservation) -> RecordedAct:
+    """Decode the pictures of a frame, and return it as it is written."""
+    cameras, left = {}, _PIXELS
+    for name, file in frame.pictures().items():
+        cameras[name] = decode(file, left)
+        left -= cameras[name].shape[0] * cameras[name].shape[1]
+    state = dict(frame.state)
+    gripper = float(state.pop(GRIPPER)[0]) if GRIPPER in state else None
+    action = np.zeros(0, np.float32) if frame.action is None else frame.action
+    at = time.time() - (time.monotonic() - frame.time)
+    return RecordedAct(Obs(cameras, gripper, state), action[np.newaxis], at, frame.number, {})
