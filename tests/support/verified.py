@@ -15,7 +15,7 @@ import re
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -113,18 +113,20 @@ def table(family: str) -> str:
         if not noted
         else f"They ran with {'; and with '.join(map(_with, noted))}."
     )
-    rows = []
-    for what, name in sorted(((what, name) for name, what in marked(family)), key=lambda one: list(WHAT).index(one[0])):
-        file_name, _, test = name.partition("::test_")
-        results = " | ".join(_result(one, name) for one in noted) or "not run"
-        rows.append(f"| {WHAT[what]} | {test.replace('_', ' ')} | `{file_name}` | {results} |")
+    groups: dict[tuple[str, str], list[str]] = {}  # tests by what they verify and by their file
+    for name, what in sorted(marked(family), key=lambda one: list(WHAT).index(one[1])):
+        groups.setdefault((what, name.partition("::")[0]), []).append(name)
+    rows = [
+        f"| {WHAT[what]} | `{file}` | {' | '.join(_result(one, names) for one in noted) or 'not run'} |"
+        for (what, file), names in groups.items()
+    ]
     cases = [f"cases, Python {one['python']}" for one in noted] if len(noted) > 1 else ["cases"]
     return "\n".join(
         [
             f"These tests of `tests/families/{family}` use small random checkpoints. {ran}",
             "",
-            f"| the policy … | test | in | {' | '.join(cases)} |",
-            f"|---|---|---{'|---' * len(cases)}|",
+            f"| the policy … | tests in | {' | '.join(cases)} |",
+            f"|---|---{'|---' * len(cases)}|",
             *rows,
             "",
             f"`make verified FAMILIES={_quoted(requirements)}` runs them, and writes this table.",
@@ -158,14 +160,20 @@ def _python() -> str:
     return ".".join(platform.python_version_tuple()[:2])
 
 
-def _result(noted: dict[str, Any], name: str) -> str:
-    """What became of a test, and why if it did not run."""
-    outcomes = noted["tests"].get(name)
-    if outcomes is None:
-        file = name.partition("::")[0]
-        return f"not run: {noted.get('left_out', {}).get(file, 'it is newer than these results')}"
+def _result(noted: dict[str, Any], names: list[str]) -> str:
+    """Return the summed outcomes of some tests, with the reasons why others were skipped or not run."""
+    ran = [name for name in names if name in noted["tests"]]
+    outcomes = sum((Counter(noted["tests"][name]) for name in ran), Counter[str]())
     said = ", ".join(f"{number} {what}" for what, number in sorted(outcomes.items()))
-    return f"{said}: {noted['skipped'][name]}" if "skipped" in outcomes else said
+    if skipped := _once(noted["skipped"][name] for name in ran if "skipped" in noted["tests"][name]):
+        said = f"{said}: {skipped}"
+    files = (name.partition("::")[0] for name in names if name not in ran)
+    not_run = _once(noted.get("left_out", {}).get(file, "it is newer than these results") for file in files)
+    return "; ".join(filter(None, (said, not_run and f"not run: {not_run}")))
+
+
+def _once(reasons: Iterable[str]) -> str:
+    return "; ".join(dict.fromkeys(reasons))
 
 
 def _version(name: str) -> str:
