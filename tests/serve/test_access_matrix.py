@@ -33,7 +33,9 @@ def _cells() -> list[Cell]:
     (_, _, *credentials), _, *lines = rows
     return [
         Cell(way, when, credential, stated)
-        for way, when, *all_stated in lines
+        for ways, moments, *all_stated in lines
+        for way in ways.split("<br>")
+        for when in moments.split("<br>")
         for credential, stated in zip(credentials, all_stated, strict=True)
     ]
 
