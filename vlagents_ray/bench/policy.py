@@ -19,7 +19,7 @@ import numpy as np
 
 from vlagents_ray.bench.clients import observation
 from vlagents_ray.bench.line_client import die_with_parent, own_stdout
-from vlagents_ray.bench.tuning.measured_policy import (
+from vlagents_ray.bench.measured_policy import (
     MeasuredPolicy,
     QueuedTurn,
     device_name,

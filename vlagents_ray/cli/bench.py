@@ -34,8 +34,7 @@ def bench_rtt(
     plot: Plot = None,
 ) -> None:
     """Round trips to a `noop` policy on this machine by every transport, in turns."""
-    from vlagents_ray.bench.figures import check_plot_file, plot_round_trips
-    from vlagents_ray.bench.machine import measured_on
+    from vlagents_ray.bench.figures import check_plot_file, measured_on, plot_round_trips
     from vlagents_ray.bench.rtt import measure_rtt
 
     with errors():
@@ -72,7 +71,7 @@ def bench_throughput(
     json_file: Json = None,
 ) -> None:
     """Actions a second of many clients on one replica, against the ideal, or the bare policy in the same run."""
-    from vlagents_ray.bench.machine import measured_on
+    from vlagents_ray.bench.figures import measured_on
     from vlagents_ray.bench.throughput import ThroughputPlan, measure_throughput
 
     with errors():
@@ -104,7 +103,7 @@ def bench_policy(
     json_file: Json = None,
 ) -> None:
     """Actions a second of one policy alone, by batch size: bare, and behind its batch queue; without Ray."""
-    from vlagents_ray.bench.machine import measured_on
+    from vlagents_ray.bench.figures import measured_on
     from vlagents_ray.bench.policy import PolicyPlan, measure_policy
     from vlagents_ray.serve.launch.deployment_file import server_args
 
@@ -123,7 +122,7 @@ def bench_compare(
     new: Annotated[Path, typer.Argument(help="Another one, of the same command.")],
 ) -> None:
     """Two runs side by side: each figure of both, and in what their machines and versions differ."""
-    from vlagents_ray.bench.comparison import compare_figures, read_figures
+    from vlagents_ray.bench.figures import compare_figures, read_figures
 
     with errors():
         found = compare_figures(read_figures(old), read_figures(new))

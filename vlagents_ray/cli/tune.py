@@ -18,7 +18,7 @@ from vlagents_ray.errors import ConfigError
 
 if TYPE_CHECKING:
     from vlagents_ray.bench.evaluation import MeasuredEvaluation
-    from vlagents_ray.bench.tuning.choice import MeasuredPoint
+    from vlagents_ray.bench.tuning_choice import MeasuredPoint
 
 
 class Wanted(str, Enum):
@@ -67,9 +67,15 @@ def tune_command(
     """
     began = time.monotonic()
     from vlagents_ray.bench.figures import check_plot_file
-    from vlagents_ray.bench.tuning.choice import TuningGoal, choose, chosen_settings, default_point, figures
-    from vlagents_ray.bench.tuning.picture import plot_latency
-    from vlagents_ray.bench.tuning.tuner import TunePlan, Tuner
+    from vlagents_ray.bench.tuner import TunePlan, Tuner
+    from vlagents_ray.bench.tuning_choice import (
+        TuningGoal,
+        choose,
+        chosen_settings,
+        default_point,
+        figures,
+        plot_latency,
+    )
     from vlagents_ray.serve.config.deployment import ServerArgs
     from vlagents_ray.serve.launch.deployment_file import policy_application
 
@@ -149,7 +155,7 @@ def _evaluation_words(one: MeasuredEvaluation) -> str:
 def _words(point: MeasuredPoint | None) -> str:
     if point is None:
         return "not measured, or out of the goal"
-    from vlagents_ray.bench.tuning.choice import sessions
+    from vlagents_ray.bench.tuning_choice import sessions
 
     figures = f"{point.actions_per_s:.1f} actions/s, p99 {point.p99_ms:.1f} ms"
     return f"{point.variant.name}, {sessions(point.sessions)}: {figures}"

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from vlagents_ray.bench.tuning.choice import (
+from vlagents_ray.bench.tuning_choice import (
     GoalMissed,
     MeasuredPoint,
     TuningGoal,

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vlagents_ray.bench.tuning.observation_file import load_observations, save_observations
-from vlagents_ray.bench.tuning.recorded import recorded_observations
+from vlagents_ray.bench.tuner import recorded_observations
+from vlagents_ray.bench.tuning_process import load_observations, save_observations
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import Trajectory
 from vlagents_ray.images.mp4 import Mp4

@@ -1,4 +1,4 @@
-"""A process with one variant of a policy, which it loads and measures: `python -m vlagents_ray.bench.tuning.process`.
+"""A process with one variant of a policy, which it loads and measures: `python -m vlagents_ray.bench.tuning_process`.
 
 It needs the light install and pydantic, not Ray, as it runs in the policy's own Python environment. The first line of
 its input is `ProcessSettings`, as JSON. Each line after it is a request, {"measure": SESSIONS, "seconds": S, "rank":
@@ -14,8 +14,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from vlagents_ray.bench.line_client import die_with_parent, own_stdout
-from vlagents_ray.bench.tuning.measured_policy import (
+from vlagents_ray.bench.measured_policy import (
     MeasuredPolicy,
     cuda,
     device_name,
@@ -23,7 +25,6 @@ from vlagents_ray.bench.tuning.measured_policy import (
     jax_device,
     peak_mib,
 )
-from vlagents_ray.bench.tuning.observation_file import load_observations
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import PolicyFailed
 from vlagents_ray.interface import Agent, Obs
@@ -31,6 +32,7 @@ from vlagents_ray.policies.wrapper import Wrapper, build_agent
 from vlagents_ray.testing.observations import random_observation
 from vlagents_ray.validation import check_observation
 
+_CAMERA, _STATE, _GRIPPER = "camera", "state", "gripper"  # keys: NUMBER/camera/NAME, NUMBER/state/NAME, NUMBER/gripper
 FRAMES = 8  # episodes whose first actions are compared
 _TUNED = ("compile", "dtype", "quantization", "batch_sizes")  # settings of a policy
 
@@ -48,6 +50,31 @@ class ProcessSettings:
     frames: str | None  # a file of `save_observations`; None: random observations
     side: int  # px, of random images whose size the contract does not state
     dims: Mapping[str, int]  # dimensions of parts of the state for which it does not say
+
+
+def save_observations(observations: Sequence[Obs], file: Path) -> None:
+    """Write observations into a .npz file."""
+    arrays: dict[str, np.ndarray] = {}
+    for number, obs in enumerate(observations):
+        arrays |= {f"{number}/{_CAMERA}/{name}": image for name, image in obs.cameras.items()}
+        arrays |= {f"{number}/{_STATE}/{name}": values for name, values in obs.state.items()}
+        if obs.gripper is not None:
+            arrays[f"{number}/{_GRIPPER}"] = np.array(obs.gripper)
+    np.savez(file, **arrays)  # type: ignore[arg-type]
+
+
+def load_observations(file: Path) -> list[Obs]:
+    """Read what `save_observations` wrote."""
+    found: dict[int, Obs] = {}
+    with np.load(file, allow_pickle=False) as arrays:
+        for key in arrays.files:
+            number, kind, *name = key.split("/", 2)
+            obs = found.setdefault(int(number), Obs())
+            if kind == _GRIPPER:
+                obs.gripper = float(arrays[key])
+            else:
+                (obs.cameras if kind == _CAMERA else obs.state)[name[0]] = arrays[key]
+    return [found[number] for number in sorted(found)]
 
 
 def main() -> None:

@@ -16,18 +16,19 @@ from typing import Any, get_args
 import numpy as np
 
 from vlagents_ray.bench.line_process import LineProcess, ProcessFailed, our_environment
-from vlagents_ray.bench.tuning.choice import MeasuredPoint, TuningGoal, Variant, sessions
-from vlagents_ray.bench.tuning.observation_file import save_observations
-from vlagents_ray.bench.tuning.parity import largest_difference
-from vlagents_ray.bench.tuning.process import FRAMES, ProcessSettings
-from vlagents_ray.bench.tuning.recorded import recorded_observations
+from vlagents_ray.bench.tuning_choice import MeasuredPoint, TuningGoal, Variant, sessions
+from vlagents_ray.bench.tuning_process import FRAMES, ProcessSettings, save_observations
 from vlagents_ray.errors import ConfigError, VLAgentsError
+from vlagents_ray.evaluate.artifacts.trajectory import Trajectory, videos_of
+from vlagents_ray.interface import Obs
 from vlagents_ray.policies.compilation import Quantization
+from vlagents_ray.registry import require
 from vlagents_ray.serve.config.deployment import ServerArgs
 
 _RISING = 1.05  # how much two larger batches must add to the rate for a still larger one to be measured
 _TURNS = 3
 _END_S = 2.0  # that a process may take to end; then it is killed
+_SMALLEST_RANGE = 0.1  # of a number of the action, as a share of its largest magnitude: it may hardly move
 
 
 class VariantFailed(VLAgentsError):
@@ -201,7 +202,7 @@ class Tuner:
             dims=self._plan.dims,
         )
         found = our_environment() if environment.python is None else {}
-        command = [environment.python or sys.executable, "-m", "vlagents_ray.bench.tuning.process"]
+        command = [environment.python or sys.executable, "-m", "vlagents_ray.bench.tuning_process"]
         with LineProcess("tune", command, found | environment.env_vars, end_s=_END_S) as process:
             process.send(json.dumps(asdict(settings)))
             said = self._answer(process)
@@ -299,3 +300,80 @@ class Tuner:
         if "failed" in said:
             raise VariantFailed(said["failed"])
         return said
+
+
+def largest_difference(actions: Sequence[np.ndarray], wanted: Sequence[np.ndarray]) -> float:
+    """Return the largest difference of two lists of actions, as a share of the range of `wanted`.
+
+    Each number of an action has a range of its own: the largest minus the smallest value among all actions and rows, or
+    a tenth of its largest magnitude if that is more.
+
+    Args:
+        actions: The actions to judge, each (D,) or (H, D); the one at i belongs to `wanted[i % len(wanted)]`.
+        wanted: The actions to compare with.
+
+    Returns:
+        The difference; infinity if shapes differ, or if a value is not finite.
+    """
+    rows = np.concatenate([np.atleast_2d(one) for one in wanted]).astype(np.float64)
+    span = np.maximum(np.ptp(rows, axis=0), _SMALLEST_RANGE * np.abs(rows).max(axis=0))
+    largest = 0.0
+    for i, action in enumerate(actions):
+        want = np.asarray(wanted[i % len(wanted)], np.float64)
+        if np.shape(action) != want.shape or not np.isfinite(action).all():
+            return float("inf")
+        off = np.abs(action - want)
+        shares = np.divide(off, span, out=np.where(off > 0, np.inf, 0.0), where=span > 0)
+        largest = max(largest, float(shares.max(initial=0.0)))
+    return largest
+
+
+def recorded_observations(folder: Path, count: int) -> list[Obs]:
+    """Read observations, spread evenly over the trajectories below a folder and over their steps.
+
+    Args:
+        folder: A folder of results, of an evaluation with `record`, or a part of it.
+        count: The number of observations.
+
+    Raises:
+        ConfigError: There is no trajectory, or one cannot be read.
+    """
+    files = sorted(folder.rglob("*.npz"))
+    if not files:
+        raise ConfigError(f"--frames {folder}: holds no trajectory (.npz), want a folder of them, as evaluations save")
+    used = files[:: max(1, len(files) // count)][:count]
+    found: list[Obs] = []
+    for number, file in enumerate(used):
+        share = len(range(number, count, len(used)))
+        found += _of_trajectory(file, share)
+    return found
+
+
+def _of_trajectory(file: Path, count: int) -> list[Obs]:
+    trajectory = Trajectory.load(file)
+    steps = np.linspace(0, len(trajectory.actions), count, dtype=int).tolist()
+    images = {camera: _images(video, steps) for camera, video in videos_of(file, trajectory.cameras).items()}
+    return [
+        Obs(
+            cameras={camera: images[camera][step] for camera in trajectory.cameras},
+            gripper=None if trajectory.gripper is None else float(trajectory.gripper[step]),
+            state={part: values[step] for part, values in trajectory.state.items()},
+        )
+        for step in steps
+    ]
+
+
+def _images(video: Path, steps: list[int]) -> dict[int, np.ndarray]:
+    """Return the images of these steps, (H, W, 3) uint8 RGB."""
+    av = require("av")
+    found: dict[int, np.ndarray] = {}
+    try:
+        with av.open(str(video)) as container:
+            for number, frame in enumerate(container.decode(video=0)):
+                if number in steps:
+                    found[number] = frame.to_ndarray(format="rgb24")
+    except (OSError, ValueError) as error:  # PyAV's errors of broken files are of these kinds
+        raise ConfigError(f"--frames: {video} cannot be read ({error})") from error
+    if missing := sorted(set(steps) - set(found)):
+        raise ConfigError(f"--frames: {video} has no frames {missing}, which its trajectory has")
+    return found

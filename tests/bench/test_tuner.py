@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from tests.bench.tuning.test_recorded import record
-from vlagents_ray.bench.tuning.choice import TuningGoal, choose
-from vlagents_ray.bench.tuning.tuner import TunePlan, Tuner, VariantFailed
+from tests.bench.test_recorded import record
+from vlagents_ray.bench.tuner import TunePlan, Tuner, VariantFailed
+from vlagents_ray.bench.tuning_choice import TuningGoal, choose
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.config.deployment import ServerArgs
 

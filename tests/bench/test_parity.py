@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from vlagents_ray.bench.tuning.parity import largest_difference
+from vlagents_ray.bench.tuner import largest_difference
 
 WANTED = [np.array([[0.0, 100.0], [2.0, 100.0]]), np.array([[1.0, 100.0], [4.0, 100.0]])]
 
