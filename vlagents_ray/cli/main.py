@@ -12,8 +12,10 @@ import typer
 
 from vlagents_ray.cli.bench import bench
 from vlagents_ray.cli.console import errors, fail, fresh, out, progress, table
-from vlagents_ray.cli.evaluation.command import evaluate_command
-from vlagents_ray.cli.evaluation.results import (
+from vlagents_ray.cli.evaluate import evaluate_command
+from vlagents_ray.cli.keys import keys
+from vlagents_ray.cli.new import new
+from vlagents_ray.cli.results import (
     bundle_command,
     export_command,
     merge_command,
@@ -21,8 +23,6 @@ from vlagents_ray.cli.evaluation.results import (
     report_command,
     verify_command,
 )
-from vlagents_ray.cli.keys import keys
-from vlagents_ray.cli.new import new
 from vlagents_ray.cli.serve import serve_command
 from vlagents_ray.cli.slurm import slurm
 from vlagents_ray.cli.tune import tune_command
@@ -49,7 +49,7 @@ def demo(
     out_dir: Annotated[Path, typer.Option("--out", help="Folder of the results.")] = Path("runs/demo"),
 ) -> None:
     """The main job in a few minutes: serve the scripted policy, evaluate it in two environments, leave videos."""
-    from vlagents_ray.cli.evaluation.run import run_evaluation
+    from vlagents_ray.cli.evaluation import run_evaluation
     from vlagents_ray.envs.maniskill import ManiSkill
     from vlagents_ray.evaluate import EvalConfig, PolicyConfig, SuiteConfig
 

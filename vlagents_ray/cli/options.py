@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 import datetime
+import functools
+import inspect
 import json
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar, get_type_hints
 
 import typer
 import yaml
@@ -31,6 +34,34 @@ LiveAt = Annotated[
     str | None,
     typer.Option("--live-at", metavar="HOST:PORT", help="The same there; beyond this machine it wants API keys."),
 ]
+
+_Options = TypeVar("_Options")
+
+
+def command_of(options: type[_Options]) -> Callable[[Callable[[_Options], None]], Callable[..., None]]:
+    """Make a command for Typer of a function that takes all its options as one object.
+
+    Args:
+        options: A dataclass, each of whose fields is annotated with its `typer.Option` or `typer.Argument`.
+    """
+    hints = get_type_hints(options, include_extras=True)
+    parameters = []
+    for one in dataclasses.fields(options):  # type: ignore[arg-type]
+        made = one.default if one.default_factory is dataclasses.MISSING else one.default_factory()
+        default = inspect.Parameter.empty if made is dataclasses.MISSING else made
+        kind = inspect.Parameter.KEYWORD_ONLY
+        parameters.append(inspect.Parameter(one.name, kind, default=default, annotation=hints[one.name]))
+
+    def decorate(command: Callable[[_Options], None]) -> Callable[..., None]:
+        @functools.wraps(command)
+        def called(**given: Any) -> None:
+            command(options(**given))
+
+        called.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        called.__annotations__ = {}
+        return called
+
+    return decorate
 
 
 def parse_settings(texts: Iterable[str], option: str) -> dict[str, Any]:

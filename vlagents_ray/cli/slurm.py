@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from vlagents_ray.cli.console import errors, out
-from vlagents_ray.cli.evaluation.command import config_from_options, evaluate_command
+from vlagents_ray.cli.evaluate import EvalOptions, config_from_options, evaluate_command
 from vlagents_ray.cli.serve import serve_command
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.slurm.submission import Script, first_index, split, submit
@@ -153,13 +153,13 @@ def _cpus(config: EvalConfig) -> float:
 
 def _evaluation(words: list[str]) -> EvalConfig:
     """Build the configuration as `eval` does; raises here what would end the job as soon as it had begun."""
-    from vlagents_ray.cli.evaluation.policies import resolve_policies
+    from vlagents_ray.cli.policies import resolve_policies
     from vlagents_ray.evaluate.plan.cases import cells
 
     given = _parsed("eval", evaluate_command, words)
     _refuse(given, _FOUND_OUT, "address", "end_at")
     _refuse(given, "`vlagents-ray eval --dry-run` plans without one", "dry_run")
     _refuse(given, "it would wait for a training; have that submit each checkpoint (`submit_evaluation`)", "watch")
-    config = config_from_options(given)
+    config = config_from_options(EvalOptions(**given))
     cells(resolve_policies(config, ask=False)[0])
     return config

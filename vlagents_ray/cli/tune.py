@@ -120,8 +120,8 @@ def tune_evaluation(file: Path, *, minutes: float, max_workers: int | None, bega
         began: s of `time.monotonic`.
     """
     from vlagents_ray.bench.evaluation import EvaluationTuner
-    from vlagents_ray.cli.evaluation.command import read_run
-    from vlagents_ray.cli.evaluation.policies import served
+    from vlagents_ray.cli.evaluate import read_run
+    from vlagents_ray.cli.policies import served
     from vlagents_ray.evaluate import EvalConfig
 
     config = EvalConfig.model_validate(read_run(file))

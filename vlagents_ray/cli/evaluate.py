@@ -1,8 +1,8 @@
-"""`vlagents-ray eval`: from a file or from options, serving what is to be served."""
+"""`vlagents-ray eval`: the settings of an evaluation from a file or from options, and what is done with them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,6 +15,7 @@ from vlagents_ray.cli.options import (
     Live,
     LiveAt,
     Set,
+    command_of,
     parse_list,
     parse_settings,
     parse_time,
@@ -29,28 +30,31 @@ if TYPE_CHECKING:
     from vlagents_ray.evaluate import EvalConfig, WorkerConfig
 
 
-# ruff: noqa: ARG001 - options are read by name from `context.params`
-# An option that is a field of `EvalConfig`, or of its policy, suite or worker, has the field's name here.
-def evaluate_command(
-    context: typer.Context,
+@dataclass(frozen=True)
+class EvalOptions:
+    """The options of `vlagents-ray eval`.
+
+    An option that is a field of `EvalConfig`, or of its policy, suite or worker, has the field's name here.
+    """
+
     what: Annotated[
         list[str],
         typer.Argument(
             metavar="FILE | ENV...",
             help="A file of runs (.yaml); or environments: maniskill/PushCube-v1, 'libero/*', …",
         ),
-    ],
+    ]
     source: Annotated[
         str | None,
         typer.Option("--policy", help="A registered name, a deployment file, or the URL of a running server."),
-    ] = None,
-    out: Annotated[Path | None, typer.Option("--out", help="Folder of the results.")] = None,
-    episodes: Annotated[int | None, typer.Option(min=1, help="Episodes of each environment; default: 10.")] = None,
-    workers: Annotated[int | None, typer.Option(min=1, help="Environments rolled out in parallel; default: 1.")] = None,
+    ] = None
+    out: Annotated[Path | None, typer.Option("--out", help="Folder of the results.")] = None
+    episodes: Annotated[int | None, typer.Option(min=1, help="Episodes of each environment; default: 10.")] = None
+    workers: Annotated[int | None, typer.Option(min=1, help="Environments rolled out in parallel; default: 1.")] = None
     cpus: Annotated[
         float | None,
         typer.Option("--worker-cpus", min=0, help="CPUs of each worker, unless the file says how many; default: 0.5."),
-    ] = None,
+    ] = None
     gpus: Annotated[
         float | None,
         typer.Option(
@@ -58,70 +62,70 @@ def evaluate_command(
             min=0,
             help="GPUs per worker for rendering; may be a fraction (0.25). Default: 0 (software rendering).",
         ),
-    ] = None,
-    seeds: Annotated[int | None, typer.Option("--seed", min=0, help="Episode i uses seed + i; default: 0.")] = None,
-    video: Annotated[str | None, typer.Option(help="none, failures (default) or all.")] = None,
+    ] = None
+    seeds: Annotated[int | None, typer.Option("--seed", min=0, help="Episode i uses seed + i; default: 0.")] = None
+    video: Annotated[str | None, typer.Option(help="none, failures (default) or all.")] = None
     record: Annotated[
         str | None, typer.Option(help="Trajectories, to export and to replay: none (default), failures or all.")
-    ] = None,
+    ] = None
     rerun: Annotated[
         str | None,
         typer.Option(
             metavar="DIR", help="Write a .rrd file of each episode for Rerun, or 'live': show them in its viewer."
         ),
-    ] = None,
+    ] = None
     foxglove: Annotated[
         str | None, typer.Option(metavar="DIR", help="Write an .mcap file of each episode for Foxglove.")
-    ] = None,
-    track: Annotated[str, typer.Option(help="wandb, trackio, tensorboard, with commas between them.")] = "",
-    resume: Annotated[bool, typer.Option(help="Go on with the results in --out.")] = False,
+    ] = None
+    track: Annotated[str, typer.Option(help="wandb, trackio, tensorboard, with commas between them.")] = ""
+    resume: Annotated[bool, typer.Option(help="Go on with the results in --out.")] = False
     accept_changes: Annotated[
         bool,
         typer.Option(
             "--accept-changes",
             help="With --resume: although files or weights of a policy or an environment changed; the report says so.",
         ),
-    ] = False,
-    execute: Annotated[int | None, typer.Option(min=1, help="Rows executed of each chunk; default: all.")] = None,
+    ] = False
+    execute: Annotated[int | None, typer.Option(min=1, help="Rows executed of each chunk; default: all.")] = None
     retries: Annotated[
         int | None, typer.Option(min=0, help="Further attempts after an infrastructure failure; default: 3.")
-    ] = None,
-    config: Set = [],  # noqa: B006 - typer reads it
+    ] = None
+    config: Set = field(default_factory=list)
     env_options: Annotated[
         list[str], typer.Option("--env-set", metavar="KEY=VALUE", help="An option of the environments: width=256.")
-    ] = [],  # noqa: B006
+    ] = field(default_factory=list)
     options: Annotated[
         list[str],
         typer.Option("--reset-set", metavar="KEY=VALUE", help="An option of the policy's reset: checkpoint_step=9."),
-    ] = [],  # noqa: B006
+    ] = field(default_factory=list)
     watch: Annotated[
         Path | None,
         typer.Option(metavar="DIR", help="Evaluate each checkpoint that a training run writes there, until Ctrl-C."),
-    ] = None,
-    until: Annotated[int | None, typer.Option(min=0, metavar="STEP", help="End --watch with this step.")] = None,
+    ] = None
+    until: Annotated[int | None, typer.Option(min=0, metavar="STEP", help="End --watch with this step.")] = None
     settle: Annotated[
         float | None, typer.Option(min=0, help="With --watch: s that a checkpoint must not have changed; default: 10.")
-    ] = None,
+    ] = None
     marker: Annotated[
         str | None, typer.Option(metavar="NAME", help="With --watch: the file that the trainer writes in it when done.")
-    ] = None,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Print plan, count and estimated time; play nothing.")
-    ] = False,
+    ] = None
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print plan, count and estimated time; play nothing.")] = (
+        False
+    )
     end_at: Annotated[
         str | None,
         typer.Option(
             metavar="TIME",
             help="Begin no episode that would not end by then: 2027-01-31T18:30, local time, or s since 1970.",
         ),
-    ] = None,
+    ] = None
     replica_per_gpu: Annotated[
         bool,
         typer.Option(
             "--replica-per-gpu",
             help="With --address: a policy has a replica on each GPU of the cluster, unless its deployment says more.",
         ),
-    ] = False,
+    ] = False
     arm: Annotated[
         str | None,
         typer.Option(
@@ -130,19 +134,46 @@ def evaluate_command(
             help="Play the file's trials on a real robot, of this class: a person resets the scene and judges, and "
             "does not see which policy plays.",
         ),
-    ] = None,
+    ] = None
     operator: Annotated[
         str | None,
         typer.Option(metavar="page|terminal", help="With --robot: where that person is asked; default: page"),
-    ] = None,
+    ] = None
     unblind: Annotated[
         bool,
         typer.Option("--unblind", help="With --robot: write the results of the judged trials; play none."),
-    ] = False,
-    address: Address = None,
-    live: Live = False,
-    live_at: LiveAt = None,
-) -> None:
+    ] = False
+    address: Address = None
+    live: Live = False
+    live_at: LiveAt = None
+
+    def given(self, *names: str) -> list[str]:
+        """Return those of these options that the command line has, as it writes them; 0 is given, False is not."""
+        values = {name: getattr(self, name) for name in names}
+        return [f"--{name.replace('_', '-')}" for name, one in values.items() if one or (one == 0 and one is not False)]
+
+    def require_together(self, *, on_robot: bool) -> None:
+        """Raise `ConfigError` for options that need another one, or that exclude one another."""
+        if self.watch is None and (needing := self.given("until", "settle", "marker")):
+            raise ConfigError(f"got {needing} without --watch")
+        if self.dry_run and self.watch is not None:
+            raise ConfigError("--dry-run and --watch exclude each other: the steps of the training are not known yet")
+        if self.end_at is not None and self.watch is not None:
+            raise ConfigError("--end-at and --watch exclude each other: watching ends with --until, or by Ctrl-C")
+        if self.replica_per_gpu and self.address is None:
+            raise ConfigError("--replica-per-gpu: want --address, a cluster whose GPUs can be counted")
+        if self.dry_run and self.given("live", "live_at"):
+            raise ConfigError("--dry-run and --live exclude each other: nothing is played that could be watched")
+        if not on_robot and (needing := self.given("operator", "unblind")):
+            raise ConfigError(f"got {needing} without --robot")
+        if on_robot and (excluded := self.given("watch", "dry_run", "end_at", "track", "live", "live_at")):
+            raise ConfigError(f"--robot and {excluded} exclude each other")
+        if self.operator not in (None, "page", "terminal"):
+            raise ConfigError(f"--operator: got {self.operator!r}, want page or terminal")
+
+
+@command_of(EvalOptions)
+def evaluate_command(options: EvalOptions) -> None:
     """Evaluate policies: episodes in parallel, success rates with confidence intervals, videos.
 
     A file holds policies, their checkpoints, suites of environments, seeds; --out, --workers, --video, --record,
@@ -153,70 +184,50 @@ def evaluate_command(
     failure, and when infrastructure lost an episode for good (--resume tries it again).
     """
     with errors(), exit_if_ray_is_lost(RESUME):
-        evaluation = config_from_options(context.params)
-        on_robot = evaluation.real_robot is not None
-        _require_together(context.params, on_robot=on_robot)
-        from vlagents_ray.cli.evaluation.live import live_address
-        from vlagents_ray.cli.evaluation.run import print_plan, run_evaluation, run_on_robot, watch_training
+        config = config_from_options(options)
+        on_robot = config.real_robot is not None
+        options.require_together(on_robot=on_robot)
+        from vlagents_ray.cli.evaluation import print_plan, run_evaluation, run_on_robot, watch_training
+        from vlagents_ray.cli.live import live_address
 
-        page = live_address(live_at) if live or live_at else None
+        address, page = options.address, live_address(options.live_at) if options.live or options.live_at else None
         if on_robot:
-            run_on_robot(evaluation, address, operator=operator or "page", unblinded=unblind)
-        elif dry_run:
+            run_on_robot(config, address, operator=options.operator or "page", unblinded=options.unblind)
+        elif options.dry_run:
             with quiet_ray(None):
-                print_plan(evaluation)
-        elif watch is not None:
-            settle_s = 10.0 if settle is None else settle
-            watch_training(evaluation, watch, address, until=until, settle_s=settle_s, marker=marker, live=page)
+                print_plan(config)
+        elif options.watch is not None:
+            settle_s = 10.0 if options.settle is None else options.settle
+            watch_training(
+                config,
+                options.watch,
+                address,
+                until=options.until,
+                settle_s=settle_s,
+                marker=options.marker,
+                live=page,
+            )
         else:
-            end = None if end_at is None else parse_time(end_at, "--end-at")
-            run_evaluation(evaluation, address, end_at=end, replica_per_gpu=replica_per_gpu, live=page)
+            end = None if options.end_at is None else parse_time(options.end_at, "--end-at")
+            run_evaluation(config, address, end_at=end, replica_per_gpu=options.replica_per_gpu, live=page)
 
 
-def _require_together(options: Mapping[str, Any], *, on_robot: bool) -> None:
-    """Raise `ConfigError` for options that need another one, or that exclude one another."""
-
-    def given(*names: str) -> list[str]:
-        values = {name: options[name] for name in names}
-        return [f"--{name.replace('_', '-')}" for name, one in values.items() if one or (one == 0 and one is not False)]
-
-    if options["watch"] is None and (needing := given("until", "settle", "marker")):
-        raise ConfigError(f"got {needing} without --watch")
-    if options["dry_run"] and options["watch"] is not None:
-        raise ConfigError("--dry-run and --watch exclude each other: the steps of the training are not known yet")
-    if options["end_at"] is not None and options["watch"] is not None:
-        raise ConfigError("--end-at and --watch exclude each other: watching ends with --until, or by Ctrl-C")
-    if options["replica_per_gpu"] and options["address"] is None:
-        raise ConfigError("--replica-per-gpu: want --address, a cluster whose GPUs can be counted")
-    if options["dry_run"] and given("live", "live_at"):
-        raise ConfigError("--dry-run and --live exclude each other: nothing is played that could be watched")
-    if not on_robot and (needing := given("operator", "unblind")):
-        raise ConfigError(f"got {needing} without --robot")
-    if on_robot and (excluded := given("watch", "dry_run", "end_at", "track", "live", "live_at")):
-        raise ConfigError(f"--robot and {excluded} exclude each other")
-    if options["operator"] not in (None, "page", "terminal"):
-        raise ConfigError(f"--operator: got {options['operator']!r}, want page or terminal")
-
-
-def config_from_options(options: Mapping[str, Any]) -> EvalConfig:
+def config_from_options(options: EvalOptions) -> EvalConfig:
     """Build the configuration of an evaluation from the options of `vlagents-ray eval`.
-
-    Args:
-        options: The parameters of `evaluate_command`, by their names, as in `context.params`.
 
     Raises:
         ConfigError: The options do not go together, or one cannot be parsed.
     """
     from vlagents_ray.evaluate import EvalConfig, PolicyConfig, SuiteConfig, WorkerConfig
 
-    what = options["what"]
+    what = options.what
     parsed = {
-        **options,
-        "track": parse_list(options["track"]),
-        "config": parse_settings(options["config"], "--set"),
-        "options": parse_settings(options["options"], "--reset-set"),
-        "env_options": parse_settings(options["env_options"], "--env-set"),
-        "seeds": None if options["seeds"] is None else [options["seeds"]],
+        **vars(options),
+        "track": parse_list(options.track),
+        "config": parse_settings(options.config, "--set"),
+        "options": parse_settings(options.options, "--reset-set"),
+        "env_options": parse_settings(options.env_options, "--env-set"),
+        "seeds": None if options.seeds is None else [options.seeds],
     }
     run, policy, suite, worker = (
         _given(parsed, model) for model in (EvalConfig, PolicyConfig, SuiteConfig, WorkerConfig)
@@ -232,12 +243,12 @@ def config_from_options(options: Mapping[str, Any]) -> EvalConfig:
                 f"got no {' and no '.join(missing)}, want {' and '.join(missing)}; or a file of runs (.yaml)"
             )
         fields = {"policies": [policy], "suites": [{"envs": list(what)} | suite], **run}
-    if options["arm"] is not None:
-        fields["robot"] = {**(fields.get("robot") or {}), "arm": options["arm"]}
+    if options.arm is not None:
+        fields["robot"] = {**(fields.get("robot") or {}), "arm": options.arm}
     return _with_resources(EvalConfig.model_validate(fields), worker)
 
 
-def _given(options: Mapping[str, Any], model: type[BaseModel]) -> dict[str, Any]:
+def _given(options: dict[str, Any], model: type[BaseModel]) -> dict[str, Any]:
     """Select the options that are fields of `model` and were given."""
     found = {name: options[name] for name in model.model_fields if name in options}
     # 0 was given, though it equals False.

@@ -13,8 +13,8 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from vlagents_ray.cli.console import fail, out
-from vlagents_ray.cli.evaluation.policies import policy_deployment, resolve_policies, served
 from vlagents_ray.cli.listing import require_packages
+from vlagents_ray.cli.policies import policy_deployment, resolve_policies, served
 from vlagents_ray.errors import ConfigError, PolicyFailed
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig, Results
 from vlagents_ray.evaluate.checkpoint_watcher import CheckpointWatcher, rounds
@@ -60,7 +60,7 @@ def shown_progress(
     config: EvalConfig, live: tuple[str, int] | None, *, goes_on: bool = False
 ) -> AbstractContextManager[Progress]:
     """Return the progress of an evaluation: on the terminal, and on the live page if that has an address."""
-    from vlagents_ray.cli.evaluation.live import live_progress
+    from vlagents_ray.cli.live import live_progress
     from vlagents_ray.evaluate import progress_for
 
     return live_progress(config.out, [one.url for one in config.policies], live, progress_for(out), goes_on=goes_on)

@@ -5,13 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from enum import Enum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from vlagents_ray.cli.console import errors, fresh, out, table
 from vlagents_ray.cli.options import Address, Live, LiveAt, parse_list, parse_settings
 from vlagents_ray.errors import ConfigError
+
+if TYPE_CHECKING:
+    from vlagents_ray.open_loop.replay import ReplayPlan
 
 
 class Videos(str, Enum):
@@ -43,7 +46,7 @@ def report_command(
 
     with errors():
         if live or live_at:
-            from vlagents_ray.cli.evaluation.live import follow, live_address
+            from vlagents_ray.cli.live import follow, live_address
 
             if len(folders) != 1 or html is not None:
                 raise ConfigError("--live shows one folder, and writes no file: want one OUT, and no --html")
@@ -211,17 +214,17 @@ def replay_command(
         if is_dataset(folder):
             if episode is not None:
                 raise ConfigError(f"{folder}: is a dataset, got {episode!r}; want --episodes, or none of it")
-            replay_dataset(
-                folder,
-                policy,
-                out_dir or fresh(Path("runs/replay")),
-                episodes=episodes,
-                horizon=horizon,
-                every=every,
-                at_once=at_once,
-                cameras=cameras,
-                state=state,
-            )
+            if policy is None:
+                raise ConfigError(
+                    f"{folder}: is a dataset, and wants --policy: a registered name, a deployment file or a URL"
+                )
+            from vlagents_ray.open_loop.recorded import Names
+            from vlagents_ray.open_loop.replay import ReplayPlan
+
+            chosen = None if episodes is None else parse_episodes(episodes)
+            names = Names(_renamed(cameras), None if state is None else parse_list(state))
+            plan = ReplayPlan(chosen, horizon, every, at_once, names)
+            replay_dataset(folder, policy, out_dir or fresh(Path("runs/replay")), plan)
             return
         if episode is None:
             raise ConfigError(f"{folder}: holds results, and wants an episode: its key, or ENV#NUMBER")
@@ -231,7 +234,7 @@ def replay_command(
 
 def _same(folder: Path, episode: str, policy: str | None, out_dir: Path | None, address: str | None) -> bool:
     """Play an episode again, print what differs, and return whether nothing does."""
-    from vlagents_ray.cli.evaluation.run import play_one
+    from vlagents_ray.cli.evaluation import play_one
     from vlagents_ray.evaluate import Results
     from vlagents_ray.evaluate.replay import compare, find
 
@@ -254,28 +257,11 @@ def is_dataset(folder: Path) -> bool:
     return (folder / "meta/info.json").is_file() or any(folder.glob("*/meta/info.json"))
 
 
-def replay_dataset(
-    folder: Path,
-    policy: str | None,
-    into: Path,
-    *,
-    episodes: str | None,
-    horizon: int | None,
-    every: int,
-    at_once: int,
-    cameras: str | None,
-    state: str | None,
-) -> None:
+def replay_dataset(folder: Path, policy: str, into: Path, plan: ReplayPlan) -> None:
     """Play a dataset to a policy, print the errors, and write the report."""
-    from vlagents_ray.open_loop.recorded import Names
-    from vlagents_ray.open_loop.replay import ReplayPlan, candidate, replay
+    from vlagents_ray.open_loop.replay import candidate, replay
     from vlagents_ray.open_loop.report import write_files
 
-    if policy is None:
-        raise ConfigError(f"{folder}: is a dataset, and wants --policy: a registered name, a deployment file or a URL")
-    names = Names(_renamed(cameras), None if state is None else parse_list(state))
-    chosen = None if episodes is None else parse_episodes(episodes)
-    plan = ReplayPlan(chosen, horizon, every, at_once, names)
     with candidate(policy) as sessions:
         result = replay(folder, sessions, plan)
     table = result.to_json()
