@@ -42,7 +42,7 @@ def report_command(
     """
     from vlagents_ray.evaluate import Results
     from vlagents_ray.evaluate.merge import combined
-    from vlagents_ray.evaluate.report.html import FILE, write_report
+    from vlagents_ray.evaluate.report.page import FILE, write_report
 
     with errors():
         if live or live_at:

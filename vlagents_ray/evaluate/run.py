@@ -23,8 +23,8 @@ from vlagents_ray.evaluate.episode.records import EpisodeResult, WorkerInfo
 from vlagents_ray.evaluate.plan.cases import EvalCase, require_envs
 from vlagents_ray.evaluate.plan.config import EvalConfig
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job, JobQueue, plan
-from vlagents_ray.evaluate.report.html import FILE as REPORT
-from vlagents_ray.evaluate.report.html import write_report
+from vlagents_ray.evaluate.report.page import FILE as REPORT
+from vlagents_ray.evaluate.report.page import write_report
 from vlagents_ray.evaluate.report.progress import Progress, SilentProgress
 from vlagents_ray.evaluate.results.reader import Results, rate_of
 from vlagents_ray.evaluate.results.stopping import Stopping

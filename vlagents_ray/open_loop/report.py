@@ -15,7 +15,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from vlagents_ray.evaluate.artifacts.storage import storing, whole
-from vlagents_ray.evaluate.report.html import charts
+from vlagents_ray.evaluate.report import charts
 from vlagents_ray.open_loop.replay import OpenLoopResult
 
 JSON_FILE, PAGE_FILE = "open_loop.json", "open_loop.html"

@@ -38,9 +38,9 @@ from vlagents_ray.evaluate.artifacts.storage import (
     whole,
 )
 from vlagents_ray.evaluate.plan.config import canonical
-from vlagents_ray.evaluate.report.html import FILE as REPORT
-from vlagents_ray.evaluate.report.html import write_report
-from vlagents_ray.evaluate.report.html.provenance import repeat
+from vlagents_ray.evaluate.report.page import FILE as REPORT
+from vlagents_ray.evaluate.report.page import write_report
+from vlagents_ray.evaluate.report.provenance import repeat
 from vlagents_ray.evaluate.results.database import FILE as DATABASE
 from vlagents_ray.evaluate.results.reader import Results, reading
 from vlagents_ray.evaluate.results.summary import FILE as SUMMARY

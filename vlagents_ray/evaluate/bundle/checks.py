@@ -19,7 +19,7 @@ from vlagents_ray.evaluate.artifacts.storage import versions
 from vlagents_ray.evaluate.artifacts.trajectory import Trajectory
 from vlagents_ray.evaluate.bundle.archive import CONFIG, MANIFEST, compared, pins, versions_of
 from vlagents_ray.evaluate.plan.config import fingerprint
-from vlagents_ray.evaluate.report.html import FILE as REPORT
+from vlagents_ray.evaluate.report.page import FILE as REPORT
 from vlagents_ray.evaluate.results.reader import Episode, Results, reading, table
 from vlagents_ray.evaluate.results.summary import FILE as SUMMARY
 from vlagents_ray.evaluate.results.summary import checkpoint_of, pushed_of, weights_of

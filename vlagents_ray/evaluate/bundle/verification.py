@@ -24,7 +24,7 @@ from vlagents_ray.evaluate.bundle.checks import (
     same_software,
 )
 from vlagents_ray.evaluate.bundle.replaying import check_replays
-from vlagents_ray.evaluate.report.html import FILE as REPORT
+from vlagents_ray.evaluate.report.page import FILE as REPORT
 from vlagents_ray.evaluate.results.database import FILE as DATABASE
 from vlagents_ray.evaluate.results.reader import Results
 from vlagents_ray.evaluate.results.summary import FILE as SUMMARY

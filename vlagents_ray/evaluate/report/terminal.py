@@ -7,7 +7,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from vlagents_ray.evaluate.report.html import FILE as REPORT
+from vlagents_ray.evaluate.report.page import FILE as REPORT
 from vlagents_ray.evaluate.results.comparison import Comparison, clock_gaps
 from vlagents_ray.evaluate.results.database import RUNNING
 from vlagents_ray.evaluate.results.summary import Group, Summary, errors_of_policies, pushed_of

@@ -10,7 +10,7 @@ import pytest
 from browser import Page, browser
 from recorded_results import record, runs
 
-from vlagents_ray.evaluate.report.html import Videos, write_report
+from vlagents_ray.evaluate.report.page import Videos, write_report
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 

@@ -1,8 +1,14 @@
-"""The page: its head, its sections, and one file of it all."""
+"""`report.html`: an evaluation as one self-contained page.
+
+Python computes what the page shows: this module, `success`, `episodes` and `provenance`, with the geometry of `charts`.
+`templates/page.html.j2` is the page, `sections.html.j2` has a macro for each of its sections, `elements.html.j2` and
+`charts.html.j2` hold what these share. `report.css` and `report.js` are written into the page.
+"""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from importlib.resources import files
@@ -13,12 +19,21 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from vlagents_ray.evaluate.artifacts.storage import storing, whole
-from vlagents_ray.evaluate.report.html import charts
-from vlagents_ray.evaluate.report.html.charts import duration, interval, interval_name, number, percent, quantity
-from vlagents_ray.evaluate.report.html.episodes import AT_ONCE, Gallery, Videos, episodes, errors, failures
-from vlagents_ray.evaluate.report.html.latency import latency
-from vlagents_ray.evaluate.report.html.provenance import configuration, protocol, repeat
-from vlagents_ray.evaluate.report.html.success import (
+from vlagents_ray.evaluate.episode.records import EpisodeResult
+from vlagents_ray.evaluate.report import charts
+from vlagents_ray.evaluate.report.charts import (
+    BarChart,
+    bar_chart,
+    duration,
+    interval,
+    interval_name,
+    number,
+    percent,
+    quantity,
+)
+from vlagents_ray.evaluate.report.episodes import AT_ONCE, Gallery, Videos, episodes, errors, failures
+from vlagents_ray.evaluate.report.provenance import configuration, protocol, repeat
+from vlagents_ray.evaluate.report.success import (
     compare_all,
     learning_curves,
     real_time_gaps,
@@ -26,9 +41,17 @@ from vlagents_ray.evaluate.report.html.success import (
     success_table,
 )
 from vlagents_ray.evaluate.results.reader import Results, by_timing, rate_of
-from vlagents_ray.evaluate.results.summary import Summary, summarize
+from vlagents_ray.evaluate.results.summary import Summary, median, summarize
 
 FILE = "report.html"
+STAGES = {  # of `act.info["timing"]`, in the order in which a request meets them
+    "decode_ms": "decode",
+    "queue_ms": "queue",
+    "inference_ms": "inference",
+    "encode_ms": "encode",
+    "wire_ms": "wire",
+}
+MOST_BARS = 12
 
 
 class Figure(NamedTuple):
@@ -145,3 +168,47 @@ def _templates() -> Environment:
     for kind in ("css", "js"):  # ours, and no template: nothing in them is escaped
         env.globals[kind] = Markup((files(__package__ or "") / f"report.{kind}").read_text("utf-8").strip())  # noqa: S704
     return env
+
+
+@dataclass(frozen=True, slots=True)
+class Latency:
+    """One answer of each policy in its stages, and the env's share: medians over the episodes of each one's median."""
+
+    chart: BarChart | None  # None: no server reported its stages
+    stages: list[str]  # that any policy has
+    rows: list[tuple[str, list[float | None], float | None, int]]  # (policy id, ms, the env's reset in ms, answers)
+    transports: list[str]
+    timed: int  # policy ids with stages, of which the chart shows the first `MOST_BARS`
+
+
+def latency(summary: Summary) -> Latency | None:
+    """The latencies; None if no episode was played."""
+    results = summary.results
+    by_name = {name: [one for cell in results.of(name) for one in cell.counted] for name in results.contenders}
+    played = {name: counted for name, counted in by_name.items() if counted}
+    if not played:
+        return None
+    spent = {name: _stages(counted) for name, counted in played.items()}
+    timed = {name: found for name, found in spent.items() if found}
+    bars = dict(list(timed.items())[:MOST_BARS])
+    stages = [stage for stage in STAGES.values() if any(stage in found for found in timed.values())]
+    rows = [
+        (
+            name,
+            [spent[name].get(stage) for stage in stages]
+            + [
+                median(getattr(one, field) for one in counted)
+                for field in ("policy_ms", "policy_p95_ms", "env_step_ms")
+            ],
+            median(one.reset_ms for one in counted),
+            sum(one.acts for one in counted),
+        )
+        for name, counted in played.items()
+    ]
+    chart = bar_chart(bars, "One act of the policy, by stage") if bars else None
+    return Latency(chart, stages, rows, summary.transports, len(timed))
+
+
+def _stages(episodes: Sequence[EpisodeResult]) -> dict[str, float]:
+    found = {stage: median(one.timing_ms.get(key) for one in episodes) for key, stage in STAGES.items()}
+    return {stage: spent for stage, spent in found.items() if spent is not None}

@@ -6,7 +6,7 @@ import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from vlagents_ray.evaluate.report.html.charts import Glyph, RateChart, Series, difference_glyph, rate_chart
+from vlagents_ray.evaluate.report.charts import Glyph, RateChart, Series, difference_glyph, rate_chart
 from vlagents_ray.evaluate.results.comparison import Comparison, Line, clock_gaps, comparable, comparisons
 from vlagents_ray.evaluate.results.reader import CellResults, Results, by_timing
 from vlagents_ray.evaluate.results.statistics import ERROR_RATE, Pairs, Rate, success_curve

@@ -11,9 +11,10 @@ from eval_fakes import LINE
 from recorded_results import HOSTILE, better_later, record, runs
 
 from vlagents_ray.evaluate import EvalConfig, Results
-from vlagents_ray.evaluate.report.html import success, write_report
-from vlagents_ray.evaluate.report.html.charts import MINUS
-from vlagents_ray.evaluate.report.html.episodes import Gallery
+from vlagents_ray.evaluate.report import success
+from vlagents_ray.evaluate.report.charts import MINUS
+from vlagents_ray.evaluate.report.episodes import Gallery
+from vlagents_ray.evaluate.report.page import write_report
 from vlagents_ray.evaluate.results.store import Store
 
 
