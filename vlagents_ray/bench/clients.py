@@ -185,14 +185,12 @@ class ActorDriver:
     actor: Any
 
     def ready(self) -> dict[str, Any]:
-        """Wait until it has connected."""
         import ray
 
         said: dict[str, Any] = ray.get(self.actor.ready.remote(), timeout=START_S)
         return said
 
     def measure(self, calls: int) -> list[float]:
-        """Make the calls in one call of the actor."""
         import ray
 
         taken: list[float] = ray.get(self.actor.measure.remote(calls), timeout=CALL_S + calls)

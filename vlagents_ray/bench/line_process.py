@@ -123,11 +123,9 @@ class Driver(Protocol):
 
     def ready(self) -> dict[str, Any]:
         """Wait until it is connected and warm; returns what it says of itself."""
-        ...
 
     def measure(self, calls: int) -> list[float]:
         """Make calls; returns the milliseconds of each."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,12 +135,10 @@ class ProcessDriver:
     child: LineProcess
 
     def ready(self) -> dict[str, Any]:
-        """Read its first line."""
         said: dict[str, Any] = self.child.read(START_S)
         return said
 
     def measure(self, calls: int) -> list[float]:
-        """Send a line, read a line."""
         taken: list[float] = self.child.request(str(calls), CALL_S + calls)
         return taken
 

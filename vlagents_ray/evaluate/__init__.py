@@ -37,7 +37,7 @@ from vlagents_ray.evaluate.results.stopping import confidence_sequence
 from vlagents_ray.evaluate.results.summary import Group, Summary
 
 if TYPE_CHECKING:
-    from vlagents_ray.evaluate.report.progress import Progress, SilentProgress, progress_for
+    from vlagents_ray.evaluate.report.progress import Progress, progress_for
     from vlagents_ray.evaluate.report.terminal import print_summary, results_table
     from vlagents_ray.evaluate.run import EvaluationInterrupted, OutOfTime, check, evaluate
     from vlagents_ray.evaluate.workers.cluster import most_cpus, most_gpus
@@ -46,7 +46,6 @@ _LATE = {
     "EvaluationInterrupted": "run",
     "OutOfTime": "run",
     "Progress": "report.progress",
-    "SilentProgress": "report.progress",
     "check": "run",
     "evaluate": "run",
     "most_cpus": "workers.cluster",
@@ -68,7 +67,6 @@ __all__ = [
     "Progress",
     "Rate",
     "Results",
-    "SilentProgress",
     "StopConfig",
     "SuccessCurve",
     "SuiteConfig",

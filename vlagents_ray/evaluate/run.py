@@ -25,7 +25,7 @@ from vlagents_ray.evaluate.plan.config import EvalConfig
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job, JobQueue, plan
 from vlagents_ray.evaluate.report.page import FILE as REPORT
 from vlagents_ray.evaluate.report.page import write_report
-from vlagents_ray.evaluate.report.progress import Progress, SilentProgress
+from vlagents_ray.evaluate.report.progress import Progress
 from vlagents_ray.evaluate.results.reader import Results, rate_of
 from vlagents_ray.evaluate.results.stopping import Stopping
 from vlagents_ray.evaluate.results.store import Store
@@ -113,7 +113,7 @@ def evaluate(
         try:
             with tracking:
                 local = {} if agent_factory is None else {"program": factory_program(agent_factory)}
-                run = _Run(config, store, progress or SilentProgress(), tracking, only, end_at, in_process, local)
+                run = _Run(config, store, progress or Progress(), tracking, only, end_at, in_process, local)
                 state, summary = run.play(factory)
         except BaseException:
             with contextlib.suppress(StorageFailed):  # probably the same disk error; report the first one

@@ -81,19 +81,16 @@ class WandbRun(TrackerRun):
             self._artifact("code", "code", about.diffs)
 
     def log(self, metrics: Mapping[str, float], step: int | None) -> None:
-        """Add a point to each curve; without a training step, write the summary."""
         if step is None:
             self._run.summary.update(dict(metrics))
         else:
             self._run.log({STEP: step, **metrics})
 
     def videos(self, label: str, paths: Sequence[Path], step: int | None) -> None:
-        """Upload the videos as an artifact of type "videos"."""
         at = "" if step is None else f"-{step}"
         self._artifact(f"videos-{plain(label.replace('/', '_'))}{at}", "videos", paths)
 
     def finish(self) -> None:
-        """Send what is buffered, and end the run."""
         self._run.finish()
 
     def _artifact(self, name: str, kind: str, paths: Sequence[Path]) -> None:
@@ -114,11 +111,9 @@ class TrackioRun(WandbRun):
         )  # fmt: skip
 
     def log(self, metrics: Mapping[str, float], step: int | None) -> None:
-        """Add a point to each curve; without a training step at 0, as trackio has no summary."""
         self._run.log(dict(metrics), step=step or 0)
 
     def videos(self, label: str, paths: Sequence[Path], step: int | None) -> None:
-        """Show the videos beside the curves."""
         shown = {f"{label}/{path.stem}": self._trackio.Video(path) for path in paths}
         self._run.log(shown, step=step or 0)
 
@@ -137,16 +132,13 @@ class TensorboardRun(TrackerRun):
         self._text("config", json.dumps(about.config, indent=1, default=str), 0)
 
     def log(self, metrics: Mapping[str, float], step: int | None) -> None:
-        """Add a point to each curve; without a training step at 0."""
         values = [self._summary.Value(tag=name, simple_value=value) for name, value in metrics.items()]
         self._add(values, step or 0)
 
     def videos(self, label: str, paths: Sequence[Path], step: int | None) -> None:
-        """Log the paths of the videos in the folder of results, as a text."""
         self._text(f"{label}/videos", "\n".join(str(path.relative_to(self._out)) for path in paths), step or 0)
 
     def finish(self) -> None:
-        """Write what is buffered, and close the file."""
         self._writer.close()
 
     def _text(self, tag: str, text: str, step: int) -> None:

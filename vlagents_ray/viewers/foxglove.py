@@ -39,7 +39,6 @@ class FoxgloveRecordings:
             Path(target).mkdir(parents=True, exist_ok=True)
 
     def begin(self, name: str, instruction: str) -> FoxgloveEpisode:
-        """Begin the file of an episode, or show the next one."""
         if self._live is not None:
             return FoxgloveEpisode(self._live[1], None)
         context = self._foxglove.Context()
@@ -48,7 +47,6 @@ class FoxgloveRecordings:
         return FoxgloveEpisode(_Topics(context), file)
 
     def close(self) -> None:
-        """Stop the server, if there is one."""
         if self._live is not None:
             self._live[0].stop()
 
@@ -72,7 +70,6 @@ class FoxgloveEpisode:
         self._file = file  # None for a live episode
 
     def write(self, frame: ViewerFrame) -> None:
-        """Log a frame."""
         tick, at = {"tick": frame.tick}, round(frame.time * 1e9)
         for name, data in frame.images().items():
             self._topics.log_image(f"/cameras/{name}", data, at)
@@ -89,7 +86,6 @@ class FoxgloveEpisode:
             self._topics.log_warning(frame.note, at)
 
     def close(self) -> None:
-        """Finish the file."""
         if self._file is not None:
             self._file.close()
 

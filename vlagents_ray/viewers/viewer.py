@@ -80,11 +80,9 @@ class ViewerEpisode(Protocol):
 
     def write(self, frame: ViewerFrame) -> None:
         """Write a frame."""
-        ...
 
     def close(self) -> None:
         """Finish the episode."""
-        ...
 
 
 class EpisodeFormat(Protocol):
@@ -96,11 +94,9 @@ class EpisodeFormat(Protocol):
 
     def begin(self, name: str, instruction: str) -> ViewerEpisode:
         """Begin an episode; `name` is also that of its file."""
-        ...
 
     def close(self) -> None:
         """Free what the episodes shared, such as a server."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)

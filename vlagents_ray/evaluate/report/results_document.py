@@ -13,7 +13,7 @@ from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.evaluate.plan.jobs import Job
-from vlagents_ray.evaluate.report.progress import Progress, SilentProgress, seconds_left
+from vlagents_ray.evaluate.report.progress import Progress, seconds_left
 from vlagents_ray.evaluate.results.database import FILE, RUNNING
 from vlagents_ray.evaluate.results.reader import CellResults, Episode, Results, rate_of
 from vlagents_ray.evaluate.results.statistics import Rate
@@ -186,32 +186,27 @@ class ProgressDocument(ResultsDocument, Progress):
         """
         super().__init__(out)
         self.goes_on = goes_on
-        self._shown = shown or SilentProgress()
+        self._shown = shown or Progress()
         self._state = STARTING
         self._changed = True
 
     def begin(self, cells: Sequence[EvalCase], recorded: Mapping[str, Rate], left: int) -> None:
-        """Note that an evaluation runs."""
         self._change(RUNNING)
         self._shown.begin(cells, recorded, left)
 
     def episode(self, cell: EvalCase, result: EpisodeResult) -> None:
-        """Note that there is a result."""
         self._changed = True
         self._shown.episode(cell, result)
 
     def retry(self, job: Job, failure: Failure) -> None:
-        """Note that there was a retry."""
         self._changed = True
         self._shown.retry(job, failure)
 
     def stopped(self, cell: EvalCase, at: int, spared: int) -> None:
-        """Note that fewer episodes are planned."""
         self._changed = True
         self._shown.stopped(cell, at, spared)
 
     def end(self) -> None:
-        """Note that this evaluation has ended."""
         if self.goes_on:
             self._change(WAITING)
         else:
@@ -229,7 +224,6 @@ class ProgressDocument(ResultsDocument, Progress):
         self._change(STOPPED)
 
     def is_due(self, *, rested: bool) -> bool:
-        """Return whether there is something new; how it ended is told at once."""
         final = self._changed and self._state in (ENDED, STOPPED)
         due = final or (rested and (self._changed or self._state == RUNNING))
         if due:
@@ -237,7 +231,6 @@ class ProgressDocument(ResultsDocument, Progress):
         return due
 
     def state(self, results: Results | None) -> str:
-        """Return how the evaluation stands: once it has ended, as its last run says."""
         return super().state(results) if self._state == ENDED else self._state
 
     def _change(self, state: str) -> None:

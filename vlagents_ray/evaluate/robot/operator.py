@@ -125,15 +125,12 @@ class Operator(Protocol):
         Returns:
             True to begin the trial, False to end the evaluation; it can be resumed.
         """
-        ...
 
     def watch(self, obs: Obs) -> None:
         """Show an observation of the running trial; called in each control tick, so it must return at once."""
-        ...
 
     def stops(self) -> bool:
         """Return whether the running trial is to be stopped, which also happens when the operator's page is closed."""
-        ...
 
     def judge(self, trial: VisibleTrial, ending: str) -> Verdict:
         """Ask for the verdict. The robot stays still.
@@ -148,7 +145,6 @@ class Operator(Protocol):
         Raises:
             KeyboardInterrupt: The operator has left. The trial will be played again.
         """
-        ...
 
 
 def start_pictures(out: Path, place: str) -> dict[str, Path]:

@@ -129,12 +129,10 @@ class WatchedRobot(Robot):
         self.stats: EpisodeStats | None = None  # of the running trial
 
     def observe(self) -> Obs:
-        """Read the sensors."""
         with env_side("robot, observe"):
             return self._robot.observe()
 
     def apply(self, action: np.ndarray) -> None:
-        """Command an action, and count it."""
         with env_side("robot, apply"):
             self._robot.apply(action)
         if self.stats is not None:
@@ -142,7 +140,6 @@ class WatchedRobot(Robot):
             self.stats.actions.update(action.astype("<f4", copy=False).tobytes())
 
     def stop(self) -> None:
-        """Bring the robot to rest."""
         with env_side("robot, stop"):
             self._robot.stop()
 

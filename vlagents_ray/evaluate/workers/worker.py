@@ -207,21 +207,17 @@ class InProcessWorkers(Workers):
         self.close()
 
     def free_slot(self) -> bool:
-        """Return whether the worker may start; ends one of another kind that is idle."""
         for worker in self.idle():
             self._workers.remove(worker)
         return not self._workers
 
     def start(self, cell: EvalCase) -> None:
-        """Start the worker, which is ready once it is waited for."""
         self._workers.append(WorkerHandle(cell.worker, cell.kind, actor=None, starting=self, started_at=0.0))
 
     def dispatch(self, worker: WorkerHandle, jobs: tuple[Job, ...]) -> None:
-        """Let the worker play `jobs`, side by side, when it is waited for."""
         worker.jobs = jobs
 
     def wait(self, timeout_s: float) -> Iterator[tuple[Job, Report]]:
-        """Play the episodes that were dispatched, however long it takes, and yield their reports."""
         for worker in self._workers:
             worker.starting = None
             jobs, worker.jobs = worker.jobs, ()
@@ -236,7 +232,6 @@ class InProcessWorkers(Workers):
             yield from zip(jobs, reports, strict=True)
 
     def close(self) -> None:
-        """Close the simulator and the connection; further episodes begin with new ones."""
         broken, self._rollout = self._rollout, self._make()
         try:
             broken.close()
