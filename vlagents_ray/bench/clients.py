@@ -68,7 +68,6 @@ class OwnClient:
 
     @property
     def name(self) -> str:
-        """The name in the table."""
         if self.transport in ("shm", "handle", "plasma"):
             return f"{self.transport}, Ray actor" if self.actor else self.transport
         return f"{self.transport}, {'default' if self.codec == 'auto' else self.codec}"
@@ -120,7 +119,6 @@ class BenchCaller:
         self.description: dict[str, Any] = {"transport": self._agent.transport, "psnr_db": info.get("psnr_db")}
 
     def measure(self, calls: int) -> list[float]:
-        """Make calls; returns the milliseconds of each."""
         return timed(lambda: self._obs, self._agent.act, calls)
 
     def ready(self) -> dict[str, Any]:
@@ -129,7 +127,6 @@ class BenchCaller:
         return self.description
 
     def close(self) -> None:
-        """End the session."""
         self._agent.close()
 
 
@@ -160,7 +157,6 @@ class LoadGenerator:
         return [one.result() for one in [self._pool.submit(self._act, *each, begin, end) for each in acting]]
 
     def close(self) -> None:
-        """End all sessions."""
         for agent in self._agents:
             agent.close()
         self._pool.shutdown()

@@ -38,12 +38,10 @@ class RoundTrips:
 
     @property
     def median(self) -> float:
-        """Return the median, ms."""
         return float(np.median(self.ms))
 
     @property
     def p99(self) -> float:
-        """The 99th percentile, ms."""
         return float(np.quantile(self.ms, 0.99))
 
     @property
@@ -52,7 +50,6 @@ class RoundTrips:
         return median_interval(self.ms)
 
     def to_json(self) -> dict[str, Any]:
-        """Return plain JSON values."""
         return {
             "way": self.name,
             "calls": len(self.ms),
@@ -71,7 +68,6 @@ class Ratio:
     high: float
 
     def to_json(self) -> dict[str, Any]:
-        """Return plain JSON values."""
         return {"ratio": self.ratio, "ci95": [self.low, self.high]}
 
 

@@ -31,12 +31,7 @@ class LineProcess:
     """A process that answers lines with lines of JSON. What it writes on standard error is shown if it fails."""
 
     def __init__(
-        self,
-        name: str,
-        command: Sequence[str],
-        environment: Mapping[str, str] | None = None,
-        *,
-        end_s: float = _END_S,
+        self, name: str, command: Sequence[str], environment: Mapping[str, str] | None = None, *, end_s: float = _END_S
     ) -> None:
         self.name = name
         self._end_s = end_s  # how long it may take to end once its input has ended
@@ -53,7 +48,6 @@ class LineProcess:
 
     @property
     def pid(self) -> int:
-        """Return the id of the process."""
         return self._process.pid
 
     def read(self, timeout_s: float) -> Any:
@@ -88,7 +82,6 @@ class LineProcess:
             self._process.stdin.flush()
 
     def request(self, line: str, timeout_s: float) -> Any:
-        """Send a line and return the answer."""
         self.send(line)
         return self.read(timeout_s)
 

@@ -9,9 +9,10 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from typing_extensions import Self
 
 from vlagents_ray.bench.figures import rate_of
 from vlagents_ray.contract import Contract
@@ -19,9 +20,6 @@ from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.messages import RankName, Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.models.agent_copies import AgentCopies
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
 
 INSTRUCTION = "pick up the cube"
 WARM = 2  # batches that do not count
@@ -37,7 +35,6 @@ class QueuedTurn:
     trips_ms: Sequence[float]  # of each call
 
     def to_json(self) -> dict[str, float]:
-        """Return the figures, without those of single calls."""
         return {
             "actions_per_s": self.actions_per_s,
             "round_trip_ms": statistics.median(self.trips_ms),

@@ -19,13 +19,7 @@ import numpy as np
 
 from vlagents_ray.bench.clients import observation
 from vlagents_ray.bench.line_client import die_with_parent, own_stdout
-from vlagents_ray.bench.measured_policy import (
-    MeasuredPolicy,
-    QueuedTurn,
-    device_name,
-    forget_peak,
-    peak_mib,
-)
+from vlagents_ray.bench.measured_policy import MeasuredPolicy, QueuedTurn, device_name, forget_peak, peak_mib
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Agent, Obs

@@ -59,7 +59,6 @@ class RoundTripsOfAll:
     psnr_db: Mapping[str, float | None] = field(default_factory=dict)  # of what the policy saw, by way; None: all of it
 
     def to_json(self) -> dict[str, Any]:
-        """Return plain JSON values."""
         return {
             "ways": [{**trips.to_json(), "psnr_db": self.psnr_db.get(trips.name)} for trips in self.ours],
             "peers": [trips.to_json() for trips in self.theirs],

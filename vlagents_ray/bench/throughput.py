@@ -64,10 +64,7 @@ def measure_throughput(plan: ThroughputPlan, progress: Callable[[str], None] = l
     found, skipped = own_clients(plan.transports)
     chosen = _one_each(found)
     served = deployment(
-        plan.policy,
-        config=dict(plan.config),
-        batch={"max_size": plan.batch},
-        resources={"num_gpus": plan.num_gpus},
+        plan.policy, config=dict(plan.config), batch={"max_size": plan.batch}, resources={"num_gpus": plan.num_gpus}
     )
     with contextlib.ExitStack() as stack:
         bare = None if plan.ideal else stack.enter_context(_bare(plan))

@@ -71,7 +71,6 @@ class TunedSize:
     took_s: float = 0.0  # of the first turn
 
     def add(self, turn: Mapping[str, Any]) -> None:
-        """Add the answer of a process."""
         self.rates.append(turn["actions_per_s"])
         self.trips_ms += turn["trips_ms"]
         self.peak_mib = max(self.peak_mib, turn["peak_mib"])

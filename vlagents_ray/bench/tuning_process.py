@@ -17,14 +17,7 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.bench.line_client import die_with_parent, own_stdout
-from vlagents_ray.bench.measured_policy import (
-    MeasuredPolicy,
-    cuda,
-    device_name,
-    forget_peak,
-    jax_device,
-    peak_mib,
-)
+from vlagents_ray.bench.measured_policy import MeasuredPolicy, cuda, device_name, forget_peak, jax_device, peak_mib
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import PolicyFailed
 from vlagents_ray.interface import Agent, Obs
@@ -53,7 +46,6 @@ class ProcessSettings:
 
 
 def save_observations(observations: Sequence[Obs], file: Path) -> None:
-    """Write observations into a .npz file."""
     arrays: dict[str, np.ndarray] = {}
     for number, obs in enumerate(observations):
         arrays |= {f"{number}/{_CAMERA}/{name}": image for name, image in obs.cameras.items()}

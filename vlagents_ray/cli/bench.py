@@ -27,12 +27,7 @@ Transports = Annotated[str, typer.Option(help="shm,websocket,http,handle,plasma;
 
 
 @bench.command("rtt")
-def bench_rtt(
-    calls: Calls = 1000,
-    transports: Transports = "",
-    json_file: Json = None,
-    plot: Plot = None,
-) -> None:
+def bench_rtt(calls: Calls = 1000, transports: Transports = "", json_file: Json = None, plot: Plot = None) -> None:
     """Round trips to a `noop` policy on this machine by every transport, in turns."""
     from vlagents_ray.bench.figures import check_plot_file, measured_on, plot_round_trips
     from vlagents_ray.bench.rtt import measure_rtt

@@ -107,7 +107,6 @@ def fresh(folder: Path) -> Path:
 
 
 def progress(text: str) -> None:
-    """Print a line of progress."""
     out.print(text)
 
 

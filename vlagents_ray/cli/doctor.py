@@ -130,8 +130,7 @@ def open_files() -> Check:
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     unlimited = sys.maxsize
     return judge_open_files(
-        unlimited if soft == resource.RLIM_INFINITY else soft,
-        unlimited if hard == resource.RLIM_INFINITY else hard,
+        unlimited if soft == resource.RLIM_INFINITY else soft, unlimited if hard == resource.RLIM_INFINITY else hard
     )
 
 

@@ -140,8 +140,7 @@ class EvalOptions:
         typer.Option(metavar="page|terminal", help="With --robot: where that person is asked; default: page"),
     ] = None
     unblind: Annotated[
-        bool,
-        typer.Option("--unblind", help="With --robot: write the results of the judged trials; play none."),
+        bool, typer.Option("--unblind", help="With --robot: write the results of the judged trials; play none.")
     ] = False
     address: Address = None
     live: Live = False
@@ -199,13 +198,7 @@ def evaluate_command(options: EvalOptions) -> None:
         elif options.watch is not None:
             settle_s = 10.0 if options.settle is None else options.settle
             watch_training(
-                config,
-                options.watch,
-                address,
-                until=options.until,
-                settle_s=settle_s,
-                marker=options.marker,
-                live=page,
+                config, options.watch, address, until=options.until, settle_s=settle_s, marker=options.marker, live=page
             )
         else:
             end = None if options.end_at is None else parse_time(options.end_at, "--end-at")

@@ -45,9 +45,7 @@ app.command("serve")(serve_command)
 
 
 @app.command()
-def demo(
-    out_dir: Annotated[Path, typer.Option("--out", help="Folder of the results.")] = Path("runs/demo"),
-) -> None:
+def demo(out_dir: Annotated[Path, typer.Option("--out", help="Folder of the results.")] = Path("runs/demo")) -> None:
     """The main job in a few minutes: serve the scripted policy, evaluate it in two environments, leave videos."""
     from vlagents_ray.cli.evaluation import run_evaluation
     from vlagents_ray.envs.maniskill import ManiSkill

@@ -201,11 +201,7 @@ class RayLoss:
 
     def _watch_ray(self) -> None:
         """Watch the Ray that this process is in, until it leaves it or that Ray is lost."""
-        from vlagents_ray.ray_tools.head_monitor import (
-            PERIOD_S,
-            HeadMonitor,
-            keep_from_printing_last_words,
-        )
+        from vlagents_ray.ray_tools.head_monitor import PERIOD_S, HeadMonitor, keep_from_printing_last_words
 
         head: HeadMonitor | None = None
         while not self.left.wait(PERIOD_S):

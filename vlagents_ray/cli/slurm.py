@@ -64,8 +64,7 @@ def eval_(
 def serve(
     context: typer.Context,
     out_dir: Annotated[
-        Path | None,
-        typer.Option("--out", help="Folder of script, logs, and server.json; default: runs/serve/POLICY."),
+        Path | None, typer.Option("--out", help="Folder of script, logs, and server.json; default: runs/serve/POLICY.")
     ] = None,
     setup: Setup = None,
     print_only: Print = False,

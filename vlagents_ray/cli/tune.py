@@ -46,8 +46,7 @@ def tune_command(
     max_batch: Annotated[int, typer.Option(min=1, help="The largest batch to try.")] = 32,
     seconds: Annotated[float, typer.Option(min=0.1, help="Of each measurement.")] = 2.0,
     dtypes: Annotated[
-        str | None,
-        typer.Option(help="To try, as bfloat16,int8; default: the one that suits the accelerator, if any."),
+        str | None, typer.Option(help="To try, as bfloat16,int8; default: the one that suits the accelerator, if any.")
     ] = None,
     tolerance: Annotated[
         float, typer.Option(min=0, help="How far actions may be off, as a share of their range.")

@@ -11,13 +11,7 @@ from typing import Any
 
 from vlagents_ray.errors import ConfigError, StorageFailed, from_code
 from vlagents_ray.evaluate.artifacts.recorder import Artifacts, save, save_views
-from vlagents_ray.evaluate.artifacts.storage import (
-    driver_code,
-    policy_code,
-    save_diffs,
-    storing,
-    versions,
-)
+from vlagents_ray.evaluate.artifacts.storage import driver_code, policy_code, save_diffs, storing, versions
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.episode.records import EpisodeResult, WorkerInfo
 from vlagents_ray.evaluate.plan.cases import EvalCase, require_envs

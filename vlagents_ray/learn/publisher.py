@@ -11,9 +11,10 @@ from collections.abc import Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import asdict
 from itertools import chain
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import urlencode
 
+from typing_extensions import Self
 from websockets.exceptions import ConnectionClosed
 
 from vlagents_ray.client.credentials import Credentials
@@ -30,9 +31,6 @@ from vlagents_ray.serve.weights.versions import PushMode
 from vlagents_ray.weights.safetensors import MESSAGE_BYTES, header_of, parts_of
 from vlagents_ray.weights.shared_values import NotShared, gpu_of, shared
 from vlagents_ray.weights.trainable import is_array, portable
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
 
 logger = logging.getLogger(__name__)
 

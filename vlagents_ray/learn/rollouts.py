@@ -10,7 +10,9 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from typing_extensions import Self
 
 from vlagents_ray.errors import ConfigError, PolicyFailed, WeightsLost, from_code
 from vlagents_ray.evaluate.episode.failures import Failure
@@ -26,9 +28,6 @@ from vlagents_ray.interface import Agent
 from vlagents_ray.learn.columns import EXTRA, RowMemory
 from vlagents_ray.learn.transitions import WANTED, TransitionRecorder
 from vlagents_ray.registry import require
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
 
 POLL_S = 0.25  # longest wait for a report, after which workers that are needed are started
 _BLOCKS = 4  # of memory for images that a worker keeps for each of its environments

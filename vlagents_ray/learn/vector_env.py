@@ -227,7 +227,6 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
         return self._observations(), rewards, terminated, truncated, infos
 
     def close_extras(self, **_kwargs: Any) -> None:
-        """Close the environments."""
         self._batch.close()
 
     def _moved(self, rows: np.ndarray, moving: np.ndarray) -> list[tuple[int, Any, dict[str, Any]]]:

@@ -129,7 +129,6 @@ class ErrorTable:
         return float(error.mean())
 
     def mean(self) -> np.ndarray:
-        """Return the mean absolute error, (H, D)."""
         return np.asarray(self.absolute / self.frames[:, np.newaxis])
 
     def to_json(self, joints: list[str]) -> dict[str, Any]:
@@ -167,7 +166,6 @@ class FrameError:
 
 
 def worst(errors: list[FrameError]) -> list[FrameError]:
-    """Return the frames with the largest errors."""
     return sorted(errors, key=lambda one: -one.mae)[:_WORST]
 
 
@@ -196,7 +194,6 @@ class OpenLoopResult:
     drawn: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)  # (D,) expected and got, first rows
 
     def to_json(self) -> dict[str, Any]:
-        """Return the result as plain JSON values."""
         by_episode: dict[tuple[str, int], list[float]] = {}
         for one in self.frames:
             by_episode.setdefault((one.dataset, one.episode), []).append(one.mae)

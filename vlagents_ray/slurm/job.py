@@ -85,7 +85,6 @@ class Allocation:
 
     @classmethod
     def here(cls, environ: Mapping[str, str] = os.environ) -> Allocation:
-        """Read the allocation of this process."""
         cpus = int(environ["SLURM_CPUS_ON_NODE"])
         return cls(
             job=int(environ["SLURM_JOB_ID"]),
@@ -138,7 +137,6 @@ def _memory(environ: Mapping[str, str], cpus: int) -> int | None:
 
 
 def print_address() -> None:
-    """Print the address of this node as Ray determines it."""
     from ray.util import get_node_ip_address
 
     sys.stdout.write(f"{get_node_ip_address()}\n")

@@ -39,10 +39,7 @@ BODY = Path(__file__).with_name("job.sh")
 _LINE_ENDS = "\x7f\x85\u2028\u2029"
 UNFINISHED = 75  # exit status of `vlagents-ray eval` when its time is over (EX_TEMPFAIL of sysexits.h)
 RECORD = "job.json"
-_KEPT = {
-    "SLURM_CONF",
-    "SLURM_CLUSTERS",
-}  # the location of Slurm; the others belong to this process's own job
+_KEPT = {"SLURM_CONF", "SLURM_CLUSTERS"}  # the location of Slurm; the others belong to this process's own job
 _SBATCH_S = 120.0
 
 
@@ -122,7 +119,6 @@ class Script:
 
     @property
     def file(self) -> Path:
-        """The file of the script."""
         return self.folder / f"{self.name}.sh"
 
     @property
@@ -220,7 +216,6 @@ def submit(script: Script) -> str:
 
 
 def write(script: Script) -> Path:
-    """Write a script to its file, and return the file."""
     file = script.file.absolute()
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text(script.text())

@@ -106,7 +106,6 @@ class _Topics:
         self._channels[topic].log(message, log_time=at)
 
     def log_image(self, topic: str, data: bytes, at: int) -> None:
-        """Log a JPEG or PNG file."""
         kind = "jpeg" if data[:3] == b"\xff\xd8\xff" else "png"
         message = self._messages.CompressedImage(
             timestamp=self._timestamp(at), frame_id=topic.rpartition("/")[2], data=data, format=kind
@@ -114,7 +113,6 @@ class _Topics:
         self._typed(topic, "CompressedImageChannel").log(message, log_time=at)
 
     def log_warning(self, text: str, at: int) -> None:
-        """Log a line for people."""
         level = self._messages.LogLevel.Warning
         message = self._messages.Log(timestamp=self._timestamp(at), level=level, message=text, name="vlagents_ray")
         self._typed("/log", "LogChannel").log(message, log_time=at)

@@ -9,9 +9,10 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from typing_extensions import Self
 
 from vlagents_ray.evaluate.artifacts.storage import episode_folder, outcome, stem, whole
 from vlagents_ray.evaluate.artifacts.trajectory import TrajectoryRecorder, save_trajectory
@@ -25,10 +26,6 @@ from vlagents_ray.evaluate.plan.jobs import Job
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.viewers.targets import SUFFIXES, is_live, open_target
 from vlagents_ray.viewers.viewer import EpisodeViewer, ViewerFrame, numbers_of
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
-
 
 log = logging.getLogger(__name__)
 
@@ -184,13 +181,11 @@ class EpisodeViews:
             self._opened = stack.pop_all()
 
     def begin(self, job: Job) -> None:
-        """Begin the episode of a job."""
         name = "_".join([*(part.replace("/", "_") for part in job.cell.name if part), stem(job.key)])
         for viewer in self._viewers:
             self._shown.enter_context(viewer.episode(name))
 
     def add_observation(self, obs: Obs) -> None:
-        """Add an observation, beginning with that of the reset."""
         if self._viewers:
             self._seen.append(ViewerFrame.of(obs, self._ticks, time=self._begun + self._ticks * self._period_s))
             self._ticks += 1

@@ -83,7 +83,6 @@ class Manifest(BaseModel):
 
 
 def digest_of(path: Path) -> FileDigest:
-    """Compute the SHA-256 and the size of a file."""
     sha256, size = hashlib.sha256(), 0
     with path.open("rb") as file:
         while chunk := file.read(_CHUNK):
@@ -211,7 +210,6 @@ def _manifest(archive: Path, file: zipfile.ZipFile, member: zipfile.ZipInfo | No
 
 
 def _copy(archive: Path, source: IO[bytes], target: IO[bytes], member: zipfile.ZipInfo) -> FileDigest:
-    """Copy a member, and compute its digest on the way."""
     sha256, size = hashlib.sha256(), 0
     while chunk := source.read(_CHUNK):
         size += len(chunk)

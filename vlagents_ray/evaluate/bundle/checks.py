@@ -188,7 +188,6 @@ def _finding(subject: str, odd: list[str], fine: str) -> Finding:
 
 
 def check_digests(odd: list[str], number: int) -> Finding:
-    """What the archive's list of digests says of its files."""
     return _finding("digests", odd, f"{number} files have the SHA-256 that {MANIFEST} states")
 
 

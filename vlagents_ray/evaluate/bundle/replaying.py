@@ -104,7 +104,6 @@ class _Comparison:
         self._success: list[bool] = []
 
     def add(self, number: int, obs: Obs) -> None:
-        """Compare observation `number`."""
         now = {part: np.asarray(values, np.float32) for part, values in obs.state.items()}
         if now.keys() != self._recorded.state.keys() or (obs.gripper is None) != (self._recorded.gripper is None):
             self._differ(number, float("inf"))
@@ -116,14 +115,12 @@ class _Comparison:
             self._compare(number, np.asarray(before), np.asarray(values))
 
     def add_outcome(self, number: int, reward: float, success: bool) -> None:
-        """Compare what action `number`, from 1, led to."""
         self._success.append(success)
         self._compare(number, self._recorded.rewards[number - 1], np.float64(reward))
         if bool(self._recorded.success[number - 1]) != success:
             self._differ(number, 0.0)
 
     def result(self, described: Mapping[str, Any]) -> Replayed:
-        """Return what came of all actions."""
         first = next((number for number, success in enumerate(self._success, 1) if success), None)
         outcome = (first is not None, bool(self._success and self._success[-1]), first)
         return Replayed(len(self._success), outcome, self._from, self._largest, described)

@@ -177,7 +177,6 @@ class _Episode:
         self._executor, self._done = self._new_executor(), False
 
     def request(self, info: Mapping[str, Any]) -> Obs:
-        """Return the observation for the next request to the policy, with `info`."""
         continuation = self._executor.request_info()
         return _for_policy(self.obs, {**info, **continuation} if info else continuation)
 
@@ -213,7 +212,6 @@ class _Episode:
         return tick
 
     def failed(self, error: VLAgentsError) -> None:
-        """End the episode with `error`."""
         if isinstance(error, PolicyFailed) and not isinstance(error, CheckpointFailed):
             self.outcome = self.stats.result(transport_of(self.session), error)
         else:

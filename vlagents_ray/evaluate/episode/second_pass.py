@@ -28,11 +28,9 @@ class PlayedEpisode:
         return any(images.keys() != self._seen[0][1].keys() for _, images in self._seen)
 
     def add_observation(self, obs: Obs) -> None:
-        """Add an observation, beginning with that of the reset."""
         self._seen.append(_digests(obs))
 
     def add_action(self, action: np.ndarray, reward: float, success: bool) -> None:
-        """Add an executed action, (D,), with its reward and success."""
         self._done.append((np.array(action), reward, success))
 
     def play_again(

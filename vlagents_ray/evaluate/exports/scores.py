@@ -34,7 +34,6 @@ class Score:
 
     @property
     def rate(self) -> Rate:
-        """The rate of `metric`."""
         return rate_of(self.cells, self.metric)
 
     @property

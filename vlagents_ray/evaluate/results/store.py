@@ -81,12 +81,7 @@ class Store:
     def begin_run(self, config: EvalConfig, versions: dict[str, Any], started: float | None = None) -> None:
         """Record that a run over the plan begins, or began at `started`, s since 1970."""
         with self._db:
-            row = (
-                time.time() if started is None else started,
-                RUNNING,
-                config.model_dump_json(),
-                canonical(versions),
-            )
+            row = (time.time() if started is None else started, RUNNING, config.model_dump_json(), canonical(versions))
             cursor = self._db.execute("INSERT INTO runs (started, state, config, versions) VALUES (?, ?, ?, ?)", row)
             self._run = int(cursor.lastrowid or 0)
             self._write_changes()
@@ -94,7 +89,6 @@ class Store:
             self._db.executemany("UPDATE cells SET program = ? WHERE cell = ?", programs)
 
     def end_run(self, state: str) -> None:
-        """Record how the run ended."""
         with self._db:
             self._db.execute("UPDATE runs SET ended = ?, state = ? WHERE run = ?", (time.time(), state, self._run))
 

@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib.resources import files as package_files
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 import uvicorn
@@ -24,16 +24,13 @@ from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response
 from starlette.routing import Mount, Route
+from typing_extensions import Self
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.artifacts.storage import whole
 from vlagents_ray.images.jpeg_png import decode, encode_jpeg
 from vlagents_ray.interface import Obs
 from vlagents_ray.naming import distinct
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
-
 
 Outcome = Literal["success", "failure", "partial", "repeat"]
 SCENES = "scenes"

@@ -41,11 +41,7 @@ class TrialsInterrupted(KeyboardInterrupt):
 
 
 def evaluate_on_robot(
-    config: EvalConfig,
-    operator: Operator,
-    *,
-    robot: Robot | None = None,
-    agent_factory: AgentFactory | None = None,
+    config: EvalConfig, operator: Operator, *, robot: Robot | None = None, agent_factory: AgentFactory | None = None
 ) -> Summary:
     """Play every trial of `config` that has no result yet, and write the results to `config.out`.
 
@@ -155,7 +151,6 @@ class _RemainingTrials:
             self._count(trials[number - 1], result_of(trials[number - 1], logged))
 
     def play(self) -> None:
-        """Play all trials that are left."""
         left = [trial for trial in self._trials if trial.number not in self._log.finished and not self._is_over(trial)]
         if not left:
             return
@@ -265,7 +260,6 @@ class _RemainingTrials:
 
 
 def result_of(trial: Trial, logged: LoggedTrial) -> EpisodeResult:
-    """Return the result of a finished trial."""
     sealed = dict(logged.sealed["result"])
     sealed["key"] = EpisodeKey(**sealed["key"])
     if sealed["key"] != trial.job.key:

@@ -101,7 +101,6 @@ class TrialLog:
         self._write({"trial": trial, "attempt": attempt, "begun": time.time()})
 
     def end(self, trial: int, attempt: int, seen: dict[str, Any], sealed: dict[str, Any]) -> LoggedTrial:
-        """Record the end of an attempt."""
         ended = LoggedTrial(trial, attempt, time.time(), seen, sealed)
         line = {"trial": trial, "attempt": attempt, "at": ended.at, **seen, "sealed": _seal(self.key, sealed)}
         self._write(line)

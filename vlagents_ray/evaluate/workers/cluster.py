@@ -149,11 +149,9 @@ class CapacityMonitor:
         self._warned = False  # whether the user was warned that there is no room for all
 
     def note_playing(self) -> None:
-        """Note that an episode is being played."""
         self._last_played = self._now()
 
     def note_started(self) -> None:
-        """Note that a worker has started."""
         self._warned = False
 
     def timed_out(self, since: float) -> bool:

@@ -134,7 +134,6 @@ class Rollout:
         return [replace(reports[0], env=setup.env, policy=setup.policy, worker=setup.worker), *reports[1:]]
 
     def close(self) -> None:
-        """Free the simulator and the connection."""
         self._drop_agent()
         self._drop_env()
 

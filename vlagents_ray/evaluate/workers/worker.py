@@ -8,7 +8,9 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from typing_extensions import Self
 
 from vlagents_ray.errors import PolicyFailed, VLAgentsError, from_code
 from vlagents_ray.evaluate.artifacts.recorder import RecorderFactory, Recording
@@ -19,10 +21,6 @@ from vlagents_ray.evaluate.plan.config import EvalConfig, WorkerConfig
 from vlagents_ray.evaluate.plan.jobs import Job, JobQueue
 from vlagents_ray.evaluate.workers.agents import AgentFactory
 from vlagents_ray.evaluate.workers.rollout import Heartbeat, Report, Rollout
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
-
 
 WATCH_S = 1.0  # s between two queries of a busy worker
 GRACE_S = 5.0  # s that a call past its deadline has to fail by itself
@@ -50,11 +48,9 @@ class WorkerHandle:
 
     @property
     def refs(self) -> list[Any]:
-        """Return the references of the pending answers."""
         return [ref for ref in (self.starting, self.running, self.query) if ref is not None]
 
     def query_is_due(self, now: float) -> bool:
-        """Whether it is time to query its progress."""
         return self.query is None and now - self.queried_at > WATCH_S
 
 
@@ -66,15 +62,12 @@ class Workers(ABC):
 
     @property
     def busy(self) -> bool:
-        """Whether an episode is being played."""
         return any(worker.jobs for worker in self._workers)
 
     def working(self) -> Counter[str]:
-        """Return the number of busy workers by place."""
         return Counter(worker.jobs[0].cell.place for worker in self._workers if worker.jobs)
 
     def kinds(self) -> Counter[str]:
-        """Return the number of workers by kind."""
         return Counter(worker.kind for worker in self._workers)
 
     def unoccupied(self) -> Counter[str]:
@@ -164,7 +157,6 @@ class FailedAttempts:
         return failure.cause != "user" and job.attempt <= self._config.retries
 
     def note_played(self) -> None:
-        """Note that an episode was played to its end."""
         self._lost = self._policy_errors = 0
 
     def note_policy_error(self, error: str) -> None:
