@@ -36,9 +36,6 @@ def tune_command(
     p99_ms: Annotated[
         float | None, typer.Option("--p99-ms", min=0, help="Of robots: the longest round trip of 99 in 100, ms.")
     ] = None,
-    plot: Annotated[
-        Path | None, typer.Option("--plot", help="Draw latency against throughput here: .png, .svg or .pdf.")
-    ] = None,
     minutes: Annotated[float, typer.Option(min=0.1, help="That all of it may take.")] = 5.0,
     max_workers: Annotated[
         int | None, typer.Option(min=1, help="Of a file of runs: the most workers to try; default: twice the cores.")
@@ -65,7 +62,6 @@ def tune_command(
     Of a deployment file: batch size, compilation and precision. Of a file of runs: workers, and environments a worker.
     """
     began = time.monotonic()
-    from vlagents_ray.bench.figures import check_plot_file
     from vlagents_ray.bench.tuner import TunePlan, Tuner
     from vlagents_ray.bench.tuning_choice import (
         TuningGoal,
@@ -82,11 +78,10 @@ def tune_command(
         goal = TuningGoal(wanted.value, p99_ms)
         if file.suffix not in YAML_SUFFIXES:
             raise ConfigError(f"got {str(file)!r}, want a deployment file or a file of runs (.yaml)")
-        check_plot_file(plot)
         if is_run_file(file):
-            if goal.kind != "throughput" or dtypes or frames or app or state or plot:
+            if goal.kind != "throughput" or dtypes or frames or app or state:
                 raise ConfigError(
-                    "--for, --dtypes, --frames, --app, --state and --plot are of deployment files; leave them out"
+                    "--for, --dtypes, --frames, --app and --state are of deployment files; leave them out"
                 )
             tune_evaluation(file, minutes=minutes, max_workers=max_workers, began=began)
             return
@@ -104,9 +99,6 @@ def tune_command(
         chosen, default = choose(points, goal), default_point(points, goal, args.batch.max_size)
         settings = chosen_settings(chosen, args.batch, tuner.fixed)
         _show_choice(_words(chosen), _words(default), began, f"below args of {application.name!r} in {file}", settings)
-        if plot is not None:
-            plot_latency(points, chosen, default, goal, plot, title)
-            out.print(f"wrote {plot}")
 
 
 def tune_evaluation(file: Path, *, minutes: float, max_workers: int | None, began: float) -> None:
