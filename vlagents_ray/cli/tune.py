@@ -69,7 +69,6 @@ def tune_command(
         chosen_settings,
         default_point,
         figures,
-        plot_latency,
     )
     from vlagents_ray.serve.config.deployment import ServerArgs
     from vlagents_ray.serve.launch.deployment_file import policy_application
