@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,6 +17,7 @@ from typing_extensions import Self
 from vlagents_ray.evaluate.artifacts.storage import episode_folder, outcome, stem, whole
 from vlagents_ray.evaluate.artifacts.trajectory import TrajectoryRecorder, save_trajectory
 from vlagents_ray.evaluate.artifacts.video import DEFAULT_FPS, Footage, VideoRecorder, save_videos
+from vlagents_ray.evaluate.episode.episode import EpisodeObserver
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.episode.second_pass import PlayedEpisode, SecondPass
 from vlagents_ray.evaluate.episode.stats import version_of
@@ -41,11 +42,8 @@ class Artifacts:
     not_repeatable: str | None = None  # why images are missing that were to be rendered in a second pass
 
 
-class EpisodeRecorder:
+class EpisodeRecorder(EpisodeObserver):
     """Records one episode. Use as a context manager, which frees what it holds. This one keeps nothing."""
-
-    request_info: Mapping[str, Any] = {}
-    """Added to the `Obs.info` of every request to the policy."""
 
     @property
     def wants_images(self) -> EpisodeChoice:
@@ -54,15 +52,6 @@ class EpisodeRecorder:
 
     def begin(self, job: Job) -> None:
         """Begin the episode of a job; called before anything is added."""
-
-    def add_observation(self, obs: Obs) -> None:
-        """Add an observation, beginning with that of the reset."""
-
-    def add_act(self, act: Act, ticks_waited: int = 0) -> None:
-        """Add an answer of the policy; some or all rows of its action are executed after `ticks_waited` other ones."""
-
-    def add_action(self, action: np.ndarray, reward: float, success: bool) -> None:
-        """Add an executed action, (D,), with its reward and success; its next observation was added before."""
 
     def finish(self, result: EpisodeResult, second_pass: SecondPass) -> Artifacts:
         """Return what is kept of an episode with this result; `second_pass` renders images that are missing."""

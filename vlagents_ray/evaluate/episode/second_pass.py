@@ -10,12 +10,12 @@ import numpy as np
 
 from vlagents_ray.envs.base import BatchEnv, Options
 from vlagents_ray.errors import VLAgentsError
-from vlagents_ray.evaluate.episode.episode import Watch
+from vlagents_ray.evaluate.episode.episode import EpisodeObserver, Watch
 from vlagents_ray.evaluate.episode.failures import checked_obs, checked_step, env_side
 from vlagents_ray.interface import Act, Obs
 
 
-class PlayedEpisode:
+class PlayedEpisode(EpisodeObserver):
     """The actions of an episode and what came of them, with digests in place of images."""
 
     def __init__(self) -> None:

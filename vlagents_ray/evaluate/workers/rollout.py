@@ -25,7 +25,14 @@ from vlagents_ray.envs.batch import BatchEnv, SequentialBatch, make_batch
 from vlagents_ray.envs.rendering.graphics import require_own
 from vlagents_ray.errors import ConfigError, EnvFailed, MissingDependency, VLAgentsError
 from vlagents_ray.evaluate.artifacts.recorder import Artifacts, EpisodeRecorder, RecorderFactory, Recording
-from vlagents_ray.evaluate.episode.episode import Outcome, Phase, options_of_reset, run_episodes, transport_of
+from vlagents_ray.evaluate.episode.episode import (
+    EpisodeSettings,
+    Outcome,
+    Phase,
+    options_of_reset,
+    run_episodes,
+    transport_of,
+)
 from vlagents_ray.evaluate.episode.failures import Failure, env_side, explain, policy_side
 from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult, WorkerInfo
 from vlagents_ray.evaluate.plan.cases import EvalCase, env_program
@@ -191,23 +198,16 @@ class Rollout:
     def _play(
         self, agent: Agent, env: BatchEnv, jobs: tuple[Job, ...], recordings: list[EpisodeRecorder]
     ) -> list[Outcome]:
-        cell = jobs[0].cell
-        wanted = recordings[0].wants_images
+        cell, wanted = jobs[0].cell, recordings[0].wants_images
         return run_episodes(
             env,
             agent,
             self._sessions_of(agent, env, len(jobs)),
             [job.key for job in jobs],
-            execute=cell.policy.execute,
-            clock=cell.suite.clock,
-            reset_options=cell.suite.reset_options,
-            policy_options=cell.policy_options,
+            EpisodeSettings(cell.policy.execute, cell.suite.clock, cell.suite.reset_options, cell.policy_options),
+            observers=recordings,
             watch=self._set_phase,
-            record=lambda i, obs: recordings[i].add_observation(obs),
             images=wanted == "all" or (wanted == "failures" and self._renders_at_once(agent, env, cell.policy)),
-            request_info=recordings[0].request_info,
-            acted=lambda i, *said: recordings[i].add_act(*said),
-            executed=lambda i, *done: recordings[i].add_action(*done),
         )
 
     def _sessions_of(self, agent: Agent, env: BatchEnv, number: int) -> list[Agent]:
