@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from vlagents_ray.learn.columns import answers, arrays
     from vlagents_ray.learn.publisher import Publisher
-    from vlagents_ray.learn.rollouts import Rollouts, RolloutStats
+    from vlagents_ray.learn.rollouts import RolloutPlan, Rollouts, RolloutStats
     from vlagents_ray.learn.training_evaluation import TrainingEvaluation
     from vlagents_ray.learn.vector_env import BatchVectorEnv, as_vector_env
 
@@ -20,6 +20,7 @@ _LATE = {
     "BatchVectorEnv": "vector_env",
     "Publisher": "publisher",
     "RolloutStats": "rollouts",
+    "RolloutPlan": "rollouts",
     "Rollouts": "rollouts",
     "TrainingEvaluation": "training_evaluation",
     "answers": "columns",
@@ -30,6 +31,7 @@ _LATE = {
 __all__ = [
     "BatchVectorEnv",
     "Publisher",
+    "RolloutPlan",
     "RolloutStats",
     "Rollouts",
     "TrainingEvaluation",
