@@ -78,7 +78,7 @@ def errors() -> Iterator[None]:
 def _model_of(error: ValidationError) -> tuple[type | None, str | None]:
     """Return the model that these settings are of, if users write it, and the option that sets its fields."""
     from vlagents_ray.evaluate import EvalConfig
-    from vlagents_ray.evaluate.exports.hub import HubSettings
+    from vlagents_ray.evaluate.exports.scores import HubSettings
     from vlagents_ray.evaluate.exports.vla_eval import VlaEvalSettings
 
     options = {EvalConfig: None, HubSettings: "--set", VlaEvalSettings: "--set"}

@@ -21,7 +21,7 @@ from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult, Worker
 from vlagents_ray.evaluate.plan.cases import EvalCase, cells
 from vlagents_ray.evaluate.plan.config import EvalConfig, canonical
 from vlagents_ray.evaluate.plan.jobs import Job
-from vlagents_ray.evaluate.results import database, lock
+from vlagents_ray.evaluate.results import database
 from vlagents_ray.evaluate.results.changes import (
     IDENTITY,
     MIX,
@@ -51,7 +51,7 @@ class Store:
         self._out = config.out
         with storing(config.out):
             self._out.mkdir(parents=True, exist_ok=True)
-            self._lock = lock.acquire(self._out)
+            self._lock = database.lock(self._out)
         self._run = 0
         self._accepts = config.accept_changes
         self._changes: list[Change] = []  # accepted in this run

@@ -24,7 +24,7 @@ from vlagents_ray.evaluate.robot.operator import Operator, Verdict, VisibleTrial
 from vlagents_ray.evaluate.robot.trial import PlayedTrial, Trial, WatchedRobot, play, rehearse, schedule
 from vlagents_ray.evaluate.robot.trial_log import LoggedTrial, TrialLog, logged_plan
 from vlagents_ray.evaluate.run import conclude
-from vlagents_ray.evaluate.workers.agents import AgentFactory, agents
+from vlagents_ray.evaluate.workers.rollout import AgentFactory, agents
 from vlagents_ray.ray_tools.private import output_printer, set_output_printer
 from vlagents_ray.registry import require
 from vlagents_ray.robot.loop import Robot, import_class

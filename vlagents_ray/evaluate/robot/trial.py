@@ -22,7 +22,7 @@ from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.evaluate.plan.config import RobotConfig, canonical
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job
 from vlagents_ray.evaluate.robot.operator import Operator, Verdict
-from vlagents_ray.evaluate.workers.agents import AgentFactory
+from vlagents_ray.evaluate.workers.rollout import AgentFactory
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.naming import plain
 from vlagents_ray.robot import Guard, LoopReport, Robot, Watchdog, run_loop

@@ -22,9 +22,8 @@ from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.evaluate.plan.config import EvalConfig
 from vlagents_ray.evaluate.plan.jobs import Job
-from vlagents_ray.evaluate.workers.agents import AgentFactory
 from vlagents_ray.evaluate.workers.cluster import CapacityMonitor, Placement, runtime_env, strategy, tail_at
-from vlagents_ray.evaluate.workers.rollout import Heartbeat, Report, Rollout
+from vlagents_ray.evaluate.workers.rollout import AgentFactory, Heartbeat, Report, Rollout
 from vlagents_ray.evaluate.workers.worker import PhaseTimeouts, WorkerHandle, Workers
 from vlagents_ray.ray_tools.head_monitor import HeadMonitor
 

@@ -7,16 +7,19 @@ episode instead of raising them, so that no exception has to survive pickling.
 from __future__ import annotations
 
 import contextlib
+import functools
 import logging
 import os
 import socket
 import sys
 import threading
 import traceback
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from time import monotonic, sleep
 from typing import Any
 
+from vlagents_ray.client import RemoteAgent
 from vlagents_ray.client.credentials import Credentials
 from vlagents_ray.client.transports.plasma import this_node
 from vlagents_ray.contract import require_match
@@ -38,18 +41,19 @@ from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult, Worker
 from vlagents_ray.evaluate.plan.cases import EvalCase, env_program
 from vlagents_ray.evaluate.plan.config import EvalConfig, PolicyConfig
 from vlagents_ray.evaluate.plan.jobs import Job
-from vlagents_ray.evaluate.workers.agents import AgentFactory
 from vlagents_ray.evaluate.workers.cluster import own_logs
 from vlagents_ray.interface import Agent
 from vlagents_ray.policies.base.checkpoint import used_checkpoints
 from vlagents_ray.policies.base.checkpoint_files import weights_of
-from vlagents_ray.policies.base.program import loaded_code
+from vlagents_ray.policies.base.program import Program, code_of_class, files_named, loaded_code
 from vlagents_ray.protocol.json_messages import plain_values
+from vlagents_ray.protocol.messages import RankName
 from vlagents_ray.ray_tools.git_state import code_of
 from vlagents_ray.registry import env_class
 
 log = logging.getLogger(__name__)
 
+AgentFactory = Callable[[PolicyConfig], Agent]
 FIRST_WAIT_S = 0.5  # s before the next attempt to reach a policy, doubled each time
 LONGEST_WAIT_S = 10.0
 LONG_S = 1.0  # s in one phase, after which a query also reports the stack
@@ -294,3 +298,46 @@ def _worker_info(policy: str, agent: Agent, env: BatchEnv) -> WorkerInfo:
         require_own(renderer)
     name = None if renderer is None else renderer.name
     return WorkerInfo(socket.gethostname(), this_node(), os.getpid(), policy, transport_of(agent), name)
+
+
+def agents(config: EvalConfig, own: Callable[[], Agent] | None, rank: RankName = "simulation") -> AgentFactory:
+    """Return the factory that a worker calls: `own`, or one of connections with this `rank`.
+
+    Raises:
+        ConfigError: A policy to connect to has no URL.
+    """
+    if own is not None:
+        return functools.partial(_own_agent, own)
+    for policy in config.policies:
+        if policy.url is None:
+            raise ConfigError(
+                f"policy {policy.name!r}: got no url, want that of its server, e.g. http://localhost:8000"
+            )
+    return functools.partial(_remote_agent, config, rank)
+
+
+def _own_agent(make: Callable[[], Agent], _policy: PolicyConfig) -> Agent:
+    return make()
+
+
+def _remote_agent(config: EvalConfig, rank: RankName, policy: PolicyConfig) -> RemoteAgent:
+    assert policy.url is not None  # noqa: S101 - `agents` has checked it
+    return RemoteAgent(
+        policy.url,
+        transport=policy.transport,
+        timeout_s=config.policy_timeout_s,
+        connect_timeout_s=config.connect_timeout_s,
+        codec=policy.codec,
+        rank=rank,
+        resume=False,  # an interrupted episode is played again, so that its result depends only on its key
+    )
+
+
+def factory_program(make: Callable[[], Agent]) -> Program:
+    """Return the files of the module that defines `make`, and those that the arguments of a `partial` name."""
+    settings: dict[str, Any] = {}
+    if isinstance(make, functools.partial):
+        settings = {**{str(i): value for i, value in enumerate(make.args)}, **make.keywords}
+        make = make.func
+    module = getattr(make, "__module__", None) or type(make).__module__
+    return code_of_class(module) | files_named(settings)

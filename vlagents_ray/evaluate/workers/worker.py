@@ -19,8 +19,7 @@ from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.evaluate.plan.config import EvalConfig, WorkerConfig
 from vlagents_ray.evaluate.plan.jobs import Job, JobQueue
-from vlagents_ray.evaluate.workers.agents import AgentFactory
-from vlagents_ray.evaluate.workers.rollout import Heartbeat, Report, Rollout
+from vlagents_ray.evaluate.workers.rollout import AgentFactory, Heartbeat, Report, Rollout
 
 WATCH_S = 1.0  # s between two queries of a busy worker
 GRACE_S = 5.0  # s that a call past its deadline has to fail by itself
