@@ -170,11 +170,7 @@ PACKAGES = ("vlagents-ray", "ray", "numpy", "torch", "jax", "transformers", "ler
 
 
 def measured_on(program: str = "vlagents-ray") -> dict[str, Any]:
-    """Return date, command, machine and versions as JSON values; call it before measuring, as it states the load.
-
-    Args:
-        program: The first words of the command, before the arguments of this process.
-    """
+    """Return date, command, machine and versions as JSON values; call it before measuring, as it states the load."""
     return {
         "date": datetime.datetime.now(datetime.timezone.utc).date().isoformat(),
         "command": " ".join([program, shlex.join(sys.argv[1:])]).rstrip(),

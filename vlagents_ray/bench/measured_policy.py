@@ -44,16 +44,7 @@ class QueuedTurn:
 
 
 class MeasuredPolicy:
-    """A policy behind the batch queue of an engine, loaded from `__enter__` to `__exit__`.
-
-    Args:
-        agent: The policy.
-        view: Makes the observation of a session, from the policy's contract and the session's number.
-        max_size: The largest number of observations in a forward pass.
-        patience: `batch.patience` of a deployment file.
-        batch_sizes: `batch.sizes` of a deployment file.
-        on_step: Called with each step of a long load.
-    """
+    """A policy behind the batch queue of an engine, loaded from `__enter__` to `__exit__`."""
 
     def __init__(
         self,

@@ -71,13 +71,7 @@ class RoundTripsOfAll:
 def measure_rtt(
     calls: int = 1000, *, transports: Sequence[str] = (), progress: Callable[[str], None] = lambda _: None
 ) -> RoundTripsOfAll:
-    """Measure `calls` round trips by each transport (rounded up to whole rounds), on a server started for them.
-
-    Args:
-        calls: Round trips of each client.
-        transports: Names of transports; by default all.
-        progress: Is called with lines of progress.
-    """
+    """Measure `calls` round trips by each transport (rounded up to whole rounds), on a server started for them."""
     own, skipped = own_clients(transports)
     return measure(own, calls, progress, skipped=skipped)
 
@@ -92,17 +86,7 @@ def measure(
     host: str = LOOPBACK,
     prefix: Sequence[str] = (),
 ) -> RoundTripsOfAll:
-    """Measure clients of ours, and others by name with servers of their own, in turns.
-
-    Args:
-        own: Clients of a server that is started on `host`.
-        calls: Round trips of each client.
-        progress: Is called with lines of progress.
-        others: Starts each other client, and its server.
-        skipped: Names of what is not measured, with the reasons.
-        host: The address of our server.
-        prefix: The first words of the command of each of our clients.
-    """
+    """Measure clients of ours, and others by name with servers of their own, in turns."""
     others = others or {}
     drivers: dict[str, Driver] = {}
     with contextlib.ExitStack() as stack:

@@ -85,13 +85,7 @@ class TunedSize:
 
 
 class Tuner:
-    """Measures what the plan says; what it leaves out is in `left_out`, a sentence each.
-
-    Args:
-        plan: The plan.
-        progress: Called with a line for each step.
-        began: The time from which the plan's minutes count, s, as `time.monotonic` says it; None: now.
-    """
+    """Measures what the plan says; what it leaves out is in `left_out`, a sentence each."""
 
     def __init__(
         self, plan: TunePlan, progress: Callable[[str], None] = lambda _: None, began: float | None = None
@@ -212,14 +206,7 @@ class Tuner:
             yield process, said
 
     def _sweep(self, process: LineProcess, variant: Variant, sizes: Sequence[int], parts: int) -> None:
-        """Measure a loaded variant with growing batches while these help, then again in turns while there is time.
-
-        Args:
-            process: The variant's process.
-            variant: The variant.
-            sizes: The batch sizes, ascending.
-            parts: The number of variants among which the time that is left is shared, this one included.
-        """
+        """Measure a loaded variant with growing batches while these help, then again in turns while there is time."""
         now = time.monotonic()
         until = now + (self._end - now) / parts
         found: list[TunedSize] = []
@@ -304,12 +291,10 @@ class Tuner:
 def largest_difference(actions: Sequence[np.ndarray], wanted: Sequence[np.ndarray]) -> float:
     """Return the largest difference of two lists of actions, as a share of the range of `wanted`.
 
+    An action is (D,) or (H, D); the one at i belongs to `wanted[i % len(wanted)]`.
+
     Each number of an action has a range of its own: the largest minus the smallest value among all actions and rows, or
     a tenth of its largest magnitude if that is more.
-
-    Args:
-        actions: The actions to judge, each (D,) or (H, D); the one at i belongs to `wanted[i % len(wanted)]`.
-        wanted: The actions to compare with.
 
     Returns:
         The difference; infinity if shapes differ, or if a value is not finite.
@@ -329,10 +314,6 @@ def largest_difference(actions: Sequence[np.ndarray], wanted: Sequence[np.ndarra
 
 def recorded_observations(folder: Path, count: int) -> list[Obs]:
     """Read observations, spread evenly over the trajectories below a folder and over their steps.
-
-    Args:
-        folder: A folder of results, of an evaluation with `record`, or a part of it.
-        count: The number of observations.
 
     Raises:
         ConfigError: There is no trajectory, or one cannot be read.

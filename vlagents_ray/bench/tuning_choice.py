@@ -71,10 +71,6 @@ def choose(points: Sequence[MeasuredPoint], goal: TuningGoal) -> MeasuredPoint:
 
     A variant must be 5 % better than one with fewer changes, or serve more robots.
 
-    Args:
-        points: All that were measured, with actions that pass.
-        goal: The goal.
-
     Raises:
         GoalMissed: None reaches the goal.
     """
@@ -90,13 +86,7 @@ def choose(points: Sequence[MeasuredPoint], goal: TuningGoal) -> MeasuredPoint:
 
 
 def default_point(points: Sequence[MeasuredPoint], goal: TuningGoal, max_size: int) -> MeasuredPoint | None:
-    """Return what the file gives as it is; None if that was not measured, or misses the goal.
-
-    Args:
-        points: All that were measured.
-        goal: The goal. For throughput, it is loaded with as many sessions as its largest batch has rows.
-        max_size: The file's largest batch.
-    """
+    """Return what the file gives as it is; None if that was not measured, or misses the goal."""
     own = [point for point in points if not point.variant.changes and point.sessions <= max_size]
     if goal.kind == "throughput":
         own = [point for point in own if point.sessions == max_size]
@@ -104,13 +94,7 @@ def default_point(points: Sequence[MeasuredPoint], goal: TuningGoal, max_size: i
 
 
 def chosen_settings(chosen: MeasuredPoint, batch: BatchArgs, fixed: Sequence[int] | None) -> dict[str, dict[str, Any]]:
-    """Return the settings of a deployment file to change, by section and key below `args`.
-
-    Args:
-        chosen: The chosen point.
-        batch: The file's settings of the batch queue.
-        fixed: `batch_sizes` of the file's policy, written or by default.
-    """
+    """Return the settings of a deployment file to change, by section and key below `args`."""
     config, queue = dict(chosen.variant.changes), dict[str, Any]()
     sizes = chosen.variant.changes.get("batch_sizes", fixed)
     if sizes and sizes[-1] > chosen.sessions:

@@ -202,14 +202,7 @@ def _at(config: EvalConfig, place: int, steps: list[int]) -> EvalConfig:
 
 
 def run_on_robot(config: EvalConfig, address: str | None, *, operator: str, unblinded: bool) -> None:
-    """Serve the policies that are not at a URL, play the trials, print the table.
-
-    Args:
-        config: The plan, with the robot's class.
-        address: A running Ray cluster; by default one is started on this machine.
-        operator: Where the person at the robot answers: "page" or "terminal".
-        unblinded: Play nothing, and write the results of the trials that have a verdict.
-    """
+    """Serve the policies that are not at a URL, play the trials, print the table."""
     from vlagents_ray.evaluate import print_summary
     from vlagents_ray.evaluate.robot import PageOperator, TerminalOperator, evaluate_on_robot, planned_cells, unblind
 

@@ -119,12 +119,7 @@ def require_packages(config: ServeDeploySchema) -> None:
 
 
 def missing_packages(name: str, *, checkout: bool = True) -> str | None:
-    """Say what a model family needs that this environment has not, with the cure; None if nothing.
-
-    Args:
-        name: The name of the policy or wrapper.
-        checkout: Whether the checkout that some families need counts.
-    """
+    """Say what a model family needs that this environment has not, with the cure; None if nothing."""
     modules, sources, requirements = _lacking(name)
     if not modules and not (sources and checkout):
         return None

@@ -55,13 +55,6 @@ def live_progress(
 ) -> Iterator[Progress]:
     """Serve the page of an evaluation for the length of the context, which lies within that of its Ray.
 
-    Args:
-        results: The folder of results.
-        urls: The URLs of the policies. The sessions of those that are in this process's Ray cluster are shown, too.
-        address: (host, port) of the page; None serves none.
-        shown: The progress on the terminal.
-        goes_on: As for `ProgressDocument`.
-
     Yields:
         The progress to evaluate with.
     """

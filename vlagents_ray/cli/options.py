@@ -129,11 +129,6 @@ def parse_time(text: str, option: str) -> float:
 def read_run_file(file: Path, kind: str, keys: str) -> dict[str, Any]:
     """Read a YAML file of the settings of a run; results go to runs/NAME unless it names a folder.
 
-    Args:
-        file: The file.
-        kind: What it is, for messages.
-        keys: Its most important keys, for messages.
-
     Raises:
         ConfigError: There is no such file, or it holds no mapping.
     """

@@ -40,11 +40,6 @@ _STARTING_S = 30.0  # how long to wait for a server at a URL
 def served(config: EvalConfig, address: str | None = None, *, replica_per_gpu: bool = False) -> Iterator[EvalConfig]:
     """Serve the policies that are not at a URL for the length of the context.
 
-    Args:
-        config: The evaluation.
-        address: A running Ray cluster; by default one is started on this machine.
-        replica_per_gpu: A policy has a replica on each GPU of the cluster at `address`, less what workers take.
-
     Yields:
         The evaluation with the URLs of all its policies.
     """
@@ -100,10 +95,6 @@ def _require_match(config: EvalConfig, parts: Mapping[str, ServeDeploySchema]) -
 
 def resolve_policies(config: EvalConfig, *, ask: bool = True) -> tuple[EvalConfig, dict[str, ServeDeploySchema]]:
     """Find out what the policies of an evaluation are and where.
-
-    Args:
-        config: The evaluation.
-        ask: Request the metadata of a server at a URL, to record what it serves.
 
     Returns:
         The evaluation with names and URLs of its policies; and the deployments to start for it, by application.

@@ -102,15 +102,7 @@ def serve_command(
 def connection_lines(
     config: ServeDeploySchema, urls: Mapping[str, str], host: str, keys: Path | None = None, *, insecure: bool = False
 ) -> Iterator[str]:
-    """Say of each application its URL, its policy, its page, and where clients of other systems connect.
-
-    Args:
-        config: The deployment, in which gateways have their hosts.
-        urls: Application -> its URL, as this machine reaches it.
-        host: Where the server listens.
-        keys: The file of keys that was named to the server, beside those of the deployment.
-        insecure: Whether it lets everybody in, whatever the deployment says.
-    """
+    """Say of each application its URL, its policy, its page, and where clients of other systems connect."""
     from vlagents_ray.serve.config.deployment import ServerArgs
     from vlagents_ray.serve.dialects.routes import describe
     from vlagents_ray.serve.launch.deployment_file import IMPORT_PATH, own_settings

@@ -101,14 +101,7 @@ def tune_command(
 
 
 def tune_evaluation(file: Path, *, minutes: float, max_workers: int | None, began: float) -> None:
-    """Serve the policies of a file of runs, measure, and print the numbers to change.
-
-    Args:
-        file: The file of runs.
-        minutes: That the measurements may take, from `began`.
-        max_workers: The most workers to try; None: twice as many as this machine has cores.
-        began: s of `time.monotonic`.
-    """
+    """Serve the policies of a file of runs, measure, and print the numbers to change."""
     from vlagents_ray.bench.evaluation import EvaluationTuner
     from vlagents_ray.cli.evaluate import read_run
     from vlagents_ray.cli.policies import served

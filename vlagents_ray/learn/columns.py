@@ -131,11 +131,7 @@ class RowMemory:
     """
 
     def __init__(self, most_free: int) -> None:
-        """Begin without memory.
-
-        Args:
-            most_free: Blocks that are kept while nobody views them.
-        """
+        """Begin without memory."""
         self._most_free = most_free
         self._free: list[bytearray] = []
 

@@ -71,9 +71,6 @@ class LocalAgent(Agent):
 def candidate(source: str) -> Iterator[Sessions]:
     """Load a policy for the time of the context.
 
-    Args:
-        source: The URL of a server; or a registered name or a deployment file, which is loaded in this process.
-
     Yields:
         Opens its sessions, which share its batches.
     """
@@ -219,12 +216,6 @@ def replay(
 
     A session is reset with its first recorded observation, its instruction and its options, and then gets each of its
     observations in order, whatever it answers.
-
-    Args:
-        folder: A LeRobotDataset, or a folder of those that a server recorded.
-        sessions: Opens sessions of the policy.
-        plan: What is replayed.
-        progress: Gets the number of sessions that are done, and of all.
 
     Raises:
         ConfigError: There is no dataset, its actions are not the policy's, or a name is unknown.

@@ -102,13 +102,7 @@ class Allocation:
         return Ports(*range(first, first + _PORTS))
 
     def ray_start(self, head: str, folder: str) -> list[str]:
-        """Return the command that starts Ray on this node with the allocated resources.
-
-        Args:
-            head: The address of the first node.
-            folder: A folder on this node for Ray's sockets, logs and spilled objects, in a subfolder that Ray opens to
-                every user.
-        """
+        """Return the command that starts Ray on this node with the allocated resources."""
         ports = self.ports
         if self.node == 0:
             where = ["--head", f"--node-ip-address={head}", f"--port={ports.gcs}", "--include-dashboard=false"]
@@ -213,11 +207,6 @@ def run_command(arguments: Sequence[str]) -> None:
 def wait_for_nodes(address: str, number: int, timeout_s: float = _NODES_S) -> int:
     """Wait until a number of nodes have joined the cluster.
 
-    Args:
-        address: The address of Ray's head, host:port.
-        number: The number of nodes.
-        timeout_s: The time limit, s; afterwards the process exits with a list of the nodes that joined.
-
     Returns:
         The number of CPUs of the cluster.
     """
@@ -291,11 +280,6 @@ def announce(words: Sequence[str]) -> None:
 
 def connection_info(apps: Mapping[str, str], port: int, environ: Mapping[str, str]) -> dict[str, Any]:
     """Return what a client needs to connect.
-
-    Args:
-        apps: The applications and their routes.
-        port: The server's port.
-        environ: The environment of the job.
 
     Returns:
         The content of the file, with the URL of each application, the key, and a command for a tunnel.

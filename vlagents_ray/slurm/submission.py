@@ -46,10 +46,6 @@ _SBATCH_S = 120.0
 def split(words: Sequence[str], known: Mapping[str, bool]) -> tuple[list[str], dict[str, str | None]]:
     """Split a command line.
 
-    Args:
-        words: The arguments.
-        known: The command's options ("--policy"), and whether each has a value.
-
     Returns:
         The command's own arguments, and sbatch's options by their long names; the value of an option without one is
         None.
@@ -183,9 +179,6 @@ class SubmissionFailed(VLAgentsError):
 
 def submit(script: Script) -> str:
     """Write a script, submit it, and record the job in `job.json` beside the script.
-
-    Args:
-        script: The script.
 
     Returns:
         The job's number.

@@ -228,16 +228,7 @@ class LoopView:
             yield
 
     def add(self, obs: Obs, act: Act, executed: np.ndarray | None, tick: int, work_s: float, stop: str = "") -> None:
-        """Show a tick; never waits.
-
-        Args:
-            obs: The observation.
-            act: What the agent answered.
-            executed: The action that was applied, (D,) float32; None if none was.
-            tick: The tick of the control loop.
-            work_s: The time from the tick until the action was applied, s.
-            stop: Why the robot is stopped, if it is.
-        """
+        """Show a tick; never waits."""
         if not any(viewer.has_room for viewer in self._viewers):
             for viewer in self._viewers:
                 viewer.dropped += 1

@@ -94,11 +94,6 @@ def digest_of(path: Path) -> FileDigest:
 def pack(folder: Path, archive: Path, written_by: dict[str, JsonValue]) -> str:
     """Write all files of `folder` into the bundle `archive`, whole or not at all; the same files give the same bytes.
 
-    Args:
-        folder: Holds what a bundle may hold, and nothing else.
-        archive: The file to write.
-        written_by: The versions here.
-
     Returns:
         The SHA-256 of the manifest, which stands for everything in the bundle.
 
@@ -129,11 +124,6 @@ def _member(name: str, how: int = zipfile.ZIP_DEFLATED) -> zipfile.ZipInfo:
 
 def unpack(archive: Path, folder: Path, *, most_bytes: int = MOST_BYTES) -> tuple[Manifest, str, list[str]]:
     """Write the files of a bundle into `folder`, without its manifest.
-
-    Args:
-        archive: The bundle.
-        folder: An empty folder.
-        most_bytes: The most bytes that all files may have together.
 
     Returns:
         The manifest, its SHA-256, and the differences between the manifest and the files, a sentence each.
@@ -250,10 +240,6 @@ def versions_of(text: str) -> dict[str, str]:
 
 def compared(there: dict[str, str], here: dict[str, str]) -> tuple[int, list[str]]:
     """Compare two environments.
-
-    Args:
-        there: Versions by the names of packages.
-        here: The same of this environment.
 
     Returns:
         The number of packages that are the same, and the others of `there`, a phrase each.

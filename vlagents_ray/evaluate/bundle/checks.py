@@ -68,13 +68,7 @@ def check_cells(results: Results) -> Finding:
 
 
 def check_derived(stated: dict[str, bytes], computed: Path, *, same_software: bool) -> Iterator[Finding]:
-    """Compare the summary, the report and the settings of the bundle with those computed from its database here.
-
-    Args:
-        stated: The bundle's files by name.
-        computed: The folder with the same files, written here.
-        same_software: Whether the same versions wrote the bundle: only then a page must be the same to the byte.
-    """
+    """Compare the summary, the report and the settings of the bundle with those computed from its database here."""
     yield _check_summary(stated.get(SUMMARY), (computed / SUMMARY).read_bytes())
     if REPORT not in stated:
         yield Finding(REPORT, "differs", "is not in the bundle")

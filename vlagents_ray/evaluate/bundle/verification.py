@@ -180,11 +180,6 @@ def replay_actions(cell: CellResults, episode: Episode, trajectory: Trajectory) 
 
     Images are neither rendered nor compared. State, gripper, rewards and success are, bit by bit.
 
-    Args:
-        cell: The cell; `require_harmless` first if it comes from another machine.
-        episode: The episode of it.
-        trajectory: Its recording.
-
     Raises:
         ConfigError: The environment does not take these options, or is unknown here; also `MissingDependency`.
         EnvFailed: The simulator failed.
@@ -264,13 +259,7 @@ def _is_plain(value: object) -> bool:
 
 
 def check_replays(results: Results, most: int, *, trust: bool) -> Iterator[Finding]:
-    """Play the recorded actions of up to `most` episodes, of as many cells as possible.
-
-    Args:
-        results: Those of the bundle.
-        most: The number of episodes.
-        trust: Whether environments that are not registered, and options that could name files, are taken.
-    """
+    """Play the recorded actions of up to `most` episodes, of as many cells as possible."""
     if not most:
         yield Finding("replay", "not checked", "was not asked for (--replay 0)")
         return

@@ -41,13 +41,6 @@ class PlayedEpisode(EpisodeObserver):
         State, gripper, reward and success of every step, and the images that were rendered before, must be the same to
         the bit. The images between them then show this episode.
 
-        Args:
-            env: The environments, none of which depends on the others.
-            seed: The seed of the episode.
-            options: The options of its reset.
-            watch: Called before the reset and each step.
-            record: Called with every observation.
-
         Returns:
             What differs, upon which nothing more is executed; None if nothing does.
         """

@@ -177,13 +177,7 @@ class ProgressDocument(ResultsDocument, Progress):
     """Describes an evaluation that calls it as its `Progress`. The page's thread may read it meanwhile."""
 
     def __init__(self, out: Path, shown: Progress | None = None, *, goes_on: bool = False) -> None:
-        """Describe the results in a folder.
-
-        Args:
-            out: The folder, which may not be there yet.
-            shown: Gets each call, too: the progress on the terminal.
-            goes_on: Whether further evaluations follow each other, as those of a training's checkpoints.
-        """
+        """Describe the results in a folder."""
         super().__init__(out)
         self.goes_on = goes_on
         self._shown = shown or Progress()

@@ -145,12 +145,7 @@ class Operator(Protocol):
 
 
 def start_pictures(out: Path, place: str) -> dict[str, Path]:
-    """Return the JPEG of each camera at the first start of a scene; {} before that.
-
-    Args:
-        out: The folder of results.
-        place: The scene's name in files.
-    """
+    """Return the JPEG of each camera at the first start of a scene; {} before that."""
     return {path.stem: path for path in sorted((out / SCENES / place).glob("*.jpg"))}
 
 
@@ -163,10 +158,6 @@ def save_start(out: Path, place: str, obs: Obs) -> None:
 
 def save_overlay(start: Path, now: np.ndarray) -> Path:
     """Save the mean of a start picture and the same camera's picture now, beside the former's folder.
-
-    Args:
-        start: The JPEG of the start picture.
-        now: (H, W, 3) uint8.
 
     Returns:
         The new JPEG; it has the size of `now`, and only `now` if the sizes differ.

@@ -169,13 +169,6 @@ def play(
 ) -> PlayedTrial:
     """Play one attempt at a trial. The robot is stopped however it ends.
 
-    Args:
-        trial: The trial.
-        robot: The robot.
-        factory: Makes the policy's agent.
-        operator: Watches, and may stop the trial.
-        recording: The folder of a new dataset with the attempt; None records nothing.
-
     Returns:
         The trial; with the status "policy_error" if the policy failed.
 

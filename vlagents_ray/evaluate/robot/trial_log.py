@@ -160,10 +160,6 @@ class TrialLog:
 def logged_plan(out: Path, key: str | None) -> EvalConfig:
     """Return the plan of the log in a folder, with the policies' URLs.
 
-    Args:
-        out: The folder.
-        key: The plan's key; None: the one that was drawn for the folder.
-
     Raises:
         ConfigError: The folder has no log, or it is of another key.
     """
