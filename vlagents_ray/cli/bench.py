@@ -10,7 +10,8 @@ import typer
 from rich.text import Text
 
 from vlagents_ray.cli.console import errors, out, progress, save, table
-from vlagents_ray.cli.options import Set, parse_counts, parse_dims, parse_list, parse_policy, parse_settings
+from vlagents_ray.cli.options import Set, parse_counts, parse_dims, parse_list, parse_settings
+from vlagents_ray.errors import ConfigError
 
 if TYPE_CHECKING:
     from vlagents_ray.bench.throughput import ThroughputPlan
@@ -55,14 +56,8 @@ def bench_throughput(
     policy: Annotated[
         str | None, typer.Option(help="A registered name or module:Class; default: noop, 20 ms + 1 ms an observation.")
     ] = None,
-    config: Annotated[str, typer.Option(help="The policy's settings, as JSON.")] = "{}",
-    model: Annotated[
-        str | None, typer.Option(help="A transformer with random weights, in the policy's place: tiny, pi0, openvla.")
-    ] = None,
-    device: Annotated[str, typer.Option(help="Where the transformer runs: cpu, cuda.")] = "cpu",
-    num_gpus: Annotated[
-        float | None, typer.Option(min=0, help="That Ray gives to the replica; default: 1 for --device cuda, else 0.")
-    ] = None,
+    settings: Set = [],  # noqa: B006
+    num_gpus: Annotated[float, typer.Option(min=0, help="That Ray gives to the replica.")] = 0.0,
     json_file: Json = None,
 ) -> None:
     """Actions a second of many clients on one replica, against the ideal, or the bare policy in the same run."""
@@ -71,11 +66,14 @@ def bench_throughput(
 
     with errors():
         origin = measured_on()
-        chosen = parse_policy(policy, config, model, device)
+        if settings and policy is None:
+            raise ConfigError("--set: is for --policy; name one")
+        chosen: dict[str, Any] = (
+            {} if policy is None else {"policy": policy, "config": parse_settings(settings, "--set")}
+        )
         counts = parse_counts(clients, "--clients")
-        gpus = float(device.startswith("cuda")) if num_gpus is None else num_gpus
         plan: ThroughputPlan = ThroughputPlan(
-            **chosen, num_gpus=gpus, batch=batch, clients=counts, seconds=seconds, rounds=rounds,
+            **chosen, num_gpus=num_gpus, batch=batch, clients=counts, seconds=seconds, rounds=rounds,
             robot_seconds=robot_seconds, transports=parse_list(transports),
         )  # fmt: skip
         found = measure_throughput(plan, progress)

@@ -6,7 +6,6 @@ import dataclasses
 import datetime
 import functools
 import inspect
-import json
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_type_hints
@@ -150,25 +149,3 @@ def is_run_file(file: Path) -> bool:
     except (OSError, yaml.YAMLError):
         return False  # who reads it as a deployment file says what is wrong
     return isinstance(document, dict) and "suites" in document
-
-
-def parse_policy(policy: str | None, config: str, model: str | None, device: str) -> dict[str, Any]:
-    """Return policy and settings of `--policy`, or of `--model`; none of them for neither."""
-    try:
-        settings = json.loads(config)
-    except ValueError as error:
-        raise ConfigError(f"--config: got {config!r}, want JSON ({error})") from error
-    if not isinstance(settings, dict):
-        raise ConfigError(f"--config: got {config!r}, want a JSON object")
-    if model is not None:
-        if policy is not None:
-            raise ConfigError("--policy and --model exclude each other; keep one")
-        return {
-            "policy": "vlagents_ray.bench.model:SizedPolicy",
-            "config": {"size": model, "device": device, **settings},
-        }
-    if policy is not None:
-        return {"policy": policy, "config": settings}
-    if settings:
-        raise ConfigError("--config: is for --policy or --model; name one")
-    return {}
