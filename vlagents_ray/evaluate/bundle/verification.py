@@ -34,12 +34,13 @@ from vlagents_ray.evaluate.bundle.checks import (
     same_software,
 )
 from vlagents_ray.evaluate.episode.episode import options_of_reset
-from vlagents_ray.evaluate.episode.failures import checked_obs, checked_step, env_side
+from vlagents_ray.evaluate.episode.failures import env_side
+from vlagents_ray.evaluate.episode.second_pass import play_actions
 from vlagents_ray.evaluate.report.page import FILE as REPORT
 from vlagents_ray.evaluate.results.database import FILE as DATABASE
 from vlagents_ray.evaluate.results.reader import CellResults, Episode, Results
 from vlagents_ray.evaluate.results.summary import FILE as SUMMARY
-from vlagents_ray.interface import Act, Obs
+from vlagents_ray.interface import Obs
 from vlagents_ray.registry import env_suite, names
 
 _MOST_DERIVED = 2**28  # bytes of a summary, a report, settings or a lock
@@ -188,19 +189,14 @@ def replay_actions(cell: CellResults, episode: Episode, trajectory: Trajectory) 
     with env_side("make"):
         env = make_batch(cell.env, 1, **(cell.settings.get("env_options") or {}))
     try:
-        env.looked_at = False
         with env_side("reset"):
-            contract = env.contract
             begin = options_of_reset(env, key.episode, cell.settings.get("reset_options"))
-            [first] = env.reset(seeds=[key.seed], options=[begin])
         compared = _Comparison(trajectory)
-        compared.add(0, checked_obs(first, contract, "reset", images=False))
-        for number, action in enumerate(trajectory.actions, 1):
-            with env_side("step"):
-                [obs], [reward], [terminated], [truncated], [info] = env.step([Act(action)])
-                step = checked_step(obs, reward, terminated, truncated, info, contract, images=False)
-            compared.add(number, step.obs)
-            compared.add_outcome(number, step.reward, step.success)
+        played = play_actions(env, key.seed, begin, trajectory.actions, images=False)
+        for number, (obs, step) in enumerate(played):
+            compared.add(number, obs)
+            if step is not None:
+                compared.add_outcome(number, step.reward, step.success)
         with env_side("describe"):
             return compared.result(env.describe())
     finally:

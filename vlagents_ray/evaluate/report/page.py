@@ -15,7 +15,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import Environment
 from markupsafe import Markup
 
 from vlagents_ray.evaluate.artifacts.storage import storing, whole
@@ -153,14 +153,7 @@ def _solved(summary: Summary) -> Figure:
 
 @cache
 def _templates() -> Environment:
-    """The templates escape whatever they are given: names of tasks, instructions and errors are text of others."""
-    env = Environment(
-        loader=PackageLoader(__package__ or ""),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    env = charts.templates(__package__ or "")
     formats = ("duration", "interval", "interval_name", "moment", "number", "p_value", "percent", "points", "quantity")
     env.filters.update({name: getattr(charts, name) for name in formats})
     env.filters.update(interval_glyph=charts.interval_glyph, px=charts.px, json=partial(json.dumps, ensure_ascii=False))

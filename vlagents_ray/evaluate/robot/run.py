@@ -122,33 +122,28 @@ def planned_cells(config: EvalConfig) -> list[EvalCase]:
     return cells(config)
 
 
+@dataclasses.dataclass(slots=True)
 class _RemainingTrials:
     """The trials that are left, one after the other."""
 
-    def __init__(
-        self,
-        config: EvalConfig,
-        operator: Operator,
-        robot: WatchedRobot,
-        factory: AgentFactory,
-        log: TrialLog,
-        trials: Sequence[Trial],
-    ) -> None:
-        self._config = config
-        self._operator = operator
-        self._robot = robot
-        self._factory = factory
-        self._log = log
-        self._trials = trials
-        self._message = ""  # for the operator, of the trial before
-        self._stopping: dict[tuple[str, str], dict[str, Stopping]] = {}  # by task and cell
-        for trial in trials:
+    _config: EvalConfig
+    _operator: Operator
+    _robot: WatchedRobot
+    _factory: AgentFactory
+    _log: TrialLog
+    _trials: Sequence[Trial]
+    _message: str = ""  # for the operator, of the trial before
+    _stopping: dict[tuple[str, str], dict[str, Stopping]] = dataclasses.field(default_factory=dict)  # by task and cell
+
+    def __post_init__(self) -> None:
+        for trial in self._trials:
             cell = trial.job.cell
-            if config.stop is not None:
+            if (stop := self._config.stop) is not None:
                 found = self._stopping.setdefault(trial.task, {})
-                found.setdefault(cell.fingerprint, Stopping(config.stop, cell.suite.seeds, cell.planned))
-        for number, logged in log.finished.items():
-            self._count(trials[number - 1], result_of(trials[number - 1], logged))
+                found.setdefault(cell.fingerprint, Stopping(stop, cell.suite.seeds, cell.planned))
+        for number, logged in self._log.finished.items():
+            trial = self._trials[number - 1]
+            self._count(trial, result_of(trial, logged))
 
     def play(self) -> None:
         left = [trial for trial in self._trials if trial.number not in self._log.finished and not self._is_over(trial)]
