@@ -22,7 +22,7 @@ from typing import Any, get_args
 import numpy as np
 
 from vlagents_ray.bench.line_client import WARM_UP, die_with_parent, obey, own_stdout, timed
-from vlagents_ray.bench.line_process import CALL_S, START_S, Driver, LineProcess, ProcessDriver, our_environment
+from vlagents_ray.bench.line_process import CALL_S, START_S, Driver, LineProcess, our_environment
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.transports.select import TransportName
 from vlagents_ray.errors import ConfigError
@@ -210,7 +210,7 @@ def connected(client: OwnClient, url: str, app: str, prefix: Sequence[str] = ())
     settings = json.dumps({"url": url, "transport": client.transport, "codec": client.codec})
     command = [*prefix, sys.executable, "-m", "vlagents_ray.bench.clients", settings]
     with LineProcess(client.name, command, our_environment()) as child:
-        yield ProcessDriver(child)
+        yield child
 
 
 def main() -> None:

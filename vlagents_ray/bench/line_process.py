@@ -10,7 +10,6 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -85,6 +84,16 @@ class LineProcess:
         self.send(line)
         return self.read(timeout_s)
 
+    def ready(self) -> dict[str, Any]:
+        """Read the first line of a client, which is connected and warm then: what it says of itself."""
+        said: dict[str, Any] = self.read(START_S)
+        return said
+
+    def measure(self, calls: int) -> list[float]:
+        """Let a client make calls; returns the milliseconds of each."""
+        taken: list[float] = self.request(str(calls), CALL_S + calls)
+        return taken
+
     def close(self) -> None:
         """End its standard input, which ends it; kill it if that does not."""
         if self._process.stdin is not None:
@@ -119,21 +128,6 @@ class Driver(Protocol):
 
     def measure(self, calls: int) -> list[float]:
         """Make calls; returns the milliseconds of each."""
-
-
-@dataclass(frozen=True, slots=True)
-class ProcessDriver:
-    """A client in a process of its own."""
-
-    child: LineProcess
-
-    def ready(self) -> dict[str, Any]:
-        said: dict[str, Any] = self.child.read(START_S)
-        return said
-
-    def measure(self, calls: int) -> list[float]:
-        taken: list[float] = self.child.request(str(calls), CALL_S + calls)
-        return taken
 
 
 def our_environment() -> dict[str, str]:
