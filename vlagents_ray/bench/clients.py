@@ -1,4 +1,4 @@
-"""Clients of ours, each in a process of its own or a Ray actor: `python -m vlagents_ray.bench.clients JSON`.
+"""Our clients, each in a process or a Ray actor: `python -m vlagents_ray.bench.clients JSON`.
 
 A process holds one client, which makes calls when it is its turn (`BenchCaller`), or several, which make load
 (`LoadGenerator`).

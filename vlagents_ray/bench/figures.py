@@ -225,7 +225,7 @@ class ComparedFigure:
 
 @dataclass(frozen=True, slots=True)
 class FigureComparison:
-    """What two files have in common, and in what they differ besides figures."""
+    """The common figures of two files, and their other differences."""
 
     figures: tuple[ComparedFigure, ...]
     only_old: tuple[str, ...]  # figures that one file alone has
@@ -250,7 +250,7 @@ def compare_figures(old: Mapping[str, Any], new: Mapping[str, Any]) -> FigureCom
 
 
 def read_figures(file: Path) -> dict[str, Any]:
-    """Read a file of figures; raises `ConfigError` if it is none."""
+    """Read a file of figures; raises `ConfigError` for any other file."""
     try:
         found = json.loads(file.read_text())
     except (OSError, ValueError) as error:

@@ -28,7 +28,7 @@ _LATE_S = 600.0  # a first batch may be compiled
 
 @dataclass(frozen=True, slots=True)
 class QueuedTurn:
-    """What a number of sessions got in one measurement."""
+    """The figures of a number of sessions in one measurement."""
 
     actions_per_s: float
     mean_batch: float

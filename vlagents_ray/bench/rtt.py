@@ -1,7 +1,7 @@
 """Round trips of one `act` by every transport, interleaved in one run.
 
 The observation is that of the paper's measurement: two 224x224 RGB cameras and seven joints. All ways
-take turns in short rounds, in an order drawn anew each time, so that whatever else the machine does hits
+take turns in short rounds, in a new random order each time, so that other load on the machine hits
 them alike. Every client is a process of its own (those that need Ray, an actor); every server stays up
 and idle while it is not its turn. So each turn begins cold, which is what the 99th percentile then shows: the ways on
 the node make calls without a break, too, at the end.

@@ -1,4 +1,4 @@
-"""Measures variants of a deployment file's settings, each in a process of its own, within a given time."""
+"""Measures variants of a deployment file's settings, each in its own process, within a given time."""
 
 from __future__ import annotations
 
@@ -293,7 +293,7 @@ def largest_difference(actions: Sequence[np.ndarray], wanted: Sequence[np.ndarra
 
     An action is (D,) or (H, D); the one at i belongs to `wanted[i % len(wanted)]`.
 
-    Each number of an action has a range of its own: the largest minus the smallest value among all actions and rows, or
+    Each number of an action has its range: the largest minus the smallest value among all actions and rows, or
     a tenth of its largest magnitude if that is more.
 
     Returns:

@@ -1,4 +1,4 @@
-"""What all commands print on, and how errors look there."""
+"""The console of all commands, and how errors are printed there."""
 
 from __future__ import annotations
 

@@ -140,7 +140,7 @@ def doctor(port: Annotated[int, typer.Option(help="The port that a server would 
 
 @env.callback()
 def _group() -> None:
-    """Keep `make` a command of its own."""
+    """Keep `make` a subcommand."""
 
 
 @env.command("make")

@@ -39,7 +39,7 @@ def serve_command(
         list[str], typer.Option("--serve-set", metavar="KEY=VALUE", help="A setting of the server: batch.max_size=8.")
     ] = [],  # noqa: B006
     vlagents_port: Annotated[
-        int | None, typer.Option(min=1, max=65535, help="Let clients of the package vlagents in at this port, too.")
+        int | None, typer.Option(min=1, max=65535, help="Also accept clients of the package vlagents, at this port.")
     ] = None,
     rerun: Annotated[
         str | None,
@@ -118,8 +118,9 @@ def connection_lines(
         settings = ", ".join(f"{name}={value!r}" for name, value in own_settings(app).items())
         yield f"  policy: {args.policy}" + (f" ({settings})" if settings else "")
         keyed = not insecure and (keys is not None or _wants_key(args))
-        yield f"  how to talk to it: {_page(url) if keyed else f'{url}/docs'}"
-        if not (insecure or args.access.insecure):  # then nobody may watch
+        curl = 'curl -H "Authorization: Bearer $VLAGENTS_RAY_API_KEY" ' if keyed else ""
+        yield f"  how to talk to it: {curl}{url}/docs"
+        if not (insecure or args.access.insecure):  # without keys there is no watching
             yield f"  what it does now: {url}/live"
         for name, one in describe(args.dialects).items():
             places = [one["address"]] if "address" in one else [_address(url, path) for path in one["paths"]]
@@ -131,10 +132,6 @@ def _wants_key(args: ServerArgs) -> bool:
         return args.access.keys() is not None
     except ConfigError:  # they are on the cluster's machines, not on this one
         return True
-
-
-def _page(url: str) -> str:
-    return f'curl -H "Authorization: Bearer $VLAGENTS_RAY_API_KEY" {url}/docs'
 
 
 def _address(url: str, path: str) -> str:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class Wanted(str, Enum):
-    """What `--for` takes."""
+    """The values of `--for`."""
 
     robots = "robots"
     throughput = "throughput"

@@ -189,7 +189,9 @@ class _Run:
             self._progress.begin(self._store.cells, self._recorded, len(self._queue))
             try:
                 with (InProcessWorkers if self._in_process else WorkerPool)(self._config, factory) as pool:
-                    while not stop.is_set() and not self._deadline.is_over and self._has_more(pool):
+                    while not stop.is_set() and not self._deadline.is_over:
+                        if not pool.busy and not (len(self._queue) and self._deadline.leaves_room):
+                            break
                         self._poll_pool(pool)
                     state = OutOfTime.why if len(self._queue) or pool.busy else "complete"
                     if not stop.is_set():
@@ -199,9 +201,6 @@ class _Run:
                     return state, conclude(self._config, self._store, state)
             finally:
                 self._progress.end()
-
-    def _has_more(self, pool: Workers) -> bool:
-        return pool.busy or (len(self._queue) > 0 and self._deadline.leaves_room)
 
     def _poll_pool(self, pool: Workers) -> None:
         if self._deadline.leaves_room:

@@ -32,7 +32,7 @@ CLOSE_S = 120.0  # for trackers to send what is buffered
 
 @dataclass(frozen=True, slots=True)
 class About:
-    """What a tracker's run is about: one policy of one folder of results, with all its checkpoints."""
+    """The subject of a tracker's run: one policy of one folder of results, with all its checkpoints."""
 
     out: Path
     project: str
@@ -101,7 +101,7 @@ class WandbRun(TrackerRun):
 
 
 class TrackioRun(WandbRun):
-    """As wandb's, without a summary and artifacts; named after policy and id, as trackio identifies runs by name."""
+    """A run as in wandb, without a summary and artifacts. Its name has the id, as trackio identifies runs by name."""
 
     def __init__(self, about: About) -> None:
         self._trackio: Any = require("trackio")
@@ -252,7 +252,7 @@ class TrackerFeed:
 
 
 def _parts(results: Results) -> list[tuple[str, list[CellResults], Group]]:
-    """What is logged together, as (the key under which that is noted, cells, aggregates): each cell, each policy id."""
+    """Return what is logged together, as (key, cells, aggregates): each cell, then each policy id."""
     summary = summarize(results)
     alone = [(cell.cell, [cell], group) for cell, group in zip(results.cells, summary.cells, strict=True)]
     totals = zip(results.contenders, summary.totals, strict=True)

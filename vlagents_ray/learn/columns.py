@@ -117,7 +117,7 @@ def at_rows(pa: Any, values: np.ndarray, rows: np.ndarray) -> Any:
     return pa.ListArray.from_arrays(pa.array(offsets), tensors(pa, values))
 
 
-# Memory for the images of episodes, which is used again when nobody views it any more.
+# Memory for the images of episodes, which is used again once no view of it is left.
 
 
 _SMALL = 2**20  # bytes of memory that `malloc` provides as fast

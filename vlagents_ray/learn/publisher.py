@@ -157,7 +157,7 @@ class EngineTarget(WeightsTarget):
         self._own = OwnWeights("this process", engine.weights)
 
     def push(self, named: Mapping[str, Any], options: PushOptions) -> int:
-        return asyncio.run(WeightPusher(self._own, _nobody).push(named, options)).version
+        return asyncio.run(WeightPusher(self._own, _no_siblings).push(named, options)).version
 
     def versions(self) -> list[int]:
         return [asyncio.run(self._own.newest_weights()).number]
@@ -267,5 +267,5 @@ def _unknown(url: str, error: Exception) -> PolicyUnavailable:
     )
 
 
-async def _nobody() -> Sequence[WeightsReplica]:
+async def _no_siblings() -> Sequence[WeightsReplica]:
     return ()

@@ -52,7 +52,7 @@ def observation_space(spaces: Any, contract: Contract, observation: Observation)
 
 
 def observed(obs: Obs, observation: Observation) -> Any:
-    """Return an observation as a member of its space, in arrays of its own.
+    """Return an observation as a member of its space, in new arrays.
 
     Args:
         obs: The observation of the environment.

@@ -168,7 +168,7 @@ def worst(errors: list[FrameError]) -> list[FrameError]:
 
 @dataclass(frozen=True, slots=True)
 class ReplayPlan:
-    """What is replayed, and how."""
+    """The settings of a replay."""
 
     episodes: Sequence[int] | None = None  # of each dataset; None: all
     horizon: int | None = None  # most rows of a chunk that are compared; None: all that both have

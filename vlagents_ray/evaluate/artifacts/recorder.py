@@ -47,7 +47,7 @@ class EpisodeRecorder(EpisodeObserver):
 
     @property
     def wants_images(self) -> EpisodeChoice:
-        """Of which episodes the images of every step are needed."""
+        """The episodes of which the images of every step are needed."""
         return "none"
 
     def begin(self, job: Job) -> None:
@@ -220,7 +220,7 @@ class EpisodeViews:
 
 
 def save_views(config: EvalConfig, cell: EvalCase, result: EpisodeResult, files: dict[str, bytes]) -> None:
-    """Write the files of an episode as `FOLDER/POLICY/SUITE/ENV/epNNNN_seedS_OUTCOME.rrd`, and `.mcap` likewise."""
+    """Write the files of an episode as `FOLDER/POLICY/SUITE/ENV/epNNNN_seedS_OUTCOME.rrd`, or `.mcap`."""
     for name, target in _targets(config).items():
         if name in files:
             folder = episode_folder(Path(target), ".", cell)

@@ -48,7 +48,7 @@ _MOST_DERIVED = 2**28  # bytes of a summary, a report, settings or a lock
 
 @dataclass(frozen=True, slots=True)
 class Verification:
-    """What was found of a bundle."""
+    """The findings on a bundle."""
 
     digest: str  # SHA-256 of the bundle's manifest, which stands for all that is in it
     findings: list[Finding]
@@ -146,7 +146,7 @@ _SHOWN = 80  # characters of a value
 
 @dataclass(frozen=True, slots=True)
 class Replayed:
-    """What came of the recorded actions."""
+    """The outcome of the recorded actions."""
 
     steps: int
     outcome: tuple[bool, bool, int | None]  # success once, success at the end, steps after which it was first solved

@@ -56,7 +56,7 @@ class Score:
 
     @property
     def deviations(self) -> list[str]:
-        """What differs from the protocol, or from the plan, a phrase each."""
+        """The differences from the protocol or the plan, a phrase each."""
         found = [text for cell in self.cells for text in _deviations(cell)]
         return list(dict.fromkeys(found))
 
@@ -181,7 +181,7 @@ _NAMES = {"success_once": "success rate (after some step)", "success_at_end": "s
 
 
 class HubSettings(BaseModel):
-    """What the results do not know of the Hub."""
+    """Settings of the export that results do not have."""
 
     model_config = ConfigDict(extra="forbid")
 

@@ -39,7 +39,7 @@ _PRO_MEAN = [f"{suite}_{kind}" for suite in _PRO_SUITES.values() for kind in ("o
 
 
 class VlaEvalSettings(BaseModel):
-    """What the leaderboard asks for, and the results do not know."""
+    """Fields of a leaderboard entry that results do not have."""
 
     model_config = ConfigDict(extra="forbid")
 

@@ -270,7 +270,7 @@ class EvalConfig(_PlanModel):
     def _named_apart(cls, policies: list[PolicyConfig]) -> list[PolicyConfig]:
         names = [policy.name for policy in policies]
         if repeated := sorted({name for name in names if names.count(name) > 1}):
-            raise ValueError(f"two policies are named {repeated}; give each a `name` of its own")
+            raise ValueError(f"two policies are named {repeated}; give each another `name`")
         return policies
 
     @property

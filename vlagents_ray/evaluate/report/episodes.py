@@ -178,7 +178,7 @@ def failures(results: Results, gallery: Gallery) -> Failures | None:
 
 
 def errors(results: Results) -> Errors | None:
-    """What broke, with the logs; None if nothing did."""
+    """Return the errors with their logs; None without any."""
     recorded = [(cell, one.result) for cell in results.cells for one in cell.episodes]
     broken = errors_of_policies(results)
     attempts = [(cell, attempt) for cell in results.cells for attempt in cell.attempts]

@@ -1,4 +1,4 @@
-"""How an evaluation shows its progress: live on a terminal, in plain lines elsewhere."""
+"""The progress of an evaluation: live on a terminal, in plain lines elsewhere."""
 
 from __future__ import annotations
 

@@ -54,7 +54,7 @@ class Configuration:
 
 @dataclass(frozen=True, slots=True)
 class Quote:
-    """What a paper's sentence says of one policy id."""
+    """The numbers of one policy id in a sentence for a paper."""
 
     name: str
     envs: list[str]
@@ -92,7 +92,7 @@ def protocol(results: Results) -> list[Env]:
 
 
 def configuration(results: Results) -> Configuration:
-    """What the results say of the software and the machines that made them."""
+    """Return the software and the machines that made the results."""
     named = [(cell.contender, one) for cell in results.cells for one in _identity(cell)]
     workers: dict[tuple[str, str, str, str], set[tuple[int, int]]] = {}
     for one in results.workers:
@@ -118,7 +118,7 @@ def _identity(cell: CellResults) -> list[str]:
 
 
 def repeat(summary: Summary) -> Repeat:
-    """How to cite and to repeat the evaluation."""
+    """Return sentences to cite the evaluation, and commands to repeat it."""
     results = summary.results
     version = next((run.versions.get("vlagents-ray") for run in reversed(results.runs)), None)
     quotes = [_quote(name, cells, version) for name, cells in summary.quotable if any(cell.counted for cell in cells)]

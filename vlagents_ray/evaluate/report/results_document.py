@@ -1,4 +1,4 @@
-"""What a page in a browser shows of a folder of results: cells, learning curves, and failures with their videos."""
+"""The live view of a folder of results: cells, learning curves, and failures with their videos."""
 
 from __future__ import annotations
 

@@ -74,7 +74,7 @@ def insert(db: sqlite3.Connection, table: str, row: Mapping[str, Any]) -> None:
 def require_readable(out: Path, db: sqlite3.Connection) -> None:
     """Raise `ConfigError` for a results file of another version, or with other columns than this version has.
 
-    A file of somebody else may have any text as the names of columns, by which `merge` inserts rows, and views or
+    A file from elsewhere may have any text as the names of columns, by which `merge` inserts rows, and views or
     triggers, which would compute whatever they like when a table is read or written.
     """
     begins = {"table": "CREATE TABLE", "index": "CREATE INDEX"}  # a virtual table is listed as a table, too
@@ -159,7 +159,7 @@ def close(db: sqlite3.Connection) -> None:
     """Close what `writable` opened. The database is one file then, which can be read on a read-only file system."""
     try:
         db.execute("PRAGMA busy_timeout = 0")
-        with contextlib.suppress(sqlite3.OperationalError):  # somebody reads it just now: the next writer will do it
+        with contextlib.suppress(sqlite3.OperationalError):  # it is being read just now: the next writer will do it
             db.execute("PRAGMA journal_mode = DELETE")
     finally:
         db.close()
@@ -176,7 +176,7 @@ def read_only(out: Path) -> sqlite3.Connection:
         unfinished = any(_size(out / f"{FILE}{suffix}") for suffix in ("-wal", "-journal"))  # not all is in the file
         if unfinished or "unable to open" not in str(error):
             raise
-        # Closed in order, with a write-ahead log that nobody here can make: nobody writes to it, either.
+        # Closed in order, with a write-ahead log that no process here can make, so that none writes to it.
         db = sqlite3.connect(f"{uri}?mode=ro&immutable=1", uri=True)
     return db
 
@@ -198,7 +198,7 @@ def lock(out: Path) -> int:
     """Lock the folder `out`.
 
     Returns:
-        A descriptor: whoever closes it releases the lock, as does the system when this process ends.
+        A descriptor: closing it releases the lock, as does the end of this process.
 
     Raises:
         ConfigError: Another evaluation holds the lock, or the file system knows no locks.

@@ -2,7 +2,7 @@
 
 `trials.jsonl` is written while the evaluation runs, in place of results.db. Its verdicts can be read by anybody; the
 policy, its checkpoint and its timing are encrypted with the key that draws the order of trials, in parts of one length.
-That keeps an operator from seeing what they do not look for; whoever has the key can open it.
+That protects an operator from seeing it by accident; the holder of the key can open it.
 """
 
 from __future__ import annotations
