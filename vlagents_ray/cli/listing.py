@@ -1,4 +1,4 @@
-"""The listings of `vlagents-ray policies` and `vlagents-ray envs`: names, their state here, and how to install the rest."""
+"""The listings of `vlagents-ray policies` and `vlagents-ray envs`: names, their state, and how to install the rest."""
 
 from __future__ import annotations
 

@@ -85,7 +85,7 @@ COLUMNS = (
     _of_result("transport", "string", "how observations went to the policy"),
     _of_episode("attempts", "integer", "1, and one more for each that infrastructure failed"),
     _of_episode("run", "integer", "which run over the plan it was played in, from 1"),
-    Column("finished", "time", "when it was recorded", lambda _cell, one: datetime.fromtimestamp(one.finished, timezone.utc)),
+    Column("finished", "time", "when it was recorded", lambda _, one: datetime.fromtimestamp(one.finished, timezone.utc)),
     _of_episode("videos", "json", "paths in the folder of results"),
     _of_episode("trajectory", "string", "path in the folder of results"),
     _of_result("revision", "string", "the hub's commit of the checkpoint, if it was loaded from the hub's cache"),
