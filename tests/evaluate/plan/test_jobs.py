@@ -128,7 +128,7 @@ def test_suites_have_options_of_their_own(config: Config) -> None:
 
 def test_an_env_in_two_suites_of_one_name_is_refused() -> None:
     suites = [SuiteConfig(envs=[LINE]), SuiteConfig(envs=[LINE], env_options={"width": 8})]
-    with pytest.raises(ConfigError, match="stand in two suites of one name"):
+    with pytest.raises(ConfigError, match="are in two suites of one name"):
         cells(EvalConfig(policies=[PolicyConfig()], suites=suites, out=Path("out")))
 
 
