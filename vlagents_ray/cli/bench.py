@@ -10,7 +10,7 @@ import typer
 from rich.text import Text
 
 from vlagents_ray.cli.console import errors, out, progress, save, table
-from vlagents_ray.cli.options import Set, parse_counts, parse_dims, parse_list, parse_settings
+from vlagents_ray.cli.options import Set, StateDims, parse_counts, parse_dims, parse_list, parse_settings
 from vlagents_ray.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -46,16 +46,12 @@ def bench_rtt(calls: Calls = 1000, transports: Transports = "", json_file: Json 
 @bench.command("throughput")
 def bench_throughput(
     transports: Annotated[str, typer.Option(help="With commas between them.")] = "plasma,handle,shm,websocket",
-    clients: Annotated[str, typer.Option(help="Numbers of clients; the greatest is compared with the ideal.")] = (
-        "1,2,4,8,16,32"
-    ),
+    clients: Annotated[str, typer.Option(help="Numbers; the largest is compared with the ideal.")] = "1,2,4,8,16,32",
     batch: Annotated[int, typer.Option(min=1, help="Observations in one forward pass, at most.")] = 16,
     seconds: Seconds = 2.0,
     rounds: Rounds = 3,
     robot_seconds: Annotated[float, typer.Option(min=0, help="How long a robot is watched; 0: not at all.")] = 10.0,
-    policy: Annotated[
-        str | None, typer.Option(help="A registered name or module:Class; default: noop, 20 ms + 1 ms an observation.")
-    ] = None,
+    policy: Annotated[str | None, typer.Option(help="Default: noop, 20 ms + 1 ms an observation.")] = None,
     settings: Set = [],  # noqa: B006
     num_gpus: Annotated[float, typer.Option(min=0, help="That Ray gives to the replica.")] = 0.0,
     json_file: Json = None,
@@ -89,9 +85,7 @@ def bench_policy(
     rounds: Rounds = 3,
     app: Annotated[str | None, typer.Option(help="Of the file, if it holds several.")] = None,
     image: Annotated[int, typer.Option(min=1, help="Pixels a side, where the policy takes any image.")] = 224,
-    state: Annotated[
-        list[str], typer.Option(metavar="PART=N", help="Numbers in a part for which the policy does not say.")
-    ] = [],  # noqa: B006
+    state: StateDims = [],  # noqa: B006
     settings: Set = [],  # noqa: B006
     json_file: Json = None,
 ) -> None:

@@ -37,17 +37,8 @@ class EvalOptions:
     An option that is a field of `EvalConfig`, or of its policy, suite or worker, has the field's name here.
     """
 
-    what: Annotated[
-        list[str],
-        typer.Argument(
-            metavar="FILE | ENV...",
-            help="A file of runs (.yaml); or environments: maniskill/PushCube-v1, 'libero/*', …",
-        ),
-    ]
-    source: Annotated[
-        str | None,
-        typer.Option("--policy", help="A registered name, a deployment file, or the URL of a running server."),
-    ] = None
+    what: Annotated[list[str], typer.Argument(metavar="FILE | ENV...", help="A file of runs (.yaml); or environments.")]
+    source: Annotated[str | None, typer.Option("--policy", help="Registered name, deployment file, or URL.")] = None
     out: Annotated[Path | None, typer.Option("--out", help="Folder of the results.")] = None
     episodes: Annotated[int | None, typer.Option(min=1, help="Episodes of each environment; default: 10.")] = None
     workers: Annotated[int | None, typer.Option(min=1, help="Environments rolled out in parallel; default: 1.")] = None
@@ -57,39 +48,21 @@ class EvalOptions:
     ] = None
     gpus: Annotated[
         float | None,
-        typer.Option(
-            "--worker-gpus",
-            min=0,
-            help="GPUs per worker for rendering; may be a fraction (0.25). Default: 0 (software rendering).",
-        ),
+        typer.Option("--worker-gpus", min=0, help="GPUs per worker to render on, such as 0.25; default: 0 (software)."),
     ] = None
     seeds: Annotated[int | None, typer.Option("--seed", min=0, help="Episode i uses seed + i; default: 0.")] = None
     video: Annotated[str | None, typer.Option(help="none, failures (default) or all.")] = None
-    record: Annotated[
-        str | None, typer.Option(help="Trajectories, to export and to replay: none (default), failures or all.")
-    ] = None
-    rerun: Annotated[
-        str | None,
-        typer.Option(
-            metavar="DIR", help="Write a .rrd file of each episode for Rerun, or 'live': show them in its viewer."
-        ),
-    ] = None
-    foxglove: Annotated[
-        str | None, typer.Option(metavar="DIR", help="Write an .mcap file of each episode for Foxglove.")
-    ] = None
+    record: Annotated[str | None, typer.Option(help="Trajectories: none (default), failures or all.")] = None
+    rerun: Annotated[str | None, typer.Option(metavar="DIR", help="Write .rrd files for Rerun; or 'live'.")] = None
+    foxglove: Annotated[str | None, typer.Option(metavar="DIR", help="Write .mcap files for Foxglove.")] = None
     track: Annotated[str, typer.Option(help="wandb, trackio, tensorboard, with commas between them.")] = ""
     resume: Annotated[bool, typer.Option(help="Go on with the results in --out.")] = False
     accept_changes: Annotated[
         bool,
-        typer.Option(
-            "--accept-changes",
-            help="With --resume: although files or weights of a policy or an environment changed; the report says so.",
-        ),
+        typer.Option("--accept-changes", help="With --resume: although files or weights changed; the report says so."),
     ] = False
     execute: Annotated[int | None, typer.Option(min=1, help="Rows executed of each chunk; default: all.")] = None
-    retries: Annotated[
-        int | None, typer.Option(min=0, help="Further attempts after an infrastructure failure; default: 3.")
-    ] = None
+    retries: Annotated[int | None, typer.Option(min=0, help="After an infrastructure failure; default: 3.")] = None
     config: Set = field(default_factory=list)
     env_options: Annotated[
         list[str], typer.Option("--env-set", metavar="KEY=VALUE", help="An option of the environments: width=256.")
@@ -103,28 +76,15 @@ class EvalOptions:
         typer.Option(metavar="DIR", help="Evaluate each checkpoint that a training run writes there, until Ctrl-C."),
     ] = None
     until: Annotated[int | None, typer.Option(min=0, metavar="STEP", help="End --watch with this step.")] = None
-    settle: Annotated[
-        float | None, typer.Option(min=0, help="With --watch: s that a checkpoint must not have changed; default: 10.")
-    ] = None
-    marker: Annotated[
-        str | None, typer.Option(metavar="NAME", help="With --watch: the file that the trainer writes in it when done.")
-    ] = None
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print plan, count and estimated time; play nothing.")] = (
-        False
-    )
+    settle: Annotated[float | None, typer.Option(min=0, help="With --watch: s without a change; default: 10.")] = None
+    marker: Annotated[str | None, typer.Option(metavar="NAME", help="With --watch: the trainer's last file.")] = None
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print plan and estimated time; play nothing.")] = False
     end_at: Annotated[
         str | None,
-        typer.Option(
-            metavar="TIME",
-            help="Begin no episode that would not end by then: 2027-01-31T18:30, local time, or s since 1970.",
-        ),
+        typer.Option(metavar="TIME", help="Begin no episode that would end later: 2027-01-31T18:30, or s since 1970."),
     ] = None
     replica_per_gpu: Annotated[
-        bool,
-        typer.Option(
-            "--replica-per-gpu",
-            help="With --address: a policy has a replica on each GPU of the cluster, unless its deployment says more.",
-        ),
+        bool, typer.Option("--replica-per-gpu", help="With --address: a policy has a replica on each of its GPUs.")
     ] = False
     arm: Annotated[
         str | None,
@@ -139,9 +99,7 @@ class EvalOptions:
         str | None,
         typer.Option(metavar="page|terminal", help="With --robot: where that person is asked; default: page"),
     ] = None
-    unblind: Annotated[
-        bool, typer.Option("--unblind", help="With --robot: write the results of the judged trials; play none.")
-    ] = False
+    unblind: Annotated[bool, typer.Option("--unblind", help="With --robot: write the results so far.")] = False
     address: Address = None
     live: Live = False
     live_at: LiveAt = None

@@ -148,9 +148,7 @@ def make(
     requirements: Annotated[Path, typer.Argument(help="A requirements file: requirements/lerobot.txt.")],
     into: Annotated[Path | None, typer.Option(help="Folder; default: .venv- and the file's name.")] = None,
     more: Annotated[list[Path], typer.Option("--with", help="A further requirements file, repeatable.")] = [],  # noqa: B006
-    python: Annotated[
-        str | None, typer.Option(help="A version or an interpreter; default: the file's, or this one.")
-    ] = None,
+    python: Annotated[str | None, typer.Option(help="Version or interpreter; default: the file's, or this.")] = None,
     light: Annotated[bool, typer.Option("--light", help="Without Ray, for a child process.")] = False,
     cuda: Annotated[bool, typer.Option("--cuda", help="CUDA packages also without a GPU: several GB.")] = False,
 ) -> None:

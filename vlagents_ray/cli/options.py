@@ -34,6 +34,9 @@ LiveAt = Annotated[
     typer.Option("--live-at", metavar="HOST:PORT", help="The same there; beyond this machine it wants API keys."),
 ]
 
+StateDims = Annotated[
+    list[str], typer.Option("--state", metavar="PART=N", help="Numbers in a part for which the policy does not say.")
+]
 _Options = TypeVar("_Options")
 
 

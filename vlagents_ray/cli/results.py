@@ -27,12 +27,8 @@ class Videos(str, Enum):
 
 def report_command(
     folders: Annotated[list[Path], typer.Argument(metavar="OUT...", help="Folders that evaluations wrote to.")],
-    html: Annotated[
-        Path | None, typer.Option(help="The file to write; default: report.html in OUT, with several here.")
-    ] = None,
-    videos: Annotated[
-        Videos, typer.Option(help="In the page as far as they fit, beside it, or stills alone.")
-    ] = Videos.LINK,
+    html: Annotated[Path | None, typer.Option(help="Default: report.html in OUT; of several folders, here.")] = None,
+    videos: Annotated[Videos, typer.Option(help="As far as they fit, beside the page, or stills.")] = Videos.LINK,
     live: Live = False,
     live_at: LiveAt = None,
 ) -> None:
@@ -70,16 +66,10 @@ def export_command(
     ],
     policy: Annotated[str | None, typer.Option(help="Only this one: NAME, or NAME@STEP in a sweep.")] = None,
     env: Annotated[str | None, typer.Option(help="Only this one.")] = None,
-    cameras: Annotated[
-        str | None, typer.Option(help="lerobot: only these, as base,wrist; '' for none. Default: all.")
-    ] = None,
-    state: Annotated[
-        str | None,
-        typer.Option(help="lerobot: only these parts of the state, in this order, as joints,gripper. Default: all."),
-    ] = None,
+    cameras: Annotated[str | None, typer.Option(help="lerobot: only these, as base,wrist; default: all.")] = None,
+    state: Annotated[str | None, typer.Option(help="lerobot: only these parts, in order; default: all.")] = None,
     environment_state: Annotated[
-        str | None,
-        typer.Option(help="lerobot: these parts of the state are observation.environment_state, as puck,target."),
+        str | None, typer.Option(help="lerobot: parts for observation.environment_state, as puck,target.")
     ] = None,
     successes: Annotated[bool, typer.Option("--successes", help="lerobot: only episodes that were solved.")] = False,
     cut_idle: Annotated[
@@ -117,12 +107,10 @@ def merge_command(
     into: Annotated[Path, typer.Argument(metavar="OUT", help="New folder.")],
     folders: Annotated[list[Path], typer.Argument(metavar="FOLDER...", help="Folders of results, which stay.")],
     keep_first: Annotated[
-        bool,
-        typer.Option("--keep-first", help="Of different outcomes of an episode keep that of the folder named first."),
+        bool, typer.Option("--keep-first", help="Of different outcomes of an episode keep that of the first folder.")
     ] = False,
     accept_changes: Annotated[
-        bool,
-        typer.Option("--accept-changes", help="Although files of a policy or an env, or weights, differ; it is shown."),
+        bool, typer.Option("--accept-changes", help="Although files or weights differ; the report says so.")
     ] = False,
 ) -> None:
     """Put results together: each episode once, by its key; videos and trajectories go along."""
@@ -149,16 +137,9 @@ def bundle_command(
 
 def verify_command(
     bundle: Annotated[Path, typer.Argument(metavar="BUNDLE", help="A file that `vlagents-ray bundle` wrote.")],
-    replay: Annotated[
-        int, typer.Option(min=0, help="Play the recorded actions of so many episodes in their simulator.")
-    ] = 3,
-    into: Annotated[
-        Path | None, typer.Option(help="Keep its results in this new folder, to merge, export or replay them.")
-    ] = None,
-    trust: Annotated[
-        bool,
-        typer.Option("--trust", help="Make its environments also by 'module:Class' and with options that name files."),
-    ] = False,
+    replay: Annotated[int, typer.Option(min=0, help="Episodes whose recorded actions are played again.")] = 3,
+    into: Annotated[Path | None, typer.Option(help="Keep its results in this new folder.")] = None,
+    trust: Annotated[bool, typer.Option("--trust", help="Also make environments that name code or files.")] = False,
     most_gb: Annotated[float, typer.Option(min=0, help="Refuse a bundle that unpacks to more.")] = 16.0,
 ) -> None:
     """Check a bundle, also a stranger's: what is equal, what differs, what could not be checked.
@@ -185,25 +166,15 @@ def replay_command(
     episode: Annotated[
         str | None, typer.Argument(help="Of results: its key, or ENV#NUMBER: 'tabletop#3'.", show_default=False)
     ] = None,
-    policy: Annotated[
-        str | None, typer.Option(help="A registered name, a deployment file, or a URL, in place of the run's own.")
-    ] = None,
-    out_dir: Annotated[
-        Path | None, typer.Option("--out", help="Folder of the replay: its video, or its report. Default: a new one.")
-    ] = None,
+    policy: Annotated[str | None, typer.Option(help="Name, deployment file, or URL; default: the run's own.")] = None,
+    out_dir: Annotated[Path | None, typer.Option("--out", help="Folder of the replay; default: a new one.")] = None,
     address: Address = None,
     episodes: Annotated[str | None, typer.Option(help="Of a dataset: these, as 0-9,12. Default: all.")] = None,
     horizon: Annotated[int | None, typer.Option(min=1, help="Of a dataset: rows of a chunk that are compared.")] = None,
-    every: Annotated[
-        int, typer.Option(min=1, help="Of a dataset without recorded answers: ask at each so many-th frame.")
-    ] = 1,
+    every: Annotated[int, typer.Option(min=1, help="Of a dataset without answers: each so many-th frame.")] = 1,
     at_once: Annotated[int, typer.Option(min=1, help="Of a dataset: episodes that share a batch.")] = 8,
-    cameras: Annotated[
-        str | None, typer.Option(help="Of a dataset: the policy's cameras by its own, as base=top,wrist=left.")
-    ] = None,
-    state: Annotated[
-        str | None, typer.Option(help="Of a dataset: parts of observation.state in order, as joints,gripper.")
-    ] = None,
+    cameras: Annotated[str | None, typer.Option(help="Of a dataset: POLICY=DATASET, as base=top,wrist=left.")] = None,
+    state: Annotated[str | None, typer.Option(help="Of a dataset: parts of observation.state in order.")] = None,
 ) -> None:
     """Play an episode of an evaluation again: exit code 0 if all is the same. Or play a dataset to another policy.
 

@@ -30,8 +30,7 @@ if TYPE_CHECKING:
 def serve_command(
     source: Annotated[str, typer.Argument(help="A registered policy, 'module:Class', or a deployment file (.yaml).")],
     host: Annotated[
-        str | None,
-        typer.Option(help="0.0.0.0, or one address of this machine, lets others in; default: the file's, 127.0.0.1."),
+        str | None, typer.Option(help="0.0.0.0, or an address of this machine; default: the file's, or 127.0.0.1.")
     ] = None,
     port: Annotated[int | None, typer.Option(min=1, max=65535, help="Default: the file's, or 8000.")] = None,
     settings: Set = [],  # noqa: B006 - typer reads it
@@ -42,28 +41,18 @@ def serve_command(
         int | None, typer.Option(min=1, max=65535, help="Also accept clients of the package vlagents, at this port.")
     ] = None,
     rerun: Annotated[
-        str | None,
-        typer.Option(metavar="DIR", help="Write a .rrd file of each session's episodes for Rerun; see `viewers` too."),
+        str | None, typer.Option(metavar="DIR", help="Write .rrd files of the sessions for Rerun.")
     ] = None,
-    foxglove: Annotated[
-        str | None, typer.Option(metavar="DIR", help="Write an .mcap file of each session's episodes for Foxglove.")
-    ] = None,
+    foxglove: Annotated[str | None, typer.Option(metavar="DIR", help="Write .mcap files for Foxglove.")] = None,
     address: Address = None,
     keys: Annotated[
-        Path | None,
-        typer.Option(help="File of the API keys (`vlagents-ray keys new`); default: VLAGENTS_RAY_KEYS_FILE or _KEYS."),
+        Path | None, typer.Option(help="File of the API keys; default: VLAGENTS_RAY_KEYS_FILE or VLAGENTS_RAY_KEYS.")
     ] = None,
-    insecure: Annotated[
-        bool, typer.Option("--insecure", help="Accept every client that reaches the port, without keys.")
-    ] = False,
-    plain_http: Annotated[
-        bool, typer.Option("--plain-http", help="Keys may cross the network unencrypted: no warning.")
-    ] = False,
+    insecure: Annotated[bool, typer.Option("--insecure", help="Accept every client, without keys.")] = False,
+    plain_http: Annotated[bool, typer.Option("--plain-http", help="No warning of unencrypted keys.")] = False,
     tls_cert: Annotated[Path | None, typer.Option(help="Certificate in PEM: serve https:// and wss://.")] = None,
     tls_key: Annotated[Path | None, typer.Option(help="Its key, in PEM.")] = None,
-    tls_client_ca: Annotated[
-        Path | None, typer.Option(help="Who signs the certificates that clients must show, in PEM.")
-    ] = None,
+    tls_client_ca: Annotated[Path | None, typer.Option(help="CA of the certificates of clients, in PEM.")] = None,
 ) -> None:
     """Serve a policy until Ctrl-C."""
     from vlagents_ray.serve.launch.deployment_file import listens_at, read_deployment, with_dialect, with_gateways_at

@@ -33,12 +33,8 @@ Setup = Annotated[Path | None, typer.Option(help="File of shell lines that the j
 @slurm.command("eval", context_settings=_BOTH, options_metavar="{FILE | ENV...} [OPTIONS]")
 def eval_(
     context: typer.Context,
-    resubmit: Annotated[
-        int, typer.Option(min=0, help="Times that the job, out of time, queues itself again to go on.")
-    ] = 0,
-    closing: Annotated[
-        float, typer.Option(min=0, metavar="S", help="The evaluation ends so long before the job's time does.")
-    ] = 60.0,
+    resubmit: Annotated[int, typer.Option(min=0, help="Times that the job, out of time, queues itself again.")] = 0,
+    closing: Annotated[float, typer.Option(min=0, metavar="S", help="End so long before the job's time does.")] = 60.0,
     setup: Setup = None,
     print_only: Print = False,
     parsable: Parsable = False,

@@ -13,7 +13,7 @@ import typer
 import yaml
 
 from vlagents_ray.cli.console import errors, out, progress, table
-from vlagents_ray.cli.options import YAML_SUFFIXES, is_run_file, parse_dims, parse_list
+from vlagents_ray.cli.options import YAML_SUFFIXES, StateDims, is_run_file, parse_dims, parse_list
 from vlagents_ray.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -33,29 +33,17 @@ def tune_command(
     wanted: Annotated[
         Wanted, typer.Option("--for", help="The most actions a second, or the most robots within --p99-ms.")
     ] = Wanted.throughput,
-    p99_ms: Annotated[
-        float | None, typer.Option("--p99-ms", min=0, help="Of robots: the longest round trip of 99 in 100, ms.")
-    ] = None,
+    p99_ms: Annotated[float | None, typer.Option("--p99-ms", min=0, help="Of robots: the longest p99, ms.")] = None,
     minutes: Annotated[float, typer.Option(min=0.1, help="That all of it may take.")] = 5.0,
-    max_workers: Annotated[
-        int | None, typer.Option(min=1, help="Of a file of runs: the most workers to try; default: twice the cores.")
-    ] = None,
+    max_workers: Annotated[int | None, typer.Option(min=1, help="Of a file of runs; default: twice the cores.")] = None,
     max_batch: Annotated[int, typer.Option(min=1, help="The largest batch to try.")] = 32,
     seconds: Annotated[float, typer.Option(min=0.1, help="Of each measurement.")] = 2.0,
-    dtypes: Annotated[
-        str | None, typer.Option(help="To try, as bfloat16,int8; default: the one that suits the accelerator, if any.")
-    ] = None,
-    tolerance: Annotated[
-        float, typer.Option(min=0, help="How far actions may be off, as a share of their range.")
-    ] = 0.01,
-    frames: Annotated[
-        Path | None, typer.Option(help="A folder of recorded trajectories to act on; default: random observations.")
-    ] = None,
+    dtypes: Annotated[str | None, typer.Option(help="To try, as bfloat16,int8; default: the accelerator's.")] = None,
+    tolerance: Annotated[float, typer.Option(min=0, help="Largest error of actions, share of their range.")] = 0.01,
+    frames: Annotated[Path | None, typer.Option(help="Recorded trajectories; default: random observations.")] = None,
     app: Annotated[str | None, typer.Option(help="Of the file, if it holds several.")] = None,
     image: Annotated[int, typer.Option(min=1, help="Pixels a side, where the policy takes any image.")] = 224,
-    state: Annotated[
-        list[str], typer.Option(metavar="PART=N", help="Numbers in a part for which the policy does not say.")
-    ] = [],  # noqa: B006
+    state: StateDims = [],  # noqa: B006
 ) -> None:
     """Find the best settings of a file by measuring, and print those to change.
 
