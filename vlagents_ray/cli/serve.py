@@ -40,9 +40,7 @@ def serve_command(
     vlagents_port: Annotated[
         int | None, typer.Option(min=1, max=65535, help="Also accept clients of the package vlagents, at this port.")
     ] = None,
-    rerun: Annotated[
-        str | None, typer.Option(metavar="DIR", help="Write .rrd files of the sessions for Rerun.")
-    ] = None,
+    rerun: Annotated[str | None, typer.Option(metavar="DIR", help="Write .rrd files for Rerun.")] = None,
     foxglove: Annotated[str | None, typer.Option(metavar="DIR", help="Write .mcap files for Foxglove.")] = None,
     address: Address = None,
     keys: Annotated[
