@@ -55,9 +55,7 @@ def demo(out_dir: Annotated[Path, typer.Option("--out", help="Folder of the resu
         missing = ManiSkill.missing()
         suite = SuiteConfig(envs=["maniskill/PushCube-v1", "maniskill/PickCube-v1"], episodes=10)
         if missing is not None:
-            out.print(
-                f"ManiSkill cannot render here, so the demo uses the built-in tabletop: {missing}", style="yellow"
-            )
+            out.print(f"ManiSkill cannot render here, so the demo uses the tabletop: {missing}", style="yellow")
             suite = SuiteConfig(envs=["tabletop"], episodes=20)
         policy = PolicyConfig(name="scripted", source="scripted")
         run_evaluation(EvalConfig(policies=[policy], suites=[suite], workers=2, video="all", out=fresh(out_dir)))

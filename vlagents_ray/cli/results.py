@@ -186,9 +186,7 @@ def replay_command(
             if episode is not None:
                 raise ConfigError(f"{folder}: is a dataset, got {episode!r}; want --episodes, or none of it")
             if policy is None:
-                raise ConfigError(
-                    f"{folder}: is a dataset, and wants --policy: a registered name, a deployment file or a URL"
-                )
+                raise ConfigError(f"{folder}: is a dataset: want --policy, a name, a deployment file or a URL")
             from vlagents_ray.open_loop.recorded import Names
             from vlagents_ray.open_loop.replay import ReplayPlan
 

@@ -67,9 +67,7 @@ def tune_command(
             raise ConfigError(f"got {str(file)!r}, want a deployment file or a file of runs (.yaml)")
         if is_run_file(file):
             if goal.kind != "throughput" or dtypes or frames or app or state:
-                raise ConfigError(
-                    "--for, --dtypes, --frames, --app and --state are of deployment files; leave them out"
-                )
+                raise ConfigError("--for, --dtypes, --frames, --app, --state are of deployment files; leave them out")
             tune_evaluation(file, minutes=minutes, max_workers=max_workers, began=began)
             return
         application = policy_application(str(file), app)

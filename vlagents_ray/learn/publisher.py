@@ -76,9 +76,7 @@ class Publisher:
         elif isinstance(target, str) and target.startswith(("http://", "https://")):
             self._target = ServerTarget(target, Credentials(api_key, ca, certificate))
         else:
-            raise ConfigError(
-                f"Publisher: got {target!r}, want 'serve://APP', 'http(s)://HOST:PORT' or an Engine of this process"
-            )
+            raise ConfigError(f"Publisher: got {target!r}, want 'serve://APP', 'http(s)://HOST:PORT' or an Engine")
 
     def push(
         self,

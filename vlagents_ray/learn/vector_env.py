@@ -204,9 +204,7 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
         self._require_begun()
         rows = np.asarray(actions, np.float32)
         if rows.shape != self.action_space.shape:
-            raise InvalidAction(
-                f"actions: got {rows.shape}, want {self.action_space.shape}, a row for each environment"
-            )
+            raise InvalidAction(f"actions: got {rows.shape}, want {self.action_space.shape}, a row an environment")
         rewards = np.zeros(self.num_envs)
         terminated, truncated = np.zeros(self.num_envs, np.bool_), np.zeros(self.num_envs, np.bool_)
         infos: dict[str, Any] = {}

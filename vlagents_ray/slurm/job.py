@@ -167,9 +167,7 @@ def wait_for_head(host: str, port: int, timeout_s: float = _HEAD_S) -> None:
             socket.create_connection((host, port), timeout=5).close()
         except OSError as error:
             if time.monotonic() > deadline:
-                sys.exit(
-                    f"Ray's head at {host}:{port} does not listen after {timeout_s:g} s ({error}); see its node's log"
-                )
+                sys.exit(f"Ray's head at {host}:{port} does not listen after {timeout_s:g} s ({error}); see its log")
             time.sleep(0.5)
         else:
             return
@@ -179,9 +177,7 @@ def run_command(arguments: Sequence[str]) -> None:
     """Wait for Ray, and replace this process by the command."""
     parser = argparse.ArgumentParser()
     parser.add_argument("what", choices=["eval", "serve"])
-    parser.add_argument(
-        "--fill", type=float, metavar="CPUS", help="start workers of so many CPUs each on all CPUs but one"
-    )
+    parser.add_argument("--fill", type=float, metavar="CPUS", help="workers of so many CPUs each, on all but one")
     parser.add_argument("--closing", type=float, default=0.0, help="s before the job's end, to end in order")
     parser.add_argument("--key", action="store_true", help="create an API key")
     parser.add_argument("--port", type=int, help="port of the server; by default derived from the job's number")

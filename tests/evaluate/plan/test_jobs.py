@@ -141,7 +141,7 @@ def test_an_env_in_two_suites_that_do_not_differ_is_refused() -> None:
 def test_policies_whose_episodes_would_share_their_files_are_refused(config: Callable[..., EvalConfig]) -> None:
     [policy] = config().policies
     policies = [policy.model_copy(update={"name": name}) for name in ("pi0/fast", "pi0_fast")]
-    with pytest.raises(ConfigError, match="would share their files"):
+    with pytest.raises(ConfigError, match="would share files"):
         cells(config().model_copy(update={"policies": policies}))
 
 

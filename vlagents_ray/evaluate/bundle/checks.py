@@ -62,9 +62,7 @@ def check_cells(results: Results) -> Finding:
     with reading(results.out) as db:
         keys = {row["key"] for row in table(db, "episodes")}
     odd += [f"{key}: its key does not match its columns, or it has no cell" for key in sorted(keys - stated)]
-    return _finding(
-        "database", odd, f"{len(results.cells)} cells and {len(keys)} episodes have the keys of their settings"
-    )
+    return _finding("database", odd, f"{len(results.cells)} cells and {len(keys)} episodes have their settings' keys")
 
 
 def check_derived(stated: dict[str, bytes], computed: Path, *, same_software: bool) -> Iterator[Finding]:

@@ -207,9 +207,7 @@ class _Episode:
                 self.stats.acted(answer, seconds, latency_s)
             rows = Act(check_action(answer.action, contract)).rows()
             if self._width not in (None, rows.shape[1]):  # the environment's contract states no size
-                raise InvalidAction(
-                    f"action: got {rows.shape}, want {self._width} numbers a row, as in the first answer"
-                )
+                raise InvalidAction(f"action: got {rows.shape}, want {self._width} numbers a row, as in the first")
             self._width = rows.shape[1]
             ticks = list(self._executor.ticks(rows, latency_s or 0.0))
             self.observer.add_act(answer, sum(tick.waited for tick in ticks))

@@ -155,9 +155,7 @@ def cells(config: EvalConfig) -> list[EvalCase]:
     for name in names:
         other = folders.setdefault(tuple(plain(part) for part in name), name)
         if other != name:
-            raise ConfigError(
-                f"{' '.join(name)!r} and {' '.join(other)!r} would share their files; give one another name"
-            )
+            raise ConfigError(f"{' '.join(name)!r} and {' '.join(other)!r} would share files; give one another name")
     prints = Counter(cell.fingerprint for cell in found)
     if twice := sorted({cell.env for cell in found if prints[cell.fingerprint] > 1}):
         raise ConfigError(

@@ -149,9 +149,7 @@ class StopConfig(_PlanModel):
     @model_validator(mode="after")
     def _some_end(self) -> Self:
         if self.target is None and self.width is None:
-            raise ValueError(
-                "got neither target nor width, want one or both: the first that is reached stops the evaluation"
-            )
+            raise ValueError("got neither target nor width, want one or both: the first that is reached ends it")
         return self
 
 

@@ -68,9 +68,7 @@ def print_summary(console: Console, summary: Summary) -> None:
     lines += [f"{name}: weights pushed by a learner, {words}" for name, words in pushed.items()]
     lines += [_stopped(group) for group in summary.cells if group.stopped]
     if len(summary.quotable) > sum(len(summary.parts(name)) for name in summary.results.contenders):
-        lines.append(
-            "cells that stopped after different numbers of episodes have no rate in common: quote each by itself"
-        )
+        lines.append("cells that stopped after different numbers of episodes have no rate in common: quote each alone")
     lines += [_gap(one) for one in clock_gaps(summary.results)]
     if summary.state == RUNNING:
         lines.append("still running")

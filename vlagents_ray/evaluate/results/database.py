@@ -85,9 +85,7 @@ def require_readable(out: Path, db: sqlite3.Connection) -> None:
             )
     version = db.execute("PRAGMA user_version").fetchone()[0]
     if version != VERSION:
-        raise ConfigError(
-            f"{out / FILE}: got version {version} of the results file, want {VERSION}; choose another out folder"
-        )
+        raise ConfigError(f"{out / FILE}: got version {version} of the results, want {VERSION}; choose another folder")
     for table, known in _known_columns().items():
         there = _columns(db, table)
         unknown, missing = there - known, known - there
@@ -213,9 +211,7 @@ def lock(out: Path) -> int:
                 time.sleep(_AGAIN_S)
                 continue
             os.close(file)
-            raise ConfigError(
-                f"{out}: another evaluation is writing there; wait for it, or choose another folder"
-            ) from error
+            raise ConfigError(f"{out}: another evaluation is writing there; wait, or choose another folder") from error
         except OSError as error:
             os.close(file)
             if error.errno not in _NO_LOCKS:

@@ -131,9 +131,7 @@ class TrialLog:
             self._write({"plan": identity, "at": self.started, "sealed": _seal(self.key, plan)})
             return
         if not hmac.compare_digest(lines[0]["plan"], identity):
-            raise ConfigError(
-                f"{self._path}: is of another plan, robot or key; take those again, or choose another out folder"
-            )
+            raise ConfigError(f"{self._path}: is of another plan, robot or key; take those, or another out folder")
         self.started = float(lines[0]["at"])
         begun: set[tuple[int, int]] = set()
         for line in lines[1:]:

@@ -71,9 +71,7 @@ def runtime_env(cell: EvalCase) -> dict[str, Any]:
     No secret may be in it: Ray writes runtime environments to logs that every user of a machine can read.
     """
     given: dict[str, Any] = dict(cell.worker.runtime_env)
-    hides_gpus = not cell.worker.gpus and bool(
-        cell.policy.url or cell.policy.source
-    )  # else the policy is in the worker
+    hides_gpus = not cell.worker.gpus and bool(cell.policy.url or cell.policy.source)  # or it is in the worker
     variables = worker_variables(cell.worker.threads, gpus=not hides_gpus)
     return given | {"env_vars": variables | given.get("env_vars", {})}
 

@@ -310,9 +310,7 @@ def agents(config: EvalConfig, own: Callable[[], Agent] | None, rank: RankName =
         return functools.partial(_own_agent, own)
     for policy in config.policies:
         if policy.url is None:
-            raise ConfigError(
-                f"policy {policy.name!r}: got no url, want that of its server, e.g. http://localhost:8000"
-            )
+            raise ConfigError(f"policy {policy.name!r}: got no url, want that of its server, as http://localhost:8000")
     return functools.partial(_remote_agent, config, rank)
 
 
