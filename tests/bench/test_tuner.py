@@ -14,7 +14,7 @@ from vlagents_ray.bench.tuning_choice import TuningGoal, choose
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.config.deployment import ServerArgs
 
-SUPPORT = str(Path(__file__).parents[2] / "support")
+SUPPORT = str(Path(__file__).parents[1] / "support")
 
 
 @pytest.fixture(autouse=True)
