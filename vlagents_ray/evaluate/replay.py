@@ -91,7 +91,9 @@ def compare(recorded: Recorded, replayed: Results) -> list[str]:
         found.insert(0, _actions(recorded, replayed.file(str(again.trajectory))))
     weights = [one.result.weights for one in (recorded.episode, again)]
     if found and None not in weights and weights[0] != weights[1]:
-        found.append(f"weights: {weights[0]} played it, now {weights[1]}: another checkpoint, or other files in it")
+        found.append(
+            f"weights: {weights[0]} played it, now it is {weights[1]}: another checkpoint, or other files in it"
+        )
     return found
 
 
