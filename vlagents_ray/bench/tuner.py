@@ -100,11 +100,7 @@ class Tuner:
         self._failed: list[Variant] = []
 
     def measure(self) -> list[MeasuredPoint]:
-        """Measure the file's own settings, then each variant.
-
-        Raises:
-            VLAgentsError: The file's own settings cannot be measured.
-        """
+        """Measure the file's own settings, then each variant."""
         with tempfile.TemporaryDirectory() as folder:
             frames = None
             if self._plan.frames is not None:
@@ -313,11 +309,7 @@ def largest_difference(actions: Sequence[np.ndarray], wanted: Sequence[np.ndarra
 
 
 def recorded_observations(folder: Path, count: int) -> list[Obs]:
-    """Read observations, spread evenly over the trajectories below a folder and over their steps.
-
-    Raises:
-        ConfigError: There is no trajectory, or one cannot be read.
-    """
+    """Read observations, spread evenly over the trajectories below a folder and over their steps."""
     files = sorted(folder.rglob("*.npz"))
     if not files:
         raise ConfigError(f"--frames {folder}: holds no trajectory (.npz), want a folder of them, as evaluations save")

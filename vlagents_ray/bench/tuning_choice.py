@@ -70,9 +70,6 @@ def choose(points: Sequence[MeasuredPoint], goal: TuningGoal) -> MeasuredPoint:
     """Choose the point that is best for a goal.
 
     A variant must be 5 % better than one with fewer changes, or serve more robots.
-
-    Raises:
-        GoalMissed: None reaches the goal.
     """
     reaching = [point for point in points if point.reaches(goal)]
     if not reaching:

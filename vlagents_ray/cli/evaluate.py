@@ -164,11 +164,7 @@ def evaluate_command(options: EvalOptions) -> None:
 
 
 def config_from_options(options: EvalOptions) -> EvalConfig:
-    """Build the configuration of an evaluation from the options of `vlagents-ray eval`.
-
-    Raises:
-        ConfigError: The options do not go together, or one cannot be parsed.
-    """
+    """Build the configuration of an evaluation from the options of `vlagents-ray eval`."""
     from vlagents_ray.evaluate import EvalConfig, PolicyConfig, SuiteConfig, WorkerConfig
 
     what = options.what

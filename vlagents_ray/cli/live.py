@@ -26,11 +26,7 @@ _NAME = "eval"  # of the page, where keys are for some applications alone
 
 
 def live_address(at: str | None) -> tuple[str, int]:
-    """Return the (host, port) that `--live-at` states; None is `--live` alone.
-
-    Raises:
-        ConfigError: `at` is not HOST:PORT, or other machines would reach the page without a key.
-    """
+    """Return the (host, port) that `--live-at` states; None is `--live` alone."""
     if at is None:
         return LOOPBACK, _PORT if is_free(LOOPBACK, _PORT) else 0
     try:

@@ -129,11 +129,7 @@ def parse_time(text: str, option: str) -> float:
 
 
 def read_run_file(file: Path, kind: str, keys: str) -> dict[str, Any]:
-    """Read a YAML file of the settings of a run; results go to runs/NAME unless it names a folder.
-
-    Raises:
-        ConfigError: There is no such file, or it holds no mapping.
-    """
+    """Read a YAML file of the settings of a run; results go to runs/NAME unless it names a folder."""
     if not file.is_file():
         raise ConfigError(f"{kind} {str(file)!r} does not exist")
     try:

@@ -49,9 +49,6 @@ def split(words: Sequence[str], known: Mapping[str, bool]) -> tuple[list[str], d
     Returns:
         The command's own arguments, and sbatch's options by their long names; the value of an option without one is
         None.
-
-    Raises:
-        ConfigError: An option of sbatch cannot be used here, or lacks its value.
     """
     own: list[str] = []
     sbatch: dict[str, str | None] = {}
@@ -182,10 +179,6 @@ def submit(script: Script) -> str:
 
     Returns:
         The job's number.
-
-    Raises:
-        ConfigError: sbatch is not installed.
-        SubmissionFailed: sbatch rejected the job, or did not answer.
     """
     file = write(script)
     try:

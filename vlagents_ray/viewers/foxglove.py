@@ -24,12 +24,7 @@ class FoxgloveRecordings:
     closing_s: float | None = None  # its server drops what a slow viewer does not take
 
     def __init__(self, target: str | Path) -> None:
-        """Write `TARGET/EPISODE.mcap`, or listen at the address `target` ("ws://HOST:PORT").
-
-        Raises:
-            ConfigError: `target` begins with "ws://" and is no address, or another process has it.
-            MissingDependency: The extra "foxglove" is not installed.
-        """
+        """Write `TARGET/EPISODE.mcap`, or listen at the address `target` ("ws://HOST:PORT")."""
         self.target = str(target)
         self._foxglove = require("foxglove")
         self._live: tuple[Any, _Topics] | None = None  # the server, and the topics of all episodes

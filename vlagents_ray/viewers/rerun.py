@@ -30,12 +30,7 @@ class RerunRecordings:
     name = "rerun"
 
     def __init__(self, target: str | Path) -> None:
-        """Write `TARGET/EPISODE.rrd`, or send to the viewer at the address `target` ("rerun+http://HOST:PORT/proxy").
-
-        Raises:
-            ConfigError: No viewer listens at the address.
-            MissingDependency: The extra "rerun" is not installed.
-        """
+        """Write `TARGET/EPISODE.rrd`, or send to the viewer at the address `target` ("rerun+http://HOST:PORT/proxy")."""
         self.target = str(target)
         self._rerun = require("rerun")
         self._folder = None if self.target.startswith("rerun+") else Path(target)

@@ -96,9 +96,6 @@ def pack(folder: Path, archive: Path, written_by: dict[str, JsonValue]) -> str:
 
     Returns:
         The SHA-256 of the manifest, which stands for everything in the bundle.
-
-    Raises:
-        ConfigError: The folder has a file that a bundle may not hold.
     """
     paths = sorted(path for path in folder.rglob("*") if path.is_file())
     names = {path.relative_to(folder).as_posix(): path for path in paths}

@@ -107,11 +107,7 @@ _WHEN = {"success_once": "solved after some step", "success_at_end": "solved aft
 
 
 def scores(results: Results) -> list[Score]:
-    """The scores of the only policy id in `results`, by benchmark, those of suites with other options apart.
-
-    Raises:
-        ConfigError: There are several policy ids, or no episode has a result.
-    """
+    """The scores of the only policy id in `results`, by benchmark, those of suites with other options apart."""
     if len(results.contenders) != 1:
         raise ConfigError(f"got the policies {results.contenders}, want one: name it with --policy NAME, or NAME@STEP")
     groups: dict[tuple[str, str], list[CellResults]] = {}

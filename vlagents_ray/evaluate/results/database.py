@@ -197,9 +197,6 @@ def lock(out: Path) -> int:
 
     Returns:
         A descriptor: closing it releases the lock, as does the end of this process.
-
-    Raises:
-        ConfigError: Another evaluation holds the lock, or the file system knows no locks.
     """
     file = os.open(out / LOCK, os.O_RDWR | os.O_CREAT, 0o644)
     give_up = time.monotonic() + _READER_S

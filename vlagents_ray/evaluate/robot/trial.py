@@ -171,9 +171,6 @@ def play(
 
     Returns:
         The trial; with the status "policy_error" if the policy failed.
-
-    Raises:
-        VLAgentsError: The robot or the connection to the policy failed.
     """
     cell = trial.job.cell
     settings, task = cell.on_robot

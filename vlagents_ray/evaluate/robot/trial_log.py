@@ -156,11 +156,7 @@ class TrialLog:
 
 
 def logged_plan(out: Path, key: str | None) -> EvalConfig:
-    """Return the plan of the log in a folder, with the policies' URLs.
-
-    Raises:
-        ConfigError: The folder has no log, or it is of another key.
-    """
+    """Return the plan of the log in a folder, with the policies' URLs."""
     try:
         with (out / LOG).open("rb") as file:
             first = json.loads(file.readline())

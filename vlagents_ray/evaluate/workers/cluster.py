@@ -196,11 +196,7 @@ def tail(paths: Sequence[str]) -> str:
 
 
 def tail_at(host: str, paths: Sequence[str]) -> str:
-    """Return `tail` of files on any host of the cluster; "" if the host is lost.
-
-    Raises:
-        TimeoutError: The host does not answer.
-    """
+    """Return `tail` of files on any host of the cluster; "" if the host is lost."""
     if host == socket.gethostname():
         return tail(paths)
     nodes = [node["NodeID"] for node in ray.nodes() if node["Alive"] and node["NodeManagerHostname"] == host]

@@ -288,11 +288,7 @@ def _metadata(agent: Agent) -> dict[str, Any]:
 
 
 def _worker_info(policy: str, agent: Agent, env: BatchEnv) -> WorkerInfo:
-    """Return this process's entry in the results.
-
-    Raises:
-        ConfigError: The environment draws on a GPU that is not this worker's.
-    """
+    """Return this process's entry in the results."""
     renderer = env.renderer()
     if renderer is not None:
         require_own(renderer)
@@ -301,11 +297,7 @@ def _worker_info(policy: str, agent: Agent, env: BatchEnv) -> WorkerInfo:
 
 
 def agents(config: EvalConfig, own: Callable[[], Agent] | None, rank: RankName = "simulation") -> AgentFactory:
-    """Return the factory that a worker calls: `own`, or one of connections with this `rank`.
-
-    Raises:
-        ConfigError: A policy to connect to has no URL.
-    """
+    """Return the factory that a worker calls: `own`, or one of connections with this `rank`."""
     if own is not None:
         return functools.partial(_own_agent, own)
     for policy in config.policies:
