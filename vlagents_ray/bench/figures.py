@@ -12,7 +12,7 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -40,35 +40,22 @@ class RoundTrips:
     def median(self) -> float:
         return float(np.median(self.ms))
 
-    @property
-    def p99(self) -> float:
-        return float(np.quantile(self.ms, 0.99))
-
-    @property
-    def interval(self) -> tuple[float, float]:
-        """The 95 % confidence interval of the median, ms."""
-        return median_interval(self.ms)
-
     def to_json(self) -> dict[str, Any]:
         return {
             "way": self.name,
             "calls": len(self.ms),
             "median_ms": self.median,
-            "ci95_ms": list(self.interval),
-            "p99_ms": self.p99,
+            "ci95_ms": list(median_interval(self.ms)),
+            "p99_ms": float(np.quantile(self.ms, 0.99)),
         }
 
 
-@dataclass(frozen=True, slots=True)
-class Ratio:
+class Ratio(NamedTuple):
     """A median over another, with its 95 % bootstrap interval."""
 
     ratio: float
     low: float
     high: float
-
-    def to_json(self) -> dict[str, Any]:
-        return {"ratio": self.ratio, "ci95": [self.low, self.high]}
 
 
 def median_interval(values: np.ndarray) -> tuple[float, float]:
@@ -98,7 +85,10 @@ def median_ratio(ours: RoundTrips, theirs: RoundTrips, *, seed: int = 0) -> Rati
 
 def ratios(ours: Sequence[RoundTrips], theirs: Sequence[RoundTrips]) -> dict[str, dict[str, Any]]:
     """Return the ratios of all of ours to all of theirs, as JSON: {ours: {theirs: ratio}}."""
-    return {a.name: {b.name: median_ratio(a, b).to_json() for b in theirs} for a in ours}
+    found = {a.name: {b.name: median_ratio(a, b) for b in theirs} for a in ours}
+    return {
+        a: {b: {"ratio": one.ratio, "ci95": [one.low, one.high]} for b, one in row.items()} for a, row in found.items()
+    }
 
 
 def rate_of(calls: Sequence[Sequence[tuple[float, ...]]]) -> float:
