@@ -37,7 +37,12 @@ class EvalOptions:
     An option that is a field of `EvalConfig`, or of its policy, suite or worker, has the field's name here.
     """
 
-    what: Annotated[list[str], typer.Argument(metavar="FILE | ENV...", help="A file of runs (.yaml); or environments.")]
+    what: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="FILE | ENV...", help="A file of runs (.yaml); or environments: tabletop, 'libero/*', …"
+        ),
+    ]
     source: Annotated[str | None, typer.Option("--policy", help="Registered name, deployment file, or URL.")] = None
     out: Annotated[Path | None, typer.Option("--out", help="Folder of the results.")] = None
     episodes: Annotated[int | None, typer.Option(min=1, help="Episodes of each environment; default: 10.")] = None
@@ -62,7 +67,7 @@ class EvalOptions:
         typer.Option("--accept-changes", help="With --resume: although files or weights changed; the report says so."),
     ] = False
     execute: Annotated[int | None, typer.Option(min=1, help="Rows executed of each chunk; default: all.")] = None
-    retries: Annotated[int | None, typer.Option(min=0, help="After an infrastructure failure; default: 3.")] = None
+    retries: Annotated[int | None, typer.Option(min=0, help="Attempts after a lost one; default: 3.")] = None
     config: Set = field(default_factory=list)
     env_options: Annotated[
         list[str], typer.Option("--env-set", metavar="KEY=VALUE", help="An option of the environments: width=256.")
