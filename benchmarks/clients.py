@@ -18,7 +18,7 @@ from typing import Annotated
 import typer
 
 from vlagents_ray.bench.clients import OwnClient, connected, observation
-from vlagents_ray.bench.line_process import Driver, LineProcess, ProcessDriver
+from vlagents_ray.bench.line_process import Driver, LineProcess
 from vlagents_ray.bench.rtt import POLICY, RoundTripsOfAll, in_turns
 from vlagents_ray.cli.bench import Json, show_round_trips
 from vlagents_ray.cli.console import errors, progress, save
@@ -49,11 +49,11 @@ def measure_clients(url: str, calls: int, progress: Callable[[str], None] = lamb
         drivers: dict[str, Driver] = {
             f"Python, {one.transport}": stack.enter_context(connected(one, url, "")) for one in PYTHON
         }
-        drivers[CPP] = ProcessDriver(stack.enter_context(LineProcess(CPP, [_compiled(folder), url, str(folder)])))
+        drivers[CPP] = stack.enter_context(LineProcess(CPP, [_compiled(folder), url, str(folder)]))
         script = str(HERE / "node_client.mjs")
         for name, transport in NODE.items():
             command = [node, script, str(TYPESCRIPT / "dist" / "index.js"), url, transport, str(folder)]
-            drivers[name] = ProcessDriver(stack.enter_context(LineProcess(name, command)))
+            drivers[name] = stack.enter_context(LineProcess(name, command))
         for driver in drivers.values():
             driver.ready()
         return RoundTripsOfAll(tuple(in_turns(drivers, calls, progress).values()))

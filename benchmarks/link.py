@@ -24,10 +24,9 @@ import typer
 
 from benchmarks import peers as others
 from vlagents_ray.bench.clients import OwnClient
-from vlagents_ray.bench.figures import check_plot_file, plot_round_trips
+from vlagents_ray.bench.figures import check_plot_file, measured_on, plot_round_trips
 from vlagents_ray.bench.line_client import die_with_parent, own_stdout
 from vlagents_ray.bench.line_process import LineProcess, our_environment
-from vlagents_ray.bench.machine import measured_on
 from vlagents_ray.bench.rtt import measure
 from vlagents_ray.cli.bench import Calls, Json, Plot, show_round_trips
 from vlagents_ray.cli.console import errors, progress, save

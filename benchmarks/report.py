@@ -17,7 +17,7 @@ from rich.text import Text
 from benchmarks import link
 from benchmarks.peers import PYTHON, PeersPython
 from benchmarks.rtt import measure_with_peers
-from vlagents_ray.bench.machine import measured_on
+from vlagents_ray.bench.figures import measured_on
 from vlagents_ray.bench.throughput import ThroughputPlan, measure_throughput
 from vlagents_ray.cli.bench import Calls
 from vlagents_ray.cli.console import errors, out, progress, table

@@ -24,7 +24,7 @@ from vlagents_ray.cli.console import out
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.envs.tabletop import Tabletop
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.learn import Rollouts
+from vlagents_ray.learn import RolloutPlan, Rollouts
 from vlagents_ray.registry import policy_class
 from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.serve.launch.server import running_server
@@ -84,7 +84,7 @@ def served(policy: str, config: dict[str, Any], patience: float, **settings: Any
     app = document.applications[0].name
     with (
         running_server(document, num_cpus=settings["workers"] + 2, ingress=False),
-        Rollouts("tabletop", f"serve://{app}", **settings) as rollouts,
+        Rollouts(RolloutPlan("tabletop", f"serve://{app}", **settings)) as rollouts,
     ):
         rollouts.collect(4 * settings["workers"] * settings["num_envs"])  # workers start, and make their environments
 

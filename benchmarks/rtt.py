@@ -10,8 +10,7 @@ import typer
 
 from benchmarks import peers as others
 from vlagents_ray.bench.clients import own_clients
-from vlagents_ray.bench.figures import check_plot_file, plot_round_trips
-from vlagents_ray.bench.machine import measured_on
+from vlagents_ray.bench.figures import check_plot_file, measured_on, plot_round_trips
 from vlagents_ray.bench.rtt import measure
 from vlagents_ray.cli.bench import Calls, Json, Plot, Transports, show_round_trips
 from vlagents_ray.cli.console import errors, progress, save

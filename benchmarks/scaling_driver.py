@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 from benchmarks.environments import ACTION_DIM, SLEEPING_ENV
 from benchmarks.overhead import cpu_seconds, recorded, steady
 from vlagents_ray.bench.line_client import die_with_parent, own_stdout
-from vlagents_ray.evaluate import EvalConfig, PolicyConfig, SilentProgress, SuiteConfig, WorkerConfig, evaluate
+from vlagents_ray.evaluate import EvalConfig, PolicyConfig, Progress, SuiteConfig, WorkerConfig, evaluate
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.policies.noop import Noop, NoopConfig
@@ -81,7 +81,7 @@ class PlayedEpisodes(NamedTuple):
         return self.episodes_per_minute
 
 
-class ScalingLedger(SilentProgress):
+class ScalingLedger(Progress):
     """When each episode was recorded, and what the driver and the daemons had used by then."""
 
     def __init__(self) -> None:

@@ -28,7 +28,7 @@ from benchmarks.environments import TIMED_TABLETOP, EpisodeTimes, read_episode_t
 from benchmarks.report import Outcome, show_outcomes, unmeasured
 from vlagents_ray.cli.bench import Json
 from vlagents_ray.cli.console import errors, out, progress, save
-from vlagents_ray.evaluate import EvalConfig, PolicyConfig, Results, SilentProgress, SuiteConfig, evaluate
+from vlagents_ray.evaluate import EvalConfig, PolicyConfig, Progress, Results, SuiteConfig, evaluate
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.cases import EvalCase, cells
 from vlagents_ray.evaluate.plan.jobs import plan as planned
@@ -98,7 +98,7 @@ def measure_soak(soak: SoakPlan, progress: Callable[[str], None] = lambda _: Non
         return report(soak, ledger, watcher, read_episode_times(notes), found, wanted)
 
 
-class SoakLedger(SilentProgress):
+class SoakLedger(Progress):
     """When each episode was recorded, and the CPU time that the driver had used by then."""
 
     def __init__(self, progress: Callable[[str], None]) -> None:

@@ -18,7 +18,7 @@ from own_policy import Servo, offset
 
 from vlagents_ray import join
 from vlagents_ray.evaluate import EvalConfig
-from vlagents_ray.learn import Publisher, Rollouts, TrainingEvaluation, arrays
+from vlagents_ray.learn import Publisher, RolloutPlan, Rollouts, TrainingEvaluation, arrays
 
 ENV = "own_env:CraneEnv"
 SPREAD = 0.5  # of the actions: standard deviation of what is tried
@@ -56,7 +56,7 @@ def main(url):
     plan = EvalConfig(policies=[{"name": "servo"}], suites=[held_out], out=out, video="none")
     evaluation = TrainingEvaluation(learner.policy, plan)  # in this process; or of the URL, by workers
     exploring = {"policy_options": {"spread": SPREAD}}
-    with Publisher(url) as weights, Rollouts(ENV, url, workers=2, num_envs=4, **exploring) as rollouts:
+    with Publisher(url) as weights, Rollouts(RolloutPlan(ENV, url, workers=2, num_envs=4, **exploring)) as rollouts:
         for iteration in range(ITERATIONS + 1):
             version = weights.push(learner.policy.parameters(), allow_same=True)
             if iteration in (0, ITERATIONS):

@@ -12,7 +12,7 @@ import pytest
 import yaml
 from page_commands import PAGES, commands, read_as_typed
 
-from vlagents_ray.cli.evaluation.command import read_run
+from vlagents_ray.cli.evaluate import read_run
 from vlagents_ray.envs import aloha, metaworld, robocasa
 from vlagents_ray.envs.calvin import env as calvin
 from vlagents_ray.envs.gymnasium.making import known

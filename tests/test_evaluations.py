@@ -11,7 +11,7 @@ import yaml
 from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
-from vlagents_ray.cli.evaluation.command import read_run
+from vlagents_ray.cli.evaluate import read_run
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig, SuiteConfig, WorkerConfig
 from vlagents_ray.evaluate.plan.cases import expand
 from vlagents_ray.evaluate.plan.config import ClockConfig, RobotConfig, RobotTask, StopConfig, TrackingConfig

@@ -65,7 +65,7 @@ def test_the_wheel_holds_every_module_and_the_licence_and_no_tests(wheel: Path) 
     modules = {str(path.relative_to(ROOT)) for path in (ROOT / "vlagents_ray").rglob("*.py")}
     assert modules - names == set()
     assert "vlagents_ray/py.typed" in names
-    page = ROOT / "vlagents_ray/evaluate/report/html"
+    page = ROOT / "vlagents_ray/evaluate/report"
     resources = {str(path.relative_to(ROOT)) for pattern in ("report.*", "templates/*") for path in page.glob(pattern)}
     assert len(resources) >= 4
     assert resources - names == set()

@@ -20,7 +20,7 @@ from typing import Annotated
 
 import typer
 
-from vlagents_ray.bench.line_process import START_S, Driver, LineProcess, ProcessDriver
+from vlagents_ray.bench.line_process import START_S, Driver, LineProcess
 from vlagents_ray.bench.rtt import LOOPBACK, StartClient
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.launch.server import free_port
@@ -105,7 +105,7 @@ def peer_connected(
         LineProcess(f"{client.name}, server", [*command, "serve", *address], alone),
         LineProcess(client.name, [*prefix, *command, "drive", *address, str(obs), client.mode], alone) as process,
     ):
-        yield ProcessDriver(process)
+        yield process
 
 
 def starters(

@@ -28,7 +28,7 @@ from vlagents_ray.cli.ray_session import quiet_ray
 from vlagents_ray.client import RemoteAgent
 from vlagents_ray.errors import ConfigError, PolicyUnavailable, WeightsLost
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig, SuiteConfig, Summary, print_summary
-from vlagents_ray.learn import Publisher, Rollouts, TrainingEvaluation, arrays
+from vlagents_ray.learn import Publisher, RolloutPlan, Rollouts, TrainingEvaluation, arrays
 from vlagents_ray.serve.launch.deployment_file import deployment, together
 from vlagents_ray.serve.launch.server import running_server
 
@@ -222,15 +222,17 @@ class LearnRun:
 
     def _rollouts(self, policy: str, want: Sequence[str] = (), first: int = 0, groups: int = 1) -> Rollouts:
         return Rollouts(
-            ENV,
-            _url(policy),
-            workers=self._plan.workers,
-            num_envs=self._plan.num_envs,
-            want=want,
-            seed=TRAINING * (1 + self._plan.seed),
-            first=first,
-            groups=groups,
-            env_options=ENV_OPTIONS,
+            RolloutPlan(
+                ENV,
+                _url(policy),
+                workers=self._plan.workers,
+                num_envs=self._plan.num_envs,
+                want=want,
+                seed=TRAINING * (1 + self._plan.seed),
+                first=first,
+                groups=groups,
+                env_options=ENV_OPTIONS,
+            )
         )
 
     def _evaluate(self, method: Method, version: int) -> Summary:

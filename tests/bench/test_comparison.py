@@ -8,8 +8,7 @@ from typing import Any
 
 import pytest
 
-from vlagents_ray.bench.comparison import compare_figures, read_figures
-from vlagents_ray.bench.machine import measured_on
+from vlagents_ray.bench.figures import compare_figures, measured_on, read_figures
 from vlagents_ray.errors import ConfigError
 
 

@@ -22,9 +22,7 @@ from vlagents_ray.cli.main import app
         (["policy", "noop", "--state", "joints=some"], "joints"),
         (["policy", "noop", "--set", "colour=blue"], "colour"),
         (["policy", "nowhere.yaml"], "nowhere.yaml"),
-        (["throughput", "--config", "{"], "JSON"),
-        (["throughput", "--config", '{"base_ms": 1}'], "--policy"),
-        (["throughput", "--model", "huge"], "size"),
+        (["throughput", "--set", "base_ms=1"], "--policy"),
     ],
 )
 def test_mistakes_are_told_in_a_line(words: list[str], text: str) -> None:

@@ -16,8 +16,10 @@ import pytest
 from typer.testing import CliRunner
 
 import vlagents_ray.evaluate
-from vlagents_ray.cli.evaluation import command, policies, run
-from vlagents_ray.cli.evaluation.live import live_address
+from vlagents_ray.cli import evaluate as command
+from vlagents_ray.cli import evaluation as run
+from vlagents_ray.cli import policies
+from vlagents_ray.cli.live import live_address
 from vlagents_ray.cli.main import app
 from vlagents_ray.evaluate import EvalConfig, OutOfTime, PolicyConfig, Results, SuiteConfig, WorkerConfig
 from vlagents_ray.evaluate.episode.failures import Failure
@@ -189,7 +191,6 @@ def test_each_option_that_is_a_setting_is_one_of_a_single_model() -> None:
         for option in inspect.signature(command.evaluate_command).parameters
     }
     of_the_run_itself = {
-        "context",
         "what",
         "watch",
         "until",

@@ -14,7 +14,8 @@ from flat_config import flat_config
 from typer.testing import CliRunner, Result
 
 import vlagents_ray.evaluate
-from vlagents_ray.cli.evaluation import command, run
+from vlagents_ray.cli import evaluate as command
+from vlagents_ray.cli import evaluation as run
 from vlagents_ray.cli.main import app
 from vlagents_ray.cli.options import parse_settings
 from vlagents_ray.contract import Contract

@@ -11,8 +11,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from vlagents_ray.cli import listing
-from vlagents_ray.cli.evaluation import policies
+from vlagents_ray.cli import listing, policies
 from vlagents_ray.cli.main import app
 from vlagents_ray.client.transports import base
 from vlagents_ray.serve.ports import free_port

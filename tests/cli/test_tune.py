@@ -57,15 +57,6 @@ def test_the_settings_to_change_are_printed_with_the_figures(file: Path) -> None
     assert args.config["batch_sizes"][-1] == args.batch.max_size
 
 
-def test_a_picture_is_drawn_where_it_is_asked_for(file: Path) -> None:
-    plot = file.with_name("mine.svg")
-    words = ["tune", str(file), *QUICK, "--for", "robots", "--p99-ms", "60000", "--plot", str(plot)]
-    done = CliRunner().invoke(app, words)
-    assert done.exit_code == 0, done.output
-    assert plot.read_text().startswith("<?xml")
-    assert {path.name for path in file.parent.iterdir()} == {"mine.yaml", "mine.svg"}
-
-
 def test_a_goal_that_nothing_reaches_is_an_error(file: Path) -> None:
     done = CliRunner().invoke(app, ["tune", str(file), *QUICK, "--for", "robots", "--p99-ms", "0.000001"])
     assert done.exit_code == 1
@@ -82,7 +73,6 @@ def test_a_goal_that_nothing_reaches_is_an_error(file: Path) -> None:
         (["nowhere.yaml", "--p99-ms", "60"], "--for robots"),
         (["FILE", "--state", "joints=some"], "joints"),
         (["FILE", "--app", "yours"], "mine"),
-        (["FILE", "--plot", "a.gif"], ".png"),
         (["FILE", "--frames", "."], "trajectory"),
     ],
 )

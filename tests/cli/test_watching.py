@@ -11,9 +11,9 @@ import typer
 import yaml
 from eval_fakes import LINE
 
-from vlagents_ray.cli.evaluation import run
-from vlagents_ray.cli.evaluation.policies import resolve_policies
-from vlagents_ray.cli.evaluation.run import _watched, watch_training
+from vlagents_ray.cli import evaluation as run
+from vlagents_ray.cli.evaluation import _watched, watch_training
+from vlagents_ray.cli.policies import resolve_policies
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig, Progress, Results, Summary
 from vlagents_ray.evaluate.episode.records import EpisodeResult, Status

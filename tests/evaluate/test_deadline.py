@@ -11,7 +11,7 @@ from eval_fakes import ToZero
 from flat_config import flat_config
 from manual_clock import Clock
 
-from vlagents_ray.evaluate import EvalConfig, OutOfTime, SilentProgress, evaluate
+from vlagents_ray.evaluate import EvalConfig, OutOfTime, Progress, evaluate
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.cases import EvalCase, cells
 from vlagents_ray.evaluate.plan.jobs import plan
@@ -48,7 +48,7 @@ def test_episodes_of_earlier_runs_tell_how_long_they_take() -> None:
     assert Deadline(100 + CLOSING_S, [20.0, 70.0], Clock()).leaves_room
 
 
-class SlowAfterTwo(SilentProgress):
+class SlowAfterTwo(Progress):
     """Once two episodes are recorded, there is no time for another one."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:

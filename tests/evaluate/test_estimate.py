@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pytest
 from eval_fakes import LINE, OTHER_LINE, ToZero
 
-from vlagents_ray.cli.evaluation.run import print_plan
+from vlagents_ray.cli.evaluation import print_plan
 from vlagents_ray.evaluate import EvalConfig, Results, evaluate
 from vlagents_ray.evaluate.estimate import forecasts, longest_episode
 from vlagents_ray.evaluate.plan.cases import cells

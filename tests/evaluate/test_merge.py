@@ -20,7 +20,7 @@ from vlagents_ray.evaluate import EvalConfig, Results
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.merge import combined, merge
 from vlagents_ray.evaluate.plan.jobs import plan
-from vlagents_ray.evaluate.report.html import write_report
+from vlagents_ray.evaluate.report.page import write_report
 from vlagents_ray.evaluate.results.store import Store
 
 Config = Callable[..., EvalConfig]

@@ -21,7 +21,7 @@ from vlagents_ray.errors import ConfigError, ConnectionLost, ContractMismatch, U
 from vlagents_ray.evaluate import (
     EvalConfig,
     EvaluationInterrupted,
-    SilentProgress,
+    Progress,
     SuiteConfig,
     check,
     evaluate,
@@ -160,7 +160,7 @@ class TestOnACluster:
 
         monkeypatch.setattr("vlagents_ray.evaluate.run.ray_cluster", looking)
 
-        class SignalAfterTwo(SilentProgress):
+        class SignalAfterTwo(Progress):
             seen = 0
 
             def episode(self, cell: EvalCase, result: EpisodeResult) -> None:

@@ -57,7 +57,7 @@ def test_throughput_comes_near_the_bare_policy_and_never_above_it(ray_home: Path
     """Written out as a class, `noop` is a policy of unknown speed, which is measured bare; it sleeps, so that the
     two cores of a busy machine do not matter."""
     file = tmp_path / "throughput.json"
-    policy = ["--policy", "vlagents_ray.policies.noop:Noop", "--config", '{"base_ms": 40, "per_item_ms": 5}']
+    policy = ["--policy", "vlagents_ray.policies.noop:Noop", "--set", "base_ms=40", "--set", "per_item_ms=5"]
     few = ["--clients", "8", "--batch", "4", "--seconds", "0.6", "--rounds", "1", "--robot-seconds", "0.6"]
     ratios = []
     for _ in range(3):  # a machine that stands still for a second spoils a measurement of 0.6 s

@@ -14,7 +14,7 @@ from flat_config import flat_config
 from ray_processes import words
 
 from tests.integration.conftest import serving
-from vlagents_ray.evaluate import EvalConfig, EvaluationInterrupted, Results, SilentProgress, evaluate
+from vlagents_ray.evaluate import EvalConfig, EvaluationInterrupted, Progress, Results, evaluate
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.serve.launch.server import Server
@@ -50,7 +50,7 @@ def outcomes(out: Path) -> dict[tuple[str, int], tuple[Any, ...]]:
     }  # fmt: skip
 
 
-class Disaster(SilentProgress):
+class Disaster(Progress):
     """Kills all workers after each fifth episode, and has the evaluation interrupted after so many."""
 
     def __init__(self, interrupted_after: int | None = None) -> None:

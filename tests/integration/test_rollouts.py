@@ -18,7 +18,7 @@ from served_agents import Stochastic
 
 from tests.integration.conftest import serving
 from vlagents_ray.errors import NotOffered
-from vlagents_ray.learn import Rollouts, arrays, rollouts
+from vlagents_ray.learn import RolloutPlan, Rollouts, arrays, rollouts
 from vlagents_ray.serve.launch.server import Server
 
 GROUPS: dict[str, Any] = {"groups": 4, "want": ["logprob", "value"], "seed": 10}
@@ -40,7 +40,7 @@ def served(version: Path) -> Iterator[Server]:
 def expected(version: Path) -> Any:
     """The transitions of 8 episodes of the policy in this process, one after the other."""
     write(version, 3)
-    with without_ray(rollouts), Rollouts(LINE, partial(Stochastic, str(version)), **GROUPS) as found:
+    with without_ray(rollouts), Rollouts(RolloutPlan(LINE, partial(Stochastic, str(version)), **GROUPS)) as found:
         return without_key(found.collect(8))
 
 
@@ -58,7 +58,7 @@ def without_key(table: Any) -> Any:
 
 @pytest.mark.parametrize("url", ["serve://Stochastic", "http"])
 def test_transitions_are_those_of_the_policy_itself(served: Server, expected: Any, url: str) -> None:
-    with Rollouts(LINE, served.url if url == "http" else url, workers=2, num_envs=3, **GROUPS) as found:
+    with Rollouts(RolloutPlan(LINE, served.url if url == "http" else url, workers=2, num_envs=3, **GROUPS)) as found:
         got = without_key(found.collect(8))
     assert got.equals(expected)
     columns = arrays(got)
@@ -81,7 +81,7 @@ def test_a_worker_killed_with_several_episodes_costs_no_transition_and_doubles_n
 
     killer = threading.Thread(target=kill)
     gate = {"folder": str(tmp_path), "trouble": {"gate": [11]}}
-    with Rollouts(LINE, "serve://Stochastic", workers=2, num_envs=3, env_options=gate, **GROUPS) as found:
+    with Rollouts(RolloutPlan(LINE, "serve://Stochastic", workers=2, num_envs=3, env_options=gate, **GROUPS)) as found:
         killer.start()
         got = without_key(found.collect(8))
         killer.join()
@@ -92,7 +92,7 @@ def test_a_worker_killed_with_several_episodes_costs_no_transition_and_doubles_n
 
 def test_episodes_of_weights_that_a_learner_has_replaced_are_played_again(served: Server, version: Path) -> None:
     write(version, 1)
-    with Rollouts(LINE, "serve://Stochastic", workers=2, num_envs=2) as found:
+    with Rollouts(RolloutPlan(LINE, "serve://Stochastic", workers=2, num_envs=2)) as found:
         first = next(found)
         write(version, 2)
         found.version = 2
@@ -105,7 +105,7 @@ def test_episodes_of_weights_that_a_learner_has_replaced_are_played_again(served
 def test_what_the_policy_does_not_offer_ends_the_rollouts_at_once(served: Server, version: Path) -> None:
     write(version, 1)
     with (
-        Rollouts(LINE, served.url, want=["logprob", "entropy"]) as found,
+        Rollouts(RolloutPlan(LINE, served.url, want=["logprob", "entropy"])) as found,
         pytest.raises(NotOffered, match=r"\['entropy'\], want some of \['logprob', 'value'\]"),
     ):
         next(found)

@@ -14,7 +14,7 @@ from served_agents import Proportional
 
 from tests.integration.conftest import serving
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.evaluate import EvalConfig, SilentProgress, Summary
+from vlagents_ray.evaluate import EvalConfig, Progress, Summary
 from vlagents_ray.learn import Publisher, TrainingEvaluation
 from vlagents_ray.serve.launch.server import Server
 
@@ -66,7 +66,7 @@ def test_each_version_is_evaluated_as_it_was_pushed(
 def test_a_push_during_an_evaluation_ends_it(server: Server, tmp_path: Path) -> None:
     weights = Publisher("serve://Proportional")
 
-    class Another(SilentProgress):
+    class Another(Progress):
         """A learner of its own."""
 
         def episode(self, *_: Any) -> None:

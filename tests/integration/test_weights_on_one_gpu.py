@@ -11,7 +11,7 @@ from shared_cpu_memory import SharedCpuMemory
 from tests.integration.test_weights import acts_of
 from vlagents_ray.errors import InvalidWeights
 from vlagents_ray.learn import Publisher
-from vlagents_ray.learn.targets import AppTarget
+from vlagents_ray.learn.publisher import AppTarget
 from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.serve.launch.server import running_server
 from vlagents_ray.weights import shared_values

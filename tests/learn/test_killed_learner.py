@@ -16,7 +16,7 @@ from eval_fakes import LINE, PYTHONPATH, ToZero, wait_for
 from in_process_pool import without_ray
 from ray_processes import processes, ray_folder, wait_for_end
 
-from vlagents_ray.learn import Rollouts, rollouts
+from vlagents_ray.learn import RolloutPlan, Rollouts, rollouts
 
 pytestmark = [pytest.mark.ray, pytest.mark.slow]
 
@@ -26,12 +26,12 @@ import json, sys
 from pathlib import Path
 import pyarrow as pa
 from eval_fakes import LINE, ToZero
-from vlagents_ray.learn import Rollouts
+from vlagents_ray.learn import RolloutPlan, Rollouts
 
 folder, episodes, options = Path(sys.argv[1]), int(sys.argv[2]), json.loads(sys.argv[3])
 checkpoint = folder / "position"
 first = int(checkpoint.read_text()) if checkpoint.exists() else 0
-with Rollouts(LINE, ToZero, workers=2, first=first, env_options=options) as rollouts:
+with Rollouts(RolloutPlan(LINE, ToZero, workers=2, first=first, env_options=options)) as rollouts:
     while rollouts.position < episodes:
         batch = next(rollouts)
         with pa.OSFile(str(folder / f"{rollouts.position - 1}.arrow"), "wb") as file:
@@ -66,7 +66,7 @@ def test_a_killed_learner_leaves_nothing_running_and_goes_on_without_a_lost_or_d
         with Popen(command, env=environment, start_new_session=True) as learner:
             assert learner.wait(300) == 0
         wait_for(lambda: not processes(ours))
-    with without_ray(rollouts), Rollouts(LINE, ToZero, env_options=options) as undisturbed:
+    with without_ray(rollouts), Rollouts(RolloutPlan(LINE, ToZero, env_options=options)) as undisturbed:
         expected = list(itertools.islice(undisturbed, EPISODES))
     got = learned(tmp_path)
     assert len(got) == EPISODES

@@ -14,7 +14,7 @@ from replica_process import ReplicaProcess, model
 from shared_cpu_memory import GPU, SharedCpuMemory
 
 from vlagents_ray.errors import InvalidWeights, UnchangedWeights
-from vlagents_ray.learn.targets import AppTarget
+from vlagents_ray.learn.publisher import AppTarget
 from vlagents_ray.serve.scaling.weight_push import WeightPusher
 from vlagents_ray.serve.weights.updates import PushOptions
 from vlagents_ray.weights import shared_values

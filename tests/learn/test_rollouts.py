@@ -20,7 +20,7 @@ from vlagents_ray.evaluate.workers import rollout
 from vlagents_ray.evaluate.workers.rollout import Report
 from vlagents_ray.evaluate.workers.worker import InProcessWorkers
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.learn import Rollouts, arrays, rollouts
+from vlagents_ray.learn import RolloutPlan, Rollouts, arrays, rollouts
 
 
 class Workers(InProcessWorkers):
@@ -89,18 +89,18 @@ def planned(episodes: int, env: str = LINE) -> list[str]:
 
 
 def test_episodes_are_those_of_an_evaluation_in_their_order_whoever_plays_them(pool: type[Workers]) -> None:
-    with Rollouts(LINE, ToZero, workers=3) as several:
+    with Rollouts(RolloutPlan(LINE, ToZero, workers=3)) as several:
         batches = list(itertools.islice(several, 8))
     assert keys(batches) == planned(8)
     assert pool.played[:8] != planned(8), "or the test shows nothing"
-    with Rollouts(LINE, ToZero) as one:
+    with Rollouts(RolloutPlan(LINE, ToZero)) as one:
         alone = list(itertools.islice(one, 8))
     assert all(first.equals(second) for first, second in zip(batches, alone, strict=True))
     assert (several.stats.episodes, several.stats.transitions, several.position) == (8, 80, 8)
 
 
 def test_collect_plays_so_many_and_no_others(pool: type[Workers]) -> None:
-    with Rollouts(LINE, ToZero, workers=3) as found:
+    with Rollouts(RolloutPlan(LINE, ToZero, workers=3)) as found:
         table = found.collect(5)
         assert sorted(pool.played) == sorted(planned(5))
         assert table.num_rows == 50
@@ -119,14 +119,14 @@ class Replayed(ToZero):
 
 
 def test_the_replay_is_a_column() -> None:
-    with Rollouts(LINE, Replayed, workers=2, want=["replay"]) as found:
+    with Rollouts(RolloutPlan(LINE, Replayed, workers=2, want=["replay"])) as found:
         got = arrays(found.collect(4))
     assert got["replay.tokens"].shape == (40, 1, 1)
     np.testing.assert_array_equal(got["replay.tokens"][:, 0], np.rint(100 * got["action"]))
 
 
 def test_a_group_begins_in_one_state_and_differs_in_the_seed_of_the_policy() -> None:
-    with Rollouts(LINE, ToZero, groups=3, workers=2, seed=10) as found:
+    with Rollouts(RolloutPlan(LINE, ToZero, groups=3, workers=2, seed=10)) as found:
         got = [arrays(batch) for batch in itertools.islice(found, 6)]
     starts = [float(one["state.position"][0, 0]) for one in got]
     assert starts[0] == starts[1] == starts[2] != starts[3] == starts[4] == starts[5]
@@ -140,7 +140,7 @@ def test_a_group_begins_in_one_state_and_differs_in_the_seed_of_the_policy() -> 
 @pytest.mark.parametrize("collected", [True, False])
 def test_workers_that_die_cost_neither_an_episode_nor_a_second_one(pool: type[Workers], collected: bool) -> None:
     pool.dying = 2
-    with Rollouts(LINE, ToZero, workers=3) as found:
+    with Rollouts(RolloutPlan(LINE, ToZero, workers=3)) as found:
         batches = found.collect(8).to_batches() if collected else list(itertools.islice(found, 8))
     assert keys(batches) == planned(8)
     assert (found.stats.retries, found.stats.lost) == (2, 0)
@@ -148,7 +148,7 @@ def test_workers_that_die_cost_neither_an_episode_nor_a_second_one(pool: type[Wo
 
 def test_an_episode_that_no_attempt_ends_is_left_out_and_counted() -> None:
     broken = {"trouble": {"raise": [2]}}
-    with Rollouts(LINE, ToZero, env_options=broken, settings={"retries": 1}) as found:
+    with Rollouts(RolloutPlan(LINE, ToZero, env_options=broken, settings={"retries": 1})) as found:
         batches = list(itertools.islice(found, 4))
     assert [int(batch.column("episode")[0].as_py()) for batch in batches] == [0, 1, 3, 4]
     assert (found.stats.retries, found.stats.lost, found.position) == (1, 1, 5)
@@ -159,7 +159,7 @@ def test_too_many_lost_in_a_row_end_it_with_their_error() -> None:
         return ToZero(lost_on=EVERY)
 
     with (
-        Rollouts(LINE, lost, settings={"retries": 0, "abort_after": 3}) as found,
+        Rollouts(RolloutPlan(LINE, lost, settings={"retries": 0, "abort_after": 3})) as found,
         pytest.raises(ConnectionLost, match=r"3 episodes in a row lost .*first=rollouts.position"),
     ):
         found.collect(4)
@@ -170,13 +170,16 @@ def test_an_error_of_the_policy_loses_the_episode_and_ends_it_if_it_stays() -> N
         def act(self, obs: Obs) -> Act:
             return Act(np.full(1, np.nan, np.float32))
 
-    with Rollouts(LINE, Nan, settings={"abort_after": 2}) as found, pytest.raises(PolicyFailed, match="2 episodes in"):
+    with (
+        Rollouts(RolloutPlan(LINE, Nan, settings={"abort_after": 2})) as found,
+        pytest.raises(PolicyFailed, match="2 episodes in"),
+    ):
         next(found)
     assert (found.stats.lost, found.stats.retries) == (2, 0)
 
 
 def test_on_policy_by_default_older_episodes_are_played_again(versioned: type[Versioned]) -> None:
-    with Rollouts(LINE, versioned, workers=3) as found:
+    with Rollouts(RolloutPlan(LINE, versioned, workers=3)) as found:
         first = next(found)
         versioned.version = found.version = 1
         rest = list(itertools.islice(found, 5))
@@ -186,7 +189,7 @@ def test_on_policy_by_default_older_episodes_are_played_again(versioned: type[Ve
 
 
 def test_a_version_that_no_act_names_is_an_error_and_not_an_endless_repetition() -> None:
-    with Rollouts(LINE, ToZero) as found:
+    with Rollouts(RolloutPlan(LINE, ToZero)) as found:
         next(found)
         found.version += 1
         with pytest.raises(ConfigError, match=r"set to 1, but its acts name 0; set it to what a push returned"):
@@ -195,13 +198,13 @@ def test_a_version_that_no_act_names_is_an_error_and_not_an_endless_repetition()
 
 def test_collect_goes_on_if_all_are_lost() -> None:
     broken = {"trouble": {"raise": [0, 1]}}
-    with Rollouts(LINE, ToZero, env_options=broken, settings={"retries": 0}) as found:
+    with Rollouts(RolloutPlan(LINE, ToZero, env_options=broken, settings={"retries": 0})) as found:
         assert set(found.collect(1).column("episode").to_pylist()) == {2}
     assert found.stats.lost == 2
 
 
 def test_the_version_rises_with_that_of_the_acts(versioned: type[Versioned]) -> None:
-    with Rollouts(LINE, versioned) as found:
+    with Rollouts(RolloutPlan(LINE, versioned)) as found:
         versioned.version = 4
         next(found)
         assert found.version == 4
@@ -215,7 +218,7 @@ def test_a_lag_may_be_allowed(versioned: type[Versioned], lag: int | None, stale
             type(self).version = versioned.version = 1  # after the first act, in the middle of the first episode
             return act
 
-    with Rollouts(LINE, Pushed, max_lag=lag) as found:
+    with Rollouts(RolloutPlan(LINE, Pushed, max_lag=lag)) as found:
         table = found.collect(2)
     assert found.stats.stale == stale
     assert (0 in table.column("version").to_pylist()) is (stale == 0)
@@ -239,26 +242,26 @@ def test_a_simulator_of_many_environments_is_one_worker_with_one_question_a_step
     monkeypatch.setattr(Line, "batched", together)
     served = Replicas([ToZero()])
     try:
-        with Rollouts(LINE, served.agent, num_envs=4, groups=2) as found:
+        with Rollouts(RolloutPlan(LINE, served.agent, num_envs=4, groups=2)) as found:
             table = found.collect(8)
     finally:
         served.close()
     assert [env.num_envs for env in made] == [4]
     assert served.frames[:22] == [4] * 22, "a reset and 10 acts, twice; sessions are closed one by one"
-    with Rollouts(LINE, ToZero, groups=2) as alone:
+    with Rollouts(RolloutPlan(LINE, ToZero, groups=2)) as alone:
         assert table.drop_columns("key").equals(alone.collect(8).drop_columns("key"))
 
 
 def test_they_go_on_where_a_learner_that_died_was() -> None:
-    with Rollouts(LINE, ToZero, groups=2) as found:
+    with Rollouts(RolloutPlan(LINE, ToZero, groups=2)) as found:
         found.collect(4)
         batches = list(itertools.islice(found, 3))
-    with Rollouts(LINE, ToZero, groups=2, first=4) as again:
+    with Rollouts(RolloutPlan(LINE, ToZero, groups=2, first=4)) as again:
         assert all(one.equals(other) for one, other in zip(batches, itertools.islice(again, 3), strict=True))
 
 
 def test_closed_and_asked_for_more_they_begin_again_what_was_not_delivered() -> None:
-    found = Rollouts(LINE, ToZero, workers=3)
+    found = Rollouts(RolloutPlan(LINE, ToZero, workers=3))
     first = next(found)
     found.close()
     found.close()
@@ -267,7 +270,7 @@ def test_closed_and_asked_for_more_they_begin_again_what_was_not_delivered() -> 
 
 
 def test_several_envs_take_turns() -> None:
-    with Rollouts([LINE, OTHER_LINE], ToZero) as found:
+    with Rollouts(RolloutPlan([LINE, OTHER_LINE], ToZero)) as found:
         got = keys(itertools.islice(found, 4))
     one, other = planned(2), planned(2, OTHER_LINE)
     assert got == [one[0], other[0], one[1], other[1]]
@@ -286,7 +289,10 @@ def test_envs_of_different_columns_do_not_fit_into_one_table(monkeypatch: pytest
             self._seven = kwargs["env"].endswith(SevenLine.__name__)
             return super().reset(obs, instruction, **kwargs)
 
-    with Rollouts([LINE, "eval_fakes:SevenLine"], Seven) as found, pytest.raises(ConfigError, match="iterate"):
+    with (
+        Rollouts(RolloutPlan([LINE, "eval_fakes:SevenLine"], Seven)) as found,
+        pytest.raises(ConfigError, match="iterate"),
+    ):
         found.collect(2)
 
 
@@ -300,11 +306,11 @@ def test_envs_of_different_columns_do_not_fit_into_one_table(monkeypatch: pytest
 )
 def test_wrong_settings_are_errors_before_any_worker_starts(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
-        Rollouts(LINE, ToZero, **settings)
+        Rollouts(RolloutPlan(LINE, ToZero, **settings))
 
 
 def test_an_env_that_nobody_knows_is_an_error_at_once() -> None:
     with pytest.raises(UnknownEnv):
-        Rollouts("nowhere", ToZero)
+        Rollouts(RolloutPlan("nowhere", ToZero))
     with pytest.raises(ValueError, match="wrkers"):
-        Rollouts(LINE, ToZero, settings={"wrkers": 3})
+        Rollouts(RolloutPlan(LINE, ToZero, settings={"wrkers": 3}))

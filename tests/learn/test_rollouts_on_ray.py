@@ -16,7 +16,7 @@ import pytest
 import ray
 from eval_fakes import LINE, PYTHONPATH, ToZero, wait_for
 
-from vlagents_ray.learn import Rollouts, arrays
+from vlagents_ray.learn import RolloutPlan, Rollouts, arrays
 from vlagents_ray.ray_tools.session import start_ray
 
 pytestmark = pytest.mark.ray
@@ -44,7 +44,7 @@ def in_plasma(values: np.ndarray) -> bool:
 
 
 def test_a_learner_on_the_node_maps_what_a_worker_wrote() -> None:
-    with Rollouts(LINE, ToZero, workers=2, env_options=IMAGES, settings=SETTINGS) as rollouts:
+    with Rollouts(RolloutPlan(LINE, ToZero, workers=2, env_options=IMAGES, settings=SETTINGS)) as rollouts:
         batches = list(itertools.islice(rollouts, 3))
         for got in map(arrays, batches):
             assert in_plasma(got["cameras.front"])
@@ -62,7 +62,7 @@ def test_a_worker_that_is_killed_costs_neither_an_episode_nor_a_second_one(tmp_p
         os.kill(int(mark.read_text()), signal.SIGKILL)
 
     killer = threading.Thread(target=kill)
-    with Rollouts(LINE, ToZero, workers=2, env_options=gate, settings=SETTINGS) as rollouts:
+    with Rollouts(RolloutPlan(LINE, ToZero, workers=2, env_options=gate, settings=SETTINGS)) as rollouts:
         killer.start()
         table = rollouts.collect(6)
         killer.join()

@@ -94,10 +94,7 @@ def test_episodes_side_by_side_have_the_transitions_of_each_by_itself() -> None:
         agent,
         [copy.deepcopy(agent) for _ in keys],
         keys,
-        record=lambda i, obs: recorders[i].add_observation(obs),
-        request_info=recorders[0].request_info,
-        acted=lambda i, *said: recorders[i].add_act(*said),
-        executed=lambda i, *done: recorders[i].add_action(*done),
+        observers=recorders,
     )
     for key, recorder, result in zip(keys, recorders, results, strict=True):
         assert isinstance(result, EpisodeResult)

@@ -18,8 +18,8 @@ from live_server import live_server
 from recorded_sessions import Brightness, recorded, seen
 from typer.testing import CliRunner
 
-from vlagents_ray.cli.evaluation.results import parse_episodes
 from vlagents_ray.cli.main import app
+from vlagents_ray.cli.results import parse_episodes
 from vlagents_ray.contract import ActionSpec, Contract, StateSpec
 from vlagents_ray.errors import ConfigError, PolicyFailed
 from vlagents_ray.images import jpeg_png

@@ -10,7 +10,7 @@ import numpy as np
 from vlagents_ray.envs import EvalEnv
 from vlagents_ray.envs.batch import SequentialBatch
 from vlagents_ray.errors import VLAgentsError
-from vlagents_ray.evaluate.episode.episode import run_episodes
+from vlagents_ray.evaluate.episode.episode import EpisodeObserver, EpisodeSettings, Watch, run_episodes
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
 from vlagents_ray.interface import Act, Agent, Obs
@@ -27,6 +27,23 @@ class Always(Agent):
         return Act(self.action.copy())
 
 
+class Watched(EpisodeObserver):
+    """Calls functions with what happens."""
+
+    def __init__(
+        self,
+        record: Callable[[Obs], None] = lambda _obs: None,
+        executed: Callable[[np.ndarray, float, bool], None] = lambda _action, _reward, _success: None,
+    ) -> None:
+        self.record, self.executed = record, executed
+
+    def add_observation(self, obs: Obs) -> None:
+        self.record(obs)
+
+    def add_action(self, action: np.ndarray, reward: float, success: bool) -> None:
+        self.executed(action, reward, success)
+
+
 def run_episode(
     env: EvalEnv,
     agent: Agent,
@@ -34,7 +51,9 @@ def run_episode(
     *,
     record: Callable[[Obs], None] = lambda _obs: None,
     executed: Callable[[np.ndarray, float, bool], None] = lambda _action, _reward, _success: None,
-    **options: Any,
+    watch: Watch = lambda _phase, _steps: None,
+    images: bool = True,
+    **settings: Any,
 ) -> EpisodeResult:
     """`run_episodes` with a batch of one, which stays open, and the agent as its only session.
 
@@ -46,9 +65,10 @@ def run_episode(
         agent,
         [agent],
         [key],
-        record=lambda _i, obs: record(obs),
-        executed=lambda _i, *done: executed(*done),
-        **options,
+        EpisodeSettings(**settings),
+        observers=[Watched(record, executed)],
+        watch=watch,
+        images=images,
     )
     if isinstance(outcome, VLAgentsError):
         raise outcome

@@ -1,8 +1,8 @@
-"""Measurements that users can repeat on their own machines: `vlagents-ray bench …`.
+"""Measurements that users can repeat on their own machines: `vlagents-ray bench …` and `vlagents-ray tune`.
 
-`rtt` takes round trips by every transport, in turns; `throughput` loads one replica with many clients; `policy`
-measures a policy without a server, and `model` is a policy of a real one's size; `tuning/` chooses settings of a
-policy; `comparison` compares two runs, and `machine` describes what their figures depend on. Each of the `clients` runs
-in a process that obeys a line protocol (`line_process`, `line_client`), or in a Ray actor. What only developers repeat
-is the folder `benchmarks/` of the checkout.
+`rtt` measures round trips by every transport, in turns; `throughput` loads one replica with many clients; `policy`
+measures a policy without a server. `tuner` measures variants of a deployment file, each in a process
+(`tuning_process`), and `tuning_choice` chooses; `evaluation` tunes a file of runs. `figures` has what all results have
+in common. Each of the `clients` runs in a process that obeys a line protocol (`line_process`, `line_client`), or in a
+Ray actor. What only developers repeat is the folder `benchmarks/` of the checkout.
 """

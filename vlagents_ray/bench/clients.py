@@ -1,4 +1,4 @@
-"""Clients of ours, each in a process of its own or a Ray actor: `python -m vlagents_ray.bench.clients JSON`.
+"""Our clients, each in a process or a Ray actor: `python -m vlagents_ray.bench.clients JSON`.
 
 A process holds one client, which makes calls when it is its turn (`BenchCaller`), or several, which make load
 (`LoadGenerator`).
@@ -22,7 +22,7 @@ from typing import Any, get_args
 import numpy as np
 
 from vlagents_ray.bench.line_client import WARM_UP, die_with_parent, obey, own_stdout, timed
-from vlagents_ray.bench.line_process import CALL_S, START_S, Driver, LineProcess, ProcessDriver, our_environment
+from vlagents_ray.bench.line_process import CALL_S, START_S, Driver, LineProcess, our_environment
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.transports.select import TransportName
 from vlagents_ray.errors import ConfigError
@@ -68,7 +68,6 @@ class OwnClient:
 
     @property
     def name(self) -> str:
-        """The name in the table."""
         if self.transport in ("shm", "handle", "plasma"):
             return f"{self.transport}, Ray actor" if self.actor else self.transport
         return f"{self.transport}, {'default' if self.codec == 'auto' else self.codec}"
@@ -120,7 +119,6 @@ class BenchCaller:
         self.description: dict[str, Any] = {"transport": self._agent.transport, "psnr_db": info.get("psnr_db")}
 
     def measure(self, calls: int) -> list[float]:
-        """Make calls; returns the milliseconds of each."""
         return timed(lambda: self._obs, self._agent.act, calls)
 
     def ready(self) -> dict[str, Any]:
@@ -129,7 +127,6 @@ class BenchCaller:
         return self.description
 
     def close(self) -> None:
-        """End the session."""
         self._agent.close()
 
 
@@ -160,7 +157,6 @@ class LoadGenerator:
         return [one.result() for one in [self._pool.submit(self._act, *each, begin, end) for each in acting]]
 
     def close(self) -> None:
-        """End all sessions."""
         for agent in self._agents:
             agent.close()
         self._pool.shutdown()
@@ -185,14 +181,12 @@ class ActorDriver:
     actor: Any
 
     def ready(self) -> dict[str, Any]:
-        """Wait until it has connected."""
         import ray
 
         said: dict[str, Any] = ray.get(self.actor.ready.remote(), timeout=START_S)
         return said
 
     def measure(self, calls: int) -> list[float]:
-        """Make the calls in one call of the actor."""
         import ray
 
         taken: list[float] = ray.get(self.actor.measure.remote(calls), timeout=CALL_S + calls)
@@ -216,7 +210,7 @@ def connected(client: OwnClient, url: str, app: str, prefix: Sequence[str] = ())
     settings = json.dumps({"url": url, "transport": client.transport, "codec": client.codec})
     command = [*prefix, sys.executable, "-m", "vlagents_ray.bench.clients", settings]
     with LineProcess(client.name, command, our_environment()) as child:
-        yield ProcessDriver(child)
+        yield child
 
 
 def main() -> None:

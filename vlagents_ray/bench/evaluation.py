@@ -57,11 +57,7 @@ class EvaluationTuner:
     found: list[MeasuredEvaluation] = field(default_factory=list)
 
     def measure(self) -> list[MeasuredEvaluation]:
-        """Measure; the first is the evaluation as it is.
-
-        Raises:
-            VLAgentsError: The evaluation cannot be played as it is.
-        """
+        """Measure; the first is the evaluation as it is."""
         own = max(suite.num_envs for suite in self.config.suites)
         self._add(self._probe(self.config.workers, own))
         self._rise([(number, own) for number in _doubled(self.max_workers) if number != self.config.workers])

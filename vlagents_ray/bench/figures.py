@@ -1,11 +1,18 @@
-"""Round trips as figures: medians, their intervals and ratios, without assuming a distribution; and as a picture."""
+"""The figures of measurements: medians, intervals and ratios without assuming a distribution; a picture; two runs."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import datetime
+import importlib.metadata
+import json
+import os
+import platform
+import shlex
+import sys
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -31,41 +38,24 @@ class RoundTrips:
 
     @property
     def median(self) -> float:
-        """Return the median, ms."""
         return float(np.median(self.ms))
 
-    @property
-    def p99(self) -> float:
-        """The 99th percentile, ms."""
-        return float(np.quantile(self.ms, 0.99))
-
-    @property
-    def interval(self) -> tuple[float, float]:
-        """The 95 % confidence interval of the median, ms."""
-        return median_interval(self.ms)
-
     def to_json(self) -> dict[str, Any]:
-        """Return plain JSON values."""
         return {
             "way": self.name,
             "calls": len(self.ms),
             "median_ms": self.median,
-            "ci95_ms": list(self.interval),
-            "p99_ms": self.p99,
+            "ci95_ms": list(median_interval(self.ms)),
+            "p99_ms": float(np.quantile(self.ms, 0.99)),
         }
 
 
-@dataclass(frozen=True, slots=True)
-class Ratio:
+class Ratio(NamedTuple):
     """A median over another, with its 95 % bootstrap interval."""
 
     ratio: float
     low: float
     high: float
-
-    def to_json(self) -> dict[str, Any]:
-        """Return plain JSON values."""
-        return {"ratio": self.ratio, "ci95": [self.low, self.high]}
 
 
 def median_interval(values: np.ndarray) -> tuple[float, float]:
@@ -95,7 +85,10 @@ def median_ratio(ours: RoundTrips, theirs: RoundTrips, *, seed: int = 0) -> Rati
 
 def ratios(ours: Sequence[RoundTrips], theirs: Sequence[RoundTrips]) -> dict[str, dict[str, Any]]:
     """Return the ratios of all of ours to all of theirs, as JSON: {ours: {theirs: ratio}}."""
-    return {a.name: {b.name: median_ratio(a, b).to_json() for b in theirs} for a in ours}
+    found = {a.name: {b.name: median_ratio(a, b) for b in theirs} for a in ours}
+    return {
+        a: {b: {"ratio": one.ratio, "ci95": [one.low, one.high]} for b, one in row.items()} for a, row in found.items()
+    }
 
 
 def rate_of(calls: Sequence[Sequence[tuple[float, ...]]]) -> float:
@@ -161,3 +154,129 @@ def plot_round_trips(found: Mapping[str, Any], file: Path, title: str = "round t
     axes.set_title(f"{title}, two 224x224 RGB cameras", loc="left", fontsize=10)
     axes.spines[["top", "right"]].set_visible(False)
     figure.savefig(file, dpi=150)
+
+
+PACKAGES = ("vlagents-ray", "ray", "numpy", "torch", "jax", "transformers", "lerobot")
+
+
+def measured_on(program: str = "vlagents-ray") -> dict[str, Any]:
+    """Return date, command, machine and versions as JSON values; call it before measuring, as it states the load."""
+    return {
+        "date": datetime.datetime.now(datetime.timezone.utc).date().isoformat(),
+        "command": " ".join([program, shlex.join(sys.argv[1:])]).rstrip(),
+        "machine": _machine(),
+        "versions": _versions() | {"Python": platform.python_version()},
+    }
+
+
+def _versions() -> dict[str, str]:
+    installed = {one.metadata["Name"]: one.version for one in importlib.metadata.distributions()}
+    return {name: installed[name] for name in PACKAGES if name in installed}
+
+
+def _machine() -> dict[str, Any]:
+    """Return the machine's description, without host or user names."""
+    cpu = platform.processor() or platform.machine()
+    for line in Path("/proc/cpuinfo").read_text().splitlines():
+        if line.startswith("model name"):
+            cpu = line.partition(":")[2].strip()
+            break
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    return {
+        "cpu": cpu,
+        "cores": os.cpu_count(),
+        "memory_gb": round(memory / 2**30),
+        "kernel": platform.release().partition("-")[0],
+        "load": os.getloadavg()[0],
+    }
+
+
+_NAMES = ("way", "clients", "batch")  # keys of which one names a row of a list
+_COMPARED = ("_ms", "_per_s", "_mib", "of_ideal", "mean_batch", "_bytes", "wall_s", "per_minute")  # ends of their names
+_SAME = ("cpu", "cores", "memory_gb", "kernel")  # of the machine
+
+
+@dataclass(frozen=True, slots=True)
+class ComparedFigure:
+    """One figure of both files."""
+
+    name: str  # its place in the files, with spaced slashes
+    old: float
+    new: float
+    overlap: bool | None = None  # whether the 95 % intervals of both overlap; None: they have none
+
+    @property
+    def ratio(self) -> float:
+        """The new figure over the old one; 1 if both are the same, also if both are 0."""
+        if self.new == self.old:
+            return 1.0
+        return self.new / self.old if self.old else float("inf")
+
+
+@dataclass(frozen=True, slots=True)
+class FigureComparison:
+    """The common figures of two files, and their other differences."""
+
+    figures: tuple[ComparedFigure, ...]
+    only_old: tuple[str, ...]  # figures that one file alone has
+    only_new: tuple[str, ...]
+    circumstances: tuple[str, ...]  # differences of machines and versions, a sentence each
+
+
+def compare_figures(old: Mapping[str, Any], new: Mapping[str, Any]) -> FigureComparison:
+    """Compare the figures of two measurements, in the order of the new one."""
+    before, after = dict(_figures(old)), dict(_figures(new))
+    figures = [
+        ComparedFigure(name, before[name][0], value, _overlap(before[name][1], interval))
+        for name, (value, interval) in after.items()
+        if name in before
+    ]
+    return FigureComparison(
+        tuple(figures),
+        tuple(name for name in before if name not in after),
+        tuple(name for name in after if name not in before),
+        tuple(_circumstances(old, new)),
+    )
+
+
+def read_figures(file: Path) -> dict[str, Any]:
+    """Read a file of figures; raises `ConfigError` for any other file."""
+    try:
+        found = json.loads(file.read_text())
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{file}: cannot be read ({error}); want what `bench … --json FILE` wrote") from error
+    if not isinstance(found, dict) or not any(True for _ in _figures(found)):
+        raise ConfigError(f"{file}: holds no figures; want what `bench … --json FILE` wrote")
+    return found
+
+
+def _figures(node: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, tuple[float, Any]]]:
+    """Yield name, value and 95 % interval of each figure below a node of JSON."""
+    if isinstance(node, Mapping):
+        for key, value in node.items():
+            if isinstance(value, int | float) and not isinstance(value, bool) and key.endswith(_COMPARED):
+                interval = node.get(f"ci95{key.removeprefix('median')}") if key.startswith("median") else None
+                yield " / ".join((*path, key)), (float(value), interval)
+            elif isinstance(value, Mapping | list):
+                yield from _figures(value, (*path, key))
+    elif isinstance(node, list):
+        for one in node:
+            if isinstance(one, Mapping) and (name := next((key for key in _NAMES if key in one), None)) is not None:
+                label = str(one[name]) if name == "way" else f"{name} {one[name]}"
+                yield from _figures(one, (*path, label))
+
+
+def _overlap(old: Any, new: Any) -> bool | None:
+    if old is None or new is None:
+        return None
+    return bool(old[0] <= new[1] and new[0] <= old[1])
+
+
+def _circumstances(old: Mapping[str, Any], new: Mapping[str, Any]) -> Iterator[str]:
+    for part, names in (("machine", _SAME), ("versions", None)):
+        before, after = old.get(part) or {}, new.get(part) or {}
+        if not before or not after:
+            continue
+        for name in names or sorted({*before, *after}):
+            if before.get(name) != after.get(name):
+                yield f"{name}: {before.get(name, 'none')} before, {after.get(name, 'none')} now"

@@ -10,7 +10,6 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -31,12 +30,7 @@ class LineProcess:
     """A process that answers lines with lines of JSON. What it writes on standard error is shown if it fails."""
 
     def __init__(
-        self,
-        name: str,
-        command: Sequence[str],
-        environment: Mapping[str, str] | None = None,
-        *,
-        end_s: float = _END_S,
+        self, name: str, command: Sequence[str], environment: Mapping[str, str] | None = None, *, end_s: float = _END_S
     ) -> None:
         self.name = name
         self._end_s = end_s  # how long it may take to end once its input has ended
@@ -53,7 +47,6 @@ class LineProcess:
 
     @property
     def pid(self) -> int:
-        """Return the id of the process."""
         return self._process.pid
 
     def read(self, timeout_s: float) -> Any:
@@ -88,9 +81,18 @@ class LineProcess:
             self._process.stdin.flush()
 
     def request(self, line: str, timeout_s: float) -> Any:
-        """Send a line and return the answer."""
         self.send(line)
         return self.read(timeout_s)
+
+    def ready(self) -> dict[str, Any]:
+        """Read the first line of a client, which is connected and warm then: what it says of itself."""
+        said: dict[str, Any] = self.read(START_S)
+        return said
+
+    def measure(self, calls: int) -> list[float]:
+        """Let a client make calls; returns the milliseconds of each."""
+        taken: list[float] = self.request(str(calls), CALL_S + calls)
+        return taken
 
     def close(self) -> None:
         """End its standard input, which ends it; kill it if that does not."""
@@ -123,28 +125,9 @@ class Driver(Protocol):
 
     def ready(self) -> dict[str, Any]:
         """Wait until it is connected and warm; returns what it says of itself."""
-        ...
 
     def measure(self, calls: int) -> list[float]:
         """Make calls; returns the milliseconds of each."""
-        ...
-
-
-@dataclass(frozen=True, slots=True)
-class ProcessDriver:
-    """A client in a process of its own."""
-
-    child: LineProcess
-
-    def ready(self) -> dict[str, Any]:
-        """Read its first line."""
-        said: dict[str, Any] = self.child.read(START_S)
-        return said
-
-    def measure(self, calls: int) -> list[float]:
-        """Send a line, read a line."""
-        taken: list[float] = self.child.request(str(calls), CALL_S + calls)
-        return taken
 
 
 def our_environment() -> dict[str, str]:

@@ -1,8 +1,8 @@
-"""What a policy alone gives on this machine, by batch size, without Ray: bare, and behind a replica's batch queue.
+"""The speed of a policy on this machine by batch size, without Ray: bare, and behind a replica's batch queue.
 
 Bare is `act_batch` on full batches, one after another. Behind the queue as many sessions as the batch has rows ask
 again as soon as they are answered. The policy is loaded once for both. `python -m vlagents_ray.bench.policy JSON` is
-the bare policy of `bench throughput`, in a process of its own.
+the bare policy of `bench throughput`, as a process.
 """
 
 from __future__ import annotations
@@ -19,13 +19,7 @@ import numpy as np
 
 from vlagents_ray.bench.clients import observation
 from vlagents_ray.bench.line_client import die_with_parent, own_stdout
-from vlagents_ray.bench.tuning.measured_policy import (
-    MeasuredPolicy,
-    QueuedTurn,
-    device_name,
-    forget_peak,
-    peak_mib,
-)
+from vlagents_ray.bench.measured_policy import MeasuredPolicy, QueuedTurn, device_name, forget_peak, peak_mib
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Agent, Obs

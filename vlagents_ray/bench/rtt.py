@@ -1,7 +1,7 @@
 """Round trips of one `act` by every transport, interleaved in one run.
 
 The observation is that of the paper's measurement: two 224x224 RGB cameras and seven joints. All ways
-take turns in short rounds, in an order drawn anew each time, so that whatever else the machine does hits
+take turns in short rounds, in a new random order each time, so that other load on the machine hits
 them alike. Every client is a process of its own (those that need Ray, an actor); every server stays up
 and idle while it is not its turn. So each turn begins cold, which is what the 99th percentile then shows: the ways on
 the node make calls without a break, too, at the end.
@@ -59,7 +59,6 @@ class RoundTripsOfAll:
     psnr_db: Mapping[str, float | None] = field(default_factory=dict)  # of what the policy saw, by way; None: all of it
 
     def to_json(self) -> dict[str, Any]:
-        """Return plain JSON values."""
         return {
             "ways": [{**trips.to_json(), "psnr_db": self.psnr_db.get(trips.name)} for trips in self.ours],
             "peers": [trips.to_json() for trips in self.theirs],
@@ -72,13 +71,7 @@ class RoundTripsOfAll:
 def measure_rtt(
     calls: int = 1000, *, transports: Sequence[str] = (), progress: Callable[[str], None] = lambda _: None
 ) -> RoundTripsOfAll:
-    """Measure `calls` round trips by each transport (rounded up to whole rounds), on a server started for them.
-
-    Args:
-        calls: Round trips of each client.
-        transports: Names of transports; by default all.
-        progress: Is called with lines of progress.
-    """
+    """Measure `calls` round trips by each transport (rounded up to whole rounds), on a server started for them."""
     own, skipped = own_clients(transports)
     return measure(own, calls, progress, skipped=skipped)
 
@@ -93,17 +86,7 @@ def measure(
     host: str = LOOPBACK,
     prefix: Sequence[str] = (),
 ) -> RoundTripsOfAll:
-    """Measure clients of ours, and others by name with servers of their own, in turns.
-
-    Args:
-        own: Clients of a server that is started on `host`.
-        calls: Round trips of each client.
-        progress: Is called with lines of progress.
-        others: Starts each other client, and its server.
-        skipped: Names of what is not measured, with the reasons.
-        host: The address of our server.
-        prefix: The first words of the command of each of our clients.
-    """
+    """Measure clients of ours, and others by name with servers of their own, in turns."""
     others = others or {}
     drivers: dict[str, Driver] = {}
     with contextlib.ExitStack() as stack:

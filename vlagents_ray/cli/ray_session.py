@@ -133,11 +133,7 @@ def _file(name: str) -> tuple[Path, logging.Handler]:
 
 @contextlib.contextmanager
 def exit_if_ray_is_lost(cure: str) -> Iterator[RayLoss]:
-    """End the process with status 1 if its Ray is lost within the context, in order if that takes no longer than 10 s.
-
-    Args:
-        cure: What the user can do about it, for the message.
-    """
+    """End the process with status 1 if its Ray is lost within the context, in order if that takes at most 10 s."""
     import ray  # noqa: F401 - before the thread does: one that two threads import at once is seen half made
 
     loss = RayLoss(cure)
@@ -201,11 +197,7 @@ class RayLoss:
 
     def _watch_ray(self) -> None:
         """Watch the Ray that this process is in, until it leaves it or that Ray is lost."""
-        from vlagents_ray.ray_tools.head_monitor import (
-            PERIOD_S,
-            HeadMonitor,
-            keep_from_printing_last_words,
-        )
+        from vlagents_ray.ray_tools.head_monitor import PERIOD_S, HeadMonitor, keep_from_printing_last_words
 
         head: HeadMonitor | None = None
         while not self.left.wait(PERIOD_S):

@@ -30,8 +30,7 @@ if TYPE_CHECKING:
 def serve_command(
     source: Annotated[str, typer.Argument(help="A registered policy, 'module:Class', or a deployment file (.yaml).")],
     host: Annotated[
-        str | None,
-        typer.Option(help="0.0.0.0, or one address of this machine, lets others in; default: the file's, 127.0.0.1."),
+        str | None, typer.Option(help="0.0.0.0, or an address of this machine; default: the file's, or 127.0.0.1.")
     ] = None,
     port: Annotated[int | None, typer.Option(min=1, max=65535, help="Default: the file's, or 8000.")] = None,
     settings: Set = [],  # noqa: B006 - typer reads it
@@ -39,31 +38,19 @@ def serve_command(
         list[str], typer.Option("--serve-set", metavar="KEY=VALUE", help="A setting of the server: batch.max_size=8.")
     ] = [],  # noqa: B006
     vlagents_port: Annotated[
-        int | None, typer.Option(min=1, max=65535, help="Let clients of the package vlagents in at this port, too.")
+        int | None, typer.Option(min=1, max=65535, help="Also accept clients of the package vlagents, at this port.")
     ] = None,
-    rerun: Annotated[
-        str | None,
-        typer.Option(metavar="DIR", help="Write a .rrd file of each session's episodes for Rerun; see `viewers` too."),
-    ] = None,
-    foxglove: Annotated[
-        str | None, typer.Option(metavar="DIR", help="Write an .mcap file of each session's episodes for Foxglove.")
-    ] = None,
+    rerun: Annotated[str | None, typer.Option(metavar="DIR", help="Write .rrd files for Rerun.")] = None,
+    foxglove: Annotated[str | None, typer.Option(metavar="DIR", help="Write .mcap files for Foxglove.")] = None,
     address: Address = None,
     keys: Annotated[
-        Path | None,
-        typer.Option(help="File of the API keys (`vlagents-ray keys new`); default: VLAGENTS_RAY_KEYS_FILE or _KEYS."),
+        Path | None, typer.Option(help="File of the API keys; default: VLAGENTS_RAY_KEYS_FILE or VLAGENTS_RAY_KEYS.")
     ] = None,
-    insecure: Annotated[
-        bool, typer.Option("--insecure", help="Accept every client that reaches the port, without keys.")
-    ] = False,
-    plain_http: Annotated[
-        bool, typer.Option("--plain-http", help="Keys may cross the network unencrypted: no warning.")
-    ] = False,
+    insecure: Annotated[bool, typer.Option("--insecure", help="Accept every client, without keys.")] = False,
+    plain_http: Annotated[bool, typer.Option("--plain-http", help="No warning of unencrypted keys.")] = False,
     tls_cert: Annotated[Path | None, typer.Option(help="Certificate in PEM: serve https:// and wss://.")] = None,
     tls_key: Annotated[Path | None, typer.Option(help="Its key, in PEM.")] = None,
-    tls_client_ca: Annotated[
-        Path | None, typer.Option(help="Who signs the certificates that clients must show, in PEM.")
-    ] = None,
+    tls_client_ca: Annotated[Path | None, typer.Option(help="CA of the certificates of clients, in PEM.")] = None,
 ) -> None:
     """Serve a policy until Ctrl-C."""
     from vlagents_ray.serve.launch.deployment_file import listens_at, read_deployment, with_dialect, with_gateways_at
@@ -102,15 +89,7 @@ def serve_command(
 def connection_lines(
     config: ServeDeploySchema, urls: Mapping[str, str], host: str, keys: Path | None = None, *, insecure: bool = False
 ) -> Iterator[str]:
-    """Say of each application its URL, its policy, its page, and where clients of other systems connect.
-
-    Args:
-        config: The deployment, in which gateways have their hosts.
-        urls: Application -> its URL, as this machine reaches it.
-        host: Where the server listens.
-        keys: The file of keys that was named to the server, beside those of the deployment.
-        insecure: Whether it lets everybody in, whatever the deployment says.
-    """
+    """Say of each application its URL, its policy, its page, and where clients of other systems connect."""
     from vlagents_ray.serve.config.deployment import ServerArgs
     from vlagents_ray.serve.dialects.routes import describe
     from vlagents_ray.serve.launch.deployment_file import IMPORT_PATH, own_settings
@@ -126,8 +105,9 @@ def connection_lines(
         settings = ", ".join(f"{name}={value!r}" for name, value in own_settings(app).items())
         yield f"  policy: {args.policy}" + (f" ({settings})" if settings else "")
         keyed = not insecure and (keys is not None or _wants_key(args))
-        yield f"  how to talk to it: {_page(url) if keyed else f'{url}/docs'}"
-        if not (insecure or args.access.insecure):  # then nobody may watch
+        curl = 'curl -H "Authorization: Bearer $VLAGENTS_RAY_API_KEY" ' if keyed else ""
+        yield f"  how to talk to it: {curl}{url}/docs"
+        if not (insecure or args.access.insecure):  # without keys there is no watching
             yield f"  what it does now: {url}/live"
         for name, one in describe(args.dialects).items():
             places = [one["address"]] if "address" in one else [_address(url, path) for path in one["paths"]]
@@ -139,10 +119,6 @@ def _wants_key(args: ServerArgs) -> bool:
         return args.access.keys() is not None
     except ConfigError:  # they are on the cluster's machines, not on this one
         return True
-
-
-def _page(url: str) -> str:
-    return f'curl -H "Authorization: Bearer $VLAGENTS_RAY_API_KEY" {url}/docs'
 
 
 def _address(url: str, path: str) -> str:

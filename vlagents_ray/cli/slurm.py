@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from vlagents_ray.cli.console import errors, out
-from vlagents_ray.cli.evaluation.command import config_from_options, evaluate_command
+from vlagents_ray.cli.evaluate import EvalOptions, config_from_options, evaluate_command
 from vlagents_ray.cli.serve import serve_command
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.slurm.submission import Script, first_index, split, submit
@@ -33,12 +33,8 @@ Setup = Annotated[Path | None, typer.Option(help="File of shell lines that the j
 @slurm.command("eval", context_settings=_BOTH, options_metavar="{FILE | ENV...} [OPTIONS]")
 def eval_(
     context: typer.Context,
-    resubmit: Annotated[
-        int, typer.Option(min=0, help="Times that the job, out of time, queues itself again to go on.")
-    ] = 0,
-    closing: Annotated[
-        float, typer.Option(min=0, metavar="S", help="The evaluation ends so long before the job's time does.")
-    ] = 60.0,
+    resubmit: Annotated[int, typer.Option(min=0, help="Times that the job, out of time, queues itself again.")] = 0,
+    closing: Annotated[float, typer.Option(min=0, metavar="S", help="End so long before the job's time does.")] = 60.0,
     setup: Setup = None,
     print_only: Print = False,
     parsable: Parsable = False,
@@ -64,8 +60,7 @@ def eval_(
 def serve(
     context: typer.Context,
     out_dir: Annotated[
-        Path | None,
-        typer.Option("--out", help="Folder of script, logs, and server.json; default: runs/serve/POLICY."),
+        Path | None, typer.Option("--out", help="Folder of script, logs, and server.json; default: runs/serve/POLICY.")
     ] = None,
     setup: Setup = None,
     print_only: Print = False,
@@ -153,13 +148,13 @@ def _cpus(config: EvalConfig) -> float:
 
 def _evaluation(words: list[str]) -> EvalConfig:
     """Build the configuration as `eval` does; raises here what would end the job as soon as it had begun."""
-    from vlagents_ray.cli.evaluation.policies import resolve_policies
+    from vlagents_ray.cli.policies import resolve_policies
     from vlagents_ray.evaluate.plan.cases import cells
 
     given = _parsed("eval", evaluate_command, words)
     _refuse(given, _FOUND_OUT, "address", "end_at")
     _refuse(given, "`vlagents-ray eval --dry-run` plans without one", "dry_run")
     _refuse(given, "it would wait for a training; have that submit each checkpoint (`submit_evaluation`)", "watch")
-    config = config_from_options(given)
+    config = config_from_options(EvalOptions(**given))
     cells(resolve_policies(config, ask=False)[0])
     return config

@@ -13,16 +13,16 @@ import typer
 import yaml
 
 from vlagents_ray.cli.console import errors, out, progress, table
-from vlagents_ray.cli.options import YAML_SUFFIXES, is_run_file, parse_dims, parse_list
+from vlagents_ray.cli.options import YAML_SUFFIXES, StateDims, is_run_file, parse_dims, parse_list
 from vlagents_ray.errors import ConfigError
 
 if TYPE_CHECKING:
     from vlagents_ray.bench.evaluation import MeasuredEvaluation
-    from vlagents_ray.bench.tuning.choice import MeasuredPoint
+    from vlagents_ray.bench.tuning_choice import MeasuredPoint
 
 
 class Wanted(str, Enum):
-    """What `--for` takes."""
+    """The values of `--for`."""
 
     robots = "robots"
     throughput = "throughput"
@@ -33,43 +33,31 @@ def tune_command(
     wanted: Annotated[
         Wanted, typer.Option("--for", help="The most actions a second, or the most robots within --p99-ms.")
     ] = Wanted.throughput,
-    p99_ms: Annotated[
-        float | None, typer.Option("--p99-ms", min=0, help="Of robots: the longest round trip of 99 in 100, ms.")
-    ] = None,
-    plot: Annotated[
-        Path | None, typer.Option("--plot", help="Draw latency against throughput here: .png, .svg or .pdf.")
-    ] = None,
+    p99_ms: Annotated[float | None, typer.Option("--p99-ms", min=0, help="Of robots: the longest p99, ms.")] = None,
     minutes: Annotated[float, typer.Option(min=0.1, help="That all of it may take.")] = 5.0,
-    max_workers: Annotated[
-        int | None, typer.Option(min=1, help="Of a file of runs: the most workers to try; default: twice the cores.")
-    ] = None,
+    max_workers: Annotated[int | None, typer.Option(min=1, help="Of a file of runs; default: twice the cores.")] = None,
     max_batch: Annotated[int, typer.Option(min=1, help="The largest batch to try.")] = 32,
     seconds: Annotated[float, typer.Option(min=0.1, help="Of each measurement.")] = 2.0,
-    dtypes: Annotated[
-        str | None,
-        typer.Option(help="To try, as bfloat16,int8; default: the one that suits the accelerator, if any."),
-    ] = None,
-    tolerance: Annotated[
-        float, typer.Option(min=0, help="How far actions may be off, as a share of their range.")
-    ] = 0.01,
-    frames: Annotated[
-        Path | None, typer.Option(help="A folder of recorded trajectories to act on; default: random observations.")
-    ] = None,
+    dtypes: Annotated[str | None, typer.Option(help="To try, as bfloat16,int8; default: the accelerator's.")] = None,
+    tolerance: Annotated[float, typer.Option(min=0, help="Largest error of actions, share of their range.")] = 0.01,
+    frames: Annotated[Path | None, typer.Option(help="Recorded trajectories; default: random observations.")] = None,
     app: Annotated[str | None, typer.Option(help="Of the file, if it holds several.")] = None,
     image: Annotated[int, typer.Option(min=1, help="Pixels a side, where the policy takes any image.")] = 224,
-    state: Annotated[
-        list[str], typer.Option(metavar="PART=N", help="Numbers in a part for which the policy does not say.")
-    ] = [],  # noqa: B006
+    state: StateDims = [],  # noqa: B006
 ) -> None:
     """Find the best settings of a file by measuring, and print those to change.
 
     Of a deployment file: batch size, compilation and precision. Of a file of runs: workers, and environments a worker.
     """
     began = time.monotonic()
-    from vlagents_ray.bench.figures import check_plot_file
-    from vlagents_ray.bench.tuning.choice import TuningGoal, choose, chosen_settings, default_point, figures
-    from vlagents_ray.bench.tuning.picture import plot_latency
-    from vlagents_ray.bench.tuning.tuner import TunePlan, Tuner
+    from vlagents_ray.bench.tuner import TunePlan, Tuner
+    from vlagents_ray.bench.tuning_choice import (
+        TuningGoal,
+        choose,
+        chosen_settings,
+        default_point,
+        figures,
+    )
     from vlagents_ray.serve.config.deployment import ServerArgs
     from vlagents_ray.serve.launch.deployment_file import policy_application
 
@@ -77,12 +65,9 @@ def tune_command(
         goal = TuningGoal(wanted.value, p99_ms)
         if file.suffix not in YAML_SUFFIXES:
             raise ConfigError(f"got {str(file)!r}, want a deployment file or a file of runs (.yaml)")
-        check_plot_file(plot)
         if is_run_file(file):
-            if goal.kind != "throughput" or dtypes or frames or app or state or plot:
-                raise ConfigError(
-                    "--for, --dtypes, --frames, --app, --state and --plot are of deployment files; leave them out"
-                )
+            if goal.kind != "throughput" or dtypes or frames or app or state:
+                raise ConfigError("--for, --dtypes, --frames, --app, --state are of deployment files; leave them out")
             tune_evaluation(file, minutes=minutes, max_workers=max_workers, began=began)
             return
         application = policy_application(str(file), app)
@@ -99,23 +84,13 @@ def tune_command(
         chosen, default = choose(points, goal), default_point(points, goal, args.batch.max_size)
         settings = chosen_settings(chosen, args.batch, tuner.fixed)
         _show_choice(_words(chosen), _words(default), began, f"below args of {application.name!r} in {file}", settings)
-        if plot is not None:
-            plot_latency(points, chosen, default, goal, plot, title)
-            out.print(f"wrote {plot}")
 
 
 def tune_evaluation(file: Path, *, minutes: float, max_workers: int | None, began: float) -> None:
-    """Serve the policies of a file of runs, measure, and print the numbers to change.
-
-    Args:
-        file: The file of runs.
-        minutes: That the measurements may take, from `began`.
-        max_workers: The most workers to try; None: twice as many as this machine has cores.
-        began: s of `time.monotonic`.
-    """
+    """Serve the policies of a file of runs, measure, and print the numbers to change."""
     from vlagents_ray.bench.evaluation import EvaluationTuner
-    from vlagents_ray.cli.evaluation.command import read_run
-    from vlagents_ray.cli.evaluation.policies import served
+    from vlagents_ray.cli.evaluate import read_run
+    from vlagents_ray.cli.policies import served
     from vlagents_ray.evaluate import EvalConfig
 
     config = EvalConfig.model_validate(read_run(file))
@@ -149,7 +124,7 @@ def _evaluation_words(one: MeasuredEvaluation) -> str:
 def _words(point: MeasuredPoint | None) -> str:
     if point is None:
         return "not measured, or out of the goal"
-    from vlagents_ray.bench.tuning.choice import sessions
+    from vlagents_ray.bench.tuning_choice import sessions
 
     figures = f"{point.actions_per_s:.1f} actions/s, p99 {point.p99_ms:.1f} ms"
     return f"{point.variant.name}, {sessions(point.sessions)}: {figures}"

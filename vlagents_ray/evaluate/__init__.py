@@ -37,24 +37,17 @@ from vlagents_ray.evaluate.results.stopping import confidence_sequence
 from vlagents_ray.evaluate.results.summary import Group, Summary
 
 if TYPE_CHECKING:
-    from vlagents_ray.evaluate.report.progress import Progress, SilentProgress, progress_for
+    from vlagents_ray.evaluate.report.progress import Progress, progress_for
     from vlagents_ray.evaluate.report.terminal import print_summary, results_table
     from vlagents_ray.evaluate.run import EvaluationInterrupted, OutOfTime, check, evaluate
     from vlagents_ray.evaluate.workers.cluster import most_cpus, most_gpus
 
 _LATE = {
-    "EvaluationInterrupted": "run",
-    "OutOfTime": "run",
-    "Progress": "report.progress",
-    "SilentProgress": "report.progress",
-    "check": "run",
-    "evaluate": "run",
-    "most_cpus": "workers.cluster",
-    "most_gpus": "workers.cluster",
-    "print_summary": "report.terminal",
-    "progress_for": "report.progress",
-    "results_table": "report.terminal",
-}
+    "report.progress": ("Progress", "progress_for"),
+    "report.terminal": ("print_summary", "results_table"),
+    "run": ("EvaluationInterrupted", "OutOfTime", "check", "evaluate"),
+    "workers.cluster": ("most_cpus", "most_gpus"),
+}  # module: its names
 
 __all__ = [
     "ClockConfig",
@@ -68,7 +61,6 @@ __all__ = [
     "Progress",
     "Rate",
     "Results",
-    "SilentProgress",
     "StopConfig",
     "SuccessCurve",
     "SuiteConfig",
@@ -94,6 +86,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _LATE:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{_LATE[name]}"), name)
+    for module, names in _LATE.items():
+        if name in names:
+            return getattr(importlib.import_module(f"{__name__}.{module}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -51,9 +51,6 @@ class CheckpointWatcher:
             folder: Where steps are looked for; by default the part of `pattern` before `{step}`.
             settle_s: Seconds without a change.
             marker: The name of a file that the trainer writes last, if it does.
-
-        Raises:
-            ConfigError: `pattern` has no `{step}`.
         """
         parts = PurePath(pattern).parts
         place = next((i for i, part in enumerate(parts) if STEP in part), None)

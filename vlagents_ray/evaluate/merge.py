@@ -25,8 +25,8 @@ from vlagents_ray.evaluate.artifacts.storage import (
     whole,
 )
 from vlagents_ray.evaluate.plan.config import canonical
-from vlagents_ray.evaluate.report.html import FILE as REPORT
-from vlagents_ray.evaluate.report.html import write_report
+from vlagents_ray.evaluate.report.page import FILE as REPORT
+from vlagents_ray.evaluate.report.page import write_report
 from vlagents_ray.evaluate.results.changes import Change, changed, listed, policy_changes, program_changes
 from vlagents_ray.evaluate.results.database import FILE, SCHEMA, VERSION, insert
 from vlagents_ray.evaluate.results.reader import CellResults, Results, Run, Worker, episode_of, reading, table

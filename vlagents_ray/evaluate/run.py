@@ -11,30 +11,23 @@ from typing import Any
 
 from vlagents_ray.errors import ConfigError, StorageFailed, from_code
 from vlagents_ray.evaluate.artifacts.recorder import Artifacts, save, save_views
-from vlagents_ray.evaluate.artifacts.storage import (
-    driver_code,
-    policy_code,
-    save_diffs,
-    storing,
-    versions,
-)
+from vlagents_ray.evaluate.artifacts.storage import driver_code, policy_code, save_diffs, storing, versions
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.episode.records import EpisodeResult, WorkerInfo
 from vlagents_ray.evaluate.plan.cases import EvalCase, require_envs
 from vlagents_ray.evaluate.plan.config import EvalConfig
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job, JobQueue, plan
-from vlagents_ray.evaluate.report.html import FILE as REPORT
-from vlagents_ray.evaluate.report.html import write_report
-from vlagents_ray.evaluate.report.progress import Progress, SilentProgress
+from vlagents_ray.evaluate.report.page import FILE as REPORT
+from vlagents_ray.evaluate.report.page import write_report
+from vlagents_ray.evaluate.report.progress import Progress
 from vlagents_ray.evaluate.results.reader import Results, rate_of
 from vlagents_ray.evaluate.results.stopping import Stopping
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.evaluate.results.summary import Summary, summarize, write_summary
 from vlagents_ray.evaluate.trackers import TrackerFeed
-from vlagents_ray.evaluate.workers.agents import AgentFactory, agents, factory_program
 from vlagents_ray.evaluate.workers.cluster import ray_cluster, unused_gpus
 from vlagents_ray.evaluate.workers.pool import WorkerPool
-from vlagents_ray.evaluate.workers.rollout import Report
+from vlagents_ray.evaluate.workers.rollout import AgentFactory, Report, agents, factory_program
 from vlagents_ray.evaluate.workers.worker import FailedAttempts, InProcessWorkers, Workers, dispatch
 from vlagents_ray.interface import Agent
 from vlagents_ray.ray_tools.signals import stop_signals
@@ -113,7 +106,7 @@ def evaluate(
         try:
             with tracking:
                 local = {} if agent_factory is None else {"program": factory_program(agent_factory)}
-                run = _Run(config, store, progress or SilentProgress(), tracking, only, end_at, in_process, local)
+                run = _Run(config, store, progress or Progress(), tracking, only, end_at, in_process, local)
                 state, summary = run.play(factory)
         except BaseException:
             with contextlib.suppress(StorageFailed):  # probably the same disk error; report the first one
@@ -196,7 +189,9 @@ class _Run:
             self._progress.begin(self._store.cells, self._recorded, len(self._queue))
             try:
                 with (InProcessWorkers if self._in_process else WorkerPool)(self._config, factory) as pool:
-                    while not stop.is_set() and not self._deadline.is_over and self._has_more(pool):
+                    while not stop.is_set() and not self._deadline.is_over:
+                        if not pool.busy and not (len(self._queue) and self._deadline.leaves_room):
+                            break
                         self._poll_pool(pool)
                     state = OutOfTime.why if len(self._queue) or pool.busy else "complete"
                     if not stop.is_set():
@@ -206,9 +201,6 @@ class _Run:
                     return state, conclude(self._config, self._store, state)
             finally:
                 self._progress.end()
-
-    def _has_more(self, pool: Workers) -> bool:
-        return pool.busy or (len(self._queue) > 0 and self._deadline.leaves_room)
 
     def _poll_pool(self, pool: Workers) -> None:
         if self._deadline.leaves_room:

@@ -32,7 +32,7 @@ CLOSE_S = 120.0  # for trackers to send what is buffered
 
 @dataclass(frozen=True, slots=True)
 class About:
-    """What a tracker's run is about: one policy of one folder of results, with all its checkpoints."""
+    """The subject of a tracker's run: one policy of one folder of results, with all its checkpoints."""
 
     out: Path
     project: str
@@ -81,19 +81,16 @@ class WandbRun(TrackerRun):
             self._artifact("code", "code", about.diffs)
 
     def log(self, metrics: Mapping[str, float], step: int | None) -> None:
-        """Add a point to each curve; without a training step, write the summary."""
         if step is None:
             self._run.summary.update(dict(metrics))
         else:
             self._run.log({STEP: step, **metrics})
 
     def videos(self, label: str, paths: Sequence[Path], step: int | None) -> None:
-        """Upload the videos as an artifact of type "videos"."""
         at = "" if step is None else f"-{step}"
         self._artifact(f"videos-{plain(label.replace('/', '_'))}{at}", "videos", paths)
 
     def finish(self) -> None:
-        """Send what is buffered, and end the run."""
         self._run.finish()
 
     def _artifact(self, name: str, kind: str, paths: Sequence[Path]) -> None:
@@ -104,7 +101,7 @@ class WandbRun(TrackerRun):
 
 
 class TrackioRun(WandbRun):
-    """As wandb's, without a summary and artifacts; named after policy and id, as trackio identifies runs by name."""
+    """A run as in wandb, without a summary and artifacts. Its name has the id, as trackio identifies runs by name."""
 
     def __init__(self, about: About) -> None:
         self._trackio: Any = require("trackio")
@@ -114,11 +111,9 @@ class TrackioRun(WandbRun):
         )  # fmt: skip
 
     def log(self, metrics: Mapping[str, float], step: int | None) -> None:
-        """Add a point to each curve; without a training step at 0, as trackio has no summary."""
         self._run.log(dict(metrics), step=step or 0)
 
     def videos(self, label: str, paths: Sequence[Path], step: int | None) -> None:
-        """Show the videos beside the curves."""
         shown = {f"{label}/{path.stem}": self._trackio.Video(path) for path in paths}
         self._run.log(shown, step=step or 0)
 
@@ -137,16 +132,13 @@ class TensorboardRun(TrackerRun):
         self._text("config", json.dumps(about.config, indent=1, default=str), 0)
 
     def log(self, metrics: Mapping[str, float], step: int | None) -> None:
-        """Add a point to each curve; without a training step at 0."""
         values = [self._summary.Value(tag=name, simple_value=value) for name, value in metrics.items()]
         self._add(values, step or 0)
 
     def videos(self, label: str, paths: Sequence[Path], step: int | None) -> None:
-        """Log the paths of the videos in the folder of results, as a text."""
         self._text(f"{label}/videos", "\n".join(str(path.relative_to(self._out)) for path in paths), step or 0)
 
     def finish(self) -> None:
-        """Write what is buffered, and close the file."""
         self._writer.close()
 
     def _text(self, tag: str, text: str, step: int) -> None:
@@ -260,7 +252,7 @@ class TrackerFeed:
 
 
 def _parts(results: Results) -> list[tuple[str, list[CellResults], Group]]:
-    """What is logged together, as (the key under which that is noted, cells, aggregates): each cell, each policy id."""
+    """Return what is logged together, as (key, cells, aggregates): each cell, then each policy id."""
     summary = summarize(results)
     alone = [(cell.cell, [cell], group) for cell, group in zip(results.cells, summary.cells, strict=True)]
     totals = zip(results.contenders, summary.totals, strict=True)

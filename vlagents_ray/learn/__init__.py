@@ -12,24 +12,22 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from vlagents_ray.learn.columns import answers, arrays
     from vlagents_ray.learn.publisher import Publisher
-    from vlagents_ray.learn.rollouts import Rollouts, RolloutStats
+    from vlagents_ray.learn.rollouts import RolloutPlan, Rollouts, RolloutStats
     from vlagents_ray.learn.training_evaluation import TrainingEvaluation
     from vlagents_ray.learn.vector_env import BatchVectorEnv, as_vector_env
 
 _LATE = {
-    "BatchVectorEnv": "vector_env",
-    "Publisher": "publisher",
-    "RolloutStats": "rollouts",
-    "Rollouts": "rollouts",
-    "TrainingEvaluation": "training_evaluation",
-    "answers": "columns",
-    "arrays": "columns",
-    "as_vector_env": "vector_env",
-}
+    "columns": ("answers", "arrays"),
+    "publisher": ("Publisher",),
+    "rollouts": ("RolloutPlan", "RolloutStats", "Rollouts"),
+    "training_evaluation": ("TrainingEvaluation",),
+    "vector_env": ("BatchVectorEnv", "as_vector_env"),
+}  # module: its names
 
 __all__ = [
     "BatchVectorEnv",
     "Publisher",
+    "RolloutPlan",
     "RolloutStats",
     "Rollouts",
     "TrainingEvaluation",
@@ -40,6 +38,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _LATE:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{_LATE[name]}"), name)
+    for module, names in _LATE.items():
+        if name in names:
+            return getattr(importlib.import_module(f"{__name__}.{module}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -117,7 +117,7 @@ def at_rows(pa: Any, values: np.ndarray, rows: np.ndarray) -> Any:
     return pa.ListArray.from_arrays(pa.array(offsets), tensors(pa, values))
 
 
-# Memory for the images of episodes, which is used again when nobody views it any more.
+# Memory for the images of episodes, which is used again once no view of it is left.
 
 
 _SMALL = 2**20  # bytes of memory that `malloc` provides as fast
@@ -131,11 +131,7 @@ class RowMemory:
     """
 
     def __init__(self, most_free: int) -> None:
-        """Begin without memory.
-
-        Args:
-            most_free: Blocks that are kept while nobody views them.
-        """
+        """Begin without memory."""
         self._most_free = most_free
         self._free: list[bytearray] = []
 

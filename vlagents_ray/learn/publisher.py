@@ -1,20 +1,41 @@
-"""A learner's way to the policies that act: `Publisher`."""
+"""A learner's way to the policies that act: `Publisher`, and the three kinds of targets that it pushes to."""
 
 from __future__ import annotations
 
+import asyncio
+import json
+import logging
 import os
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from contextlib import closing, suppress
+from dataclasses import asdict
+from itertools import chain
+from typing import Any
+from urllib.parse import urlencode
+
+from typing_extensions import Self
+from websockets.exceptions import ConnectionClosed
 
 from vlagents_ray.client.credentials import Credentials
-from vlagents_ray.errors import ConfigError, InvalidWeights
-from vlagents_ray.learn.targets import AppTarget, EngineTarget, ServerTarget, WeightsTarget
+from vlagents_ray.client.transports.codec_selection import CodecChoice
+from vlagents_ray.client.transports.http import HttpTransport, http_url
+from vlagents_ray.client.transports.websocket import ProxiedSocket, open_websocket
+from vlagents_ray.errors import ConfigError, InvalidWeights, PolicyUnavailable, VLAgentsError
+from vlagents_ray.protocol.frames import read_error
+from vlagents_ray.serve.endpoints.weights import PATH
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.weights.updates import PushOptions
+from vlagents_ray.serve.scaling.weight_push import OwnWeights, Values, WeightPusher, WeightsReplica
+from vlagents_ray.serve.weights.updates import PushOptions, PushResult
 from vlagents_ray.serve.weights.versions import PushMode
+from vlagents_ray.weights.safetensors import MESSAGE_BYTES, header_of, parts_of
+from vlagents_ray.weights.shared_values import NotShared, gpu_of, shared
+from vlagents_ray.weights.trainable import is_array, portable
 
-if TYPE_CHECKING:
-    from typing_extensions import Self
+logger = logging.getLogger(__name__)
+
+_ANSWER_S = 10.0  # time limit for the question which versions act
+_PUSH_S = 600.0  # time limit for a push, which includes the transfer to all nodes
 
 
 class Publisher:
@@ -55,9 +76,7 @@ class Publisher:
         elif isinstance(target, str) and target.startswith(("http://", "https://")):
             self._target = ServerTarget(target, Credentials(api_key, ca, certificate))
         else:
-            raise ConfigError(
-                f"Publisher: got {target!r}, want 'serve://APP', 'http(s)://HOST:PORT' or an Engine of this process"
-            )
+            raise ConfigError(f"Publisher: got {target!r}, want 'serve://APP', 'http(s)://HOST:PORT' or an Engine")
 
     def push(
         self,
@@ -107,11 +126,144 @@ class Publisher:
         return sum(newest >= version for newest in self._target.versions())
 
     def close(self) -> None:
-        """End the connection; the policy keeps its weights."""
-        self._target.close()
+        """End the use of the policy, which keeps its weights; between pushes there is no connection to close."""
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *exc: object) -> None:
         self.close()
+
+
+class WeightsTarget(ABC):
+    """A policy that takes new weights."""
+
+    @abstractmethod
+    def push(self, named: Mapping[str, Any], options: PushOptions) -> int:
+        """Let the policy act with new weights, and return their version; see `Publisher.push`."""
+
+    @abstractmethod
+    def versions(self) -> list[int]:
+        """Return the newest version of each replica."""
+
+
+class EngineTarget(WeightsTarget):
+    """An engine in this process; tensors are copied once, on the device where they are."""
+
+    def __init__(self, engine: Engine) -> None:
+        """Push to that engine alone."""
+        self._own = OwnWeights("this process", engine.weights)
+
+    def push(self, named: Mapping[str, Any], options: PushOptions) -> int:
+        return asyncio.run(WeightPusher(self._own, _no_siblings).push(named, options)).version
+
+    def versions(self) -> list[int]:
+        return [asyncio.run(self._own.newest_weights()).number]
+
+
+class AppTarget(WeightsTarget):
+    """An application of the Ray cluster that this process is in.
+
+    If the learner and all replicas have their weights on the same GPU, the replicas copy them from where they are.
+    Otherwise the values are put into Ray's object store once. All replicas of this node read them there, without a copy
+    where the policy is on the CPU; Ray transfers them to other nodes once each.
+    """
+
+    def __init__(self, app: str) -> None:
+        """Push to the application of that name; raises `ConfigError` if this process is in no Ray cluster."""
+        import ray
+
+        if not ray.is_initialized():
+            raise ConfigError(f"serve://{app}: this process is in no Ray cluster; call ray.init() first")
+        self._app = app
+
+    def push(self, named: Mapping[str, Any], options: PushOptions) -> int:
+        import ray
+
+        if gpu_of(named):
+            try:
+                with shared(named) as values:
+                    return self._push(values, options)
+            except NotShared as error:
+                logger.info("serve://%s: the weights go through Ray's object store: %s", self._app, error)
+        return self._push([ray.put(_portable(named))], options)
+
+    def _push(self, values: Values, options: PushOptions) -> int:
+        result: PushResult = self._call("push_weights", values, options, timeout_s=_PUSH_S)
+        return result.version
+
+    def versions(self) -> list[int]:
+        found: list[int] = self._call("versions_of_weights", timeout_s=_ANSWER_S)
+        return found
+
+    def _call(self, method: str, *args: Any, timeout_s: float) -> Any:
+        import ray
+        from ray import serve
+        from ray.serve.exceptions import RayServeException
+
+        try:
+            handle = serve.get_app_handle(self._app)
+            return getattr(handle, method).remote(*args).result(timeout_s=timeout_s)
+        except ray.exceptions.RayTaskError as error:
+            if isinstance(error.cause, VLAgentsError):
+                raise error.cause from error
+            raise PolicyUnavailable(f"serve://{self._app}: {error.cause}") from error
+        except (RayServeException, ray.exceptions.RayError, TimeoutError) as error:
+            raise _unknown(f"serve://{self._app}", error) from error
+
+
+class ServerTarget(WeightsTarget):
+    """A server, also on another machine; the values travel in parts, over a WebSocket that ends with each push."""
+
+    def __init__(self, url: str, credentials: Credentials) -> None:
+        """Push to the server at a URL, "http(s)://HOST:PORT" or one with the path of an application."""
+        base = http_url(url)
+        credentials.use_at(base.geturl())
+        self._credentials = credentials
+        self._base = url
+        scheme = "wss" if base.scheme == "https" else "ws"
+        self._url = base._replace(scheme=scheme, path=base.path.rstrip("/") + PATH).geturl()
+
+    def push(self, named: Mapping[str, Any], options: PushOptions) -> int:
+        values = _portable(named)
+        if wrong := [name for name, value in values.items() if not is_array(value)]:
+            raise InvalidWeights(f"weights: {wrong[0]!r}: got {type(values[wrong[0]]).__name__}, want an array")
+        header = header_of(values)
+        if len(header) > MESSAGE_BYTES:
+            raise InvalidWeights(f"weights: {len(values)} names take {len(header)} bytes, the limit is {MESSAGE_BYTES}")
+        stated = {name: str(value).lower() for name, value in asdict(options).items() if value is not None}
+        with closing(open_websocket(f"{self._url}?{urlencode(stated)}", self._credentials, _ANSWER_S)) as socket:
+            for part in chain((header,), parts_of(values)):
+                answer = self._ask(socket, part)
+                if "code" in answer:
+                    raise read_error(answer)
+        return int(answer["version"])
+
+    def _ask(self, socket: ProxiedSocket, part: bytes) -> dict[str, Any]:
+        try:
+            with suppress(ConnectionClosed, OSError):  # the server has refused the push, and its answer says why
+                socket.send(part, _ANSWER_S)
+            answer: dict[str, Any] = json.loads(socket.recv(_PUSH_S))
+        except (ConnectionClosed, OSError) as error:
+            raise _unknown(self._url, error) from error
+        return answer
+
+    def versions(self) -> list[int]:
+        with closing(HttpTransport(self._base, CodecChoice("raw"), self._credentials)) as http:
+            found: list[int] = http.get(PATH, _ANSWER_S)["versions"]
+        return found
+
+
+def _portable(named: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: portable(value) if is_array(value) else value for name, value in named.items()}
+
+
+def _unknown(url: str, error: Exception) -> PolicyUnavailable:
+    return PolicyUnavailable(
+        f"{url}: {str(error) or 'no answer'}; whether it acts with the version is unknown: look at `acknowledged`, and "
+        f"push again"
+    )
+
+
+async def _no_siblings() -> Sequence[WeightsReplica]:
+    return ()

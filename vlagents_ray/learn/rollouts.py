@@ -9,26 +9,24 @@ import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, field
+from typing import Any
+
+from typing_extensions import Self
 
 from vlagents_ray.errors import ConfigError, PolicyFailed, WeightsLost, from_code
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.plan.cases import cells, require_envs
 from vlagents_ray.evaluate.plan.config import EvalConfig
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job, JobQueue
-from vlagents_ray.evaluate.workers.agents import agents
 from vlagents_ray.evaluate.workers.cluster import ray_cluster
 from vlagents_ray.evaluate.workers.pool import WorkerPool
-from vlagents_ray.evaluate.workers.rollout import Report
+from vlagents_ray.evaluate.workers.rollout import Report, agents
 from vlagents_ray.evaluate.workers.worker import FailedAttempts, dispatch
 from vlagents_ray.interface import Agent
 from vlagents_ray.learn.columns import EXTRA, RowMemory
 from vlagents_ray.learn.transitions import WANTED, TransitionRecorder
 from vlagents_ray.registry import require
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
 
 POLL_S = 0.25  # longest wait for a report, after which workers that are needed are started
 _BLOCKS = 4  # of memory for images that a worker keeps for each of its environments
@@ -57,10 +55,58 @@ class _PlannedEpisode:
     pushed: int = 0  # version that the learner had pushed when the last attempt began
 
 
+@dataclass(frozen=True, slots=True)
+class RolloutPlan:
+    """The settings of `Rollouts`.
+
+    Raises:
+        ConfigError: A setting is wrong.
+    """
+
+    env: str | Sequence[str]  # the name, as for an evaluation; of several envs, each has its turn
+    policy: str | Callable[[], Agent]  # URL of a server, or a factory that each worker calls to create its own agent
+    workers: int = 1
+    num_envs: int = 1  # environments that one worker steps together, with one request to the policy for all of them
+    groups: int = 1  # episodes from one start state, one after another, that differ in the seed of the policy (GRPO)
+    want: Sequence[str] = ()  # what the policy returns for each act: "logprob", "value", "entropy", "replay"
+    # Deliver no episode with an act of weights that are more than so many versions old: it is played again. 0 is
+    # on-policy; None delivers all.
+    max_lag: int | None = 0
+    seed: int = 0  # of the first start state; state n has `seed` + n
+    first: int = 0  # number of the first episode: `position` of rollouts that ended, to go on with them
+    images: bool = True  # whether there are columns for the cameras
+    env_options: Mapping[str, Any] = field(default_factory=dict)  # of the env's constructor
+    reset_options: Mapping[str, Any] = field(default_factory=dict)  # of each reset of the env
+    policy_options: Mapping[str, Any] = field(default_factory=dict)  # of each reset of the policy
+    execute: int | None = None  # rows of each action chunk that are executed; None: all
+    # Further settings of an evaluation, such as `worker`, `retries` and `env_timeout_s`.
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name, least in (("groups", 1), ("first", 0), ("seed", 0)):
+            if (value := getattr(self, name)) < least:
+                raise ConfigError(f"{name}: got {value}, want at least {least}")
+        if unknown := sorted(set(self.want) - set(WANTED)):
+            raise ConfigError(f"want: got {unknown}, want some of {list(WANTED)}")
+
+    def config(self) -> EvalConfig:
+        """Return the settings of an evaluation of these episodes; nothing is written."""
+        url = self.policy if isinstance(self.policy, str) else None
+        policy = {"url": url, "options": self.policy_options, "execute": self.execute}
+        suite = {
+            "envs": [self.env] if isinstance(self.env, str) else list(self.env),
+            "env_options": self.env_options,
+            "reset_options": self.reset_options,
+            "num_envs": self.num_envs,
+        }
+        document = {"policies": [policy], "suites": [suite], "workers": self.workers, "out": os.devnull}
+        return EvalConfig.model_validate({**document, **self.settings})
+
+
 class Rollouts:
     """Plays episodes in the workers of an evaluation, and returns their transitions for a learner.
 
-        with Rollouts("tabletop/lift", "http://localhost:8000", workers=4) as rollouts:
+        with Rollouts(RolloutPlan("tabletop/lift", "http://localhost:8000", workers=4)) as rollouts:
             for _ in range(100):
                 columns = arrays(rollouts.collect(64))
                 ...  # learn from them, and push the new weights
@@ -73,82 +119,29 @@ class Rollouts:
     into Ray's object store once, and numpy maps it from there; keeping it keeps its memory in the store.
     """
 
-    def __init__(
-        self,
-        env: str | Sequence[str],
-        policy: str | Callable[[], Agent],
-        *,
-        workers: int = 1,
-        num_envs: int = 1,
-        groups: int = 1,
-        want: Sequence[str] = (),
-        max_lag: int | None = 0,
-        seed: int = 0,
-        first: int = 0,
-        images: bool = True,
-        env_options: Mapping[str, Any] | None = None,
-        reset_options: Mapping[str, Any] | None = None,
-        policy_options: Mapping[str, Any] | None = None,
-        execute: int | None = None,
-        settings: Mapping[str, Any] | None = None,
-    ) -> None:
-        """Check the settings. Workers start with the first episode.
+    def __init__(self, plan: RolloutPlan) -> None:
+        """Check the plan. Workers start with the first episode.
 
         Args:
-            env: The name of the env, as for an evaluation; of several envs, each has its turn.
-            policy: The URL of the policy's server, or what each worker makes an agent of its own with.
-            workers: The number of workers.
-            num_envs: Environments that one worker steps together, with one request to the policy for all of them.
-            groups: Episodes from one start state, one after another, that differ in the seed of the policy (GRPO).
-            want: What the policy is to return for each act: "logprob", "value", "entropy", "replay".
-            max_lag: Deliver no episode with an act of weights that are more than so many versions old; it is played
-                again. 0 is on-policy; None delivers all.
-            seed: The seed of the first start state; state n has `seed` + n.
-            first: The number of the first episode: `position` of rollouts that ended, to go on with them.
-            images: Whether there are columns for the cameras.
-            env_options: The options of the env's constructor.
-            reset_options: The options of each reset of the env.
-            policy_options: The options of each reset of the policy.
-            execute: Rows of each action chunk that are executed; None: all.
-            settings: Further settings of an evaluation, such as `worker`, `retries` and `env_timeout_s`.
+            plan: What is played.
 
         Raises:
             ConfigError: A setting is wrong.
             MissingDependency: pyarrow is not installed.
             UnknownEnv: There is no such env.
         """
-        for name, value, least in (("groups", groups, 1), ("first", first, 0), ("seed", seed, 0)):
-            if value < least:
-                raise ConfigError(f"{name}: got {value}, want at least {least}")
-        if unknown := sorted(set(want) - set(WANTED)):
-            raise ConfigError(f"want: got {unknown}, want some of {list(WANTED)}")
         self._pa: Any = require("pyarrow", extra=EXTRA)
-        served = isinstance(policy, str)
-        config = EvalConfig.model_validate(
-            {
-                "policies": [{"url": policy if served else None, "options": policy_options or {}, "execute": execute}],
-                "suites": [
-                    {
-                        "envs": [env] if isinstance(env, str) else list(env),
-                        "env_options": env_options or {},
-                        "reset_options": reset_options or {},
-                        "num_envs": num_envs,
-                    }
-                ],
-                "workers": workers,
-                "out": os.devnull,  # nothing is written
-                **(settings or {}),
-            }
-        )
+        config = plan.config()
         require_envs(config)
-        self._config, self._cells = config, cells(config)
-        self._factory = agents(config, None if isinstance(policy, str) else policy)
-        memory = RowMemory(_BLOCKS * num_envs)  # each worker gets one of its own
-        self._recorders = functools.partial(TransitionRecorder, want=tuple(want), images=images, memory=memory)
-        self._groups, self._seed, self._max_lag = groups, seed, max_lag
-        self._block = math.lcm(groups, num_envs)  # episodes that are queued together
-        self._ahead = self._block * max(2, math.ceil(2 * workers * num_envs / self._block))
-        self._position = self._planned = first
+        self._settings, self._config, self._cells = plan, config, cells(config)
+        self._factory = agents(config, None if isinstance(plan.policy, str) else plan.policy)
+        memory = RowMemory(_BLOCKS * plan.num_envs)  # each worker gets one of its own
+        self._recorders = functools.partial(
+            TransitionRecorder, want=tuple(plan.want), images=plan.images, memory=memory
+        )
+        self._block = math.lcm(plan.groups, plan.num_envs)  # episodes that are queued together
+        self._ahead = self._block * max(2, math.ceil(2 * plan.workers * plan.num_envs / self._block))
+        self._position = self._planned = plan.first
         self._queue = JobQueue([])
         self._episodes: dict[EpisodeKey, _PlannedEpisode] = {}  # from number `position` on
         self._attempts = FailedAttempts(config)
@@ -188,7 +181,7 @@ class Rollouts:
         return delivered[0]
 
     def collect(self, episodes: int) -> Any:
-        """Play the next episodes, and queue no other ones, so that the workers play none with weights of the past.
+        """Run the next episodes without prefetching, so none uses outdated weights.
 
         Args:
             episodes: Their number; whole groups, if there are groups.
@@ -202,8 +195,8 @@ class Rollouts:
             WeightsLost: The policy acts with older weights than `version`, after a restart: push them, and call again.
             VLAgentsError: The last infrastructure error, after `abort_after` lost episodes in a row.
         """
-        if episodes < 1 or episodes % self._groups:
-            raise ConfigError(f"collect: got {episodes} episodes, want a multiple of groups, {self._groups}")
+        if episodes < 1 or episodes % self._settings.groups:
+            raise ConfigError(f"collect: got {episodes} episodes, want a multiple of groups, {self._settings.groups}")
         batches: list[Any] = []
         while not batches:
             end = self._position + episodes
@@ -257,12 +250,12 @@ class Rollouts:
     def _plan(self, limit: int) -> None:
         """Queue the episodes up to number `limit`."""
         for number in range(self._planned, limit):
-            state, member = divmod(number, self._groups)
+            state, member = divmod(number, self._settings.groups)
             episode, turn = divmod(state, len(self._cells))
             cell = self._cells[turn]
             # The first of a group is the episode of an evaluation; the others have numbers above its own seed's.
-            policy_seed = self._seed + number if member else None
-            job = Job(EpisodeKey(cell.env, episode, self._seed + episode, cell.fingerprint, policy_seed), cell)
+            policy_seed = self._settings.seed + number if member else None
+            job = Job(EpisodeKey(cell.env, episode, self._settings.seed + episode, cell.fingerprint, policy_seed), cell)
             self._episodes[job.key] = _PlannedEpisode(job)
             self._queue.put(job)
         self._planned = max(self._planned, limit)
@@ -302,7 +295,9 @@ class Rollouts:
         self._attempts.note_played()
         versions = transitions.column("version").to_numpy()
         episode.oldest, self._version = int(versions.min()), max(self._version, int(versions.max()))
-        if self._max_lag is not None and episode.pushed - episode.oldest > self._max_lag:  # so it would be forever
+        if (
+            self._settings.max_lag is not None and episode.pushed - episode.oldest > self._settings.max_lag
+        ):  # so it would be forever
             raise WeightsLost(
                 f"version: {job.key} began when rollouts.version had been set to {episode.pushed}, but its acts name "
                 f"{episode.oldest}; set it to what a push returned, after it has (a policy that names none has 0), and "
@@ -313,7 +308,7 @@ class Rollouts:
         """Queue the episodes again that have acts of weights which are too old by now."""
         for episode in self._episodes.values():
             lag = self._version - episode.oldest if episode.transitions is not None else 0
-            if self._max_lag is not None and lag > self._max_lag:
+            if self._settings.max_lag is not None and lag > self._settings.max_lag:
                 episode.over, episode.transitions = False, None
                 self.stats.stale += 1
                 self._queue.put_back(episode.job)

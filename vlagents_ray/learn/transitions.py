@@ -34,13 +34,7 @@ class TransitionRecorder(EpisodeRecorder):
         images: bool = True,
         memory: RowMemory | None = None,
     ) -> None:
-        """Begin an episode.
-
-        Args:
-            want: Names of `WANTED`, which each request asks of the policy.
-            images: Whether there are columns for the cameras.
-            memory: The memory of the worker's episodes; None: this episode has memory of its own.
-        """
+        """Begin an episode."""
         self._pa: Any = require("pyarrow", extra=EXTRA)
         self._want, self._images = tuple(want), images
         self._memory = memory or RowMemory(0)

@@ -52,7 +52,7 @@ def observation_space(spaces: Any, contract: Contract, observation: Observation)
 
 
 def observed(obs: Obs, observation: Observation) -> Any:
-    """Return an observation as a member of its space, in arrays of its own.
+    """Return an observation as a member of its space, in new arrays.
 
     Args:
         obs: The observation of the environment.
@@ -204,9 +204,7 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
         self._require_begun()
         rows = np.asarray(actions, np.float32)
         if rows.shape != self.action_space.shape:
-            raise InvalidAction(
-                f"actions: got {rows.shape}, want {self.action_space.shape}, a row for each environment"
-            )
+            raise InvalidAction(f"actions: got {rows.shape}, want {self.action_space.shape}, a row an environment")
         rewards = np.zeros(self.num_envs)
         terminated, truncated = np.zeros(self.num_envs, np.bool_), np.zeros(self.num_envs, np.bool_)
         infos: dict[str, Any] = {}
@@ -227,7 +225,6 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
         return self._observations(), rewards, terminated, truncated, infos
 
     def close_extras(self, **_kwargs: Any) -> None:
-        """Close the environments."""
         self._batch.close()
 
     def _moved(self, rows: np.ndarray, moving: np.ndarray) -> list[tuple[int, Any, dict[str, Any]]]:

@@ -27,7 +27,7 @@ _PICTURES = ("video", "image")  # dtypes
 
 @dataclass(frozen=True, slots=True)
 class Names:
-    """How a policy names what a dataset without a contract of ours holds."""
+    """The policy's names for the cameras and state of a dataset without a contract of ours."""
 
     cameras: Mapping[str, str] = field(default_factory=dict)  # policy's camera -> camera or feature of the dataset
     state: Sequence[str] | None = None  # parts side by side in `observation.state`; "gripper" is `Obs.gripper`
@@ -65,7 +65,7 @@ class RecordedDataset:
     """A dataset that is read, not written."""
 
     def __init__(self, root: Path) -> None:
-        """Open a dataset; raises `ConfigError` if there is none that can be read."""
+        """Open a dataset; raises `ConfigError` if it cannot be read."""
         self.root = root
         self._pq: Any = require("pyarrow.parquet")
         self._av: Any = require("av")
@@ -149,7 +149,10 @@ class RecordedDataset:
             tables = [self._pq.read_table(file, columns=kept) for file, kept in zip(files, columns, strict=True)]
             rows = [row for table in tables for row in table.to_pylist()]
         rows.sort(key=lambda row: row["episode_index"])
-        return [RecordedEpisode(self, row["episode_index"], row["length"], _task(row), row) for row in rows]
+        return [
+            RecordedEpisode(self, row["episode_index"], row["length"], str(next(iter(row.get("tasks") or ()), "")), row)
+            for row in rows
+        ]
 
     def _rows(self, part: RecordedEpisode, columns: Sequence[str]) -> dict[str, list[Any]]:
         file = self.root / self.info["data_path"].format(**self._place(part, "data"))
@@ -199,7 +202,10 @@ class RecordedDataset:
         if about is not None and names.state is None:
             specs = about.contract.state or {}
             order = {STATE: about.state, ENVIRONMENT: about.environment}
-            return {name: [(part, _dim(specs, part)) for part in order[name]] for name in widths}
+            return {
+                name: [(part, int(specs[part].dim or 0) if part in specs else 1) for part in order[name]]
+                for name in widths
+            }
         found: dict[str, list[tuple[str, int]]] = {}
         if ENVIRONMENT in widths:
             found[ENVIRONMENT] = [(ENVIRONMENT.rpartition(".")[2], widths[ENVIRONMENT])]
@@ -220,19 +226,11 @@ def find_datasets(folder: Path) -> list[Path]:
     return [path.parents[1] for pattern in ("", "*/") for path in sorted(folder.glob(f"{pattern}meta/info.json"))]
 
 
-def _dim(specs: Mapping[str, Any], part: str) -> int:
-    return int(specs[part].dim or 0) if part in specs else 1
-
-
 def _image(value: Mapping[str, Any]) -> np.ndarray:
     """Decode a picture that lies in the table."""
     if not value.get("bytes"):
         raise ConfigError(f"a picture is at {value.get('path')!r}, want its bytes in the table; LeRobot embeds them")
     return jpeg_png.decode(value["bytes"], DEFAULT_LIMITS.pixels)
-
-
-def _task(row: Mapping[str, Any]) -> str:
-    return str(row["tasks"][0]) if row.get("tasks") else ""
 
 
 def _values(text: str) -> dict[str, Any]:

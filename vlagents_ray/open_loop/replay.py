@@ -72,9 +72,6 @@ class LocalAgent(Agent):
 def candidate(source: str) -> Iterator[Sessions]:
     """Load a policy for the time of the context.
 
-    Args:
-        source: The URL of a server; or a registered name or a deployment file, which is loaded in this process.
-
     Yields:
         Opens its sessions, which share its batches.
     """
@@ -130,7 +127,6 @@ class ErrorTable:
         return float(error.mean())
 
     def mean(self) -> np.ndarray:
-        """Return the mean absolute error, (H, D)."""
         return np.asarray(self.absolute / self.frames[:, np.newaxis])
 
     def to_json(self, joints: list[str]) -> dict[str, Any]:
@@ -168,13 +164,12 @@ class FrameError:
 
 
 def worst(errors: list[FrameError]) -> list[FrameError]:
-    """Return the frames with the largest errors."""
     return sorted(errors, key=lambda one: -one.mae)[:_WORST]
 
 
 @dataclass(frozen=True, slots=True)
 class ReplayPlan:
-    """What is replayed, and how."""
+    """The settings of a replay."""
 
     episodes: Sequence[int] | None = None  # of each dataset; None: all
     horizon: int | None = None  # most rows of a chunk that are compared; None: all that both have
@@ -197,7 +192,6 @@ class OpenLoopResult:
     drawn: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)  # (D,) expected and got, first rows
 
     def to_json(self) -> dict[str, Any]:
-        """Return the result as plain JSON values."""
         by_episode: dict[tuple[str, int], list[float]] = {}
         for one in self.frames:
             by_episode.setdefault((one.dataset, one.episode), []).append(one.mae)
@@ -223,12 +217,6 @@ def replay(
 
     A session is reset with its first recorded observation, its instruction and its options, and then gets each of its
     observations in order, whatever it answers.
-
-    Args:
-        folder: A LeRobotDataset, or a folder of those that a server recorded.
-        sessions: Opens sessions of the policy.
-        plan: What is replayed.
-        progress: Gets the number of sessions that are done, and of all.
 
     Raises:
         ConfigError: There is no dataset, its actions are not the policy's, or a name is unknown.

@@ -11,11 +11,11 @@ from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import Environment
 from markupsafe import Markup
 
 from vlagents_ray.evaluate.artifacts.storage import storing, whole
-from vlagents_ray.evaluate.report.html import charts
+from vlagents_ray.evaluate.report import charts
 from vlagents_ray.open_loop.replay import OpenLoopResult
 
 JSON_FILE, PAGE_FILE = "open_loop.json", "open_loop.html"
@@ -124,11 +124,7 @@ def _map(result: OpenLoopResult) -> ErrorMap:
 
 @cache
 def _templates() -> Environment:
-    """The templates escape whatever they are given, as names of joints and folders are text of others."""
-    env = Environment(
-        loader=PackageLoader(__package__ or ""), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
-        lstrip_blocks=True,
-    )  # fmt: skip
+    env = charts.templates(__package__ or "")
     css = (files(charts.__package__ or "") / "report.css").read_text("utf-8").strip()
     env.globals.update(css=Markup(css), width=_WIDTH, height=_HEIGHT, left=_LEFT, bottom=_BOTTOM)  # noqa: S704 - ours
     return env

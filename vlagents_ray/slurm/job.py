@@ -85,7 +85,6 @@ class Allocation:
 
     @classmethod
     def here(cls, environ: Mapping[str, str] = os.environ) -> Allocation:
-        """Read the allocation of this process."""
         cpus = int(environ["SLURM_CPUS_ON_NODE"])
         return cls(
             job=int(environ["SLURM_JOB_ID"]),
@@ -103,13 +102,7 @@ class Allocation:
         return Ports(*range(first, first + _PORTS))
 
     def ray_start(self, head: str, folder: str) -> list[str]:
-        """Return the command that starts Ray on this node with the allocated resources.
-
-        Args:
-            head: The address of the first node.
-            folder: A folder on this node for Ray's sockets, logs and spilled objects, in a subfolder that Ray opens to
-                every user.
-        """
+        """Return the command that starts Ray on this node with the allocated resources."""
         ports = self.ports
         if self.node == 0:
             where = ["--head", f"--node-ip-address={head}", f"--port={ports.gcs}", "--include-dashboard=false"]
@@ -138,7 +131,6 @@ def _memory(environ: Mapping[str, str], cpus: int) -> int | None:
 
 
 def print_address() -> None:
-    """Print the address of this node as Ray determines it."""
     from ray.util import get_node_ip_address
 
     sys.stdout.write(f"{get_node_ip_address()}\n")
@@ -175,9 +167,7 @@ def wait_for_head(host: str, port: int, timeout_s: float = _HEAD_S) -> None:
             socket.create_connection((host, port), timeout=5).close()
         except OSError as error:
             if time.monotonic() > deadline:
-                sys.exit(
-                    f"Ray's head at {host}:{port} does not listen after {timeout_s:g} s ({error}); see its node's log"
-                )
+                sys.exit(f"Ray's head at {host}:{port} does not listen after {timeout_s:g} s ({error}); see its log")
             time.sleep(0.5)
         else:
             return
@@ -187,9 +177,7 @@ def run_command(arguments: Sequence[str]) -> None:
     """Wait for Ray, and replace this process by the command."""
     parser = argparse.ArgumentParser()
     parser.add_argument("what", choices=["eval", "serve"])
-    parser.add_argument(
-        "--fill", type=float, metavar="CPUS", help="start workers of so many CPUs each on all CPUs but one"
-    )
+    parser.add_argument("--fill", type=float, metavar="CPUS", help="workers of so many CPUs each, on all but one")
     parser.add_argument("--closing", type=float, default=0.0, help="s before the job's end, to end in order")
     parser.add_argument("--key", action="store_true", help="create an API key")
     parser.add_argument("--port", type=int, help="port of the server; by default derived from the job's number")
@@ -214,11 +202,6 @@ def run_command(arguments: Sequence[str]) -> None:
 
 def wait_for_nodes(address: str, number: int, timeout_s: float = _NODES_S) -> int:
     """Wait until a number of nodes have joined the cluster.
-
-    Args:
-        address: The address of Ray's head, host:port.
-        number: The number of nodes.
-        timeout_s: The time limit, s; afterwards the process exits with a list of the nodes that joined.
 
     Returns:
         The number of CPUs of the cluster.
@@ -293,11 +276,6 @@ def announce(words: Sequence[str]) -> None:
 
 def connection_info(apps: Mapping[str, str], port: int, environ: Mapping[str, str]) -> dict[str, Any]:
     """Return what a client needs to connect.
-
-    Args:
-        apps: The applications and their routes.
-        port: The server's port.
-        environ: The environment of the job.
 
     Returns:
         The content of the file, with the URL of each application, the key, and a command for a tunnel.

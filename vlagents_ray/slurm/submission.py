@@ -39,26 +39,16 @@ BODY = Path(__file__).with_name("job.sh")
 _LINE_ENDS = "\x7f\x85\u2028\u2029"
 UNFINISHED = 75  # exit status of `vlagents-ray eval` when its time is over (EX_TEMPFAIL of sysexits.h)
 RECORD = "job.json"
-_KEPT = {
-    "SLURM_CONF",
-    "SLURM_CLUSTERS",
-}  # the location of Slurm; the others belong to this process's own job
+_KEPT = {"SLURM_CONF", "SLURM_CLUSTERS"}  # the location of Slurm; the others belong to this process's own job
 _SBATCH_S = 120.0
 
 
 def split(words: Sequence[str], known: Mapping[str, bool]) -> tuple[list[str], dict[str, str | None]]:
     """Split a command line.
 
-    Args:
-        words: The arguments.
-        known: The command's options ("--policy"), and whether each has a value.
-
     Returns:
         The command's own arguments, and sbatch's options by their long names; the value of an option without one is
         None.
-
-    Raises:
-        ConfigError: An option of sbatch cannot be used here, or lacks its value.
     """
     own: list[str] = []
     sbatch: dict[str, str | None] = {}
@@ -122,7 +112,6 @@ class Script:
 
     @property
     def file(self) -> Path:
-        """The file of the script."""
         return self.folder / f"{self.name}.sh"
 
     @property
@@ -188,15 +177,8 @@ class SubmissionFailed(VLAgentsError):
 def submit(script: Script) -> str:
     """Write a script, submit it, and record the job in `job.json` beside the script.
 
-    Args:
-        script: The script.
-
     Returns:
         The job's number.
-
-    Raises:
-        ConfigError: sbatch is not installed.
-        SubmissionFailed: sbatch rejected the job, or did not answer.
     """
     file = write(script)
     try:
@@ -220,7 +202,6 @@ def submit(script: Script) -> str:
 
 
 def write(script: Script) -> Path:
-    """Write a script to its file, and return the file."""
     file = script.file.absolute()
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text(script.text())

@@ -9,7 +9,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -149,26 +149,19 @@ def _check_threads(suite: _Suite, first: list[Act]) -> None:
         one.result()
 
 
+@dataclass(slots=True)
 class _Suite:
     """Begins sessions and calls them, and checks their arguments and results."""
 
-    def __init__(
-        self,
-        agent: Agent,
-        contract: Contract | None,
-        views: list[Obs],
-        instructions: Sequence[str],
-        reset_kwargs: dict[str, Any],
-    ) -> None:
-        self._agent = agent
-        self._contract = contract
-        self._views = views
-        self._instructions = instructions
-        self._reset_kwargs = reset_kwargs
-        self.cure = (  # of errors that the agent raises
-            "if the policy parses its instructions or takes only some observations, give "
-            "check_agent(…, instructions=[…], obs=[…]) those that it knows"
-        )
+    _agent: Agent
+    _contract: Contract | None
+    _views: list[Obs]
+    _instructions: Sequence[str]
+    _reset_kwargs: dict[str, Any]
+    cure: str = (  # of errors that the agent raises
+        "if the policy parses its instructions or takes only some observations, give "
+        "check_agent(…, instructions=[…], obs=[…]) those that it knows"
+    )
 
     def begin(self, i: int) -> Agent:
         """Begin session `i`: copy the agent except for its shared objects, and reset the copy."""

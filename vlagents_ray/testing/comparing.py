@@ -43,12 +43,6 @@ def require_wireable(value: object, where: str) -> None:
 def difference(a: object, b: object, where: str, atol: float = 0.0) -> str | None:
     """Describe the first difference between two values.
 
-    Args:
-        a: A value: an `Obs`, an `Act`, an array or tensor, a dataclass, or a mapping or list of them.
-        b: The other value.
-        where: The values' name, for the description.
-        atol: The largest difference of numbers in arrays that count as equal.
-
     Returns:
         The description; None if the values are equal.
     """

@@ -18,12 +18,6 @@ def random_observation(
 ) -> Obs:
     """Make a random observation that fits a contract.
 
-    Args:
-        contract: The policy's contract; if it states no cameras or state, the observation has one of each.
-        seed: The seed of the random generator.
-        side: Height and width of images whose size the contract does not state, pixels.
-        dims: The dimensions of parts of the proprioception that the contract does not state.
-
     Returns:
         The observation; equal seeds give equal observations.
     """

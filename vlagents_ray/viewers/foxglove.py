@@ -24,12 +24,7 @@ class FoxgloveRecordings:
     closing_s: float | None = None  # its server drops what a slow viewer does not take
 
     def __init__(self, target: str | Path) -> None:
-        """Write `TARGET/EPISODE.mcap`, or listen at the address `target` ("ws://HOST:PORT").
-
-        Raises:
-            ConfigError: `target` begins with "ws://" and is no address, or another process has it.
-            MissingDependency: The extra "foxglove" is not installed.
-        """
+        """Write `TARGET/EPISODE.mcap`, or listen at the address `target` ("ws://HOST:PORT")."""
         self.target = str(target)
         self._foxglove = require("foxglove")
         self._live: tuple[Any, _Topics] | None = None  # the server, and the topics of all episodes
@@ -39,7 +34,6 @@ class FoxgloveRecordings:
             Path(target).mkdir(parents=True, exist_ok=True)
 
     def begin(self, name: str, instruction: str) -> FoxgloveEpisode:
-        """Begin the file of an episode, or show the next one."""
         if self._live is not None:
             return FoxgloveEpisode(self._live[1], None)
         context = self._foxglove.Context()
@@ -48,7 +42,6 @@ class FoxgloveRecordings:
         return FoxgloveEpisode(_Topics(context), file)
 
     def close(self) -> None:
-        """Stop the server, if there is one."""
         if self._live is not None:
             self._live[0].stop()
 
@@ -72,7 +65,6 @@ class FoxgloveEpisode:
         self._file = file  # None for a live episode
 
     def write(self, frame: ViewerFrame) -> None:
-        """Log a frame."""
         tick, at = {"tick": frame.tick}, round(frame.time * 1e9)
         for name, data in frame.images().items():
             self._topics.log_image(f"/cameras/{name}", data, at)
@@ -89,7 +81,6 @@ class FoxgloveEpisode:
             self._topics.log_warning(frame.note, at)
 
     def close(self) -> None:
-        """Finish the file."""
         if self._file is not None:
             self._file.close()
 
@@ -110,7 +101,6 @@ class _Topics:
         self._channels[topic].log(message, log_time=at)
 
     def log_image(self, topic: str, data: bytes, at: int) -> None:
-        """Log a JPEG or PNG file."""
         kind = "jpeg" if data[:3] == b"\xff\xd8\xff" else "png"
         message = self._messages.CompressedImage(
             timestamp=self._timestamp(at), frame_id=topic.rpartition("/")[2], data=data, format=kind
@@ -118,7 +108,6 @@ class _Topics:
         self._typed(topic, "CompressedImageChannel").log(message, log_time=at)
 
     def log_warning(self, text: str, at: int) -> None:
-        """Log a line for people."""
         level = self._messages.LogLevel.Warning
         message = self._messages.Log(timestamp=self._timestamp(at), level=level, message=text, name="vlagents_ray")
         self._typed("/log", "LogChannel").log(message, log_time=at)

@@ -30,12 +30,7 @@ class RerunRecordings:
     name = "rerun"
 
     def __init__(self, target: str | Path) -> None:
-        """Write `TARGET/EPISODE.rrd`, or send to the viewer at the address `target` ("rerun+http://HOST:PORT/proxy").
-
-        Raises:
-            ConfigError: No viewer listens at the address.
-            MissingDependency: The extra "rerun" is not installed.
-        """
+        """Write `TARGET/EPISODE.rrd`, or send to the viewer at the address `target` ("rerun+http://HOST:PORT/proxy")."""
         self.target = str(target)
         self._rerun = require("rerun")
         self._folder = None if self.target.startswith("rerun+") else Path(target)
@@ -47,7 +42,6 @@ class RerunRecordings:
             self._folder.mkdir(parents=True, exist_ok=True)
 
     def begin(self, name: str, instruction: str) -> RerunEpisode:
-        """Begin the recording of an episode."""
         recording = self._rerun.RecordingStream(APPLICATION, recording_id=uuid4())
         if self._folder is None:
             recording.connect_grpc(self.target)
@@ -71,7 +65,6 @@ class RerunEpisode:
             recording.log("instruction", rerun.TextDocument(instruction), static=True)
 
     def write(self, frame: ViewerFrame) -> None:
-        """Log a frame."""
         rerun, recording = self._rerun, self._recording
         recording.set_time("tick", sequence=frame.tick)
         recording.set_time("time", timestamp=frame.time)
@@ -92,7 +85,6 @@ class RerunEpisode:
             recording.log("log", rerun.TextLog(frame.note, level="WARN"))
 
     def close(self) -> None:
-        """Finish the recording."""
         if self._live:
             self._recording.flush(timeout_sec=CLOSING_S)
         self._recording.disconnect()

@@ -80,11 +80,9 @@ class ViewerEpisode(Protocol):
 
     def write(self, frame: ViewerFrame) -> None:
         """Write a frame."""
-        ...
 
     def close(self) -> None:
         """Finish the episode."""
-        ...
 
 
 class EpisodeFormat(Protocol):
@@ -96,11 +94,9 @@ class EpisodeFormat(Protocol):
 
     def begin(self, name: str, instruction: str) -> ViewerEpisode:
         """Begin an episode; `name` is also that of its file."""
-        ...
 
     def close(self) -> None:
         """Free what the episodes shared, such as a server."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -232,16 +228,7 @@ class LoopView:
             yield
 
     def add(self, obs: Obs, act: Act, executed: np.ndarray | None, tick: int, work_s: float, stop: str = "") -> None:
-        """Show a tick; never waits.
-
-        Args:
-            obs: The observation.
-            act: What the agent answered.
-            executed: The action that was applied, (D,) float32; None if none was.
-            tick: The tick of the control loop.
-            work_s: The time from the tick until the action was applied, s.
-            stop: Why the robot is stopped, if it is.
-        """
+        """Show a tick; never waits."""
         if not any(viewer.has_room for viewer in self._viewers):
             for viewer in self._viewers:
                 viewer.dropped += 1

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 from eval_fakes import Line, ToZero
-from in_process_episode import run_episode
+from in_process_episode import Watched, run_episode
 from in_process_replicas import Replicas
 
 from vlagents_ray.envs.batch import BatchEnv, SequentialBatch, make_batch
 from vlagents_ray.envs.tabletop import Tabletop
 from vlagents_ray.errors import ConfigError, ConnectionLost, EnvFailed, VLAgentsError
-from vlagents_ray.evaluate.episode.episode import run_episodes
+from vlagents_ray.evaluate.episode.episode import EpisodeSettings, run_episodes
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.config import ClockConfig
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
@@ -50,8 +50,17 @@ def untimed(results: Sequence[EpisodeResult | VLAgentsError]) -> list[EpisodeRes
     return timeless
 
 
-def together(env: BatchEnv, agent: Agent, wanted: Sequence[EpisodeKey], **options: Any) -> Any:
-    return run_episodes(env, agent, [copy.deepcopy(agent) for _ in wanted], wanted, **options)
+def together(
+    env: BatchEnv,
+    agent: Agent,
+    wanted: Sequence[EpisodeKey],
+    *,
+    images: bool = True,
+    observers: Sequence[Watched] = (),
+    **settings: Any,
+) -> Any:
+    sessions = [copy.deepcopy(agent) for _ in wanted]
+    return run_episodes(env, agent, sessions, wanted, EpisodeSettings(**settings), observers=observers, images=images)
 
 
 @pytest.mark.parametrize("execute", [None, 2])
@@ -94,7 +103,7 @@ def test_the_recorder_is_told_every_observation_of_its_own_episode() -> None:
     wanted = keys("tabletop", 2)
     recorded: dict[int, list[Obs]] = {0: [], 1: []}
     with make_batch("tabletop", 2, **SIZE, max_steps=30) as env:
-        results = together(env, Scripted(), wanted, record=lambda i, obs: recorded[i].append(obs))
+        results = together(env, Scripted(), wanted, observers=[Watched(seen.append) for seen in recorded.values()])
     alone: list[Obs] = []
     with Tabletop(**SIZE, max_steps=30) as env_alone:
         run_episode(env_alone, Scripted(), wanted[1], record=alone.append)

@@ -81,7 +81,7 @@ def test_envs_that_differ_are_exported_one_by_one(config: Config, tmp_path: Path
 
 
 def test_without_trajectories_the_cure_is_said(config: Config, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"--record all or failures \(`record: all`"):
+    with pytest.raises(ConfigError, match=r"--record all \(`record: all`"):
         to_lerobot(play(config(episodes=1)), tmp_path / "dataset")
 
 

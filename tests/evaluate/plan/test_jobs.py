@@ -128,7 +128,7 @@ def test_suites_have_options_of_their_own(config: Config) -> None:
 
 def test_an_env_in_two_suites_of_one_name_is_refused() -> None:
     suites = [SuiteConfig(envs=[LINE]), SuiteConfig(envs=[LINE], env_options={"width": 8})]
-    with pytest.raises(ConfigError, match="stand in two suites of one name"):
+    with pytest.raises(ConfigError, match="are in two suites of one name"):
         cells(EvalConfig(policies=[PolicyConfig()], suites=suites, out=Path("out")))
 
 
@@ -141,7 +141,7 @@ def test_an_env_in_two_suites_that_do_not_differ_is_refused() -> None:
 def test_policies_whose_episodes_would_share_their_files_are_refused(config: Callable[..., EvalConfig]) -> None:
     [policy] = config().policies
     policies = [policy.model_copy(update={"name": name}) for name in ("pi0/fast", "pi0_fast")]
-    with pytest.raises(ConfigError, match="would share their files"):
+    with pytest.raises(ConfigError, match="would share files"):
         cells(config().model_copy(update={"policies": policies}))
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from recorded_results import HOSTILE, record, runs
 
-from vlagents_ray.evaluate import Results, SilentProgress
+from vlagents_ray.evaluate import Progress, Results
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.episode.records import EpisodeResult, Status
 from vlagents_ray.evaluate.plan.cases import cells
@@ -196,7 +196,7 @@ def test_the_results_are_read_for_a_share_of_the_time_at_most(
 def test_calls_reach_the_terminal_too(tmp_path: Path) -> None:
     told: list[str] = []
 
-    class Terminal(SilentProgress):
+    class Terminal(Progress):
         def begin(self, *_: Any) -> None:
             told.append("begin")
 

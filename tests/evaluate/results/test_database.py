@@ -21,7 +21,7 @@ from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.merge import merge
 from vlagents_ray.evaluate.plan.cases import cells
 from vlagents_ray.evaluate.plan.jobs import plan
-from vlagents_ray.evaluate.results import database, lock
+from vlagents_ray.evaluate.results import database
 from vlagents_ray.evaluate.results.store import Store
 
 Config = Callable[..., EvalConfig]
@@ -157,7 +157,7 @@ def test_readers_that_look_at_the_lock_stop_no_evaluation(config: Config) -> Non
 
     def look() -> None:
         while not over.is_set():
-            lock.is_held(config().out)
+            database.is_locked(config().out)
             looked.set()
 
     readers = [threading.Thread(target=look) for _ in range(4)]

@@ -16,7 +16,7 @@ from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult
 from vlagents_ray.evaluate.plan.cases import cells
 from vlagents_ray.evaluate.plan.jobs import plan
-from vlagents_ray.evaluate.report.html import write_report
+from vlagents_ray.evaluate.report.page import write_report
 from vlagents_ray.evaluate.results.reader import Results
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.evaluate.results.summary import summarize, write_summary

@@ -1,1 +1,1 @@
-"""What an episode leaves in files: videos, trajectories, provenance."""
+"""The files of episodes: videos, trajectories, provenance."""

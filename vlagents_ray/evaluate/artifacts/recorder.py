@@ -5,17 +5,19 @@ from __future__ import annotations
 import logging
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from typing_extensions import Self
 
 from vlagents_ray.evaluate.artifacts.storage import episode_folder, outcome, stem, whole
 from vlagents_ray.evaluate.artifacts.trajectory import TrajectoryRecorder, save_trajectory
 from vlagents_ray.evaluate.artifacts.video import DEFAULT_FPS, Footage, VideoRecorder, save_videos
+from vlagents_ray.evaluate.episode.episode import EpisodeObserver
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.episode.second_pass import PlayedEpisode, SecondPass
 from vlagents_ray.evaluate.episode.stats import version_of
@@ -25,10 +27,6 @@ from vlagents_ray.evaluate.plan.jobs import Job
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.viewers.targets import SUFFIXES, is_live, open_target
 from vlagents_ray.viewers.viewer import EpisodeViewer, ViewerFrame, numbers_of
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
-
 
 log = logging.getLogger(__name__)
 
@@ -44,28 +42,16 @@ class Artifacts:
     not_repeatable: str | None = None  # why images are missing that were to be rendered in a second pass
 
 
-class EpisodeRecorder:
+class EpisodeRecorder(EpisodeObserver):
     """Records one episode. Use as a context manager, which frees what it holds. This one keeps nothing."""
-
-    request_info: Mapping[str, Any] = {}
-    """Added to the `Obs.info` of every request to the policy."""
 
     @property
     def wants_images(self) -> EpisodeChoice:
-        """Of which episodes the images of every step are needed."""
+        """The episodes of which the images of every step are needed."""
         return "none"
 
     def begin(self, job: Job) -> None:
         """Begin the episode of a job; called before anything is added."""
-
-    def add_observation(self, obs: Obs) -> None:
-        """Add an observation, beginning with that of the reset."""
-
-    def add_act(self, act: Act, ticks_waited: int = 0) -> None:
-        """Add an answer of the policy; some or all rows of its action are executed after `ticks_waited` other ones."""
-
-    def add_action(self, action: np.ndarray, reward: float, success: bool) -> None:
-        """Add an executed action, (D,), with its reward and success; its next observation was added before."""
 
     def finish(self, result: EpisodeResult, second_pass: SecondPass) -> Artifacts:
         """Return what is kept of an episode with this result; `second_pass` renders images that are missing."""
@@ -184,13 +170,11 @@ class EpisodeViews:
             self._opened = stack.pop_all()
 
     def begin(self, job: Job) -> None:
-        """Begin the episode of a job."""
         name = "_".join([*(part.replace("/", "_") for part in job.cell.name if part), stem(job.key)])
         for viewer in self._viewers:
             self._shown.enter_context(viewer.episode(name))
 
     def add_observation(self, obs: Obs) -> None:
-        """Add an observation, beginning with that of the reset."""
         if self._viewers:
             self._seen.append(ViewerFrame.of(obs, self._ticks, time=self._begun + self._ticks * self._period_s))
             self._ticks += 1
@@ -236,7 +220,7 @@ class EpisodeViews:
 
 
 def save_views(config: EvalConfig, cell: EvalCase, result: EpisodeResult, files: dict[str, bytes]) -> None:
-    """Write the files of an episode as `FOLDER/POLICY/SUITE/ENV/epNNNN_seedS_OUTCOME.rrd`, and `.mcap` likewise."""
+    """Write the files of an episode as `FOLDER/POLICY/SUITE/ENV/epNNNN_seedS_OUTCOME.rrd`, or `.mcap`."""
     for name, target in _targets(config).items():
         if name in files:
             folder = episode_folder(Path(target), ".", cell)

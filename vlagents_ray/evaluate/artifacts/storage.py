@@ -62,7 +62,7 @@ def stem(key: EpisodeKey) -> str:
 def require_below(path: str) -> str:
     """Return `path`, of an episode's file in results.db, or raise `ConfigError` if it leads out of the folder.
 
-    The folder may come from somebody else.
+    The folder may come from another machine.
     """
     parts = PurePosixPath(path).parts
     if not parts or path.startswith("/") or ".." in parts or "\0" in path:

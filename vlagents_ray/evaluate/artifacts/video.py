@@ -64,7 +64,6 @@ class VideoRecorder:
         return Footage(shown, seen)
 
     def close(self) -> None:
-        """Discard what is not finished."""
         while self._tracks:
             self._tracks.popitem()[1][1].abandon()
 

@@ -38,9 +38,9 @@ from vlagents_ray.evaluate.artifacts.storage import (
     whole,
 )
 from vlagents_ray.evaluate.plan.config import canonical
-from vlagents_ray.evaluate.report.html import FILE as REPORT
-from vlagents_ray.evaluate.report.html import write_report
-from vlagents_ray.evaluate.report.html.provenance import repeat
+from vlagents_ray.evaluate.report.page import FILE as REPORT
+from vlagents_ray.evaluate.report.page import write_report
+from vlagents_ray.evaluate.report.provenance import repeat
 from vlagents_ray.evaluate.results.database import FILE as DATABASE
 from vlagents_ray.evaluate.results.reader import Results, reading
 from vlagents_ray.evaluate.results.summary import FILE as SUMMARY
@@ -83,7 +83,6 @@ class Manifest(BaseModel):
 
 
 def digest_of(path: Path) -> FileDigest:
-    """Compute the SHA-256 and the size of a file."""
     sha256, size = hashlib.sha256(), 0
     with path.open("rb") as file:
         while chunk := file.read(_CHUNK):
@@ -95,16 +94,8 @@ def digest_of(path: Path) -> FileDigest:
 def pack(folder: Path, archive: Path, written_by: dict[str, JsonValue]) -> str:
     """Write all files of `folder` into the bundle `archive`, whole or not at all; the same files give the same bytes.
 
-    Args:
-        folder: Holds what a bundle may hold, and nothing else.
-        archive: The file to write.
-        written_by: The versions here.
-
     Returns:
         The SHA-256 of the manifest, which stands for everything in the bundle.
-
-    Raises:
-        ConfigError: The folder has a file that a bundle may not hold.
     """
     paths = sorted(path for path in folder.rglob("*") if path.is_file())
     names = {path.relative_to(folder).as_posix(): path for path in paths}
@@ -130,11 +121,6 @@ def _member(name: str, how: int = zipfile.ZIP_DEFLATED) -> zipfile.ZipInfo:
 
 def unpack(archive: Path, folder: Path, *, most_bytes: int = MOST_BYTES) -> tuple[Manifest, str, list[str]]:
     """Write the files of a bundle into `folder`, without its manifest.
-
-    Args:
-        archive: The bundle.
-        folder: An empty folder.
-        most_bytes: The most bytes that all files may have together.
 
     Returns:
         The manifest, its SHA-256, and the differences between the manifest and the files, a sentence each.
@@ -211,7 +197,6 @@ def _manifest(archive: Path, file: zipfile.ZipFile, member: zipfile.ZipInfo | No
 
 
 def _copy(archive: Path, source: IO[bytes], target: IO[bytes], member: zipfile.ZipInfo) -> FileDigest:
-    """Copy a member, and compute its digest on the way."""
     sha256, size = hashlib.sha256(), 0
     while chunk := source.read(_CHUNK):
         size += len(chunk)
@@ -252,10 +237,6 @@ def versions_of(text: str) -> dict[str, str]:
 
 def compared(there: dict[str, str], here: dict[str, str]) -> tuple[int, list[str]]:
     """Compare two environments.
-
-    Args:
-        there: Versions by the names of packages.
-        here: The same of this environment.
 
     Returns:
         The number of packages that are the same, and the others of `there`, a phrase each.

@@ -19,7 +19,7 @@ from vlagents_ray.evaluate.artifacts.storage import versions
 from vlagents_ray.evaluate.artifacts.trajectory import Trajectory
 from vlagents_ray.evaluate.bundle.archive import CONFIG, MANIFEST, compared, pins, versions_of
 from vlagents_ray.evaluate.plan.config import fingerprint
-from vlagents_ray.evaluate.report.html import FILE as REPORT
+from vlagents_ray.evaluate.report.page import FILE as REPORT
 from vlagents_ray.evaluate.results.reader import Episode, Results, reading, table
 from vlagents_ray.evaluate.results.summary import FILE as SUMMARY
 from vlagents_ray.evaluate.results.summary import checkpoint_of, pushed_of, weights_of
@@ -62,19 +62,11 @@ def check_cells(results: Results) -> Finding:
     with reading(results.out) as db:
         keys = {row["key"] for row in table(db, "episodes")}
     odd += [f"{key}: its key does not match its columns, or it has no cell" for key in sorted(keys - stated)]
-    return _finding(
-        "database", odd, f"{len(results.cells)} cells and {len(keys)} episodes have the keys of their settings"
-    )
+    return _finding("database", odd, f"{len(results.cells)} cells and {len(keys)} episodes have their settings' keys")
 
 
 def check_derived(stated: dict[str, bytes], computed: Path, *, same_software: bool) -> Iterator[Finding]:
-    """Compare the summary, the report and the settings of the bundle with those computed from its database here.
-
-    Args:
-        stated: The bundle's files by name.
-        computed: The folder with the same files, written here.
-        same_software: Whether the same versions wrote the bundle: only then a page must be the same to the byte.
-    """
+    """Compare the summary, the report and the settings of the bundle with those computed from its database here."""
     yield _check_summary(stated.get(SUMMARY), (computed / SUMMARY).read_bytes())
     if REPORT not in stated:
         yield Finding(REPORT, "differs", "is not in the bundle")
@@ -188,7 +180,6 @@ def _finding(subject: str, odd: list[str], fine: str) -> Finding:
 
 
 def check_digests(odd: list[str], number: int) -> Finding:
-    """What the archive's list of digests says of its files."""
     return _finding("digests", odd, f"{number} files have the SHA-256 that {MANIFEST} states")
 
 

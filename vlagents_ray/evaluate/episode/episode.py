@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from time import perf_counter
 from typing import Any, Literal
@@ -39,11 +39,36 @@ from vlagents_ray.validation import check_action
 Phase = Literal["idle", "connect", "make", "env reset", "policy reset", "policy act", "env step"]
 Outcome = EpisodeResult | VLAgentsError
 Watch = Callable[[Phase, int], None]  # called with the phase that begins and the number of steps so far
-Record = Callable[[int, Obs], None]  # called with the number of the episode and each of its observations
-Acted = Callable[[int, Act, int], None]  # the same, each answer of the policy, and how many steps it came after
-Executed = Callable[[int, np.ndarray, float, bool], None]  # the same, each action, (D,), its reward, and success
 
 _ACTING, _STEPPING = policy_side("act"), env_side("step")  # entered at each step
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeSettings:
+    """The settings of episodes of one cell."""
+
+    execute: int | None = None  # rows of each action chunk that are executed, open loop; None: all
+    # Real-time mode, in which time passes while the policy computes, for each episode by itself (see `latency`); None:
+    # the environments wait for the policy.
+    clock: ClockConfig | None = None
+    reset_options: Mapping[str, Any] = field(default_factory=dict)  # of each reset of an environment
+    policy_options: Mapping[str, Any] = field(default_factory=dict)  # of each reset of the policy
+
+
+class EpisodeObserver:
+    """Is called with what happens in one episode. This one ignores it: override some methods."""
+
+    request_info: Mapping[str, Any] = {}
+    """Added to the `Obs.info` of every request to the policy."""
+
+    def add_observation(self, obs: Obs) -> None:
+        """Add an observation, beginning with that of the reset."""
+
+    def add_act(self, act: Act, ticks_waited: int = 0) -> None:
+        """Add an answer of the policy; some or all rows of its action are executed after `ticks_waited` other ones."""
+
+    def add_action(self, action: np.ndarray, reward: float, success: bool) -> None:
+        """Add an executed action, (D,), with its reward and success; its next observation was added before."""
 
 
 def run_episodes(
@@ -51,19 +76,14 @@ def run_episodes(
     agent: Agent,
     sessions: Sequence[Agent],
     keys: Sequence[EpisodeKey],
+    settings: EpisodeSettings = EpisodeSettings(),
     *,
-    execute: int | None = None,
-    clock: ClockConfig | None = None,
-    reset_options: Mapping[str, Any] | None = None,
-    policy_options: Mapping[str, Any] | None = None,
+    observers: Sequence[EpisodeObserver] = (),
     watch: Watch = lambda _phase, _steps: None,
-    record: Record = lambda _i, _obs: None,
     images: bool = True,
-    request_info: Mapping[str, Any] | None = None,
-    acted: Acted = lambda _i, _act, _ticks_waited: None,
-    executed: Executed = lambda _i, _action, _reward, _success: None,
 ) -> list[Outcome]:
     """Play the episodes `keys` together, at most `env.num_envs`, each with its own session.
+
     `agent.act_batch` is called for all sessions that have no rows of a chunk left. Either `agent` is a `RemoteAgent`
     and `sessions` come from its `sessions(n)`, or it is an initialized policy in this process and they are copies of
     it. A single session may be `agent` itself, whose `act` is then called. A finished episode is idle until all are.
@@ -74,19 +94,11 @@ def run_episodes(
         agent: The policy.
         sessions: The session of each episode.
         keys: Environment, number and seed of each episode.
-        execute: Rows of each action chunk that are executed, open loop; None: all.
-        clock: Real-time mode, in which time passes while the policy computes, for each episode by itself (see
-            `vlagents_ray.evaluate.episode.latency`); None: the environments wait for the policy.
-        reset_options: Options for each reset of an environment.
-        policy_options: Options for each reset of the policy.
+        settings: What the episodes have in common.
+        observers: The observer of each episode, or none.
         watch: Called before each phase that may take long.
-        record: Called with every observation, the first one included.
-        images: Whether `record` needs the images of every step. If not, the environments may leave out those between
-            two requests to the policy, and after the last step.
-        request_info: Added to the `Obs.info` of every request to the policy.
-        acted: Called with every answer of the policy, before its rows are executed, and with the number of steps that
-            are executed first, in real-time mode, since it came late.
-        executed: Called with every action that was executed.
+        images: Whether the observers need the images of every step. If not, the environments may leave out those
+            between two requests to the policy, and after the last step.
 
     Returns:
         An outcome for each key. A policy error ends only its own episode, with status "policy_error". Where an episode
@@ -107,35 +119,37 @@ def run_episodes(
         contract = env.contract
         seen = env.reset(
             seeds=[key.seed for key in keys],
-            options=[options_of_reset(env, key.episode, reset_options) for key in keys],
+            options=[options_of_reset(env, key.episode, settings.reset_options) for key in keys],
         )
         first = [
             (checked_obs(obs, contract, "reset"), checked_instruction(text, "reset"))
             for obs, text in zip(seen, env.instructions, strict=True)
         ]
     reset_ms = 1e3 * (perf_counter() - begun)
+    executor = partial(ChunkExecutor, settings.execute, settings.clock, contract)
+    watched = observers or [EpisodeObserver()] * len(keys)
     episodes = []
-    for i, (key, session, (obs, instruction)) in enumerate(zip(keys, sessions, first, strict=True)):
-        record(i, obs)
-        stats = EpisodeStats(key, begun, instruction=instruction, reset_ms=reset_ms)
-        episodes.append(_Episode(i, session, stats, partial(ChunkExecutor, execute, clock, contract), obs))
+    for i, (key, session, observer, (obs, text)) in enumerate(zip(keys, sessions, watched, first, strict=True)):
+        observer.add_observation(obs)
+        stats = EpisodeStats(key, begun, instruction=text, reset_ms=reset_ms)
+        episodes.append(_Episode(i, session, stats, observer, executor, obs))
     watch("policy reset", 0)
-    _reset_policy(agent, episodes, contract, policy_options or {})
+    _reset_policy(agent, episodes, contract, settings.policy_options)
     steps, playing = 0, _unfinished(episodes)
     while playing:
         if requesting := [episode for episode in playing if not episode.ticks]:
             watch("policy act", steps)
-            _request_actions(agent, requesting, contract, request_info or {}, acted)
+            _request_actions(agent, requesting, contract)
             playing = _unfinished(playing)
         if playing:
             watch("env step", steps)
             asks = steps + 1 < env.max_steps and any(len(episode.ticks) == 1 for episode in playing)
             env.looked_at = images or asks
-            _step(env, episodes, playing, contract, record, executed)
+            _step(env, episodes, playing, contract)
             steps, playing = steps + 1, _unfinished(playing)
             if env.several_tasks and (begun_anew := _instructed(env, playing)):
                 watch("policy reset", steps)
-                _reset_policy(agent, begun_anew, contract, policy_options or {})
+                _reset_policy(agent, begun_anew, contract, settings.policy_options)
                 playing = _unfinished(playing)
     return [episode.outcome for episode in episodes if episode.outcome is not None]
 
@@ -144,21 +158,24 @@ def _unfinished(episodes: Sequence[_Episode]) -> list[_Episode]:
     return [episode for episode in episodes if episode.outcome is None]
 
 
+@dataclass(slots=True, eq=False)
 class _Episode:
     """One of the episodes in lockstep."""
 
-    def __init__(
-        self, number: int, session: Agent, stats: EpisodeStats, executor: Callable[[], ChunkExecutor], obs: Obs
-    ) -> None:
-        self.number = number
-        self.session = session
-        self.stats = stats
-        self.obs = obs
-        self.ticks: deque[Tick] = deque()  # the ticks before the next request
-        self.outcome: Outcome | None = None  # set once the episode is over
-        self._new_executor, self._executor = executor, executor()
-        self._width: int | None = None  # numbers of an action
-        self._done = False  # the policy ends the episode with these ticks
+    number: int
+    session: Agent
+    stats: EpisodeStats
+    observer: EpisodeObserver
+    new_executor: Callable[[], ChunkExecutor]
+    obs: Obs  # the newest
+    ticks: deque[Tick] = field(default_factory=deque)  # before the next request
+    outcome: Outcome | None = None  # set once the episode is over
+    _executor: ChunkExecutor = field(init=False)
+    _width: int | None = None  # numbers of an action
+    _done: bool = False  # the policy ends the episode with these ticks
+
+    def __post_init__(self) -> None:
+        self._executor = self.new_executor()
 
     def began(self, answer: dict[str, Any] | Exception) -> None:
         """Begin with the policy's answer to the reset of the session."""
@@ -174,14 +191,13 @@ class _Episode:
         """Take up a further task; what is left of the plan was for the last one."""
         self.stats.instructed(instruction)
         self.ticks.clear()
-        self._executor, self._done = self._new_executor(), False
+        self._executor, self._done = self.new_executor(), False
 
-    def request(self, info: Mapping[str, Any]) -> Obs:
-        """Return the observation for the next request to the policy, with `info`."""
-        continuation = self._executor.request_info()
+    def request(self) -> Obs:
+        continuation, info = self._executor.request_info(), self.observer.request_info
         return _for_policy(self.obs, {**info, **continuation} if info else continuation)
 
-    def answered(self, answer: Act | Exception, contract: Contract, seconds: float, acted: Acted) -> None:
+    def answered(self, answer: Act | Exception, contract: Contract, seconds: float) -> None:
         """Plan the next ticks from the policy's answer, which took `seconds`."""
         try:
             with _ACTING:
@@ -191,29 +207,27 @@ class _Episode:
                 self.stats.acted(answer, seconds, latency_s)
             rows = Act(check_action(answer.action, contract)).rows()
             if self._width not in (None, rows.shape[1]):  # the environment's contract states no size
-                raise InvalidAction(
-                    f"action: got {rows.shape}, want {self._width} numbers a row, as in the first answer"
-                )
+                raise InvalidAction(f"action: got {rows.shape}, want {self._width} numbers a row, as in the first")
             self._width = rows.shape[1]
             ticks = list(self._executor.ticks(rows, latency_s or 0.0))
-            acted(self.number, answer, sum(tick.waited for tick in ticks))
+            self.observer.add_act(answer, sum(tick.waited for tick in ticks))
             self.ticks.extend(ticks)
             self._done = answer.done
         except VLAgentsError as error:
             self.failed(error)
 
-    def stepped(self, step: EnvStep, limit: int) -> Tick:
-        """Record the outputs of the next of `ticks`, which is returned."""
+    def stepped(self, step: EnvStep, limit: int) -> None:
+        """Record the outputs of the next of `ticks`."""
+        self.observer.add_observation(step.obs)
         self.obs, tick = step.obs, self.ticks.popleft()
         over = self.stats.stepped(tick, step, limit)
         if not over and self._done and not self.ticks:
             self.stats.ending, over = "policy_done", True
         if over:
             self.outcome = self.stats.result(transport_of(self.session))
-        return tick
+        self.observer.add_action(tick.action, step.reward, step.success)
 
     def failed(self, error: VLAgentsError) -> None:
-        """End the episode with `error`."""
         if isinstance(error, PolicyFailed) and not isinstance(error, CheckpointFailed):
             self.outcome = self.stats.result(transport_of(self.session), error)
         else:
@@ -259,13 +273,11 @@ def _reset_session(
         return error
 
 
-def _request_actions(
-    agent: Agent, episodes: Sequence[_Episode], contract: Contract, info: Mapping[str, Any], acted: Acted
-) -> None:
+def _request_actions(agent: Agent, episodes: Sequence[_Episode], contract: Contract) -> None:
     begun = perf_counter()
     try:
         with _ACTING:
-            requests = [episode.request(info) for episode in episodes]
+            requests = [episode.request() for episode in episodes]
             if len(episodes) == 1 and episodes[0].session is agent:
                 answers: list[Act | Exception] = [agent.act(requests[0])]
             else:
@@ -276,17 +288,10 @@ def _request_actions(
         answers = [error] * len(episodes)
     seconds = perf_counter() - begun
     for episode, answer in zip(episodes, answers, strict=True):
-        episode.answered(answer, contract, seconds, acted)
+        episode.answered(answer, contract, seconds)
 
 
-def _step(
-    env: BatchEnv,
-    episodes: Sequence[_Episode],
-    playing: Sequence[_Episode],
-    contract: Contract,
-    record: Record,
-    executed: Executed,
-) -> None:
+def _step(env: BatchEnv, episodes: Sequence[_Episode], playing: Sequence[_Episode], contract: Contract) -> None:
     acts = [Act(episode.ticks[0].action) if episode.outcome is None else None for episode in episodes]
     begun = perf_counter()
     try:
@@ -303,9 +308,7 @@ def _step(
         if episode.outcome is None:
             step = checked_step(obs, reward, terminated, truncated, info, contract, images=env.looked_at)
             episode.stats.step_ms.append(took_ms)
-            record(episode.number, step.obs)
-            tick = episode.stepped(step, env.max_steps)
-            executed(episode.number, tick.action, step.reward, step.success)
+            episode.stepped(step, env.max_steps)
 
 
 def transport_of(agent: Agent) -> str:

@@ -1,21 +1,53 @@
-"""A second pass over an episode, by its actions: it renders the images that the first pass left out."""
+"""A second pass over an episode by its actions, which renders the images that the first pass left out."""
 
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import numpy as np
 
 from vlagents_ray.envs.base import BatchEnv, Options
 from vlagents_ray.errors import VLAgentsError
-from vlagents_ray.evaluate.episode.episode import Watch
-from vlagents_ray.evaluate.episode.failures import checked_obs, checked_step, env_side
+from vlagents_ray.evaluate.episode.episode import EpisodeObserver, Watch
+from vlagents_ray.evaluate.episode.failures import EnvStep, checked_obs, checked_step, env_side
 from vlagents_ray.interface import Act, Obs
 
 
-class PlayedEpisode:
+def play_actions(
+    env: BatchEnv,
+    seed: int,
+    options: Options | None,
+    actions: Iterable[np.ndarray],
+    *,
+    images: bool,
+    watch: Watch = lambda _phase, _steps: None,
+) -> Iterator[tuple[Obs, EnvStep | None]]:
+    """Begin an episode in the first of these environments, and execute actions, each (D,).
+
+    Yields:
+        The observation of the reset with None, then that of each step with all its outputs.
+
+    Raises:
+        EnvFailed: The simulator failed, or is over sooner.
+    """
+    env.looked_at = images
+    watch("env reset", 0)
+    with env_side("reset"):
+        contract = env.contract
+        [first] = env.reset(seeds=[seed], options=[options])
+        obs = checked_obs(first, contract, "reset", images=images)
+    yield obs, None
+    for number, action in enumerate(actions):
+        watch("env step", number)
+        with env_side("step"):
+            [seen], [reward], [terminated], [truncated], [info] = env.step([Act(action)])
+            step = checked_step(seen, reward, terminated, truncated, info, contract, images=images)
+        yield step.obs, step
+
+
+class PlayedEpisode(EpisodeObserver):
     """The actions of an episode and what came of them, with digests in place of images."""
 
     def __init__(self) -> None:
@@ -28,11 +60,9 @@ class PlayedEpisode:
         return any(images.keys() != self._seen[0][1].keys() for _, images in self._seen)
 
     def add_observation(self, obs: Obs) -> None:
-        """Add an observation, beginning with that of the reset."""
         self._seen.append(_digests(obs))
 
     def add_action(self, action: np.ndarray, reward: float, success: bool) -> None:
-        """Add an executed action, (D,), with its reward and success."""
         self._done.append((np.array(action), reward, success))
 
     def play_again(
@@ -43,37 +73,21 @@ class PlayedEpisode:
         State, gripper, reward and success of every step, and the images that were rendered before, must be the same to
         the bit. The images between them then show this episode.
 
-        Args:
-            env: The environments, none of which depends on the others.
-            seed: The seed of the episode.
-            options: The options of its reset.
-            watch: Called before the reset and each step.
-            record: Called with every observation.
-
         Returns:
             What differs, upon which nothing more is executed; None if nothing does.
         """
-        contract, env.looked_at = env.contract, True
+        played = play_actions(env, seed, options, (action for action, _, _ in self._done), images=True, watch=watch)
         try:
-            watch("env reset", 0)
-            with env_side("reset"):
-                [first] = env.reset(seeds=[seed], options=[options])
-                obs = checked_obs(first, contract, "reset")
-            record(obs)
-            differs = self._difference(0, obs)
-            for number, (action, reward, success) in enumerate(self._done, start=1):
+            for number, (obs, step) in enumerate(played):
+                record(obs)
+                same = step is None or (step.reward, step.success) == self._done[number - 1][1:]
+                differs = self._difference(number, obs) if same else "reward or success"
                 if differs is not None:
-                    return f"after {number - 1} steps, {differs} differs"
-                watch("env step", number - 1)
-                with env_side("step"):
-                    [seen], [gained], [terminated], [truncated], [info] = env.step([Act(action)])
-                    step = checked_step(seen, gained, terminated, truncated, info, contract)
-                record(step.obs)
-                same = (step.reward, step.success) == (reward, success)
-                differs = self._difference(number, step.obs) if same else "reward or success"
+                    steps = "the last step" if number == len(self._done) else f"{number} steps"
+                    return f"after {steps}, {differs} differs"
         except VLAgentsError as error:  # as of an environment that is over sooner
             return str(error)
-        return differs and f"after the last step, {differs} differs"
+        return None
 
     def _difference(self, number: int, obs: Obs) -> str | None:
         """Return the part of observation `number` that is not in `obs`, or None."""

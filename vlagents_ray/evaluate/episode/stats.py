@@ -50,7 +50,6 @@ class EpisodeStats:
     timing_ms: dict[str, list[float]] = field(default_factory=dict)
 
     def began(self, info: object) -> None:
-        """Record the info of the policy's reset."""
         said = info if isinstance(info, dict) else {}
         self.checkpoint, self.weights, self.revision = (
             value if isinstance(value := said.get(name), str) else None
@@ -58,7 +57,6 @@ class EpisodeStats:
         )
 
     def instructed(self, instruction: str) -> None:
-        """Record a further instruction."""
         self.earlier.append(self.instruction)
         self.instruction = instruction
 

@@ -2,8 +2,8 @@
 
 from collections.abc import Callable
 
-from vlagents_ray.evaluate.exports.hub import to_hub
 from vlagents_ray.evaluate.exports.lerobot import to_lerobot
+from vlagents_ray.evaluate.exports.scores import to_hub
 from vlagents_ray.evaluate.exports.tables import COLUMNS, Column, rows, to_csv, to_json, to_parquet
 from vlagents_ray.evaluate.exports.vla_eval import to_vla_eval
 

@@ -87,9 +87,7 @@ def to_lerobot(
     """
     recorded = [(cell, one) for cell in results.cells for one in cell.episodes if one.trajectory is not None]
     if not recorded:
-        raise ConfigError(
-            f"{results.out}: has no trajectories; evaluate with --record all or failures (`record: all` in its file)"
-        )
+        raise ConfigError(f"{results.out}: has no trajectories; evaluate with --record all (`record: all` in its file)")
     if successes:
         solved = [(cell, one) for cell, one in recorded if one.result.success_once]
         if not solved:
@@ -115,9 +113,7 @@ def to_lerobot(
             finished = _finished(one, angles, root / UNFINISHED)
             if dataset.episodes and finished.features != dataset.info["features"]:
                 odd = sorted(k for k, v in finished.features.items() if dataset.info["features"].get(k) != v)
-                raise ConfigError(
-                    f"{one.cell.env}: has other features than the envs before it ({', '.join(odd)}); {_CURE}"
-                )
+                raise ConfigError(f"{one.cell.env}: has other features than envs before ({', '.join(odd)}); {_CURE}")
             dataset.save(finished)
         if not dataset.episodes:
             raise ConfigError(f"{results.out}: in none of the {len(recorded)} recorded episodes did the policy act")

@@ -1,16 +1,28 @@
-"""Success rates as others quote them: with the episodes, the interval, the protocol, the weights and the code."""
+"""Success rates as others quote them: with the episodes, the interval, the protocol, the weights and the code.
+
+`to_hub` writes them for a model repository of the Hugging Face Hub: `.eval_results/*.yaml`, and a model card's
+`model-index`. The formats are those of the Hub's documentation, https://huggingface.co/docs/hub/eval-results and
+https://github.com/huggingface/hub-docs/blob/main/modelcard.md; `huggingface_hub` 2.4 reads both.
+"""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
+from pathlib import Path
 from typing import Any, Literal
 
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
 from vlagents_ray.errors import ConfigError
+from vlagents_ray.evaluate.artifacts.storage import whole_folder
 from vlagents_ray.evaluate.results.reader import CellResults, Results, have_common_rate, rate_of
 from vlagents_ray.evaluate.results.statistics import Rate
 from vlagents_ray.evaluate.results.summary import checkpoint_of, pushed_of, weights_of
+from vlagents_ray.naming import distinct, plain
 
 Metric = Literal["success_once", "success_at_end"]
 _AT_END = "at the end"  # SIMPLER's protocol: the last state decides
@@ -34,7 +46,6 @@ class Score:
 
     @property
     def rate(self) -> Rate:
-        """The rate of `metric`."""
         return rate_of(self.cells, self.metric)
 
     @property
@@ -45,7 +56,7 @@ class Score:
 
     @property
     def deviations(self) -> list[str]:
-        """What differs from the protocol, or from the plan, a phrase each."""
+        """The differences from the protocol or the plan, a phrase each."""
         found = [text for cell in self.cells for text in _deviations(cell)]
         return list(dict.fromkeys(found))
 
@@ -96,11 +107,7 @@ _WHEN = {"success_once": "solved after some step", "success_at_end": "solved aft
 
 
 def scores(results: Results) -> list[Score]:
-    """The scores of the only policy id in `results`, by benchmark, those of suites with other options apart.
-
-    Raises:
-        ConfigError: There are several policy ids, or no episode has a result.
-    """
+    """The scores of the only policy id in `results`, by benchmark, those of suites with other options apart."""
     if len(results.contenders) != 1:
         raise ConfigError(f"got the policies {results.contenders}, want one: name it with --policy NAME, or NAME@STEP")
     groups: dict[tuple[str, str], list[CellResults]] = {}
@@ -163,3 +170,140 @@ def _code_text(code: dict[str, Any]) -> str:
     commit = f" at commit {code['commit']}" if "commit" in code else ""
     changed = f" with changes (SHA-256 {code['diff_sha256']})" if "diff_sha256" in code else ""
     return f"vlagents-ray {code.get('vlagents-ray')}{commit}{changed}"
+
+
+_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
+_NAMES = {"success_once": "success rate (after some step)", "success_at_end": "success rate (after the last step)"}
+
+
+class HubSettings(BaseModel):
+    """Settings of the export that results do not have."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    dataset: str = Field(
+        examples=["OWNER/NAME"]
+    )  # the benchmark's dataset on the Hub, OWNER/NAME, where its leaderboard is
+    task_id: str | None = None  # of that benchmark's eval.yaml; None: the name of the score, without its simulator
+    model: str | None = None  # name in the model-index; None: the policy's in the evaluation
+    source_url: str | None = None  # of the bundle, or of a paper
+
+    @field_validator("dataset")
+    @classmethod
+    def _is_id(cls, dataset: str) -> str:
+        if not _ID.fullmatch(dataset):
+            raise ValueError(f"got {dataset!r}, want the id of a dataset on the Hub, OWNER/NAME")
+        return dataset
+
+
+def to_hub(results: Results, path: Path, **settings: Any) -> int:
+    """Write the new folder `path`, whose files go into the model's repository.
+
+    `.eval_results/DATASET.yaml` has an entry for each score, whose `value` is in per cent and whose `notes` say the
+    episodes, the interval, the protocol, the deviations, the digest of the weights and the commit in one line.
+    `README.md` is a model card with a `model-index`, whose metrics have all of that as `args`; merge its head into the
+    card that the repository has.
+
+    Args:
+        results: Of one policy id.
+        path: A folder that does not exist, or is empty.
+        settings: The fields of `HubSettings`.
+
+    Returns:
+        The number of episodes that the scores count.
+
+    Raises:
+        ConfigError: There are several policy ids, `task_id` stands for several scores, or `path` has files.
+    """
+    given = HubSettings.model_validate(settings)
+    found = scores(results)
+    if given.task_id is not None and len(found) > 1:
+        raise ConfigError(
+            f"task_id: got {given.task_id!r} for the scores {[one.name for one in found]}, want one; choose with --env"
+        )
+    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        raise ConfigError(f"{path}: is there already; want a new folder")
+    ids = _task_ids([one.name for one in found])
+    tasks = [(one, given.task_id or ids[one.name]) for one in found]
+    card = {"tags": ["robotics"], "model-index": _index(tasks, given)}
+    with whole_folder(path) as folder:
+        entries = folder / ".eval_results" / f"{plain(given.dataset)}.yaml"
+        entries.parent.mkdir()
+        entries.write_text(_yaml([_entry(one, task, given) for one, task in tasks]), encoding="utf-8")
+        (folder / "README.md").write_text(f"---\n{_yaml(card)}---\n\n{_table(found)}", encoding="utf-8")
+    return sum(one.rate.episodes for one in found)
+
+
+def _entry(score: Score, task: str, given: HubSettings) -> dict[str, Any]:
+    entry: dict[str, Any] = {
+        "dataset": {"id": given.dataset, "task_id": task},
+        "value": _percent(score.rate.rate),
+        "date": score.date.isoformat().replace("+00:00", "Z"),
+        "notes": score.note,
+    }
+    if given.source_url is not None:
+        entry["source"] = {"url": given.source_url, "name": "results by vlagents-ray"}
+    return entry
+
+
+def _index(found: list[tuple[Score, str]], given: HubSettings) -> list[dict[str, Any]]:
+    source = (
+        {} if given.source_url is None else {"source": {"url": given.source_url, "name": "results by vlagents-ray"}}
+    )
+    return [
+        {
+            "name": given.model or found[0][0].results.contenders[0],
+            "results": [
+                {
+                    "task": {"type": "robotics", "name": "Robotics"},
+                    "dataset": {"name": one.name, "type": given.dataset, "config": task},
+                    "metrics": _metrics(one),
+                    **source,
+                }
+                for one, task in found
+            ],
+        }
+    ]
+
+
+def _metrics(score: Score) -> list[dict[str, Any]]:
+    """The success that the protocol counts, with all facts; then the other one, with its interval."""
+    other: Metric = "success_at_end" if score.metric == "success_once" else "success_once"
+    return [
+        {"type": score.metric, "name": _NAMES[score.metric], "value": _percent(score.rate.rate), "args": score.facts},
+        {
+            "type": other,
+            "name": _NAMES[other],
+            "value": _percent(rate_of(score.cells, other).rate),
+            "args": rate_of(score.cells, other).to_json(),
+        },
+    ]
+
+
+def _task_ids(names: list[str]) -> dict[str, str]:
+    """The names without their simulator, "libero_spatial" of "libero/libero_spatial", where that tells them apart."""
+    short = [plain(name.rpartition("/")[2]) for name in names]
+    return dict(zip(names, short, strict=True)) if len(set(short)) == len(short) else distinct(names)
+
+
+def _percent(rate: float | None) -> float:
+    return round(100 * (rate or 0.0), 2)
+
+
+def _table(found: list[Score]) -> str:
+    """The scores as Markdown, in which names are code: they are text of others."""
+    lines = ["# Evaluation", "", "| benchmark | success | episodes | interval |", "| --- | --- | --- | --- |"]
+    for one in found:
+        low, high = (f"{100 * bound:.1f}" for bound in one.rate.interval)
+        success = f"{_percent(one.rate.rate):g} %"
+        lines.append(f"| {_as_code(one.name)} | {success} | {one.rate.episodes} | {low} to {high} % |")
+    return "\n".join([*lines, "", *(f"- {_as_code(one.name)}: {_as_code(one.note)}" for one in found)]) + "\n"
+
+
+def _as_code(text: str) -> str:
+    plain_text = " ".join(text.split()).replace("`", "'").replace("|", "/")
+    return f"`{plain_text}`"
+
+
+def _yaml(value: Any) -> str:
+    return str(yaml.safe_dump(value, sort_keys=False, allow_unicode=True, width=100))

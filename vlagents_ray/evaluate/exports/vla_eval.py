@@ -39,7 +39,7 @@ _PRO_MEAN = [f"{suite}_{kind}" for suite in _PRO_SUITES.values() for kind in ("o
 
 
 class VlaEvalSettings(BaseModel):
-    """What the leaderboard asks for, and the results do not know."""
+    """Fields of a leaderboard entry that results do not have."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -85,11 +85,7 @@ def to_vla_eval(results: Results, path: Path, **settings: Any) -> int:
 
 
 def _benchmark(score: Score) -> str:
-    """The leaderboard's name of the benchmark.
-
-    Raises:
-        ConfigError: It has none.
-    """
+    """The leaderboard's name of the benchmark."""
     suite = env_suite(score.cells[0].env)
     found = {"simpler": "simpler_env"}.get(suite)
     if suite == "libero":
@@ -150,11 +146,7 @@ def _libero(found: list[Score]) -> dict[str, Any]:
 
 
 def _libero_pro(found: list[Score]) -> dict[str, Any]:
-    """The suites, as the leaderboard has no scores of tasks here.
-
-    Raises:
-        ConfigError: A suite lacks a task.
-    """
+    """The suites, as the leaderboard has no scores of tasks here."""
     own = _libero([score for score in found if _suite(score) in _PRO_SUITES])["suite_scores"]
     suites: dict[str, float] = {f"{_PRO_SUITES[suite]}_ori": rate for suite, rate in own.items()}
     tasks = _by_task([score for score in found if _suite(score) in _PRO])
@@ -177,11 +169,7 @@ def _simpler(found: list[Score]) -> dict[str, Any]:
 
 
 def _by_task(found: list[Score]) -> Mapping[str, float]:
-    """The success rate of each task, in per cent.
-
-    Raises:
-        ConfigError: A task was played under several settings, of which the leaderboard shows one.
-    """
+    """The success rate of each task, in per cent."""
     rates: dict[str, float] = {}
     for score in found:
         for cell in score.cells:

@@ -1,1 +1,1 @@
-"""What is to be evaluated: configuration, cases and jobs."""
+"""The plan of an evaluation: configuration, cases and jobs."""

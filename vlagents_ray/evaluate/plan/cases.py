@@ -1,4 +1,4 @@
-"""What an evaluation is made of: one policy, at one checkpoint, in one environment."""
+"""The cases of an evaluation, each one policy at one checkpoint in one environment."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class EvalCase:
 
     @property
     def policy_options(self) -> dict[str, Any]:
-        """What is handed to every reset of the policy."""
+        """The options of every reset of the policy."""
         return self.policy.options | ({"checkpoint_step": self.step} if self.policy.steps else {})
 
     @property
@@ -150,14 +150,12 @@ def cells(config: EvalConfig) -> list[EvalCase]:
     ]
     names = Counter(cell.name for cell in found)
     if twice := sorted({env for (_, _, env), number in names.items() if number > 1}):
-        raise ConfigError(f"suites: {twice} stand in two suites of one name; give each a `name` of its own")
+        raise ConfigError(f"suites: {twice} are in two suites of one name; give each suite another `name`")
     folders: dict[tuple[str, ...], tuple[str, ...]] = {}
     for name in names:
         other = folders.setdefault(tuple(plain(part) for part in name), name)
         if other != name:
-            raise ConfigError(
-                f"{' '.join(name)!r} and {' '.join(other)!r} would share their files; give one another name"
-            )
+            raise ConfigError(f"{' '.join(name)!r} and {' '.join(other)!r} would share files; give one another name")
     prints = Counter(cell.fingerprint for cell in found)
     if twice := sorted({cell.env for cell in found if prints[cell.fingerprint] > 1}):
         raise ConfigError(

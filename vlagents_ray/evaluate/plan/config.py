@@ -149,9 +149,7 @@ class StopConfig(_PlanModel):
     @model_validator(mode="after")
     def _some_end(self) -> Self:
         if self.target is None and self.width is None:
-            raise ValueError(
-                "got neither target nor width, want one or both: the first that is reached stops the evaluation"
-            )
+            raise ValueError("got neither target nor width, want one or both: the first that is reached ends it")
         return self
 
 
@@ -270,7 +268,7 @@ class EvalConfig(_PlanModel):
     def _named_apart(cls, policies: list[PolicyConfig]) -> list[PolicyConfig]:
         names = [policy.name for policy in policies]
         if repeated := sorted({name for name in names if names.count(name) > 1}):
-            raise ValueError(f"two policies are named {repeated}; give each a `name` of its own")
+            raise ValueError(f"two policies are named {repeated}; give each another `name`")
         return policies
 
     @property

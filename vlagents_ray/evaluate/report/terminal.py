@@ -7,7 +7,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from vlagents_ray.evaluate.report.html import FILE as REPORT
+from vlagents_ray.evaluate.report.page import FILE as REPORT
 from vlagents_ray.evaluate.results.comparison import Comparison, clock_gaps
 from vlagents_ray.evaluate.results.database import RUNNING
 from vlagents_ray.evaluate.results.summary import Group, Summary, errors_of_policies, pushed_of
@@ -68,9 +68,7 @@ def print_summary(console: Console, summary: Summary) -> None:
     lines += [f"{name}: weights pushed by a learner, {words}" for name, words in pushed.items()]
     lines += [_stopped(group) for group in summary.cells if group.stopped]
     if len(summary.quotable) > sum(len(summary.parts(name)) for name in summary.results.contenders):
-        lines.append(
-            "cells that stopped after different numbers of episodes have no rate in common: quote each by itself"
-        )
+        lines.append("cells that stopped after different numbers of episodes have no rate in common: quote each alone")
     lines += [_gap(one) for one in clock_gaps(summary.results)]
     if summary.state == RUNNING:
         lines.append("still running")

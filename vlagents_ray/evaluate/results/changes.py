@@ -1,4 +1,4 @@
-"""What changed in the program of an evaluation: the files and weights of its policies and environments."""
+"""Changes of the program of an evaluation: the files and weights of its policies and environments."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""results.db: its tables, and how it is opened, by the one evaluation that writes it and by all that read it.
+"""results.db: its tables, its lock, and how it is opened, by the one evaluation that writes it and by all that read it.
 
 SQLite's write-ahead log lets readers look while an evaluation writes, but its index is shared memory: all processes
 must be on one host (https://www.sqlite.org/wal.html). On a file system that other hosts may mount, or that is not
@@ -9,10 +9,13 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import errno
+import fcntl
 import functools
 import os
 import sqlite3
 import sys
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -71,7 +74,7 @@ def insert(db: sqlite3.Connection, table: str, row: Mapping[str, Any]) -> None:
 def require_readable(out: Path, db: sqlite3.Connection) -> None:
     """Raise `ConfigError` for a results file of another version, or with other columns than this version has.
 
-    A file of somebody else may have any text as the names of columns, by which `merge` inserts rows, and views or
+    A file from elsewhere may have any text as the names of columns, by which `merge` inserts rows, and views or
     triggers, which would compute whatever they like when a table is read or written.
     """
     begins = {"table": "CREATE TABLE", "index": "CREATE INDEX"}  # a virtual table is listed as a table, too
@@ -82,9 +85,7 @@ def require_readable(out: Path, db: sqlite3.Connection) -> None:
             )
     version = db.execute("PRAGMA user_version").fetchone()[0]
     if version != VERSION:
-        raise ConfigError(
-            f"{out / FILE}: got version {version} of the results file, want {VERSION}; choose another out folder"
-        )
+        raise ConfigError(f"{out / FILE}: got version {version} of the results, want {VERSION}; choose another folder")
     for table, known in _known_columns().items():
         there = _columns(db, table)
         unknown, missing = there - known, known - there
@@ -156,7 +157,7 @@ def close(db: sqlite3.Connection) -> None:
     """Close what `writable` opened. The database is one file then, which can be read on a read-only file system."""
     try:
         db.execute("PRAGMA busy_timeout = 0")
-        with contextlib.suppress(sqlite3.OperationalError):  # somebody reads it just now: the next writer will do it
+        with contextlib.suppress(sqlite3.OperationalError):  # it is being read just now: the next writer will do it
             db.execute("PRAGMA journal_mode = DELETE")
     finally:
         db.close()
@@ -173,7 +174,7 @@ def read_only(out: Path) -> sqlite3.Connection:
         unfinished = any(_size(out / f"{FILE}{suffix}") for suffix in ("-wal", "-journal"))  # not all is in the file
         if unfinished or "unable to open" not in str(error):
             raise
-        # Closed in order, with a write-ahead log that nobody here can make: nobody writes to it, either.
+        # Closed in order, with a write-ahead log that no process here can make, so that none writes to it.
         db = sqlite3.connect(f"{uri}?mode=ro&immutable=1", uri=True)
     return db
 
@@ -183,3 +184,54 @@ def _size(path: Path) -> int:
         return path.stat().st_size
     except FileNotFoundError:
         return 0
+
+
+LOCK = "results.lock"
+_NO_LOCKS = (errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK)
+_READER_S = 1.0  # more than `is_locked` of another process holds the lock
+_AGAIN_S = 0.01
+
+
+def lock(out: Path) -> int:
+    """Lock the folder `out`.
+
+    Returns:
+        A descriptor: closing it releases the lock, as does the end of this process.
+    """
+    file = os.open(out / LOCK, os.O_RDWR | os.O_CREAT, 0o644)
+    give_up = time.monotonic() + _READER_S
+    while True:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            if time.monotonic() < give_up:
+                time.sleep(_AGAIN_S)
+                continue
+            os.close(file)
+            raise ConfigError(f"{out}: another evaluation is writing there; wait, or choose another folder") from error
+        except OSError as error:
+            os.close(file)
+            if error.errno not in _NO_LOCKS:
+                raise
+            raise ConfigError(
+                f"{out}: its file system knows no locks ({error.strerror}), so that two evaluations could write to one "
+                f"folder; choose another one with --out (Lustre: have it mounted with `-o flock`)"
+            ) from error
+        return file
+
+
+def is_locked(out: Path) -> bool:
+    """Whether an evaluation holds the lock of the folder `out`; it is taken to, where that cannot be known."""
+    try:
+        file = os.open(out / LOCK, os.O_RDONLY)
+    except FileNotFoundError:
+        return False
+    except OSError:
+        return True
+    try:
+        fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError:
+        return True
+    finally:
+        os.close(file)
+    return False

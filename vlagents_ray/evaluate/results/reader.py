@@ -17,9 +17,8 @@ from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.cases import contender
 from vlagents_ray.evaluate.plan.config import StopConfig
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
-from vlagents_ray.evaluate.results import lock
 from vlagents_ray.evaluate.results.changes import Change
-from vlagents_ray.evaluate.results.database import FILE, RUNNING, read_only, require_readable
+from vlagents_ray.evaluate.results.database import FILE, RUNNING, is_locked, read_only, require_readable
 from vlagents_ray.evaluate.results.statistics import Rate
 from vlagents_ray.evaluate.results.stopping import Stopping, pooled
 
@@ -162,7 +161,7 @@ class Results:
             ConfigError: The folder holds no results, or they are of another version, or cannot be read.
         """
         out = Path(out)
-        written = lock.is_held(out)
+        written = is_locked(out)
         with reading(out) as db:
             episodes: dict[str, list[Episode]] = {}
             for row in table(db, "episodes", "seed"):
@@ -171,7 +170,7 @@ class Results:
             for row in table(db, "attempts"):
                 attempts.setdefault(row["cell"], []).append(Attempt(**row | {"retried": bool(row["retried"])}))
             runs = [_run(row) for row in table(db, "runs")]
-            written = written or lock.is_held(out)  # it may have begun meanwhile
+            written = written or is_locked(out)  # it may have begun meanwhile
             return cls(
                 out,
                 tuple(

@@ -141,10 +141,7 @@ class Pairs:
 
     def __add__(self, other: Pairs) -> Pairs:
         return Pairs(
-            self.both + other.both,
-            self.only_a + other.only_a,
-            self.only_b + other.only_b,
-            self.neither + other.neither,
+            self.both + other.both, self.only_a + other.only_a, self.only_b + other.only_b, self.neither + other.neither
         )
 
     @property

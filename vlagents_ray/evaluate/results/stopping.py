@@ -86,7 +86,6 @@ class Stopping:
         self.at: int | None = None  # after so many episodes the cell stops; None: not yet
 
     def add_all(self, results: Iterable[EpisodeResult]) -> None:
-        """Add the outcomes of several episodes."""
         for result in results:
             self.add(result)
 

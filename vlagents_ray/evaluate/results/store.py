@@ -21,7 +21,7 @@ from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult, Worker
 from vlagents_ray.evaluate.plan.cases import EvalCase, cells
 from vlagents_ray.evaluate.plan.config import EvalConfig, canonical
 from vlagents_ray.evaluate.plan.jobs import Job
-from vlagents_ray.evaluate.results import database, lock
+from vlagents_ray.evaluate.results import database
 from vlagents_ray.evaluate.results.changes import (
     IDENTITY,
     MIX,
@@ -51,7 +51,7 @@ class Store:
         self._out = config.out
         with storing(config.out):
             self._out.mkdir(parents=True, exist_ok=True)
-            self._lock = lock.acquire(self._out)
+            self._lock = database.lock(self._out)
         self._run = 0
         self._accepts = config.accept_changes
         self._changes: list[Change] = []  # accepted in this run
@@ -81,12 +81,7 @@ class Store:
     def begin_run(self, config: EvalConfig, versions: dict[str, Any], started: float | None = None) -> None:
         """Record that a run over the plan begins, or began at `started`, s since 1970."""
         with self._db:
-            row = (
-                time.time() if started is None else started,
-                RUNNING,
-                config.model_dump_json(),
-                canonical(versions),
-            )
+            row = (time.time() if started is None else started, RUNNING, config.model_dump_json(), canonical(versions))
             cursor = self._db.execute("INSERT INTO runs (started, state, config, versions) VALUES (?, ?, ?, ?)", row)
             self._run = int(cursor.lastrowid or 0)
             self._write_changes()
@@ -94,7 +89,6 @@ class Store:
             self._db.executemany("UPDATE cells SET program = ? WHERE cell = ?", programs)
 
     def end_run(self, state: str) -> None:
-        """Record how the run ended."""
         with self._db:
             self._db.execute("UPDATE runs SET ended = ?, state = ? WHERE run = ?", (time.time(), state, self._run))
 

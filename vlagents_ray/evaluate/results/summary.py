@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -262,9 +262,9 @@ def group_of(name: tuple[str, str, str], cells: Sequence[CellResults]) -> Group:
         steps=sum(one.steps for one in finished),
         mean_steps=_mean([one.steps for one in finished]),
         mean_return=_mean([one.episode_return for one in finished]),
-        env_step_ms=_median([one.env_step_ms for one in finished]),
-        policy_ms=_median([one.policy_ms for one in finished]),
-        policy_p95_ms=_median([one.policy_p95_ms for one in finished]),
+        env_step_ms=median([one.env_step_ms for one in finished]),
+        policy_ms=median([one.policy_ms for one in finished]),
+        policy_p95_ms=median([one.policy_p95_ms for one in finished]),
     )
 
 
@@ -272,7 +272,8 @@ def _mean(values: Sequence[float]) -> float | None:
     return float(np.mean(values)) if values else None
 
 
-def _median(values: Sequence[float | None]) -> float | None:
+def median(values: Iterable[float | None]) -> float | None:
+    """Return the median of the values that are known; None if none is."""
     known = [value for value in values if value is not None]
     return float(np.median(known)) if known else None
 

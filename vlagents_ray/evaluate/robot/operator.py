@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib.resources import files as package_files
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 import uvicorn
@@ -24,16 +24,13 @@ from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response
 from starlette.routing import Mount, Route
+from typing_extensions import Self
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.artifacts.storage import whole
 from vlagents_ray.images.jpeg_png import decode, encode_jpeg
 from vlagents_ray.interface import Obs
 from vlagents_ray.naming import distinct
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
-
 
 Outcome = Literal["success", "failure", "partial", "repeat"]
 SCENES = "scenes"
@@ -125,15 +122,12 @@ class Operator(Protocol):
         Returns:
             True to begin the trial, False to end the evaluation; it can be resumed.
         """
-        ...
 
     def watch(self, obs: Obs) -> None:
         """Show an observation of the running trial; called in each control tick, so it must return at once."""
-        ...
 
     def stops(self) -> bool:
         """Return whether the running trial is to be stopped, which also happens when the operator's page is closed."""
-        ...
 
     def judge(self, trial: VisibleTrial, ending: str) -> Verdict:
         """Ask for the verdict. The robot stays still.
@@ -148,16 +142,10 @@ class Operator(Protocol):
         Raises:
             KeyboardInterrupt: The operator has left. The trial will be played again.
         """
-        ...
 
 
 def start_pictures(out: Path, place: str) -> dict[str, Path]:
-    """Return the JPEG of each camera at the first start of a scene; {} before that.
-
-    Args:
-        out: The folder of results.
-        place: The scene's name in files.
-    """
+    """Return the JPEG of each camera at the first start of a scene; {} before that."""
     return {path.stem: path for path in sorted((out / SCENES / place).glob("*.jpg"))}
 
 
@@ -170,10 +158,6 @@ def save_start(out: Path, place: str, obs: Obs) -> None:
 
 def save_overlay(start: Path, now: np.ndarray) -> Path:
     """Save the mean of a start picture and the same camera's picture now, beside the former's folder.
-
-    Args:
-        start: The JPEG of the start picture.
-        now: (H, W, 3) uint8.
 
     Returns:
         The new JPEG; it has the size of `now`, and only `now` if the sizes differ.

@@ -24,7 +24,7 @@ from vlagents_ray.evaluate.robot.operator import Operator, Verdict, VisibleTrial
 from vlagents_ray.evaluate.robot.trial import PlayedTrial, Trial, WatchedRobot, play, rehearse, schedule
 from vlagents_ray.evaluate.robot.trial_log import LoggedTrial, TrialLog, logged_plan
 from vlagents_ray.evaluate.run import conclude
-from vlagents_ray.evaluate.workers.agents import AgentFactory, agents
+from vlagents_ray.evaluate.workers.rollout import AgentFactory, agents
 from vlagents_ray.ray_tools.private import output_printer, set_output_printer
 from vlagents_ray.registry import require
 from vlagents_ray.robot.loop import Robot, import_class
@@ -41,11 +41,7 @@ class TrialsInterrupted(KeyboardInterrupt):
 
 
 def evaluate_on_robot(
-    config: EvalConfig,
-    operator: Operator,
-    *,
-    robot: Robot | None = None,
-    agent_factory: AgentFactory | None = None,
+    config: EvalConfig, operator: Operator, *, robot: Robot | None = None, agent_factory: AgentFactory | None = None
 ) -> Summary:
     """Play every trial of `config` that has no result yet, and write the results to `config.out`.
 
@@ -126,36 +122,30 @@ def planned_cells(config: EvalConfig) -> list[EvalCase]:
     return cells(config)
 
 
+@dataclasses.dataclass(slots=True)
 class _RemainingTrials:
     """The trials that are left, one after the other."""
 
-    def __init__(
-        self,
-        config: EvalConfig,
-        operator: Operator,
-        robot: WatchedRobot,
-        factory: AgentFactory,
-        log: TrialLog,
-        trials: Sequence[Trial],
-    ) -> None:
-        self._config = config
-        self._operator = operator
-        self._robot = robot
-        self._factory = factory
-        self._log = log
-        self._trials = trials
-        self._message = ""  # for the operator, of the trial before
-        self._stopping: dict[tuple[str, str], dict[str, Stopping]] = {}  # by task and cell
-        for trial in trials:
+    _config: EvalConfig
+    _operator: Operator
+    _robot: WatchedRobot
+    _factory: AgentFactory
+    _log: TrialLog
+    _trials: Sequence[Trial]
+    _message: str = ""  # for the operator, of the trial before
+    _stopping: dict[tuple[str, str], dict[str, Stopping]] = dataclasses.field(default_factory=dict)  # by task and cell
+
+    def __post_init__(self) -> None:
+        for trial in self._trials:
             cell = trial.job.cell
-            if config.stop is not None:
+            if (stop := self._config.stop) is not None:
                 found = self._stopping.setdefault(trial.task, {})
-                found.setdefault(cell.fingerprint, Stopping(config.stop, cell.suite.seeds, cell.planned))
-        for number, logged in log.finished.items():
-            self._count(trials[number - 1], result_of(trials[number - 1], logged))
+                found.setdefault(cell.fingerprint, Stopping(stop, cell.suite.seeds, cell.planned))
+        for number, logged in self._log.finished.items():
+            trial = self._trials[number - 1]
+            self._count(trial, result_of(trial, logged))
 
     def play(self) -> None:
-        """Play all trials that are left."""
         left = [trial for trial in self._trials if trial.number not in self._log.finished and not self._is_over(trial)]
         if not left:
             return
@@ -265,7 +255,6 @@ class _RemainingTrials:
 
 
 def result_of(trial: Trial, logged: LoggedTrial) -> EpisodeResult:
-    """Return the result of a finished trial."""
     sealed = dict(logged.sealed["result"])
     sealed["key"] = EpisodeKey(**sealed["key"])
     if sealed["key"] != trial.job.key:

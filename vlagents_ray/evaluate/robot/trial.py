@@ -13,13 +13,7 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.chunking.player import ChunkPlayer
-from vlagents_ray.errors import (
-    CheckpointFailed,
-    EnvFailed,
-    InvalidAction,
-    PolicyFailed,
-    PolicyUnavailable,
-)
+from vlagents_ray.errors import CheckpointFailed, EnvFailed, InvalidAction, PolicyFailed, PolicyUnavailable
 from vlagents_ray.evaluate.episode.episode import transport_of
 from vlagents_ray.evaluate.episode.failures import env_side, policy_side
 from vlagents_ray.evaluate.episode.records import EpisodeResult
@@ -28,7 +22,7 @@ from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.evaluate.plan.config import RobotConfig, canonical
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job
 from vlagents_ray.evaluate.robot.operator import Operator, Verdict
-from vlagents_ray.evaluate.workers.agents import AgentFactory
+from vlagents_ray.evaluate.workers.rollout import AgentFactory
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.naming import plain
 from vlagents_ray.robot import Guard, LoopReport, Robot, Watchdog, run_loop
@@ -129,12 +123,10 @@ class WatchedRobot(Robot):
         self.stats: EpisodeStats | None = None  # of the running trial
 
     def observe(self) -> Obs:
-        """Read the sensors."""
         with env_side("robot, observe"):
             return self._robot.observe()
 
     def apply(self, action: np.ndarray) -> None:
-        """Command an action, and count it."""
         with env_side("robot, apply"):
             self._robot.apply(action)
         if self.stats is not None:
@@ -142,7 +134,6 @@ class WatchedRobot(Robot):
             self.stats.actions.update(action.astype("<f4", copy=False).tobytes())
 
     def stop(self) -> None:
-        """Bring the robot to rest."""
         with env_side("robot, stop"):
             self._robot.stop()
 
@@ -178,18 +169,8 @@ def play(
 ) -> PlayedTrial:
     """Play one attempt at a trial. The robot is stopped however it ends.
 
-    Args:
-        trial: The trial.
-        robot: The robot.
-        factory: Makes the policy's agent.
-        operator: Watches, and may stop the trial.
-        recording: The folder of a new dataset with the attempt; None records nothing.
-
     Returns:
         The trial; with the status "policy_error" if the policy failed.
-
-    Raises:
-        VLAgentsError: The robot or the connection to the policy failed.
     """
     cell = trial.job.cell
     settings, task = cell.on_robot

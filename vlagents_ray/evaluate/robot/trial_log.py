@@ -2,7 +2,7 @@
 
 `trials.jsonl` is written while the evaluation runs, in place of results.db. Its verdicts can be read by anybody; the
 policy, its checkpoint and its timing are encrypted with the key that draws the order of trials, in parts of one length.
-That keeps an operator from seeing what they do not look for; whoever has the key can open it.
+That protects an operator from seeing it by accident; the holder of the key can open it.
 """
 
 from __future__ import annotations
@@ -101,7 +101,6 @@ class TrialLog:
         self._write({"trial": trial, "attempt": attempt, "begun": time.time()})
 
     def end(self, trial: int, attempt: int, seen: dict[str, Any], sealed: dict[str, Any]) -> LoggedTrial:
-        """Record the end of an attempt."""
         ended = LoggedTrial(trial, attempt, time.time(), seen, sealed)
         line = {"trial": trial, "attempt": attempt, "at": ended.at, **seen, "sealed": _seal(self.key, sealed)}
         self._write(line)
@@ -132,9 +131,7 @@ class TrialLog:
             self._write({"plan": identity, "at": self.started, "sealed": _seal(self.key, plan)})
             return
         if not hmac.compare_digest(lines[0]["plan"], identity):
-            raise ConfigError(
-                f"{self._path}: is of another plan, robot or key; take those again, or choose another out folder"
-            )
+            raise ConfigError(f"{self._path}: is of another plan, robot or key; take those, or another out folder")
         self.started = float(lines[0]["at"])
         begun: set[tuple[int, int]] = set()
         for line in lines[1:]:
@@ -159,15 +156,7 @@ class TrialLog:
 
 
 def logged_plan(out: Path, key: str | None) -> EvalConfig:
-    """Return the plan of the log in a folder, with the policies' URLs.
-
-    Args:
-        out: The folder.
-        key: The plan's key; None: the one that was drawn for the folder.
-
-    Raises:
-        ConfigError: The folder has no log, or it is of another key.
-    """
+    """Return the plan of the log in a folder, with the policies' URLs."""
     try:
         with (out / LOG).open("rb") as file:
             first = json.loads(file.readline())

@@ -71,9 +71,7 @@ def runtime_env(cell: EvalCase) -> dict[str, Any]:
     No secret may be in it: Ray writes runtime environments to logs that every user of a machine can read.
     """
     given: dict[str, Any] = dict(cell.worker.runtime_env)
-    hides_gpus = not cell.worker.gpus and bool(
-        cell.policy.url or cell.policy.source
-    )  # else the policy is in the worker
+    hides_gpus = not cell.worker.gpus and bool(cell.policy.url or cell.policy.source)  # or it is in the worker
     variables = worker_variables(cell.worker.threads, gpus=not hides_gpus)
     return given | {"env_vars": variables | given.get("env_vars", {})}
 
@@ -149,11 +147,9 @@ class CapacityMonitor:
         self._warned = False  # whether the user was warned that there is no room for all
 
     def note_playing(self) -> None:
-        """Note that an episode is being played."""
         self._last_played = self._now()
 
     def note_started(self) -> None:
-        """Note that a worker has started."""
         self._warned = False
 
     def timed_out(self, since: float) -> bool:
@@ -200,11 +196,7 @@ def tail(paths: Sequence[str]) -> str:
 
 
 def tail_at(host: str, paths: Sequence[str]) -> str:
-    """Return `tail` of files on any host of the cluster; "" if the host is lost.
-
-    Raises:
-        TimeoutError: The host does not answer.
-    """
+    """Return `tail` of files on any host of the cluster; "" if the host is lost."""
     if host == socket.gethostname():
         return tail(paths)
     nodes = [node["NodeID"] for node in ray.nodes() if node["Alive"] and node["NodeManagerHostname"] == host]

@@ -22,9 +22,8 @@ from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.evaluate.plan.config import EvalConfig
 from vlagents_ray.evaluate.plan.jobs import Job
-from vlagents_ray.evaluate.workers.agents import AgentFactory
 from vlagents_ray.evaluate.workers.cluster import CapacityMonitor, Placement, runtime_env, strategy, tail_at
-from vlagents_ray.evaluate.workers.rollout import Heartbeat, Report, Rollout
+from vlagents_ray.evaluate.workers.rollout import AgentFactory, Heartbeat, Report, Rollout
 from vlagents_ray.evaluate.workers.worker import PhaseTimeouts, WorkerHandle, Workers
 from vlagents_ray.ray_tools.head_monitor import HeadMonitor
 
@@ -74,7 +73,6 @@ class WorkerPool(Workers):
         self._leaving.clear()
 
     def free_slot(self) -> bool:
-        """Return whether one more worker may start; ends an idle one if there is no room."""
         if not self._head.answers():
             return False
         if len(self._workers) < self._config.workers:
@@ -89,7 +87,6 @@ class WorkerPool(Workers):
         return True
 
     def start(self, cell: EvalCase) -> None:
-        """Start one more worker that can play `cell`, close to its policy if there is room."""
         node = self._placement.node(cell.policy.url, Counter(worker.node for worker in self._workers))
         options = {
             "num_cpus": cell.worker.cpus,
@@ -103,7 +100,6 @@ class WorkerPool(Workers):
         self._workers.append(WorkerHandle(cell.worker, cell.kind, actor, starting=starting, started_at=now, node=node))
 
     def dispatch(self, worker: WorkerHandle, jobs: tuple[Job, ...]) -> None:
-        """Let `worker` play `jobs`, side by side."""
         phase: Phase = "env reset" if worker.env_place == jobs[0].cell.place else "make"
         worker.jobs = jobs
         worker.heartbeat, worker.heartbeat_at = Heartbeat(phase, 0.0, 0), monotonic()
@@ -130,7 +126,6 @@ class WorkerPool(Workers):
         yield from self._check_workers()
 
     def close(self) -> None:
-        """Let idle workers close their simulators, which some need for a clean exit."""
         closing = {worker.actor.close.remote(): worker for worker in self.idle()}
         if not closing:
             return

@@ -7,16 +7,19 @@ episode instead of raising them, so that no exception has to survive pickling.
 from __future__ import annotations
 
 import contextlib
+import functools
 import logging
 import os
 import socket
 import sys
 import threading
 import traceback
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from time import monotonic, sleep
 from typing import Any
 
+from vlagents_ray.client import RemoteAgent
 from vlagents_ray.client.credentials import Credentials
 from vlagents_ray.client.transports.plasma import this_node
 from vlagents_ray.contract import require_match
@@ -25,24 +28,32 @@ from vlagents_ray.envs.batch import BatchEnv, SequentialBatch, make_batch
 from vlagents_ray.envs.rendering.graphics import require_own
 from vlagents_ray.errors import ConfigError, EnvFailed, MissingDependency, VLAgentsError
 from vlagents_ray.evaluate.artifacts.recorder import Artifacts, EpisodeRecorder, RecorderFactory, Recording
-from vlagents_ray.evaluate.episode.episode import Outcome, Phase, options_of_reset, run_episodes, transport_of
+from vlagents_ray.evaluate.episode.episode import (
+    EpisodeSettings,
+    Outcome,
+    Phase,
+    options_of_reset,
+    run_episodes,
+    transport_of,
+)
 from vlagents_ray.evaluate.episode.failures import Failure, env_side, explain, policy_side
 from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult, WorkerInfo
 from vlagents_ray.evaluate.plan.cases import EvalCase, env_program
 from vlagents_ray.evaluate.plan.config import EvalConfig, PolicyConfig
 from vlagents_ray.evaluate.plan.jobs import Job
-from vlagents_ray.evaluate.workers.agents import AgentFactory
 from vlagents_ray.evaluate.workers.cluster import own_logs
 from vlagents_ray.interface import Agent
 from vlagents_ray.policies.base.checkpoint import used_checkpoints
 from vlagents_ray.policies.base.checkpoint_files import weights_of
-from vlagents_ray.policies.base.program import loaded_code
+from vlagents_ray.policies.base.program import Program, code_of_class, files_named, loaded_code
 from vlagents_ray.protocol.json_messages import plain_values
+from vlagents_ray.protocol.messages import RankName
 from vlagents_ray.ray_tools.git_state import code_of
 from vlagents_ray.registry import env_class
 
 log = logging.getLogger(__name__)
 
+AgentFactory = Callable[[PolicyConfig], Agent]
 FIRST_WAIT_S = 0.5  # s before the next attempt to reach a policy, doubled each time
 LONGEST_WAIT_S = 10.0
 LONG_S = 1.0  # s in one phase, after which a query also reports the stack
@@ -134,7 +145,6 @@ class Rollout:
         return [replace(reports[0], env=setup.env, policy=setup.policy, worker=setup.worker), *reports[1:]]
 
     def close(self) -> None:
-        """Free the simulator and the connection."""
         self._drop_agent()
         self._drop_env()
 
@@ -192,23 +202,16 @@ class Rollout:
     def _play(
         self, agent: Agent, env: BatchEnv, jobs: tuple[Job, ...], recordings: list[EpisodeRecorder]
     ) -> list[Outcome]:
-        cell = jobs[0].cell
-        wanted = recordings[0].wants_images
+        cell, wanted = jobs[0].cell, recordings[0].wants_images
         return run_episodes(
             env,
             agent,
             self._sessions_of(agent, env, len(jobs)),
             [job.key for job in jobs],
-            execute=cell.policy.execute,
-            clock=cell.suite.clock,
-            reset_options=cell.suite.reset_options,
-            policy_options=cell.policy_options,
+            EpisodeSettings(cell.policy.execute, cell.suite.clock, cell.suite.reset_options, cell.policy_options),
+            observers=recordings,
             watch=self._set_phase,
-            record=lambda i, obs: recordings[i].add_observation(obs),
             images=wanted == "all" or (wanted == "failures" and self._renders_at_once(agent, env, cell.policy)),
-            request_info=recordings[0].request_info,
-            acted=lambda i, *said: recordings[i].add_act(*said),
-            executed=lambda i, *done: recordings[i].add_action(*done),
         )
 
     def _sessions_of(self, agent: Agent, env: BatchEnv, number: int) -> list[Agent]:
@@ -285,13 +288,46 @@ def _metadata(agent: Agent) -> dict[str, Any]:
 
 
 def _worker_info(policy: str, agent: Agent, env: BatchEnv) -> WorkerInfo:
-    """Return this process's entry in the results.
-
-    Raises:
-        ConfigError: The environment draws on a GPU that is not this worker's.
-    """
+    """Return this process's entry in the results."""
     renderer = env.renderer()
     if renderer is not None:
         require_own(renderer)
     name = None if renderer is None else renderer.name
     return WorkerInfo(socket.gethostname(), this_node(), os.getpid(), policy, transport_of(agent), name)
+
+
+def agents(config: EvalConfig, own: Callable[[], Agent] | None, rank: RankName = "simulation") -> AgentFactory:
+    """Return the factory that a worker calls: `own`, or one of connections with this `rank`."""
+    if own is not None:
+        return functools.partial(_own_agent, own)
+    for policy in config.policies:
+        if policy.url is None:
+            raise ConfigError(f"policy {policy.name!r}: got no url, want that of its server, as http://localhost:8000")
+    return functools.partial(_remote_agent, config, rank)
+
+
+def _own_agent(make: Callable[[], Agent], _policy: PolicyConfig) -> Agent:
+    return make()
+
+
+def _remote_agent(config: EvalConfig, rank: RankName, policy: PolicyConfig) -> RemoteAgent:
+    assert policy.url is not None  # noqa: S101 - `agents` has checked it
+    return RemoteAgent(
+        policy.url,
+        transport=policy.transport,
+        timeout_s=config.policy_timeout_s,
+        connect_timeout_s=config.connect_timeout_s,
+        codec=policy.codec,
+        rank=rank,
+        resume=False,  # an interrupted episode is played again, so that its result depends only on its key
+    )
+
+
+def factory_program(make: Callable[[], Agent]) -> Program:
+    """Return the files of the module that defines `make`, and those that the arguments of a `partial` name."""
+    settings: dict[str, Any] = {}
+    if isinstance(make, functools.partial):
+        settings = {**{str(i): value for i, value in enumerate(make.args)}, **make.keywords}
+        make = make.func
+    module = getattr(make, "__module__", None) or type(make).__module__
+    return code_of_class(module) | files_named(settings)

@@ -8,7 +8,9 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from typing_extensions import Self
 
 from vlagents_ray.errors import PolicyFailed, VLAgentsError, from_code
 from vlagents_ray.evaluate.artifacts.recorder import RecorderFactory, Recording
@@ -17,12 +19,7 @@ from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.evaluate.plan.config import EvalConfig, WorkerConfig
 from vlagents_ray.evaluate.plan.jobs import Job, JobQueue
-from vlagents_ray.evaluate.workers.agents import AgentFactory
-from vlagents_ray.evaluate.workers.rollout import Heartbeat, Report, Rollout
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
-
+from vlagents_ray.evaluate.workers.rollout import AgentFactory, Heartbeat, Report, Rollout
 
 WATCH_S = 1.0  # s between two queries of a busy worker
 GRACE_S = 5.0  # s that a call past its deadline has to fail by itself
@@ -50,11 +47,9 @@ class WorkerHandle:
 
     @property
     def refs(self) -> list[Any]:
-        """Return the references of the pending answers."""
         return [ref for ref in (self.starting, self.running, self.query) if ref is not None]
 
     def query_is_due(self, now: float) -> bool:
-        """Whether it is time to query its progress."""
         return self.query is None and now - self.queried_at > WATCH_S
 
 
@@ -66,15 +61,12 @@ class Workers(ABC):
 
     @property
     def busy(self) -> bool:
-        """Whether an episode is being played."""
         return any(worker.jobs for worker in self._workers)
 
     def working(self) -> Counter[str]:
-        """Return the number of busy workers by place."""
         return Counter(worker.jobs[0].cell.place for worker in self._workers if worker.jobs)
 
     def kinds(self) -> Counter[str]:
-        """Return the number of workers by kind."""
         return Counter(worker.kind for worker in self._workers)
 
     def unoccupied(self) -> Counter[str]:
@@ -164,15 +156,10 @@ class FailedAttempts:
         return failure.cause != "user" and job.attempt <= self._config.retries
 
     def note_played(self) -> None:
-        """Note that an episode was played to its end."""
         self._lost = self._policy_errors = 0
 
     def note_policy_error(self, error: str) -> None:
-        """Note that an error of the policy ended an episode.
-
-        Raises:
-            PolicyFailed: The error, if it ended too many episodes in a row.
-        """
+        """Note that an error of the policy ended an episode."""
         self._policy_errors += 1
         if self._policy_errors == self._config.abort_after:
             raise PolicyFailed(
@@ -207,21 +194,17 @@ class InProcessWorkers(Workers):
         self.close()
 
     def free_slot(self) -> bool:
-        """Return whether the worker may start; ends one of another kind that is idle."""
         for worker in self.idle():
             self._workers.remove(worker)
         return not self._workers
 
     def start(self, cell: EvalCase) -> None:
-        """Start the worker, which is ready once it is waited for."""
         self._workers.append(WorkerHandle(cell.worker, cell.kind, actor=None, starting=self, started_at=0.0))
 
     def dispatch(self, worker: WorkerHandle, jobs: tuple[Job, ...]) -> None:
-        """Let the worker play `jobs`, side by side, when it is waited for."""
         worker.jobs = jobs
 
     def wait(self, timeout_s: float) -> Iterator[tuple[Job, Report]]:
-        """Play the episodes that were dispatched, however long it takes, and yield their reports."""
         for worker in self._workers:
             worker.starting = None
             jobs, worker.jobs = worker.jobs, ()
@@ -236,7 +219,6 @@ class InProcessWorkers(Workers):
             yield from zip(jobs, reports, strict=True)
 
     def close(self) -> None:
-        """Close the simulator and the connection; further episodes begin with new ones."""
         broken, self._rollout = self._rollout, self._make()
         try:
             broken.close()

@@ -1,0 +1,315 @@
+from __future__ import annotations
+
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from urllib.parse import unquote
+
+import pytest
+import yaml
+from eval_fakes import LINE
+from recorded_results import HOSTILE, better_later, record, runs
+
+from vlagents_ray.evaluate import EvalConfig, Results
+from vlagents_ray.evaluate.report import success
+from vlagents_ray.evaluate.report.charts import MINUS
+from vlagents_ray.evaluate.report.episodes import Gallery
+from vlagents_ray.evaluate.report.page import write_report
+from vlagents_ray.evaluate.results.store import Store
+
+
+class Read(HTMLParser):
+    """The elements of a page, and its text; a tag that is not closed is an error."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.elements: list[tuple[str, dict[str, str | None]]] = []
+        self.text: list[str] = []
+        self.sections: dict[str, list[str]] = {}  # their texts, by heading
+        self._open: list[str] = []
+        self.feed(path.read_text())
+        self.close()
+        assert self._open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.append((tag, dict(attrs)))
+        if tag not in ("meta", "img"):
+            self._open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self._open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if not {"style", "script"} & set(self._open):
+            self.text.append(data)
+            if "h2" in self._open:
+                self.sections[data] = []
+            elif self.sections:
+                self.sections[next(reversed(self.sections))].append(data)
+
+    def all(self, name: str) -> list[dict[str, str | None]]:
+        return [attributes for tag, attributes in self.elements if tag == name]
+
+    @property
+    def words(self) -> str:
+        return " ".join(" ".join(self.text).split())
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Results:
+    return record(runs(tmp_path_factory.mktemp("results")), videos=True, troubles=True)
+
+
+@pytest.fixture(scope="module")
+def page(results: Results) -> Read:
+    return Read(write_report(results, results.out / "report.html"))
+
+
+def test_nothing_is_fetched_from_anywhere(page: Read) -> None:
+    addresses = [
+        value for _, attributes in page.elements for key in ("src", "href", "poster") if (value := attributes.get(key))
+    ]
+    assert addresses
+    assert all(re.match(r"(#|data:|videos/)", address) for address in addresses)
+    assert page.all("link") == []
+
+
+def test_what_policies_and_simulators_say_is_text(page: Read) -> None:
+    assert len(page.all("script")) == 1
+    assert all("onerror" not in attributes for attributes in page.all("img"))
+    assert page.words.count(" ".join(HOSTILE.split())) >= 4  # instruction, policy error, failure, protocol
+
+
+def test_names_are_text_wherever_they_are_shown(page: Read, tmp_path: Path) -> None:
+    given = runs(tmp_path).model_dump()
+    for one in (*given["policies"], *given["suites"]):
+        one["name"] += HOSTILE
+    hostile = record(EvalConfig.model_validate(given), videos=True, troubles=True)
+    read = Read(write_report(hostile, tmp_path / "report.html"))
+    tags = [tag for tag, _ in read.elements]
+    assert tags == [tag for tag, _ in page.elements]
+    assert not any(name.startswith("on") for _, attributes in read.elements for name in attributes)
+    for shown in (read.all("figure"), read.all("div")):  # in attributes too
+        assert any(HOSTILE in str(value) for attributes in shown for value in attributes.values())
+
+
+def test_rates_stand_with_their_intervals(page: Read) -> None:
+    assert re.search(r"all base \d+ .*? learner@1000 35/36 25\.7 14\.2 to 42\.1 25\.7", page.words)
+
+
+def test_workers_are_counted_where_they_ran_by_transport_and_renderer(page: Read) -> None:
+    assert re.search(r"gpu-box base handle llvmpipe .* 2 gpu-box learner handle llvmpipe .* 2 ", page.words)
+
+
+def test_every_part_is_there(page: Read) -> None:
+    headings = ["Success", "Comparison", "Learning curve", "Success over time", "Latency", "Failures", "Episodes"]
+    headings += ["Errors", "Protocol", "Configuration", "To cite and to repeat"]
+    links = [attributes["href"] for attributes in page.all("a") if (attributes["href"] or "").startswith("#")]
+    assert links == [f"#{attributes['id']}" for attributes in page.all("h2")]
+    for heading in headings:
+        assert heading in page.words
+    for word in ("Traceback … line 7", "settle steps", "vlagents-ray report", "inference", "base"):
+        assert word in page.words
+
+
+def test_tables_and_charts_are_named_for_those_who_cannot_see_them(page: Read) -> None:
+    assert all(attributes.get("scope") for attributes in page.all("th"))
+    regions = [attributes for attributes in page.all("div") if attributes.get("class") == "scroll"]
+    assert all(attributes.get("aria-label") and attributes.get("tabindex") == "0" for attributes in regions)
+    charts = [attributes for attributes in page.all("svg") if attributes.get("class") == "chart"]
+    assert charts
+    assert all(attributes.get("role") == "img" for attributes in charts)
+    assert len(page.all("title")) > len(charts)
+    assert all(attributes.get("aria-label") for attributes in page.all("video"))
+
+
+def test_the_settings_it_shows_give_the_same_again(page: Read, results: Results) -> None:
+    text = "".join(page.text)
+    shown = (
+        text[text.index("Save this as again.yaml:") :].partition(":")[2].partition("vlagents-ray eval again.yaml")[0]
+    )
+    again = EvalConfig.model_validate(yaml.safe_load(shown) | {"out": results.out})
+    assert again == EvalConfig.model_validate(results.runs[-1].config)
+
+
+def test_a_policy_that_was_served_is_served_again(tmp_path: Path) -> None:
+    policies = [{"name": "noop", "source": "noop", "url": "serve://noop"}]
+    config = EvalConfig.model_validate({"policies": policies, "suites": [{"envs": [LINE]}], "out": tmp_path})
+    words = Read(write_report(record(config), tmp_path / "report.html")).words
+    again = words[words.index("Save this as") :]
+    assert "source: noop" in again
+    assert "serve://" not in again
+
+
+def test_videos_are_linked_from_where_the_page_is(results: Results, tmp_path: Path) -> None:
+    path = results.out / "pages" / "report.html"
+    for video in Read(write_report(results, path)).all("video"):
+        assert (path.parent / unquote(str(video["src"]))).is_file()
+
+
+def test_videos_are_in_the_page_up_to_a_budget(results: Results) -> None:
+    videos = [video for cell in results.cells for one in cell.episodes for video in one.videos]
+    size = (results.out / videos[0]).stat().st_size
+    gallery = Gallery(results, results.out / "report.html", "inline", budget=size)
+    players = [gallery.player(video, "a label") for video in videos[:2]]
+    inside, beside = (str(player.source) for player in players if player is not None)
+    assert inside.startswith("data:video/mp4;base64,")
+    assert beside.startswith("videos/")
+    assert (gallery.inlined, gallery.linked) == (1, 1)
+
+
+def test_without_videos_there_are_stills(results: Results, tmp_path: Path) -> None:
+    page = Read(write_report(results, tmp_path / "report.html", videos="none"))
+    assert page.all("video") == []
+    stills = page.all("img")
+    assert stills
+    assert all((one["src"] or "").startswith("data:image/jpeg") and one["alt"] for one in stills)
+
+
+def test_a_video_that_is_gone_or_broken_leaves_the_rest(tmp_path: Path) -> None:
+    results = record(runs(tmp_path, episodes=2), lambda _cell, _seed: None, videos=True)
+    first, second, *others = sorted(tmp_path.glob("videos/**/*.mp4"))
+    first.unlink()
+    second.write_bytes(b"not a video")
+    page = Read(write_report(results, tmp_path / "report.html"))
+    assert sum(1 for video in page.all("video") if video.get("poster")) == len(others)
+    assert str(first.relative_to(tmp_path)) not in [video["src"] for video in page.all("video")]
+
+
+def test_one_policy_that_solved_everything_has_no_failures_and_nothing_to_compare(tmp_path: Path) -> None:
+    config = EvalConfig.model_validate(
+        {"policies": [{"name": "a", "url": "http://localhost:1"}], "suites": [{"envs": [LINE]}], "out": tmp_path}
+    )
+    page = Read(write_report(record(config, lambda _cell, _seed: 7), tmp_path / "report.html"))
+    headings = {attributes["id"] for attributes in page.all("h2")}
+    assert not headings & {"failures", "errors", "comparison", "learning-curve"}
+    assert "a solved 100.0 % of 10 episodes" in page.words
+
+
+def test_a_run_without_an_episode_has_a_page(tmp_path: Path) -> None:
+    config = runs(tmp_path)
+    with Store(config) as store:
+        store.begin_run(config, {"vlagents-ray": "0"})
+        store.end_run("interrupted")
+    page = Read(write_report(Results.load(tmp_path), tmp_path / "report.html"))
+    assert "Not complete: interrupted" in page.words
+
+
+def test_many_checkpoints_are_compared_with_the_best_first(tmp_path: Path) -> None:
+    results = record(runs(tmp_path, steps=list(range(200, 2001, 200)), episodes=6), better_later)
+    words = Read(write_report(results, tmp_path / "report.html")).words
+    assert "45 further pairs" in words  # 11 contenders: 55 pairs, 10 of them with the best
+    assert "5 are not" in words  # of the curves over time
+
+
+def test_of_very_many_checkpoints_only_the_pairs_that_are_asked_for_most_are_compared(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(success, "MOST_COMPARED", 20)
+    results = record(runs(tmp_path, steps=list(range(200, 2001, 200)), episodes=6), better_later)
+    words = section_of(Read(write_report(results, tmp_path / "report.html")), "Comparison")
+    assert "45 pairs of so many checkpoints are left out" in words  # of 55
+    assert "further pairs" not in words
+    for step in range(200, 2000, 200):
+        assert f"learner@{step + 200} learner@{step}" in words
+    assert "learner@2000 base" in words
+
+
+def section_of(page: Read, heading: str) -> str:
+    """The words from a heading to the next one."""
+    return " ".join(" ".join(page.sections[heading]).split())
+
+
+def test_all_episodes_are_in_a_table_with_their_videos(tmp_path: Path) -> None:
+    results = record(runs(tmp_path, episodes=6, video="all"), videos=True, troubles=True)
+    page = Read(write_report(results, tmp_path / "report.html"))
+    played = [one for cell in results.cells for one in cell.episodes]
+    assert page.text.count("solved") + page.text.count("not solved") == len(played) - 2
+    assert (page.text.count("policy error"), page.text.count("lost")) == (1, 1)
+    links = {unquote(str(one["href"])) for one in page.all("a") if one.get("class") == "video"}
+    assert links == {video for one in played for video in one.videos}
+    assert len(links) == len(played) - 2
+    words = section_of(page, "Episodes")
+    assert f"one {LINE} base solved video 1" in words
+    assert f"one {LINE} learner@1000 not solved video 1" in words
+
+
+def test_solved_episodes_have_players_too(tmp_path: Path) -> None:
+    results = record(runs(tmp_path, episodes=6, video="all"), lambda _cell, _seed: 9, videos=True)
+    page = Read(write_report(results, tmp_path / "report.html"))
+    assert len(page.all("video")) == 12
+    assert "Solved: 12 videos" in page.words
+
+
+def test_an_episode_that_does_not_count_is_marked(tmp_path: Path) -> None:
+    record(runs(tmp_path, episodes=6), lambda _cell, _seed: 9)
+    fewer = runs(tmp_path, episodes=4, resume=True)
+    with Store(fewer):
+        page = Read(write_report(Results.load(tmp_path), tmp_path / "report.html"))
+    assert page.text.count("(solved)") == 3 * 3 * 2  # contenders, tasks, episodes
+    assert "In brackets: beyond the point" in page.words
+
+
+def test_baselines_stand_before_checkpoints_and_these_in_the_order_of_their_steps(tmp_path: Path) -> None:
+    results = record(runs(tmp_path, steps=[3000, 1000, 2000]), better_later)
+    assert results.contenders == ["base", "learner@1000", "learner@2000", "learner@3000"]
+    words = section_of(Read(write_report(results, tmp_path / "report.html")), "Success")
+    places = [words.index(f"{name} 12") for name in results.contenders]
+    assert places == sorted(places)
+
+
+def test_a_baseline_is_a_level_line_in_the_learning_curve(tmp_path: Path) -> None:
+    page = Read(write_report(record(runs(tmp_path)), tmp_path / "report.html"))
+    words = section_of(page, "Learning curve")
+    assert "base (no steps)" in words
+    assert re.search(r"base \(no steps\) \N{EN DASH} \d", words)  # in the numbers, with no step
+
+
+def test_consecutive_checkpoints_are_compared_first_and_the_later_one_is_a(tmp_path: Path) -> None:
+    results = record(runs(tmp_path, steps=[1000, 2000, 3000]), better_later)
+    words = section_of(Read(write_report(results, tmp_path / "report.html")), "Comparison")
+    first = [words.index(pair) for pair in ("learner@2000 learner@1000", "learner@3000 learner@2000")]
+    others = [words.index(pair) for pair in ("learner@3000 base", "learner@2000 base", "learner@3000 learner@1000")]
+    assert first == sorted(first)
+    assert max(first) < min(others)
+    assert others[0] == min(others)  # the best against the baseline
+
+
+def test_with_an_expert_the_checkpoints_before_and_after_are_not_folded_away(tmp_path: Path) -> None:
+    config = runs(tmp_path, steps=list(range(200, 2001, 200)), episodes=6)
+    expert = record(config, lambda cell, seed: 5 if cell.step is None else better_later(cell, seed))
+    words = section_of(Read(write_report(expert, tmp_path / "report.html")), "Comparison")
+    unfolded = words[: words.index("further pairs")]
+    for step in range(200, 2000, 200):
+        assert f"learner@{step + 200} learner@{step}" in unfolded
+    assert len(re.findall(r"learner@\d+ base", unfolded)) == 1 + 1  # and by suite
+
+
+def test_cells_that_stopped_early_have_intervals_of_another_name(tmp_path: Path) -> None:
+    config = runs(tmp_path, steps=[], episodes=60, stop={"width": 0.5, "at_least": 10})
+    results = record(config, lambda _cell, seed: 5 if seed % 2 else None)
+    assert any(cell.stopped_at is not None for cell in results.cells)
+    words = Read(write_report(results, tmp_path / "report.html")).words
+    assert "the intervals of this table are confidence sequences" in words
+    assert "95 % confidence sequence" in words
+    assert "Wilson interval" not in words
+    assert "Wilson's method" not in words
+
+
+def test_an_env_of_two_suites_is_named_with_its_suite_in_errors_and_protocol(tmp_path: Path) -> None:
+    suites = [{"name": name, "envs": [LINE], "episodes": 4, "env_options": {"folder": name}} for name in ("one", "two")]
+    page = write_report(record(runs(tmp_path, suites=suites), troubles=True), tmp_path / "report.html").read_text()
+    errors, _, rest = page.partition('id="errors"')[2].partition("</section>")
+    assert f"one {LINE}" in errors
+    assert f"<h3>one {LINE}</h3>" in rest
+    assert f"<h3>two {LINE}</h3>" in rest
+
+
+def test_the_gap_to_the_synchronous_score_is_shown(tmp_path: Path) -> None:
+    suites = [
+        {"name": "live", "envs": [LINE], "episodes": 4, "clock": {"latency": 0.1, "meanwhile": "hold"}},
+        {"name": "waiting", "envs": [LINE], "episodes": 4},
+    ]
+    results = record(runs(tmp_path, steps=[], suites=suites), lambda _cell, _seed: 5)
+    words = Read(write_report(results, tmp_path / "report.html")).words
+    assert f"learner, live in real time learner, waiting 0.0 {MINUS}50.0 to +50.0 1.00 1.00 4 4 0 0 0 " in words

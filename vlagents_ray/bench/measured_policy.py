@@ -1,0 +1,202 @@
+"""A policy in this process, bare and behind a replica's batch queue, whose calls are timed; without Ray."""
+
+from __future__ import annotations
+
+import queue
+import resource
+import statistics
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from typing_extensions import Self
+
+from vlagents_ray.bench.figures import rate_of
+from vlagents_ray.contract import Contract
+from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.protocol.messages import RankName, Reply, Request
+from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.models.agent_copies import AgentCopies
+from vlagents_ray.serve.requests import RANKS, PendingRequest
+
+INSTRUCTION = "pick up the cube"
+WARM = 2  # batches that do not count
+_LATE_S = 600.0  # a first batch may be compiled
+
+
+@dataclass(frozen=True, slots=True)
+class QueuedTurn:
+    """The figures of a number of sessions in one measurement."""
+
+    actions_per_s: float
+    mean_batch: float
+    trips_ms: Sequence[float]  # of each call
+
+    def to_json(self) -> dict[str, float]:
+        return {
+            "actions_per_s": self.actions_per_s,
+            "round_trip_ms": statistics.median(self.trips_ms),
+            "p99_ms": float(np.quantile(self.trips_ms, 0.99)),
+            "mean_batch": self.mean_batch,
+        }
+
+
+class MeasuredPolicy:
+    """A policy behind the batch queue of an engine, loaded from `__enter__` to `__exit__`."""
+
+    def __init__(
+        self,
+        agent: Agent,
+        view: Callable[[Contract | None, int], Obs],
+        *,
+        max_size: int,
+        patience: float = 0.0,
+        batch_sizes: Sequence[int] = (),
+        on_step: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        self.agent = agent
+        self.engine = Engine(agent, max_batch_size=max_size, patience=patience, batch_sizes=batch_sizes)
+        self.engine.models.on_step = on_step
+        self.load_s = 0.0
+        self._view = view
+        self._copies: AgentCopies
+
+    def __enter__(self) -> Self:
+        began = time.perf_counter()
+        try:
+            self.engine.start()
+        except BaseException:
+            self.engine.close()
+            raise
+        self.load_s = time.perf_counter() - began
+        self._copies = AgentCopies(self.agent)
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.engine.close()
+
+    def bare(self, size: int, seconds: float) -> dict[str, float]:
+        """Measure `act_batch` on full batches of that size, one after another, without the queue."""
+        views, sessions = self._views(size), self._sessions(range(size))
+        times: list[float] = []
+        while len(times) < WARM + 1 or sum(times[WARM:]) < seconds:
+            begun = time.perf_counter()
+            self._act(views, sessions)
+            times.append(time.perf_counter() - begun)
+        times = times[WARM:]
+        return {"actions_per_s": size * len(times) / sum(times), "batch_ms": statistics.median(times) * 1e3}
+
+    def actions(self, size: int, count: int) -> list[np.ndarray]:
+        """Return the first actions of episodes 0, 1, … of their own observations and seeds, in batches of that size.
+
+        Args:
+            size: The batch size.
+            count: The number of episodes; if `size` is no divisor of it, the last batch begins again with episode 0.
+
+        Returns:
+            At least `count` actions, (D,) or (H, D) float32; the one at i is of episode i modulo `count`.
+        """
+        found: list[np.ndarray] = []
+        while len(found) < count:
+            episodes = [i % count for i in range(len(found), len(found) + size)]
+            views = [self._view(self.engine.contract, i) for i in episodes]
+            found += [act.action for act in self._act(views, self._sessions(episodes))]
+        return found
+
+    def queued(self, size: int, seconds: float, rank: RankName) -> QueuedTurn:
+        """Measure that many sessions, each of which sends the next request as soon as it is answered."""
+        views = self._views(size)
+        answers: queue.SimpleQueue[tuple[int, Reply]] = queue.SimpleQueue()
+        asked = [0.0] * size
+
+        def ask(i: int, op: Any, **given: Any) -> None:
+            asked[i] = time.perf_counter()
+            request = Request(op, views[i], rank=rank, **given)
+            done = lambda reply: answers.put((i, reply))  # noqa: E731 - of this request
+            self.engine.submit([PendingRequest(f"bench-{i}", request, done, RANKS[rank])])
+
+        def answer() -> tuple[int, Reply, float]:
+            i, reply = answers.get(timeout=_LATE_S)
+            if reply.error is not None:
+                raise reply.error
+            return i, reply, time.perf_counter()
+
+        for i in range(size):
+            ask(i, "reset", instruction=INSTRUCTION, kwargs={"seed": i})
+        for _ in range(size):
+            answer()
+        for i in range(size):
+            ask(i, "act")
+        calls: list[tuple[float, float, float]] = []
+        waiting, first = size, WARM * size
+        while waiting:
+            i, reply, now = answer()
+            calls.append((now, now - asked[i], reply.timing["batch_size"]))
+            waiting -= 1
+            if len(calls) <= first or now - calls[first][0] < seconds:
+                waiting += 1
+                ask(i, "act")
+        for i in range(size):
+            ask(i, "close")
+            answer()
+        calls = calls[first:]
+        # Each call counts its batch once for each of the batch's members: the harmonic mean is the batches' own.
+        mean_batch = len(calls) / sum(1 / call[2] for call in calls)
+        return QueuedTurn(rate_of([calls]), mean_batch, [call[1] * 1e3 for call in calls])
+
+    def _views(self, size: int) -> list[Obs]:
+        return [self._view(self.engine.contract, i) for i in range(size)]
+
+    def _sessions(self, episodes: Sequence[int]) -> list[Agent]:
+        sessions = [self._copies.make() for _ in episodes]
+        for session, i in zip(sessions, episodes, strict=True):
+            session.reset(self._view(self.engine.contract, i), INSTRUCTION, seed=i)
+        return sessions
+
+    def _act(self, views: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act]:
+        acts = []
+        for act in self.agent.act_batch(views, sessions):
+            if isinstance(act, Exception):
+                raise act
+            acts.append(act)
+        return acts
+
+
+def cuda() -> Any:
+    """Return `torch.cuda` if this process uses it."""
+    torch = sys.modules.get("torch")
+    return torch.cuda if torch is not None and torch.cuda.is_available() and torch.cuda.is_initialized() else None
+
+
+def jax_device() -> Any:
+    """Return JAX's first device, if this process uses one that is no CPU."""
+    jax = sys.modules.get("jax")
+    device = None if jax is None else jax.local_devices()[0]
+    return None if device is None or device.platform == "cpu" else device
+
+
+def forget_peak() -> None:
+    """Let `peak_mib` begin again, where the accelerator can."""
+    if (used := cuda()) is not None:
+        used.reset_peak_memory_stats()
+
+
+def peak_mib() -> float:
+    """Return the peak memory of the policy's accelerator, by torch since `forget_peak`; else of this process."""
+    if (used := cuda()) is not None:
+        return float(used.max_memory_allocated()) / 2**20
+    if (device := jax_device()) is not None:
+        return float((device.memory_stats() or {}).get("peak_bytes_in_use", 0)) / 2**20
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
+
+
+def device_name() -> str:
+    """Return the name of the policy's accelerator, or "cpu"."""
+    if (used := cuda()) is not None:
+        return str(used.get_device_name())
+    if (device := jax_device()) is not None:
+        return str(device.device_kind)
+    return "cpu"

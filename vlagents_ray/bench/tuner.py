@@ -1,0 +1,351 @@
+"""Measures variants of a deployment file's settings, each in its own process, within a given time."""
+
+from __future__ import annotations
+
+import json
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+
+from vlagents_ray.bench.line_process import LineProcess, ProcessFailed, our_environment
+from vlagents_ray.bench.tuning_choice import MeasuredPoint, TuningGoal, Variant, sessions
+from vlagents_ray.bench.tuning_process import FRAMES, ProcessSettings, save_observations
+from vlagents_ray.errors import ConfigError, VLAgentsError
+from vlagents_ray.evaluate.artifacts.trajectory import Trajectory, videos_of
+from vlagents_ray.interface import Obs
+from vlagents_ray.policies.compilation import Quantization
+from vlagents_ray.registry import require
+from vlagents_ray.serve.config.deployment import ServerArgs
+
+_RISING = 1.05  # how much two larger batches must add to the rate for a still larger one to be measured
+_TURNS = 3
+_END_S = 2.0  # that a process may take to end; then it is killed
+_SMALLEST_RANGE = 0.1  # of a number of the action, as a share of its largest magnitude: it may hardly move
+
+
+class VariantFailed(VLAgentsError):
+    """A variant could not be loaded or measured; the message says why."""
+
+
+@dataclass(frozen=True, slots=True)
+class TunePlan:
+    """The settings of `Tuner`."""
+
+    args: ServerArgs  # of a deployment file
+    goal: TuningGoal
+    max_batch: int = 32
+    minutes: float = 5.0  # that all of it may take
+    seconds: float = 2.0  # of each measurement
+    tolerance: float = 0.01  # largest difference of actions, as a share of their range
+    dtypes: Sequence[str] | None = None  # to try; None: those that the device computes natively
+    frames: Path | None = None  # folder of recorded trajectories; None: random observations
+    side: int = 224  # px, of random images of which the policy takes any size
+    dims: Mapping[str, int] = field(default_factory=dict)  # of parts of the state for which it does not say
+
+    def __post_init__(self) -> None:
+        if self.args.environment.requirements is not None:
+            raise ConfigError(
+                "environment.requirements: only Ray installs them; tune with an environment of your own, "
+                "`environment: {python: ...}`, or in a Python that has them, without `environment`"
+            )
+
+
+@dataclass(slots=True)
+class TunedSize:
+    """A variant with one number of sessions, measured in turns with others."""
+
+    variant: Variant
+    sessions: int
+    difference: float
+    rates: list[float] = field(default_factory=list)  # actions a second, of each turn
+    trips_ms: list[float] = field(default_factory=list)
+    peak_mib: float = 0.0
+    took_s: float = 0.0  # of the first turn
+
+    def add(self, turn: Mapping[str, Any]) -> None:
+        self.rates.append(turn["actions_per_s"])
+        self.trips_ms += turn["trips_ms"]
+        self.peak_mib = max(self.peak_mib, turn["peak_mib"])
+
+    def point(self) -> MeasuredPoint:
+        """Return the median rate of the turns, and the quantiles of all round trips."""
+        median, p99 = np.quantile(self.trips_ms, [0.5, 0.99])
+        rate = statistics.median(self.rates)
+        return MeasuredPoint(
+            self.variant, self.sessions, rate, float(median), float(p99), self.peak_mib, self.difference
+        )  # fmt: skip
+
+
+class Tuner:
+    """Measures what the plan says; what it leaves out is in `left_out`, a sentence each."""
+
+    def __init__(
+        self, plan: TunePlan, progress: Callable[[str], None] = lambda _: None, began: float | None = None
+    ) -> None:
+        self.left_out: list[str] = []
+        self.device = ""
+        self.fixed: Sequence[int] | None = None  # `batch_sizes` of the file's own settings, by itself or by default
+        self._plan, self._progress = plan, progress
+        self._end = (time.monotonic() if began is None else began) + plan.minutes * 60
+        self._wanted: list[np.ndarray] = []  # actions of the file's own settings
+        self._sizes: list[TunedSize] = []
+        self._failed: list[Variant] = []
+
+    def measure(self) -> list[MeasuredPoint]:
+        """Measure the file's own settings, then each variant."""
+        with tempfile.TemporaryDirectory() as folder:
+            frames = None
+            if self._plan.frames is not None:
+                frames = Path(folder) / "frames.npz"
+                save_observations(recorded_observations(self._plan.frames, FRAMES), frames)
+            ready = self._measure_own(frames)
+            variants = self._variants(ready, self._useful())
+            for number, variant in enumerate(variants):
+                self._try(variant, frames, parts=len(variants) - number)
+        return [size.point() for size in self._sizes]
+
+    def _measure_own(self, frames: Path | None) -> Mapping[str, Any]:
+        """Measure the file's own settings; returns what their process says of them."""
+        own, ready = Variant(), None
+        try:
+            with self._loaded(own, frames) as (process, ready):
+                self.device, self.fixed = ready["device"], ready["settings"].get("batch_sizes")
+                if self._plan.dtypes and "dtype" not in ready["settings"]:
+                    raise ConfigError(f"--dtypes: {self._plan.args.policy!r} has no setting `dtype`; leave it out")
+                sizes = self._candidates()
+                self._wanted = self._actions(process, sizes[0])[:FRAMES]
+                self._sweep(process, own, sizes, parts=len(self._variants(ready, ())) + 1)
+        except VariantFailed as error:
+            if ready is None or not self._sizes:
+                raise VariantFailed(f"the file's own settings: {error}") from error
+            self.left_out.append(f"{own.name}: {error}")
+        return ready
+
+    def _candidates(self) -> list[int]:
+        """Return the batch sizes to measure, ascending: the fixed ones, or else 1, 2, 4, …"""
+        fixed = self._plan.args.batch.sizes or self.fixed
+        sizes = fixed or [2**power for power in range(self._plan.max_batch.bit_length())]
+        found = [size for size in sizes if size <= self._plan.max_batch]
+        if not found:
+            raise ConfigError(f"--max-batch: got {self._plan.max_batch}, the file's smallest fixed size is {sizes[0]}")
+        return found
+
+    def _variants(self, ready: Mapping[str, Any], sizes: Sequence[int]) -> list[Variant]:
+        """Return the variants beside the file's own settings; a compiled one has these sizes, unless the file has."""
+        has = ready["settings"]
+        wanted = ready["dtypes"] if self._plan.dtypes is None else self._plan.dtypes
+        named = [{"quantization" if one in get_args(Quantization) else "dtype": one} for one in wanted]
+        dtypes = [change for change in named if change.keys() <= has.keys() and not change.items() <= has.items()]
+        compiled: list[dict[str, Any]] = []
+        if has.get("compile") is False:
+            compiled = [{"compile": True} | ({"batch_sizes": list(sizes)} if has.get("batch_sizes", 0) is None else {})]
+        both = [one | other for other in compiled for one in dtypes]
+        return [Variant(changes) for changes in [*dtypes, *compiled, *both]]
+
+    def _useful(self) -> list[int]:
+        """Return the measured sizes; for throughput, up to the one with the largest rate."""
+        rates = {size.sessions: statistics.median(size.rates) for size in self._sizes}
+        most = max(rates, key=rates.__getitem__) if self._plan.goal.kind == "throughput" else max(rates)
+        return sorted(size for size in rates if size <= most)
+
+    def _try(self, variant: Variant, frames: Path | None, parts: int) -> None:
+        """Measure a variant; if that fails, say so."""
+        if any(failed.changes.items() <= variant.changes.items() for failed in self._failed):
+            return
+        if time.monotonic() >= self._end:
+            self.left_out.append(f"{variant.name}: no time was left")
+            return
+        sizes = self._plan.args.batch.sizes or variant.changes.get("batch_sizes") or self._candidates()
+        try:
+            with self._loaded(variant, frames) as (process, ready):
+                for what in ready["uncompiled"]:
+                    self.left_out.append(f"{variant.name}: not compiled: {what}")
+                if variant.changes.get("compile") and len(ready["uncompiled"]) == len(sizes):
+                    raise VariantFailed("no size could be compiled")
+                self._sweep(process, variant, sizes, parts)
+        except VariantFailed as error:
+            self._failed.append(variant)
+            self.left_out.append(f"{variant.name}: {error}")
+
+    @contextmanager
+    def _loaded(self, variant: Variant, frames: Path | None) -> Iterator[tuple[LineProcess, Mapping[str, Any]]]:
+        """Yield the process of a variant that is loaded, and what it says of itself."""
+        args, environment = self._plan.args, self._plan.args.environment
+        settings = ProcessSettings(
+            policy=args.policy,
+            config=args.config | dict(variant.changes),
+            wrappers=args.wrappers,
+            max_size=args.batch.sizes[-1] if args.batch.sizes else max(self._plan.max_batch, args.batch.max_size),
+            patience=args.batch.patience,
+            batch_sizes=args.batch.sizes or (),
+            frames=None if frames is None else str(frames),
+            side=self._plan.side,
+            dims=self._plan.dims,
+        )
+        found = our_environment() if environment.python is None else {}
+        command = [environment.python or sys.executable, "-m", "vlagents_ray.bench.tuning_process"]
+        with LineProcess("tune", command, found | environment.env_vars, end_s=_END_S) as process:
+            process.send(json.dumps(asdict(settings)))
+            said = self._answer(process)
+            while "step" in said:
+                self._progress(f"{variant.name}: {said['step']}")
+                said = self._answer(process)
+            self._progress(f"{variant.name}: loaded in {said['load_s']:.1f} s on {said['device']}")
+            yield process, said
+
+    def _sweep(self, process: LineProcess, variant: Variant, sizes: Sequence[int], parts: int) -> None:
+        """Measure a loaded variant with growing batches while these help, then again in turns while there is time."""
+        now = time.monotonic()
+        until = now + (self._end - now) / parts
+        found: list[TunedSize] = []
+        for size in sizes:
+            if not self._worth_more(found) or not self._add(process, variant, size, found, until):
+                break
+        default = self._plan.args.batch.max_size
+        if self._plan.goal.kind == "throughput" and not variant.changes and default not in [s.sessions for s in found]:
+            self._add(process, variant, default, found, (time.monotonic() + self._end) / 2)
+        turn_s = sum(measured.took_s for measured in found)
+        for _ in range(_TURNS - 1):
+            if time.monotonic() + turn_s > until:
+                break
+            for measured in found:
+                measured.add(self._turn(process, measured.sessions))
+
+    def _worth_more(self, found: Sequence[TunedSize]) -> bool:
+        """Whether a larger batch may serve the goal better than those that were measured, ascending."""
+        if found and self._plan.goal.p99_ms is not None:
+            return found[-1].point().round_trip_ms <= self._plan.goal.p99_ms
+        rates = [measured.rates[0] for measured in found]
+        return len(rates) < 3 or max(rates[-2:]) >= _RISING * max(rates[:-2])  # one may have been disturbed
+
+    def _add(self, process: LineProcess, variant: Variant, size: int, found: list[TunedSize], until: float) -> bool:
+        """Compare the actions of a batch size, and measure it once; return False if it is left out, and say why."""
+        began = time.monotonic()
+        if found and began + found[-1].took_s * size / found[-1].sessions > until:
+            self.left_out.append(f"{variant.name}, {sessions(size)}: no time was left")
+            return False
+        try:
+            difference = largest_difference(self._actions(process, size), self._wanted)
+            if difference > self._plan.tolerance:
+                raise VariantFailed(self._refusal(difference, itself=not variant.changes and not found))
+            measured = TunedSize(variant, size, difference)
+            measured.add(self._turn(process, size))
+        except VariantFailed as error:
+            if not found:
+                raise
+            self.left_out.append(f"{variant.name}, {sessions(size)}: {error}")
+            return False
+        measured.took_s = time.monotonic() - began
+        found.append(measured)
+        self._sizes.append(measured)
+        self._progress(f"{variant.name}, {sessions(size)}: {measured.rates[0]:.1f} actions/s")
+        return True
+
+    def _refusal(self, difference: float, *, itself: bool) -> str:
+        off = f"actions differ by {difference:.2%} of their range, want at most {self._plan.tolerance:.2%}"
+        if itself:
+            return (
+                f"{off}, for the same observations and seeds, so that nothing can be compared with them; let the seed "
+                f"of `reset` determine what is random in the policy, or raise --tolerance"
+            )
+        return f"refused, as {off}"
+
+    def _actions(self, process: LineProcess, size: int) -> list[np.ndarray]:
+        said = self._request(process, {"act": size})
+        return [np.array(action, np.float64) for action in said["actions"]]
+
+    def _turn(self, process: LineProcess, number: int) -> dict[str, Any]:
+        rank = "robot" if self._plan.goal.kind == "robots" else "simulation"
+        return self._request(process, {"measure": number, "seconds": self._plan.seconds, "rank": rank})
+
+    def _request(self, process: LineProcess, asked: Mapping[str, Any]) -> dict[str, Any]:
+        process.send(json.dumps(asked))
+        return self._answer(process)
+
+    def _answer(self, process: LineProcess) -> dict[str, Any]:
+        """Return the next line of a process. Raises `VariantFailed` for its error, its end, or the end of the time."""
+        try:
+            said: dict[str, Any] = process.read(max(0.0, self._end - time.monotonic()))
+        except ProcessFailed as error:
+            if time.monotonic() >= self._end:
+                raise VariantFailed(f"not done within {self._plan.minutes:g} minutes; raise --minutes") from error
+            first, *more = str(error).partition(": ")[2].splitlines()
+            raise VariantFailed(". ".join([first, *more[-1:]])) from error
+        if "failed" in said:
+            raise VariantFailed(said["failed"])
+        return said
+
+
+def largest_difference(actions: Sequence[np.ndarray], wanted: Sequence[np.ndarray]) -> float:
+    """Return the largest difference of two lists of actions, as a share of the range of `wanted`.
+
+    An action is (D,) or (H, D); the one at i belongs to `wanted[i % len(wanted)]`.
+
+    Each number of an action has its range: the largest minus the smallest value among all actions and rows, or
+    a tenth of its largest magnitude if that is more.
+
+    Returns:
+        The difference; infinity if shapes differ, or if a value is not finite.
+    """
+    rows = np.concatenate([np.atleast_2d(one) for one in wanted]).astype(np.float64)
+    span = np.maximum(np.ptp(rows, axis=0), _SMALLEST_RANGE * np.abs(rows).max(axis=0))
+    largest = 0.0
+    for i, action in enumerate(actions):
+        want = np.asarray(wanted[i % len(wanted)], np.float64)
+        if np.shape(action) != want.shape or not np.isfinite(action).all():
+            return float("inf")
+        off = np.abs(action - want)
+        shares = np.divide(off, span, out=np.where(off > 0, np.inf, 0.0), where=span > 0)
+        largest = max(largest, float(shares.max(initial=0.0)))
+    return largest
+
+
+def recorded_observations(folder: Path, count: int) -> list[Obs]:
+    """Read observations, spread evenly over the trajectories below a folder and over their steps."""
+    files = sorted(folder.rglob("*.npz"))
+    if not files:
+        raise ConfigError(f"--frames {folder}: holds no trajectory (.npz), want a folder of them, as evaluations save")
+    used = files[:: max(1, len(files) // count)][:count]
+    found: list[Obs] = []
+    for number, file in enumerate(used):
+        share = len(range(number, count, len(used)))
+        found += _of_trajectory(file, share)
+    return found
+
+
+def _of_trajectory(file: Path, count: int) -> list[Obs]:
+    trajectory = Trajectory.load(file)
+    steps = np.linspace(0, len(trajectory.actions), count, dtype=int).tolist()
+    images = {camera: _images(video, steps) for camera, video in videos_of(file, trajectory.cameras).items()}
+    return [
+        Obs(
+            cameras={camera: images[camera][step] for camera in trajectory.cameras},
+            gripper=None if trajectory.gripper is None else float(trajectory.gripper[step]),
+            state={part: values[step] for part, values in trajectory.state.items()},
+        )
+        for step in steps
+    ]
+
+
+def _images(video: Path, steps: list[int]) -> dict[int, np.ndarray]:
+    """Return the images of these steps, (H, W, 3) uint8 RGB."""
+    av = require("av")
+    found: dict[int, np.ndarray] = {}
+    try:
+        with av.open(str(video)) as container:
+            for number, frame in enumerate(container.decode(video=0)):
+                if number in steps:
+                    found[number] = frame.to_ndarray(format="rgb24")
+    except (OSError, ValueError) as error:  # PyAV's errors of broken files are of these kinds
+        raise ConfigError(f"--frames: {video} cannot be read ({error})") from error
+    if missing := sorted(set(steps) - set(found)):
+        raise ConfigError(f"--frames: {video} has no frames {missing}, which its trajectory has")
+    return found

@@ -1,0 +1,228 @@
+"""`vlagents-ray eval`: the settings of an evaluation from a file or from options, and what is done with them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from vlagents_ray.cli.console import errors
+from vlagents_ray.cli.options import (
+    YAML_SUFFIXES,
+    Address,
+    Live,
+    LiveAt,
+    Set,
+    command_of,
+    parse_list,
+    parse_settings,
+    parse_time,
+    read_run_file,
+)
+from vlagents_ray.cli.ray_session import RESUME, exit_if_ray_is_lost, quiet_ray
+from vlagents_ray.errors import ConfigError
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+
+    from vlagents_ray.evaluate import EvalConfig, WorkerConfig
+
+
+@dataclass(frozen=True)
+class EvalOptions:
+    """The options of `vlagents-ray eval`.
+
+    An option that is a field of `EvalConfig`, or of its policy, suite or worker, has the field's name here.
+    """
+
+    what: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="FILE | ENV...", help="A file of runs (.yaml); or environments: tabletop, 'libero/*', …"
+        ),
+    ]
+    source: Annotated[str | None, typer.Option("--policy", help="Registered name, deployment file, or URL.")] = None
+    out: Annotated[Path | None, typer.Option("--out", help="Folder of the results.")] = None
+    episodes: Annotated[int | None, typer.Option(min=1, help="Episodes of each environment; default: 10.")] = None
+    workers: Annotated[int | None, typer.Option(min=1, help="Environments rolled out in parallel; default: 1.")] = None
+    cpus: Annotated[
+        float | None,
+        typer.Option("--worker-cpus", min=0, help="CPUs of each worker, unless the file says how many; default: 0.5."),
+    ] = None
+    gpus: Annotated[
+        float | None,
+        typer.Option("--worker-gpus", min=0, help="GPUs per worker to render on, such as 0.25; default: 0 (software)."),
+    ] = None
+    seeds: Annotated[int | None, typer.Option("--seed", min=0, help="Episode i uses seed + i; default: 0.")] = None
+    video: Annotated[str | None, typer.Option(help="none, failures (default) or all.")] = None
+    record: Annotated[str | None, typer.Option(help="Trajectories: none (default), failures or all.")] = None
+    rerun: Annotated[str | None, typer.Option(metavar="DIR", help="Write .rrd files for Rerun; or 'live'.")] = None
+    foxglove: Annotated[str | None, typer.Option(metavar="DIR", help="Write .mcap files for Foxglove.")] = None
+    track: Annotated[str, typer.Option(help="wandb, trackio, tensorboard, with commas between them.")] = ""
+    resume: Annotated[bool, typer.Option(help="Go on with the results in --out.")] = False
+    accept_changes: Annotated[
+        bool,
+        typer.Option("--accept-changes", help="With --resume: although files or weights changed; the report says so."),
+    ] = False
+    execute: Annotated[int | None, typer.Option(min=1, help="Rows executed of each chunk; default: all.")] = None
+    retries: Annotated[int | None, typer.Option(min=0, help="Attempts after a lost one; default: 3.")] = None
+    config: Set = field(default_factory=list)
+    env_options: Annotated[
+        list[str], typer.Option("--env-set", metavar="KEY=VALUE", help="An option of the environments: width=256.")
+    ] = field(default_factory=list)
+    options: Annotated[
+        list[str],
+        typer.Option("--reset-set", metavar="KEY=VALUE", help="An option of the policy's reset: checkpoint_step=9."),
+    ] = field(default_factory=list)
+    watch: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Evaluate each checkpoint that a training run writes there, until Ctrl-C."),
+    ] = None
+    until: Annotated[int | None, typer.Option(min=0, metavar="STEP", help="End --watch with this step.")] = None
+    settle: Annotated[float | None, typer.Option(min=0, help="With --watch: s without a change; default: 10.")] = None
+    marker: Annotated[str | None, typer.Option(metavar="NAME", help="With --watch: the trainer's last file.")] = None
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print plan and estimated time; play nothing.")] = False
+    end_at: Annotated[
+        str | None,
+        typer.Option(metavar="TIME", help="Begin no episode that would end later: 2027-01-31T18:30, or s since 1970."),
+    ] = None
+    replica_per_gpu: Annotated[
+        bool, typer.Option("--replica-per-gpu", help="With --address: a policy has a replica on each of its GPUs.")
+    ] = False
+    arm: Annotated[
+        str | None,
+        typer.Option(
+            "--robot",
+            metavar="MODULE:CLASS",
+            help="Play the file's trials on a real robot, of this class: a person resets the scene and judges, and "
+            "does not see which policy plays.",
+        ),
+    ] = None
+    operator: Annotated[
+        str | None,
+        typer.Option(metavar="page|terminal", help="With --robot: where that person is asked; default: page"),
+    ] = None
+    unblind: Annotated[bool, typer.Option("--unblind", help="With --robot: write the results so far.")] = False
+    address: Address = None
+    live: Live = False
+    live_at: LiveAt = None
+
+    def given(self, *names: str) -> list[str]:
+        """Return those of these options that the command line has, as it writes them; 0 is given, False is not."""
+        values = {name: getattr(self, name) for name in names}
+        return [f"--{name.replace('_', '-')}" for name, one in values.items() if one or (one == 0 and one is not False)]
+
+    def require_together(self, *, on_robot: bool) -> None:
+        """Raise `ConfigError` for options that need another one, or that exclude one another."""
+        if self.watch is None and (needing := self.given("until", "settle", "marker")):
+            raise ConfigError(f"got {needing} without --watch")
+        if self.dry_run and self.watch is not None:
+            raise ConfigError("--dry-run and --watch exclude each other: the steps of the training are not known yet")
+        if self.end_at is not None and self.watch is not None:
+            raise ConfigError("--end-at and --watch exclude each other: watching ends with --until, or by Ctrl-C")
+        if self.replica_per_gpu and self.address is None:
+            raise ConfigError("--replica-per-gpu: want --address, a cluster whose GPUs can be counted")
+        if self.dry_run and self.given("live", "live_at"):
+            raise ConfigError("--dry-run and --live exclude each other: nothing is played that could be watched")
+        if not on_robot and (needing := self.given("operator", "unblind")):
+            raise ConfigError(f"got {needing} without --robot")
+        if on_robot and (excluded := self.given("watch", "dry_run", "end_at", "track", "live", "live_at")):
+            raise ConfigError(f"--robot and {excluded} exclude each other")
+        if self.operator not in (None, "page", "terminal"):
+            raise ConfigError(f"--operator: got {self.operator!r}, want page or terminal")
+
+
+@command_of(EvalOptions)
+def evaluate_command(options: EvalOptions) -> None:
+    """Evaluate policies: episodes in parallel, success rates with confidence intervals, videos.
+
+    A file holds policies, their checkpoints, suites of environments, seeds; --out, --workers, --video, --record,
+    --rerun, --foxglove, --track, --retries and --resume win over it.
+
+    Exit status: 0 when every episode has its result; 75 when --end-at left some over, 130 if interrupted (resume both
+    with --resume); 2 for invalid settings; 3 when an error of the policy ended every episode of a cell; 1 for any other
+    failure, and when infrastructure lost an episode for good (--resume tries it again).
+    """
+    with errors(), exit_if_ray_is_lost(RESUME):
+        config = config_from_options(options)
+        on_robot = config.real_robot is not None
+        options.require_together(on_robot=on_robot)
+        from vlagents_ray.cli.evaluation import print_plan, run_evaluation, run_on_robot, watch_training
+        from vlagents_ray.cli.live import live_address
+
+        address, page = options.address, live_address(options.live_at) if options.live or options.live_at else None
+        if on_robot:
+            run_on_robot(config, address, operator=options.operator or "page", unblinded=options.unblind)
+        elif options.dry_run:
+            with quiet_ray(None):
+                print_plan(config)
+        elif options.watch is not None:
+            settle_s = 10.0 if options.settle is None else options.settle
+            watch_training(
+                config, options.watch, address, until=options.until, settle_s=settle_s, marker=options.marker, live=page
+            )
+        else:
+            end = None if options.end_at is None else parse_time(options.end_at, "--end-at")
+            run_evaluation(config, address, end_at=end, replica_per_gpu=options.replica_per_gpu, live=page)
+
+
+def config_from_options(options: EvalOptions) -> EvalConfig:
+    """Build the configuration of an evaluation from the options of `vlagents-ray eval`."""
+    from vlagents_ray.evaluate import EvalConfig, PolicyConfig, SuiteConfig, WorkerConfig
+
+    what = options.what
+    parsed = {
+        **vars(options),
+        "track": parse_list(options.track),
+        "config": parse_settings(options.config, "--set"),
+        "options": parse_settings(options.options, "--reset-set"),
+        "env_options": parse_settings(options.env_options, "--env-set"),
+        "seeds": None if options.seeds is None else [options.seeds],
+    }
+    run, policy, suite, worker = (
+        _given(parsed, model) for model in (EvalConfig, PolicyConfig, SuiteConfig, WorkerConfig)
+    )
+    if what[0].endswith(YAML_SUFFIXES):
+        if beside := [*what[1:], *policy, *suite]:
+            raise ConfigError(f"{what[0]} says what is evaluated; got {beside} beside it: write that there")
+        fields = read_run(Path(what[0])) | run
+    else:
+        missing = [option for option, there in (("--policy", "source" in policy), ("--out", "out" in run)) if not there]
+        if missing:
+            raise ConfigError(
+                f"got no {' and no '.join(missing)}, want {' and '.join(missing)}; or a file of runs (.yaml)"
+            )
+        fields = {"policies": [policy], "suites": [{"envs": list(what)} | suite], **run}
+    if options.arm is not None:
+        fields["robot"] = {**(fields.get("robot") or {}), "arm": options.arm}
+    return _with_resources(EvalConfig.model_validate(fields), worker)
+
+
+def _given(options: dict[str, Any], model: type[BaseModel]) -> dict[str, Any]:
+    """Select the options that are fields of `model` and were given."""
+    found = {name: options[name] for name in model.model_fields if name in options}
+    # 0 was given, though it equals False.
+    return {name: value for name, value in found.items() if value not in (None, {}, []) and value is not False}
+
+
+def _with_resources(config: EvalConfig, resources: dict[str, float]) -> EvalConfig:
+    """Give each worker these resources where the configuration does not say what it takes."""
+    if not resources:
+        return config
+
+    def filled(worker: WorkerConfig) -> WorkerConfig:
+        unset = {name: value for name, value in resources.items() if name not in worker.model_fields_set}
+        return worker.model_copy(update=unset)
+
+    suites = [
+        suite if suite.worker is None else suite.model_copy(update={"worker": filled(suite.worker)})
+        for suite in config.suites
+    ]
+    return config.model_copy(update={"worker": filled(config.worker), "suites": suites})
+
+
+def read_run(file: Path) -> dict[str, Any]:
+    """Read a file of runs."""
+    return read_run_file(file, "file of runs", "`policies` and `suites`")

@@ -1,0 +1,270 @@
+"""Evaluations from the command line, once their configuration is known: played, planned, watched, or on a robot."""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import threading
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
+
+from vlagents_ray.cli.console import fail, out
+from vlagents_ray.cli.listing import require_packages
+from vlagents_ray.cli.policies import policy_deployment, resolve_policies, served
+from vlagents_ray.errors import ConfigError, PolicyFailed
+from vlagents_ray.evaluate import EvalConfig, PolicyConfig, Results
+from vlagents_ray.evaluate.checkpoint_watcher import CheckpointWatcher, rounds
+from vlagents_ray.evaluate.estimate import Forecast, forecasts
+from vlagents_ray.evaluate.plan.cases import cells
+from vlagents_ray.evaluate.results.database import FILE
+from vlagents_ray.evaluate.workers.cluster import ray_cluster
+from vlagents_ray.policies.base.checkpoint import STEP
+from vlagents_ray.serve.launch.deployment_file import own_settings
+from vlagents_ray.serve.models.checkpoints import CHOICE
+from vlagents_ray.slurm.submission import UNFINISHED
+
+if TYPE_CHECKING:
+    from vlagents_ray.evaluate import Progress, Summary
+
+
+POLICY_ERRORS = 3  # exit status: an error of the policy ended every episode of a cell
+LOOK_S = 1.0  # between two looks at the folder
+_BASES = {
+    "results": "from episodes that were played before",
+    "measured": "at most, as every episode may end early; without the time that the policy takes",
+}
+
+
+def run_evaluation(
+    config: EvalConfig,
+    address: str | None = None,
+    *,
+    end_at: float | None = None,
+    replica_per_gpu: bool = False,
+    live: tuple[str, int] | None = None,
+) -> None:
+    """Serve the policies that are not at a URL, evaluate them all, print the table.
+
+    `end_at` is as in `evaluate`, and `live` the address of the live page, as for `live_progress`.
+    """
+    with served(config, address, replica_per_gpu=replica_per_gpu) as ready, shown_progress(ready, live) as progress:
+        summary = evaluate_and_print(ready, progress, end_at)
+    require_results(ready, summary)
+
+
+def shown_progress(
+    config: EvalConfig, live: tuple[str, int] | None, *, goes_on: bool = False
+) -> AbstractContextManager[Progress]:
+    """Return the progress of an evaluation: on the terminal, and on the live page if that has an address."""
+    from vlagents_ray.cli.live import live_progress
+    from vlagents_ray.evaluate import progress_for
+
+    return live_progress(config.out, [one.url for one in config.policies], live, progress_for(out), goes_on=goes_on)
+
+
+def play_one(config: EvalConfig, address: str | None, only: tuple[int, int]) -> Summary:
+    """Serve the policy unless it is at a URL, and play one episode of it; `only` as in `evaluate`."""
+    from vlagents_ray.evaluate import evaluate, progress_for
+
+    with served(config, address) as ready:
+        return evaluate(ready, progress=progress_for(out), only=only)
+
+
+def evaluate_and_print(config: EvalConfig, progress: Progress, end_at: float | None = None) -> Summary:
+    """Evaluate policies that are at their URLs; an interrupted evaluation prints what it has."""
+    from vlagents_ray.evaluate import EvaluationInterrupted, OutOfTime, Results, evaluate, print_summary
+    from vlagents_ray.evaluate.results.summary import failing_cells, summarize
+
+    try:
+        summary = evaluate(config, progress=progress, end_at=end_at)
+    except PolicyFailed as error:
+        results = Results.load(config.out)
+        if not failing_cells(results):
+            raise
+        print_summary(out, summarize(results))
+        fail(str(error), POLICY_ERRORS)
+    except EvaluationInterrupted as interrupted:
+        print_summary(out, interrupted.summary)
+        if isinstance(interrupted, OutOfTime):
+            fail(str(interrupted), UNFINISHED)
+        raise
+    print_summary(out, summary)
+    return summary
+
+
+def require_results(config: EvalConfig, summary: Summary) -> None:
+    """End the command with status 3 if an error of the policy ended every episode of a cell that `config` plans.
+
+    With status 1, if an episode has no result: infrastructure lost it.
+    """
+    from vlagents_ray.evaluate.plan.cases import cells
+    from vlagents_ray.evaluate.results.summary import errors_of_policies, failing_cells
+
+    wanted = {cell.fingerprint for cell in cells(config)}
+    mine = [cell for cell in summary.results.cells if cell.cell in wanted]
+    if failing := failing_cells(summary.results.among(mine)):
+        (_, _, error), _ = errors_of_policies(summary.results.among(failing))[0]
+        where = ", ".join(f"{cell.contender} in {cell.task}" for cell in failing)
+        fail(f"every episode ended by an error of the policy: {where}; the first one: {error.strip()}", POLICY_ERRORS)
+    missing = sum(cell.missing for cell in mine)
+    if not missing:
+        return
+    lost = [attempt for cell in mine for attempt in cell.attempts if not attempt.retried]
+    last = max(lost, key=lambda attempt: attempt.at, default=None)
+    why = "" if last is None else f", the last one to {last.code}: {last.error.strip().partition(chr(10))[0]}"
+    fail(
+        f"{missing} of {sum(cell.planned for cell in mine)} episodes have no result: lost to infrastructure{why}; "
+        f"the report lists every attempt under Errors, --resume tries them again",
+        1,
+    )
+
+
+def watch_training(
+    config: EvalConfig,
+    folder: Path,
+    address: str | None = None,
+    *,
+    until: int | None = None,
+    settle_s: float = 10.0,
+    marker: str | None = None,
+    live: tuple[str, int] | None = None,
+) -> None:
+    """Evaluate each step of the one policy whose checkpoint holds `{step}` once it is whole.
+
+    All go into one folder, and one server stays up for them. Policies without `{step}` are evaluated in the first
+    round. `live` is the address of the live page, as for `live_progress`. Ends as `rounds` does, or by Ctrl-C; to go
+    on, resume. An episode without a result ends the command with status 1, after the last round.
+    """
+    place, pattern = _watched(config)
+    if (config.out / FILE).is_file() and not config.resume:  # said now, not when the first checkpoint is there
+        raise ConfigError(f"{config.out} already has results: resume them (--resume), or choose another out folder")
+    if address is None:
+        for part in resolve_policies(_at(config, place, [0]), ask=False)[1].values():
+            require_packages(part)
+    watcher = CheckpointWatcher(pattern, folder, settle_s=settle_s, marker=marker)
+    shown: dict[int, str] = {}
+
+    def pause() -> None:
+        for step, why in watcher.waiting().items():
+            if shown.get(step) != why:
+                shown[step] = why
+                out.print(f"step {step}: not yet: {why}")
+        threading.Event().wait(LOOK_S)
+
+    out.print(f"watching {watcher.folder}{'' if watcher.folder.is_dir() else ', which is not there yet'}")
+    found = rounds(watcher, until, pause)
+    first = next(found, None)
+    if first is None:
+        raise ConfigError(f"{watcher.folder}: watching ended without a checkpoint; still waiting: {watcher.waiting()}")
+    with (
+        served(_at(config, place, first), address) as ready,
+        ray_cluster(ready),
+        shown_progress(ready, live, goes_on=True) as progress,
+    ):
+        summary = evaluate_and_print(ready, progress)
+        every = [*first]
+        for steps in found:
+            every += steps
+            summary = evaluate_and_print(_at(ready, place, steps).model_copy(update={"resume": True}), progress)
+    require_results(_at(ready, place, every), summary)
+
+
+def _watched(config: EvalConfig) -> tuple[int, str]:
+    """Find the index of the policy that is trained, and the pattern of its checkpoints."""
+    found = {place: pattern for place, one in enumerate(config.policies) if (pattern := _pattern(one)) is not None}
+    if len(found) != 1:
+        raise ConfigError(
+            f"--watch: got {STEP} in the checkpoints of {len(found)} policies, want it in that of one, such as "
+            f"checkpoint: /runs/a/{STEP}"
+        )
+    [(place, pattern)] = found.items()
+    if config.policies[place].steps:
+        raise ConfigError(f"policy {config.policies[place].name!r}: --watch finds its steps; leave `steps` out")
+    return place, pattern
+
+
+def _pattern(policy: PolicyConfig) -> str | None:
+    settings: dict[str, Any] = {CHOICE: policy.checkpoint}
+    if policy.source is not None and "://" not in policy.source:
+        settings |= own_settings(policy_deployment(policy, policy.source, step_follows=True).applications[0])
+    checkpoint = settings[CHOICE]
+    return checkpoint if isinstance(checkpoint, str) and STEP in checkpoint else None
+
+
+def _at(config: EvalConfig, place: int, steps: list[int]) -> EvalConfig:
+    policies = list(config.policies)
+    policies[place] = policies[place].model_copy(update={"steps": steps})
+    return config.model_copy(update={"policies": policies})
+
+
+def run_on_robot(config: EvalConfig, address: str | None, *, operator: str, unblinded: bool) -> None:
+    """Serve the policies that are not at a URL, play the trials, print the table."""
+    from vlagents_ray.evaluate import print_summary
+    from vlagents_ray.evaluate.robot import PageOperator, TerminalOperator, evaluate_on_robot, planned_cells, unblind
+
+    if unblinded:
+        print_summary(out, unblind(config.out, config.robot.key if config.robot is not None else None))
+        return
+    planned_cells(config)  # what is wrong is said before anything starts
+    with served(config, address) as ready, contextlib.ExitStack() as stack:
+        person = TerminalOperator() if operator == "terminal" else stack.enter_context(PageOperator(out.print))
+        summary = evaluate_on_robot(ready, person)
+    print_summary(out, summary)
+
+
+def print_plan(config: EvalConfig) -> None:
+    """Print a row for each cell, the sum, and where the times come from. Nothing is served or written."""
+    config, _ = resolve_policies(config, ask=False)
+    planned = cells(config)
+    results = Results.load(config.out) if (config.out / FILE).is_file() else None
+    found = forecasts(config, planned, results)
+    out.print(_table(found))
+    for line in _sum(config, found):
+        out.print(line)
+
+
+def _table(found: list[Forecast]) -> Table:
+    table = Table(box=SIMPLE_HEAD, padding=0, pad_edge=False)
+    for title in ("policy", "env"):
+        table.add_column(title, overflow="fold")
+    for title in ("seeds", "episodes", "finished", "to play", "s each", "time"):
+        table.add_column(title, justify="right", no_wrap=True)
+    for one in found:
+        about = "" if one.basis == "results" else "≤ "
+        table.add_row(
+            one.cell.contender,
+            " ".join(filter(None, one.cell.name[1:])),
+            str(len(one.cell.suite.seeds)),
+            str(one.cell.planned),
+            str(one.finished),
+            str(one.left),
+            "?" if one.seconds is None else f"{about}{one.seconds:.3g}",
+            "?" if one.seconds is None else f"{about}{_time(one.left * one.seconds)}",
+        )
+    return table
+
+
+def _sum(config: EvalConfig, found: list[Forecast]) -> list[str]:
+    planned, finished, left = (
+        sum(column) for column in zip(*((f.cell.planned, f.finished, f.left) for f in found), strict=True)
+    )
+    # Workers share one queue; what is short of a worker's turn is a single episode at the end.
+    seconds = sum(one.left * (one.seconds or 0.0) for one in found) / max(1, min(config.workers, left))
+    cells = [one.cell for one in found]
+    policies, envs = len({cell.contender for cell in cells}), len({(cell.suite.name, cell.env) for cell in cells})
+    bases = [text for basis, text in _BASES.items() if any(one.basis == basis for one in found)]
+    lines = [
+        f"{len(found)} cells: {policies} policies at their checkpoints x {envs} environments of suites",
+        f"{planned} episodes, {finished} of them finished in {config.out}, {left} to play",
+        f"{_time(seconds)} with {config.workers} workers ({'; '.join(bases) or 'nothing is known of the time'})",
+    ]
+    unknown = {one.cell.env: one.why for one in found if one.seconds is None}
+    return lines + [f"{env}: time unknown: {why}" for env, why in unknown.items()]
+
+
+def _time(seconds: float) -> str:
+    return str(datetime.timedelta(seconds=round(seconds)))

@@ -1,1 +1,0 @@
-"""`vlagents-ray eval`, and the commands that read its results."""

@@ -1,0 +1,262 @@
+"""The commands that read results: `vlagents-ray report`, `export`, `merge`, `bundle`, `verify` and `replay`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import Enum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from vlagents_ray.cli.console import errors, fresh, out, table
+from vlagents_ray.cli.options import Address, Live, LiveAt, parse_list, parse_settings
+from vlagents_ray.errors import ConfigError
+
+if TYPE_CHECKING:
+    from vlagents_ray.open_loop.replay import ReplayPlan
+
+
+class Videos(str, Enum):
+    """Where the videos of the page are."""
+
+    INLINE = "inline"
+    LINK = "link"
+    NONE = "none"
+
+
+def report_command(
+    folders: Annotated[list[Path], typer.Argument(metavar="OUT...", help="Folders that evaluations wrote to.")],
+    html: Annotated[Path | None, typer.Option(help="Default: report.html in OUT; of several folders, here.")] = None,
+    videos: Annotated[Videos, typer.Option(help="As far as they fit, beside the page, or stills.")] = Videos.LINK,
+    live: Live = False,
+    live_at: LiveAt = None,
+) -> None:
+    """Write a page of what came out: success with intervals, comparisons, latency, failures, and all that made it.
+
+    With --live it writes none: it shows the results in OUT as another process adds to them, until Ctrl-C.
+    """
+    from vlagents_ray.evaluate import Results
+    from vlagents_ray.evaluate.merge import combined
+    from vlagents_ray.evaluate.report.page import FILE, write_report
+
+    with errors():
+        if live or live_at:
+            from vlagents_ray.cli.live import follow, live_address
+
+            if len(folders) != 1 or html is not None:
+                raise ConfigError("--live shows one folder, and writes no file: want one OUT, and no --html")
+            follow(folders[0], live_address(live_at))
+            return
+        results = combined([Results.load(folder) for folder in folders])
+        path = html or (folders[0] / FILE if len(folders) == 1 else Path(FILE))
+        written = write_report(results, path, videos=videos.value)
+        out.print(f"report: {written}")
+
+
+def export_command(
+    folder: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of the results.")],
+    path: Annotated[Path, typer.Argument(metavar="PATH", help="File to write; of lerobot and hub, a new folder.")],
+    to: Annotated[
+        str,
+        typer.Option(
+            help="json, csv, parquet: a row an episode; lerobot: a dataset of what was seen; hub: scores for a model's "
+            "repository; vla-eval: for its leaderboard."
+        ),
+    ],
+    policy: Annotated[str | None, typer.Option(help="Only this one: NAME, or NAME@STEP in a sweep.")] = None,
+    env: Annotated[str | None, typer.Option(help="Only this one.")] = None,
+    cameras: Annotated[str | None, typer.Option(help="lerobot: only these, as base,wrist; default: all.")] = None,
+    state: Annotated[str | None, typer.Option(help="lerobot: only these parts, in order; default: all.")] = None,
+    environment_state: Annotated[
+        str | None, typer.Option(help="lerobot: parts for observation.environment_state, as puck,target.")
+    ] = None,
+    successes: Annotated[bool, typer.Option("--successes", help="lerobot: only episodes that were solved.")] = False,
+    cut_idle: Annotated[
+        bool, typer.Option("--cut-idle", help="lerobot: end each episode where nothing moves after it was solved.")
+    ] = False,
+    settings: Annotated[
+        list[str],
+        typer.Option("--set", metavar="KEY=VALUE", help="hub: dataset=OWNER/NAME; vla-eval: curated_by=@handle, …"),
+    ] = [],  # noqa: B006 - typer reads it
+) -> None:
+    """Write the episodes of an evaluation as JSON, CSV, Parquet or a LeRobotDataset v3.0; or its scores, to publish."""
+    from vlagents_ray.evaluate import Results
+    from vlagents_ray.evaluate.artifacts.storage import storing
+    from vlagents_ray.evaluate.exports import EXPORTS, SCORES
+
+    with errors():
+        if to not in EXPORTS:
+            raise ConfigError(f"--to: got {to!r}, want one of {', '.join(EXPORTS)}")
+        named = {"cameras": cameras, "state": state, "environment_state": environment_state}
+        chosen: dict[str, Any] = {name: parse_list(value) for name, value in named.items() if value is not None}
+        chosen |= {name: True for name, on in (("successes", successes), ("cut_idle", cut_idle)) if on}
+        if chosen and to != "lerobot":
+            given = ", ".join(f"--{name.replace('_', '-')}" for name in chosen)
+            raise ConfigError(f"{given}: got --to {to}, want --to lerobot, whose frames they choose")
+        if settings and to not in SCORES:
+            raise ConfigError(f"--set: got --to {to}, want one of {', '.join(SCORES)}")
+        chosen |= parse_settings(settings, "--set")
+        results = Results.load(folder).only(policy, env)
+        with storing(path.parent):
+            number = EXPORTS[to](results, path, **chosen)
+    out.print(f"wrote {number} episodes to {path}")
+
+
+def merge_command(
+    into: Annotated[Path, typer.Argument(metavar="OUT", help="New folder.")],
+    folders: Annotated[list[Path], typer.Argument(metavar="FOLDER...", help="Folders of results, which stay.")],
+    keep_first: Annotated[
+        bool, typer.Option("--keep-first", help="Of different outcomes of an episode keep that of the first folder.")
+    ] = False,
+    accept_changes: Annotated[
+        bool, typer.Option("--accept-changes", help="Although files or weights differ; the report says so.")
+    ] = False,
+) -> None:
+    """Put results together: each episode once, by its key; videos and trajectories go along."""
+    from vlagents_ray.evaluate import print_summary
+    from vlagents_ray.evaluate.merge import merge
+
+    with errors():
+        print_summary(out, merge(into, folders, keep_first=keep_first, accept_changes=accept_changes))
+
+
+def bundle_command(
+    folder: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of the results.")],
+    file: Annotated[Path | None, typer.Option("--out", help="The file; default: OUT.bundle.zip beside OUT.")] = None,
+    videos: Annotated[bool, typer.Option("--videos", help="With its videos, which may be large.")] = False,
+) -> None:
+    """Write an evaluation as one file: database, report, settings, versions of packages, trajectories, digests."""
+    from vlagents_ray.evaluate.bundle import write_bundle
+
+    with errors():
+        path = file or folder.absolute().with_name(f"{folder.absolute().name}.bundle.zip")
+        digest = write_bundle(folder, path, videos=videos)
+    out.print(f"bundle: {path}, {path.stat().st_size / 1e6:.1f} MB\nto cite: sha256:{digest}")
+
+
+def verify_command(
+    bundle: Annotated[Path, typer.Argument(metavar="BUNDLE", help="A file that `vlagents-ray bundle` wrote.")],
+    replay: Annotated[int, typer.Option(min=0, help="Episodes whose recorded actions are played again.")] = 3,
+    into: Annotated[Path | None, typer.Option(help="Keep its results in this new folder.")] = None,
+    trust: Annotated[bool, typer.Option("--trust", help="Also make environments that name code or files.")] = False,
+    most_gb: Annotated[float, typer.Option(min=0, help="Refuse a bundle that unpacks to more.")] = 16.0,
+) -> None:
+    """Check a bundle, also a stranger's: what is equal, what differs, what could not be checked.
+
+    Exit code 0 if nothing contradicts it, 1 if something does: a digest, the tables, a recording, an outcome of a
+    replay. Other versions of software here are named, and contradict nothing.
+    """
+    from vlagents_ray.evaluate.bundle import verify
+
+    with errors():
+        found = verify(bundle, into=into, replay=replay, trust=trust, most_bytes=int(most_gb * 1e9))
+        rows = table("what", "found", "detail", box=None)
+        for one in found.findings:
+            rows.add_row(one.subject, one.verdict, one.detail)
+        out.print(rows)
+        out.print(f"\nbundle sha256:{found.digest}: {'holds' if found.holds else 'is contradicted'}")
+        if into is not None:
+            out.print(f"results: {into}")
+    raise typer.Exit(not found.holds)
+
+
+def replay_command(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of results, or a LeRobotDataset.")],
+    episode: Annotated[
+        str | None, typer.Argument(help="Of results: its key, or ENV#NUMBER: 'tabletop#3'.", show_default=False)
+    ] = None,
+    policy: Annotated[str | None, typer.Option(help="Name, deployment file, or URL; default: the run's own.")] = None,
+    out_dir: Annotated[Path | None, typer.Option("--out", help="Folder of the replay; default: a new one.")] = None,
+    address: Address = None,
+    episodes: Annotated[str | None, typer.Option(help="Of a dataset: these, as 0-9,12. Default: all.")] = None,
+    horizon: Annotated[int | None, typer.Option(min=1, help="Of a dataset: rows of a chunk that are compared.")] = None,
+    every: Annotated[int, typer.Option(min=1, help="Of a dataset without answers: each so many-th frame.")] = 1,
+    at_once: Annotated[int, typer.Option(min=1, help="Of a dataset: episodes that share a batch.")] = 8,
+    cameras: Annotated[str | None, typer.Option(help="Of a dataset: POLICY=DATASET, as base=top,wrist=left.")] = None,
+    state: Annotated[str | None, typer.Option(help="Of a dataset: parts of observation.state in order.")] = None,
+) -> None:
+    """Play an episode of an evaluation again: exit code 0 if all is the same. Or play a dataset to another policy.
+
+    A dataset is what a server recorded, or any LeRobotDataset: its errors by joint and by step of the horizon are
+    printed, and written as JSON and as a page.
+    """
+    with errors():
+        if is_dataset(folder):
+            if episode is not None:
+                raise ConfigError(f"{folder}: is a dataset, got {episode!r}; want --episodes, or none of it")
+            if policy is None:
+                raise ConfigError(f"{folder}: is a dataset: want --policy, a name, a deployment file or a URL")
+            from vlagents_ray.open_loop.recorded import Names
+            from vlagents_ray.open_loop.replay import ReplayPlan
+
+            chosen = None if episodes is None else parse_episodes(episodes)
+            names = Names(_renamed(cameras), None if state is None else parse_list(state))
+            plan = ReplayPlan(chosen, horizon, every, at_once, names)
+            replay_dataset(folder, policy, out_dir or fresh(Path("runs/replay")), plan)
+            return
+        if episode is None:
+            raise ConfigError(f"{folder}: holds results, and wants an episode: its key, or ENV#NUMBER")
+        same = _same(folder, episode, policy, out_dir, address)
+    raise typer.Exit(not same)
+
+
+def _same(folder: Path, episode: str, policy: str | None, out_dir: Path | None, address: str | None) -> bool:
+    """Play an episode again, print what differs, and return whether nothing does."""
+    from vlagents_ray.cli.evaluation import play_one
+    from vlagents_ray.evaluate import Results
+    from vlagents_ray.evaluate.replay import compare, find
+
+    recorded = find(Results.load(folder), episode)
+    other: dict[str, Any] | None = None
+    if policy is not None:
+        other = {"source": policy, "url": None, "config": {}, "checkpoint": None}
+    into = out_dir or fresh(folder / "replays" / "replay")
+    summary = play_one(recorded.config(into, policy=other), address, recorded.number_and_seed)
+    found = compare(recorded, summary.results)
+    steps = recorded.episode.result.steps
+    lines = found or [f"the same: {steps} actions byte for byte, and what came of them"]
+    for line in [*lines, f"replay: {into}"]:
+        out.print(line)
+    return not found
+
+
+def is_dataset(folder: Path) -> bool:
+    """Return whether a folder is a LeRobotDataset, or has such datasets in it."""
+    return (folder / "meta/info.json").is_file() or any(folder.glob("*/meta/info.json"))
+
+
+def replay_dataset(folder: Path, policy: str, into: Path, plan: ReplayPlan) -> None:
+    """Play a dataset to a policy, print the errors, and write the report."""
+    from vlagents_ray.open_loop.replay import candidate, replay
+    from vlagents_ray.open_loop.report import write_files
+
+    with candidate(policy) as sessions:
+        result = replay(folder, sessions, plan)
+    table = result.to_json()
+    out.print(
+        f"{table['frames']} frames of {table['sessions']} sessions, against the recorded {result.against}: "
+        f"mean absolute error {table['mae']:.4g}, root mean square {table['rmse']:.4g}, largest {table['max']:.4g}"
+    )
+    for one in table["by_joint"]:
+        out.print(f"  {one['joint']}: {one['mae']:.4g}, {one['rmse']:.4g}, {one['max']:.4g}")
+    for path in write_files(result, policy, into):
+        out.print(f"wrote {path}")
+
+
+def parse_episodes(text: str) -> Sequence[int]:
+    """Return the numbers in a list such as "0-9,12"; raise `ConfigError` for any other text."""
+    found: list[int] = []
+    for part in parse_list(text):
+        first, dash, last = part.partition("-")
+        if not first.isdecimal() or (dash and not last.isdecimal()):
+            raise ConfigError(f"--episodes: got {part!r}, want numbers and ranges, such as 0-9,12")
+        found += range(int(first), int(last or first) + 1)
+    return found
+
+
+def _renamed(text: str | None) -> dict[str, str]:
+    pairs = [part.partition("=") for part in parse_list(text or "")]
+    if odd := [name for name, equals, _ in pairs if not equals]:
+        raise ConfigError(f"--cameras: got {odd[0]!r}, want POLICY=DATASET, such as base=top,wrist=wrist_left")
+    return {name: camera for name, _, camera in pairs}

@@ -1,0 +1,260 @@
+"""Geometry of the page's charts, in SVG's units; `templates/charts.html.j2` draws them.
+
+Colours are the classes c0 to c5 of the stylesheet, so that light, dark and paper each have their own. Lines differ in
+their dashes too, for readers who cannot tell the colours apart.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from itertools import pairwise
+from typing import NamedTuple
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from vlagents_ray.evaluate.results.statistics import Rate
+
+NONE, MINUS = "\u2013", "\u2212"
+_COLOURS = 6
+_DASHES = (None, "7 3", "2 3", "9 3 2 3", "12 4", "4 4")
+_GLYPH, _EDGE = 96, 6  # width of a glyph, and what a dot takes beyond the ends of its axis
+
+
+def percent(rate: Rate) -> str:
+    """The rate in per cent, with one decimal."""
+    return NONE if rate.rate is None else f"{100 * rate.rate:.1f}"
+
+
+def interval(rate: Rate) -> str:
+    """The interval of the rate, in per cent."""
+    if rate.rate is None:
+        return NONE
+    low, high = rate.interval
+    return f"{100 * low:.1f} to {100 * high:.1f}"
+
+
+def interval_name(rate: Rate) -> str:
+    """The kind of that interval: a confidence sequence where cells could stop early, else Wilson's."""
+    if rate.error_rate is None:
+        return "95 % Wilson interval"
+    return f"{100 * (1 - rate.error_rate):g} % confidence sequence"
+
+
+def points(difference: float | None) -> str:
+    """A difference of rates, in percentage points, with its sign."""
+    if difference is None:
+        return NONE
+    text = f"{100 * difference:+.1f}".replace("-", MINUS)
+    return "0.0" if float(f"{100 * difference:.1f}") == 0 else text
+
+
+def p_value(p: float) -> str:
+    """A p-value with its significant digits; never 0."""
+    if p < 1e-4:
+        return "< 0.0001"
+    return f"{p:.4f}" if p < 0.01 else f"{p:.3f}" if p < 0.1 else f"{p:.2f}"
+
+
+def number(value: float | None, digits: int = 1) -> str:
+    """A number with thin spaces between thousands; a dash for None."""
+    return NONE if value is None else f"{value:,.{digits}f}".replace(",", "\u202f")
+
+
+def quantity(n: int, thing: str) -> str:
+    """A number of things: "1 episode", "2 episodes"."""
+    return f"{number(n, 0)} {thing}" if n == 1 else f"{number(n, 0)} {thing}s"
+
+
+def duration(seconds: float) -> str:
+    """A duration in at most two units: "1 h 12 min"."""
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    minutes = round(seconds / 60)
+    return f"{minutes} min" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"
+
+
+def moment(seconds: float) -> str:
+    """A time in seconds since 1970, to the minute, in UTC."""
+    return datetime.fromtimestamp(seconds, timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
+
+
+class PlotArea(NamedTuple):
+    """Size of a chart, and the edges of the area inside its axes."""
+
+    width: int = 460
+    height: int = 280
+    left: int = 38
+    right: int = 450
+    top: int = 10
+    bottom: int = 240
+
+    def y(self, share: float) -> float:
+        """The height at which `share`, in [0, 1], is drawn."""
+        return self.top + (self.bottom - self.top) * (1 - share)
+
+
+PLOT = PlotArea()
+
+
+@dataclass(frozen=True, slots=True)
+class Series:
+    """Rates with their intervals, by x."""
+
+    name: str
+    points: Sequence[tuple[float, Rate]]
+    stepped: bool = False  # constant up to the next point, rather than a straight line to it
+    level: bool = False  # one rate, whatever x is
+
+
+@dataclass(frozen=True, slots=True)
+class Style:
+    """An entry of a legend."""
+
+    name: str
+    colour: str  # a class of the stylesheet
+    dashes: str | None = None  # `stroke-dasharray`
+
+
+@dataclass(frozen=True, slots=True)
+class Curve:
+    """A series as it is drawn."""
+
+    style: Style
+    path: str | None  # None: no rate is known
+    band: str | None  # the path around its intervals
+    dots: list[tuple[float, float, str]]  # (x, y, description)
+
+
+@dataclass(frozen=True, slots=True)
+class RateChart:
+    """Rates in per cent over x, each with its band."""
+
+    title: str
+    x_label: str
+    x_ticks: list[tuple[float, str]]  # (x, text)
+    lines: list[Curve]
+
+
+@dataclass(frozen=True, slots=True)
+class BarChart:
+    """Bars made of parts, all on one scale. A bar is (name, its sum, [(style, value, width in per cent)])."""
+
+    title: str
+    legend: list[Style]
+    bars: list[tuple[str, float, list[tuple[Style, float, float]]]]
+
+
+@dataclass(frozen=True, slots=True)
+class Glyph:
+    """A dot with its interval on an axis, for the cell of a table; decoration, as the numbers are beside it."""
+
+    axis: str
+    range: str | None
+    dot: float | None
+    decided: bool = True  # False: the dot is hollow
+
+
+def rate_chart(series: Sequence[Series], x_label: str, title: str) -> RateChart:
+    """The lines of `series` in the order in which they are given, on a common axis from the least x to the largest."""
+    most = max((x for one in series for x, _ in one.points), default=0.0)
+    least = min((x for one in series for x, _ in one.points), default=0.0)
+    left, right = (least - 1, most + 1) if least == most else (least, most)
+
+    def x_of(x: float) -> float:
+        return PLOT.left + (PLOT.right - PLOT.left) * (x - left) / (right - left)
+
+    lines = []
+    for index, one in enumerate(series):
+        known = [(x, rate) for x, rate in one.points if rate.rate is not None]
+        bounds = [(rate.rate or 0.0, *rate.interval) for _, rate in known]
+        rates, lows, highs = (
+            _corners([(x_of(x), PLOT.y(shares[i])) for (x, _), shares in zip(known, bounds, strict=True)], one.stepped)
+            for i in range(3)
+        )
+        dots = [
+            (x_of(x), PLOT.y(rate.rate or 0.0), f"{one.name}, {short(x)}: {percent(rate)} % ({interval(rate)})")
+            for x, rate in known
+            if not (one.stepped or one.level)
+        ]
+        style = Style(one.name, f"c{index % _COLOURS}", _DASHES[index % len(_DASHES)])
+        band = f"{_path([*lows, *reversed(highs)])}Z"
+        lines.append(Curve(style, _path(rates) if known else None, band if known else None, dots))
+    return RateChart(title, x_label, [(x_of(tick), short(tick)) for tick in ticks(left, right)], lines)
+
+
+def bar_chart(rows: Mapping[str, Mapping[str, float]], title: str) -> BarChart:
+    """A bar for each of `rows`, of which there is at least one."""
+    names = dict.fromkeys(part for parts in rows.values() for part in parts)
+    styles = {name: Style(name, f"c{index % _COLOURS}") for index, name in enumerate(names)}
+    longest = max(sum(parts.values()) for parts in rows.values())
+    bars = [
+        (
+            name,
+            sum(parts.values()),
+            [(styles[part], value, 100 * value / longest if longest else 0.0) for part, value in parts.items()],
+        )
+        for name, parts in rows.items()
+    ]
+    return BarChart(title, list(styles.values()), bars)
+
+
+def interval_glyph(rate: Rate) -> Glyph:
+    """The rate and its interval on an axis from 0 to 100 %."""
+    axis = f"M{_EDGE} 8H{_GLYPH - _EDGE}"
+    if rate.rate is None:
+        return Glyph(axis, None, None)
+    low, dot, high = (_EDGE + (_GLYPH - 2 * _EDGE) * value for value in (rate.interval[0], rate.rate, rate.interval[1]))
+    return Glyph(axis, f"M{low:.1f} 8H{high:.1f}", dot)
+
+
+def difference_glyph(difference: float, low: float, high: float, *, decided: bool) -> Glyph:
+    """A difference of rates and its interval on an axis from -100 to 100 percentage points."""
+    middle = _GLYPH / 2
+    left, dot, right = (middle + (middle - _EDGE) * value for value in (low, difference, high))
+    axis = f"M{_EDGE} 8H{_GLYPH - _EDGE}M{middle:.1f} 2V14"
+    return Glyph(axis, f"M{left:.1f} 8H{right:.1f}", dot, decided)
+
+
+def ticks(low: float, high: float, most: int = 6) -> list[float]:
+    """Round numbers within [low, high], at most `most` or one more, at equal distances."""
+    if high <= low:
+        return [low]
+    rough = (high - low) / most
+    magnitude = 10 ** math.floor(math.log10(rough))
+    distance = next(factor * magnitude for factor in (1, 2, 2.5, 5, 10) if factor * magnitude >= rough * (1 - 1e-9))
+    first, last = math.ceil(low / distance - 1e-9), math.floor(high / distance + 1e-9)
+    return [distance * step for step in range(first, last + 1)]
+
+
+def short(value: float) -> str:
+    """A number for an axis: 20000 -> "20k"."""
+    for size, suffix in ((1e6, "M"), (1e3, "k")):
+        if abs(value) >= size:
+            return f"{value / size:g}{suffix}"
+    return f"{value:g}"
+
+
+def px(value: float) -> str:
+    """A coordinate with at most two decimals."""
+    return f"{value:.2f}".rstrip("0").rstrip(".")
+
+
+def _corners(points: Sequence[tuple[float, float]], stepped: bool) -> list[tuple[float, float]]:
+    """The corners of a line through `points`."""
+    if not stepped:
+        return list(points)
+    corners = [corner for (_, y), (x, then) in pairwise(points) for corner in ((x, y), (x, then))]
+    return [*points[:1], *corners]
+
+
+def _path(points: Iterable[tuple[float, float]]) -> str:
+    return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in points)
+
+
+def templates(package: str) -> Environment:
+    """Return the templates of a package, which escape whatever they are given: names and errors are text of others."""
+    loader = PackageLoader(package)
+    return Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)

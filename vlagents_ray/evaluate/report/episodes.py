@@ -1,0 +1,233 @@
+"""The episodes: a table of all, videos of the solved and the unsolved ones, and what broke."""
+
+from __future__ import annotations
+
+import base64
+import collections
+import itertools
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+from urllib.parse import quote
+
+import numpy as np
+
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.evaluate.artifacts.storage import outcome
+from vlagents_ray.evaluate.results.reader import Attempt, CellResults, Episode, Results
+from vlagents_ray.evaluate.results.summary import errors_of_policies
+from vlagents_ray.images.jpeg_png import encode_jpeg
+from vlagents_ray.registry import require
+
+Videos = Literal["inline", "link", "none"]
+
+BUDGET = 24 * 2**20  # bytes of videos that one page carries
+POSTER = 224  # the most pixels of a poster's side
+SMALL = 128  # a video whose sides have fewer pixels is enlarged without blurring
+MOST_UNSOLVED, MOST_SOLVED = 24, 12  # videos
+MOST_LISTED = 20_000  # episodes
+AT_ONCE = 500  # of them are laid out when the page opens; its script shows more
+MOST_ERRORS = 500
+MOST_LOGS = 50
+_OUTCOMES = {"success": "solved", "failure": "not solved", "policy_error": "policy error", "infra_failed": "lost"}
+
+Found = tuple[CellResults, Episode]
+
+
+@dataclass(frozen=True, slots=True)
+class Player:
+    """A video, or its last frame if `source` is None."""
+
+    label: str
+    source: str | None  # URL of the video
+    still: str | None  # URL of its last frame; None: the file does not play
+    style: str | None  # a class of the stylesheet
+    tall: float | None  # height / width
+
+
+Card = tuple[CellResults, Episode, Player]  # of a gallery
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeRow:
+    """An episode of the table."""
+
+    cell: CellResults
+    episode: Episode
+    outcome: str
+    style: str | None  # a class of the stylesheet
+    videos: list[tuple[int, str]]  # (number, URL)
+
+
+@dataclass(frozen=True, slots=True)
+class Episodes:
+    """All episodes, the first `MOST_LISTED` of them as rows."""
+
+    rows: list[EpisodeRow]
+    left_out: int
+    all_count: bool  # in the rates
+    solved: list[Card]
+
+
+@dataclass(frozen=True, slots=True)
+class Failures:
+    """The episodes that were not solved, some of them with a video."""
+
+    unsolved: int
+    cards: list[Card]
+    inlined: int  # videos in the page
+    linked: int  # videos beside the page
+    outside: int  # videos that are not shown, as they are symbolic links out of the folder
+
+
+@dataclass(frozen=True, slots=True)
+class Errors:
+    """Errors of the policies, and what infrastructure failed."""
+
+    of_policies: list[tuple[tuple[str, str, str], int]]  # ((policy id, task, error), episodes)
+    attempts: list[tuple[CellResults, Attempt]]  # the first `MOST_LOGS` that infrastructure failed
+    failed: int  # attempts
+    repeated: int  # attempts
+    lost: int  # episodes
+
+
+class Gallery:
+    """Chooses which videos the report embeds or links, within a size budget."""
+
+    def __init__(self, results: Results, page: Path, mode: Videos, budget: int = BUDGET) -> None:
+        self._results = results
+        self._page = page
+        self._mode = mode
+        self._budget = budget
+        self.inlined = 0
+        self.linked = 0
+        self.outside: set[str] = set()  # paths that are symbolic links out of their folder of results: not shown
+
+    def cards(self, found: Sequence[Found], most: int) -> list[Card]:
+        """At most so many of these episodes that have a video, taken from tasks and policies in turns."""
+        drawn = (self._card(cell, one) for cell, one in _in_turns(found))
+        return list(itertools.islice(filter(None, drawn), most))
+
+    def player(self, video: str, label: str) -> Player | None:
+        """A player for `video`, a path of an episode; None if the file is not there."""
+        path = self._file(video)
+        if path is None:
+            return None
+        frame = last_frame(path)
+        still = None if frame is None else poster(frame)
+        style = "small" if frame is not None and max(frame.shape[:2]) < SMALL else None
+        if self._mode == "none":
+            return None if still is None else Player(f"{label}: the last frame", None, still, style, None)
+        tall = None if frame is None else frame.shape[0] / frame.shape[1]
+        return Player(label, self._source(video, path), still, style, tall)
+
+    def link(self, video: str) -> str | None:
+        """Where the page finds the file; None if it has none to link to."""
+        path = self._file(video)
+        if self._mode == "none" or path is None:
+            return None
+        return quote(Path(os.path.relpath(path, self._page.parent.resolve())).as_posix())
+
+    def _card(self, cell: CellResults, episode: Episode) -> Card | None:
+        label = f"{cell.task}, episode {episode.result.key.episode}, {cell.contender}"
+        player = self.player(episode.videos[0], label)
+        return None if player is None else (cell, episode, player)
+
+    def _file(self, video: str) -> Path | None:
+        try:
+            path = self._results.file(video)
+        except ConfigError:
+            self.outside.add(video)
+            return None
+        return path if path.is_file() else None
+
+    def _source(self, video: str, path: Path) -> str | None:
+        size = path.stat().st_size
+        if self._mode == "inline" and size <= self._budget:
+            self._budget -= size
+            self.inlined += 1
+            return data_url("video/mp4", path.read_bytes())
+        self.linked += 1
+        return self.link(video)
+
+
+def episodes(results: Results, gallery: Gallery) -> Episodes | None:
+    """Return all episodes, or None without any."""
+    order = {name: index for index, name in enumerate(results.contenders)}
+    cells = sorted(results.cells, key=lambda cell: order[cell.contender])
+    found = [(cell, one) for cell in cells for one in cell.episodes]
+    if not found:
+        return None
+    solved = [(cell, one) for cell, one in found if one.counts and one.result.success_once]
+    cards = gallery.cards(solved, MOST_SOLVED)
+    rows = [_row(cell, one, gallery) for cell, one in found[:MOST_LISTED]]
+    return Episodes(rows, len(found) - len(rows), all(one.counts for _, one in found), cards)
+
+
+def failures(results: Results, gallery: Gallery) -> Failures | None:
+    """The episodes that were not solved; None if there are none."""
+    found = [
+        (cell, one) for cell in results.cells for one in cell.episodes if one.counts and not one.result.success_once
+    ]
+    if not found:
+        return None
+    cards = gallery.cards(found, MOST_UNSOLVED)
+    return Failures(len(found), cards, gallery.inlined, gallery.linked, len(gallery.outside))
+
+
+def errors(results: Results) -> Errors | None:
+    """Return the errors with their logs; None without any."""
+    recorded = [(cell, one.result) for cell in results.cells for one in cell.episodes]
+    broken = errors_of_policies(results)
+    attempts = [(cell, attempt) for cell in results.cells for attempt in cell.attempts]
+    if not broken and not attempts:
+        return None
+    return Errors(
+        sorted(broken, key=lambda one: -one[1])[:MOST_ERRORS],
+        attempts[:MOST_LOGS],
+        len(attempts),
+        sum(attempt.retried for _, attempt in attempts),
+        sum(result.status == "infra_failed" for _, result in recorded),
+    )
+
+
+def last_frame(video: Path) -> np.ndarray | None:
+    """(H, W, 3) uint8 RGB; None of a file that does not play."""
+    av = require("av")
+    try:
+        with av.open(str(video)) as container:
+            frames = collections.deque(container.decode(video=0), maxlen=1)
+    except (OSError, ValueError):  # PyAV's errors of broken files are of these kinds
+        return None
+    return np.asarray(frames[0].to_ndarray(format="rgb24")) if frames else None
+
+
+def poster(frame: np.ndarray) -> str:
+    """A data: URL of `frame`, (H, W, 3) uint8 RGB, as a JPEG; a large frame is made smaller."""
+    stride = -(-max(frame.shape[:2]) // POSTER)
+    return data_url("image/jpeg", encode_jpeg(np.ascontiguousarray(frame[::stride, ::stride]), quality=75))
+
+
+def data_url(kind: str, data: bytes) -> str:
+    """A URL that holds `data`, which is of the media type `kind`."""
+    return f"data:{kind};base64,{base64.b64encode(data).decode()}"
+
+
+def _in_turns(found: Sequence[Found]) -> Iterator[Found]:
+    """One episode of each cell that has videos, then the second of each, and so on."""
+    by_cell: dict[str, list[Found]] = {}
+    for cell, one in found:
+        if one.videos:
+            by_cell.setdefault(cell.cell, []).append((cell, one))
+    rounds = itertools.zip_longest(*by_cell.values())
+    return (one for turn in rounds for one in turn if one is not None)
+
+
+def _row(cell: CellResults, one: Episode, gallery: Gallery) -> EpisodeRow:
+    kind = outcome(one.result)
+    words = f"({_OUTCOMES[kind]})" if one.beyond else _OUTCOMES[kind]
+    style = {"success": "good", "failure": None}.get(kind, "bad")
+    links = [(number, gallery.link(video)) for number, video in enumerate(one.videos, 1)]
+    return EpisodeRow(cell, one, words, style, [(number, link) for number, link in links if link is not None])

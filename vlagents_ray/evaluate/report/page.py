@@ -1,0 +1,207 @@
+"""`report.html`: an evaluation as one self-contained page.
+
+Python computes what the page shows: this module, `success`, `episodes` and `provenance`, with the geometry of `charts`.
+`templates/page.html.j2` is the page, `sections.html.j2` has a macro for each of its sections, `elements.html.j2` and
+`charts.html.j2` hold what these share. `report.css` and `report.js` are written into the page.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache, partial
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from jinja2 import Environment
+from markupsafe import Markup
+
+from vlagents_ray.evaluate.artifacts.storage import storing, whole
+from vlagents_ray.evaluate.episode.records import EpisodeResult
+from vlagents_ray.evaluate.report import charts
+from vlagents_ray.evaluate.report.charts import (
+    BarChart,
+    bar_chart,
+    duration,
+    interval,
+    interval_name,
+    number,
+    percent,
+    quantity,
+)
+from vlagents_ray.evaluate.report.episodes import AT_ONCE, Gallery, Videos, episodes, errors, failures
+from vlagents_ray.evaluate.report.provenance import configuration, protocol, repeat
+from vlagents_ray.evaluate.report.success import (
+    compare_all,
+    learning_curves,
+    real_time_gaps,
+    success_over_time,
+    success_table,
+)
+from vlagents_ray.evaluate.results.reader import Results, by_timing, rate_of
+from vlagents_ray.evaluate.results.summary import Summary, median, summarize
+
+FILE = "report.html"
+STAGES = {  # of `act.info["timing"]`, in the order in which a request meets them
+    "decode_ms": "decode",
+    "queue_ms": "queue",
+    "inference_ms": "inference",
+    "encode_ms": "encode",
+    "wire_ms": "wire",
+}
+MOST_BARS = 12
+
+
+class Figure(NamedTuple):
+    """A number of the page's head."""
+
+    value: str
+    name: str
+    note: str
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """A part of the page with a heading that the table of contents leads to."""
+
+    title: str
+    macro: str  # of sections.html.j2
+    view: Any  # its argument; None or empty: the page has no such section
+
+    @property
+    def anchor(self) -> str:
+        """The id of its heading."""
+        return self.title.lower().replace(" ", "-")
+
+
+def write_report(results: Results, path: Path, *, videos: Videos = "link") -> Path:
+    """Write the report of `results` to `path`, one HTML file, whole or not at all.
+
+    Args:
+        results: Of one folder, or of several (`combined`).
+        path: The file; folders that are missing are made.
+        videos: "link" to the files (relative to `path`), "inline" up to `episodes.BUDGET` bytes and links for the
+            rest, or "none", with a still of each.
+
+    Returns:
+        `path`.
+    """
+    text = report(summarize(results), Gallery(results, path, videos))
+    with storing(path.parent), whole(path) as part:
+        part.write_text(text, encoding="utf-8")
+    return path
+
+
+def report(summary: Summary, gallery: Gallery) -> str:
+    """The page as text."""
+    results = summary.results
+    sections = [
+        Section("Success", "success", success_table(summary)),
+        Section("Comparison", "comparison", compare_all(summary)),
+        Section("Gap to the synchronous score", "real_time", real_time_gaps(summary)),
+        Section("Learning curve", "learning_curve", learning_curves(summary)),
+        Section("Success over time", "success_over_time", success_over_time(summary)),
+        Section("Latency", "latency", latency(summary)),
+        Section("Failures", "failures", failures(results, gallery)),
+        Section("Episodes", "episodes", episodes(results, gallery)),
+        Section("Errors", "errors", errors(results)),
+        Section("Protocol", "protocol", protocol(results)),
+        Section("Configuration", "configuration", configuration(results)),
+        Section("To cite and to repeat", "repeat", repeat(summary)),
+    ]
+    return (
+        _templates()
+        .get_template("page.html.j2")
+        .render(
+            summary=summary,
+            policies=list(dict.fromkeys(cell.policy for cell in results.cells)),
+            tasks=len({(cell.suite, cell.env) for cell in results.cells}),
+            run=results.runs[-1],
+            figures=_figures(summary),
+            sections=[one for one in sections if one.view],
+        )
+    )
+
+
+def _figures(summary: Summary) -> list[Figure]:
+    total = summary.total
+    return [
+        _solved(summary),
+        Figure(number(total.episodes, 0), "episodes", f"of {number(total.planned, 0)} planned"),
+        Figure(number(total.steps, 0), "env steps", f"{number(summary.steps_per_second)} a second"),
+        Figure(duration(summary.wall_seconds), "wall time", f"{quantity(total.retries, 'attempt')} repeated"),
+    ]
+
+
+def _solved(summary: Summary) -> Figure:
+    """The headline: one rate only if its cells have one in common, and of synchronous episodes if there are any."""
+    best = summary.best[0]
+    timing, part = next(iter(summary.parts(best).items()))
+    name = "solved" if len(summary.results.contenders) == 1 else f"solved by the best, {best}"
+    if len(by_timing(summary.results.cells)) > 1:
+        name += f", {timing}"
+    once = part.success_once
+    if once.pooled:
+        return Figure(f"{percent(once)} %", name, f"{interval_name(once)} {interval(once)} %")
+    cells = by_timing(summary.results.of(best))[timing]
+    rates = [rate for cell in cells if (rate := rate_of([cell], "success_once")).rate is not None]
+    low, high = (percent(pick(rates, key=lambda rate: rate.rate or 0.0)) for pick in (min, max))
+    return Figure(f"{low} to {high} %", name, f"{quantity(len(cells), 'task')} that stopped apart: no rate in common")
+
+
+@cache
+def _templates() -> Environment:
+    env = charts.templates(__package__ or "")
+    formats = ("duration", "interval", "interval_name", "moment", "number", "p_value", "percent", "points", "quantity")
+    env.filters.update({name: getattr(charts, name) for name in formats})
+    env.filters.update(interval_glyph=charts.interval_glyph, px=charts.px, json=partial(json.dumps, ensure_ascii=False))
+    env.globals.update(PLOT=charts.PLOT, AT_ONCE=AT_ONCE, NONE=charts.NONE, MINUS=charts.MINUS)
+    for kind in ("css", "js"):  # ours, and no template: nothing in them is escaped
+        env.globals[kind] = Markup((files(__package__ or "") / f"report.{kind}").read_text("utf-8").strip())  # noqa: S704
+    return env
+
+
+@dataclass(frozen=True, slots=True)
+class Latency:
+    """One answer of each policy in its stages, and the env's share: medians over the episodes of each one's median."""
+
+    chart: BarChart | None  # None: no server reported its stages
+    stages: list[str]  # that any policy has
+    rows: list[tuple[str, list[float | None], float | None, int]]  # (policy id, ms, the env's reset in ms, answers)
+    transports: list[str]
+    timed: int  # policy ids with stages, of which the chart shows the first `MOST_BARS`
+
+
+def latency(summary: Summary) -> Latency | None:
+    """The latencies; None if no episode was played."""
+    results = summary.results
+    by_name = {name: [one for cell in results.of(name) for one in cell.counted] for name in results.contenders}
+    played = {name: counted for name, counted in by_name.items() if counted}
+    if not played:
+        return None
+    spent = {name: _stages(counted) for name, counted in played.items()}
+    timed = {name: found for name, found in spent.items() if found}
+    bars = dict(list(timed.items())[:MOST_BARS])
+    stages = [stage for stage in STAGES.values() if any(stage in found for found in timed.values())]
+    rows = [
+        (
+            name,
+            [spent[name].get(stage) for stage in stages]
+            + [
+                median(getattr(one, field) for one in counted)
+                for field in ("policy_ms", "policy_p95_ms", "env_step_ms")
+            ],
+            median(one.reset_ms for one in counted),
+            sum(one.acts for one in counted),
+        )
+        for name, counted in played.items()
+    ]
+    chart = bar_chart(bars, "One act of the policy, by stage") if bars else None
+    return Latency(chart, stages, rows, summary.transports, len(timed))
+
+
+def _stages(episodes: Sequence[EpisodeResult]) -> dict[str, float]:
+    found = {stage: median(one.timing_ms.get(key) for one in episodes) for key, stage in STAGES.items()}
+    return {stage: spent for stage, spent in found.items() if spent is not None}

@@ -1,0 +1,162 @@
+"""Where the numbers come from: protocol, contracts, settings, versions; and how to cite and repeat them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import yaml
+
+from vlagents_ray.evaluate.plan.config import EvalConfig
+from vlagents_ray.evaluate.results.changes import Change
+from vlagents_ray.evaluate.results.reader import CellResults, Results, Run
+from vlagents_ray.evaluate.results.statistics import Rate
+from vlagents_ray.evaluate.results.summary import (
+    TOTAL,
+    Summary,
+    checkpoint_of,
+    group_of,
+    pushed_of,
+    revision_of,
+    weights_of,
+)
+
+PROTOCOL = "protocol"  # of what an env describes: the constants of its benchmark
+_SETTINGS = ("env_options", "reset_options", "clock")
+
+
+@dataclass(frozen=True, slots=True)
+class Env:
+    """Envs that described themselves alike, with their contract."""
+
+    tasks: list[str]
+    constants: Mapping[str, Any] | None  # of the benchmark
+    described: Mapping[str, Any]
+    settings: Mapping[str, Any]
+    contract: str | None  # as YAML
+
+
+@dataclass(frozen=True, slots=True)
+class Configuration:
+    """Runs, workers, versions, the metadata of each policy's server, and all settings."""
+
+    runs: tuple[Run, ...]
+    changes: list[Change]  # of files or weights, between episodes
+    programs: list[tuple[str, Mapping[str, str]]]  # (env, digests of its files)
+    checkpoints: list[tuple[str, str]]  # (policy id, checkpoint, commit, digest or version of its weights)
+    workers: list[tuple[str, str, str, str, int]]  # (host, policy, transport, renderer, workers)
+    versions: list[Mapping[str, Any]]  # of each folder
+    policies: list[tuple[str, str]]  # (name, metadata as YAML)
+    settings: list[tuple[str, str]]  # (folder, settings as YAML)
+
+
+@dataclass(frozen=True, slots=True)
+class Quote:
+    """The numbers of one policy id in a sentence for a paper."""
+
+    name: str
+    envs: list[str]
+    success_once: Rate
+    success_at_end: Rate
+    version: str | None
+    seeds: str
+
+
+@dataclass(frozen=True, slots=True)
+class Again:
+    """The settings of a run as a file; a policy that Python code made cannot be in it."""
+
+    yaml: str
+    lacks_a_policy: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Repeat:
+    """Sentences for a paper, and the commands that repeat the evaluation and this page."""
+
+    quotes: list[Quote]
+    runs: list[Again]
+    folders: list[str]
+
+
+def protocol(results: Results) -> list[Env]:
+    """The description and contract of the envs; envs with the same ones are one entry."""
+    alike: dict[str, tuple[CellResults, list[str]]] = {}
+    for cell in results.cells:
+        settings = {name: cell.settings.get(name) for name in _SETTINGS}
+        same = json.dumps([cell.described, cell.contract, settings], sort_keys=True)
+        alike.setdefault(same, (cell, []))[1].append(cell.task)
+    return [_env(cell, list(dict.fromkeys(tasks))) for cell, tasks in alike.values()]
+
+
+def configuration(results: Results) -> Configuration:
+    """Return the software and the machines that made the results."""
+    named = [(cell.contender, one) for cell in results.cells for one in _identity(cell)]
+    workers: dict[tuple[str, str, str, str], set[tuple[int, int]]] = {}
+    for one in results.workers:
+        where = (one.host, one.policy, one.transport, one.renderer or "none")
+        workers.setdefault(where, set()).add((one.run, one.pid))
+    last = _last_runs(results)
+    return Configuration(
+        results.runs,
+        results.accepted_changes,
+        list({cell.env: (cell.env, cell.program) for cell in results.cells if cell.program}.values()),
+        list(dict.fromkeys(named)),
+        [(*where, len(alike)) for where, alike in sorted(workers.items())],
+        [{name: value for name, value in run.versions.items() if value is not None} for run in last],
+        [(name, _yaml(metadata)) for name, metadata in results.policies.items()],
+        [(str(run.config.get("out")), _yaml(run.config)) for run in last],
+    )
+
+
+def _identity(cell: CellResults) -> list[str]:
+    commit = revision_of(cell)
+    found = (checkpoint_of(cell), commit and f"commit {commit}", weights_of(cell), pushed_of(cell))
+    return [one for one in found if one is not None]
+
+
+def repeat(summary: Summary) -> Repeat:
+    """Return sentences to cite the evaluation, and commands to repeat it."""
+    results = summary.results
+    version = next((run.versions.get("vlagents-ray") for run in reversed(results.runs)), None)
+    quotes = [_quote(name, cells, version) for name, cells in summary.quotable if any(cell.counted for cell in cells)]
+    folders = list(dict.fromkeys(str(run.config.get("out")) for run in results.runs))
+    return Repeat(quotes, [_again(run) for run in _last_runs(results)], folders)
+
+
+def _env(cell: CellResults, tasks: list[str]) -> Env:
+    described = dict(cell.described)
+    constants = described.pop(PROTOCOL, None)
+    settings = {name: value for name in _SETTINGS if (value := cell.settings.get(name))}
+    contract = _yaml(cell.contract) if cell.contract else None
+    return Env(tasks, constants if isinstance(constants, Mapping) else None, described, settings, contract)
+
+
+def _last_runs(results: Results) -> list[Run]:
+    """The last run of each folder: those before had the same settings, as far as results depend on them."""
+    return list({run.config.get("out"): run for run in results.runs}.values())
+
+
+def _quote(name: str, cells: list[CellResults], version: str | None) -> Quote:
+    group = group_of((cells[0].contender, "", TOTAL), cells)
+    envs = list(dict.fromkeys(cell.env for cell in cells))
+    seeds = sorted({one.result.key.seed for cell in cells for one in cell.episodes if one.counts})
+    between = f"{seeds[0]} to {seeds[-1]}"
+    text = f"seeds {between}" if seeds[-1] - seeds[0] + 1 == len(seeds) else f"{len(seeds)} seeds from {between}"
+    return Quote(name, envs, group.success_once, group.success_at_end, version, text)
+
+
+def _again(run: Run) -> Again:
+    """The settings as a file. A policy that was served for the run is served again: its address is left out."""
+    config = EvalConfig.model_validate(run.config)
+    document = config.model_dump(mode="json", exclude_defaults=True, exclude={"out", "resume", "accept_changes"})
+    for policy in document["policies"]:
+        if policy.get("source") is not None:
+            policy.pop("url", None)
+    return Again(_yaml(document), any(not {"source", "url"} & policy.keys() for policy in document["policies"]))
+
+
+def _yaml(value: Any) -> str:
+    return str(yaml.safe_dump(value, sort_keys=False, allow_unicode=True, width=100)).rstrip()

@@ -1,0 +1,279 @@
+"""Success rates and their differences, as sections of the page."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from vlagents_ray.evaluate.report.charts import Glyph, RateChart, Series, difference_glyph, rate_chart
+from vlagents_ray.evaluate.results.comparison import Comparison, Line, clock_gaps, comparable, comparisons
+from vlagents_ray.evaluate.results.reader import CellResults, Results, by_timing
+from vlagents_ray.evaluate.results.statistics import ERROR_RATE, Pairs, Rate, success_curve
+from vlagents_ray.evaluate.results.summary import TOTAL, Group, Summary, group_of
+
+MOST_CURVES = 6  # that a chart holds and a reader tells apart
+MOST_PAIRS = 15  # shown unfolded: those of six policy ids
+MOST_COMPARED = 780  # pairs, those of 40 policy ids; of more, as of a whole training's, only those asked for most
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """Rows of the table: one for each policy id."""
+
+    name: str
+    groups: list[Group]
+    is_sum: bool = False  # of the tasks above it
+
+
+@dataclass(frozen=True, slots=True)
+class SuccessTable:
+    """Each task, each suite where there are several, and all."""
+
+    blocks: list[Block]
+    several: bool  # policy ids
+    stopped: int | None  # cells that stopped early; None: none could
+    pooled: bool  # every policy has one rate for all its cells
+
+
+@dataclass(frozen=True, slots=True)
+class LearningCurve:
+    """Success over the training step."""
+
+    chart: RateChart
+    rows: list[tuple[str, float | None, Rate]]  # (policy, step, rate); no step: a policy without checkpoints
+
+
+@dataclass(frozen=True, slots=True)
+class SuccessOverTime:
+    """The share of episodes that are solved by each step."""
+
+    chart: RateChart
+    rows: list[tuple[str, list[Rate], int]]  # (name, rates at each quarter of the steps, steps)
+    left_out: int  # curves that are not drawn
+
+
+def success_table(summary: Summary) -> SuccessTable:
+    """The table that the page begins with."""
+    total = summary.total
+    parts = [part for name in summary.results.contenders for part in summary.parts(name).values()]
+    return SuccessTable(
+        list(_blocks(summary)),
+        len(summary.results.contenders) > 1,
+        None if total.success_once.bounds is None else total.stopped,
+        all(part.success_once.pooled for part in parts),
+    )
+
+
+def learning_curves(summary: Summary) -> list[LearningCurve]:
+    """Success over the training steps of each policy that has several; empty if none has."""
+    return [curve for title, cells in _parts_with_a_rate(summary) if (curve := _learning_curve(title, cells))]
+
+
+def success_over_time(summary: Summary) -> SuccessOverTime | None:
+    """The curves of what can be quoted, of the best `MOST_CURVES`; None if no episode was played."""
+    parts = [(name, [one for cell in cells for one in cell.counted]) for name, cells in summary.quotable]
+    groups = {name: results for name, results in parts if results}
+    if not groups:
+        return None
+    solved = {name: sum(bool(one.success_once) for one in found) / len(found) for name, found in groups.items()}
+    best = sorted(groups, key=lambda name: -solved[name])[:MOST_CURVES]
+    shown = [name for name in groups if name in best]
+    horizon = max(1, *(one.steps for name in shown for one in groups[name]))
+    series, rows = [], []
+    for name in shown:
+        curve = success_curve([one.first_success for one in groups[name]], horizon)
+        points = list(zip(curve.steps, curve.solved, strict=True))
+        steps = points[-1][0]
+        quarters = [
+            next(rate for step, rate in reversed(points) if step <= share * steps) for share in (0.25, 0.5, 0.75, 1)
+        ]
+        series.append(Series(name, points, stepped=True))
+        rows.append((name, quarters, steps))
+    return SuccessOverTime(
+        rate_chart(series, "env steps", "Episodes solved by each step"), rows, len(groups) - len(shown)
+    )
+
+
+def _blocks(summary: Summary) -> Iterator[Block]:
+    """Tasks in the order of the plan, after those of each suite their sum, and last the sum of all."""
+    cells: dict[str, dict[str, list[Group]]] = {}
+    order = {name: number for number, name in enumerate(summary.results.contenders)}
+
+    def in_order(groups: list[Group]) -> list[Group]:
+        return sorted(groups, key=lambda group: order[group.contender])
+
+    for group in summary.cells:
+        cells.setdefault(group.suite, {}).setdefault(group.env, []).append(group)
+    for suite, envs in cells.items():
+        for env, groups in envs.items():
+            yield Block(" ".join(filter(None, (suite, env))), in_order(groups))
+        if len(cells) > 1 and len(envs) > 1:
+            of_suite = [cell for cell in summary.results.cells if cell.suite == suite]
+            yield Block(
+                f"all of {suite or 'the nameless suite'}", in_order(_by_policy_id(of_suite, suite)), is_sum=True
+            )
+    timings = by_timing(summary.results.cells)
+    for timing, found in timings.items():
+        suites = {cell.suite for cell in found}
+        envs_of_one = {cell.env for cell in found} if len(suites) == 1 else set()
+        if len(envs_of_one) == 1 or (envs_of_one and len(cells) > 1):
+            continue  # it is above, as the only row, or as the sum of its suite
+        name = "all" if len(timings) == 1 else f"all {timing}"
+        yield Block(name, in_order(_by_policy_id(found, TOTAL)), is_sum=True)
+
+
+def _by_policy_id(cells: Sequence[CellResults], suite: str) -> list[Group]:
+    found: dict[str, list[CellResults]] = {}
+    for cell in cells:
+        found.setdefault(cell.contender, []).append(cell)
+    return [group_of((policy_id, suite, TOTAL), group) for policy_id, group in found.items()]
+
+
+def _parts_with_a_rate(summary: Summary) -> Iterator[tuple[str, list[CellResults]]]:
+    """The cells of one chart each: all, and each suite; single tasks where a suite has no common rate."""
+    timings = by_timing(summary.results.cells)
+    for timing, cells in timings.items():
+        suffix = "" if len(timings) == 1 else f", {timing}"
+        suites: dict[str, list[CellResults]] = {}
+        for cell in cells:
+            suites.setdefault(cell.suite, []).append(cell)
+        if _all_have_rates(cells):
+            yield f"Success over training{suffix}", cells
+        for suite, found in suites.items() if len(suites) > 1 or not _all_have_rates(cells) else ():
+            name = suite or "the nameless suite"
+            if _all_have_rates(found):
+                yield f"{name}{suffix}", found
+                continue
+            for env in dict.fromkeys(cell.env for cell in found):
+                yield f"{name} {env}{suffix}", [cell for cell in found if cell.env == env]
+
+
+def _all_have_rates(cells: Sequence[CellResults]) -> bool:
+    return all(group.success_once.pooled for group in _by_policy_id(cells, ""))
+
+
+def _learning_curve(title: str, cells: Sequence[CellResults]) -> LearningCurve | None:
+    """A curve for each policy with several steps, a level line for each without; None if no policy has several."""
+    by_policy: dict[str, dict[int, list[CellResults]]] = {}
+    without_steps: dict[str, list[CellResults]] = {}
+    for cell in cells:
+        if cell.step is None:
+            without_steps.setdefault(cell.policy, []).append(cell)
+        else:
+            by_policy.setdefault(cell.policy, {}).setdefault(cell.step, []).append(cell)
+    swept = {policy: found for policy, found in by_policy.items() if len(found) > 1}
+    if not swept:
+        return None
+    lines = [
+        Series(policy, [(step, _rate(policy, group)) for step, group in sorted(found.items())])
+        for policy, found in swept.items()
+    ]
+    first, last = min(min(found) for found in swept.values()), max(max(found) for found in swept.values())
+    levels = []
+    for policy, group in without_steps.items():
+        rate = _rate(policy, group)
+        levels.append(Series(f"{policy} (no steps)", [(first, rate), (last, rate)], level=True))
+    rows: list[tuple[str, float | None, Rate]] = [(line.name, None, line.points[0][1]) for line in levels]
+    rows += [(line.name, step, rate) for line in lines for step, rate in line.points]
+    pushed = all("pushed_weights" in cell.settings for cell in cells if cell.step is not None)
+    of_axis = "version of the weights" if pushed else "training step"
+    return LearningCurve(rate_chart([*lines, *levels], of_axis, title), rows)
+
+
+def _rate(policy: str, cells: Sequence[CellResults]) -> Rate:
+    return group_of((policy, "", TOTAL), cells).success_once
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """A row of the table: success rate of A less that of B."""
+
+    a: str
+    b: str
+    suite: str
+    pairs: Pairs
+    interval: tuple[float, float]  # 95 %
+    adjusted: float  # p-value
+    decided: bool
+    glyph: Glyph
+
+
+@dataclass(frozen=True, slots=True)
+class ComparisonPart:
+    """The comparisons of the episodes with one timing."""
+
+    timing: str
+    shown: list[Difference]
+    by_suite: list[list[Difference]]  # of those shown, each with its suites
+    folded: list[Difference]
+
+
+@dataclass(frozen=True, slots=True)
+class Comparisons:
+    """The pairs of policy ids, the ones that are asked for most first."""
+
+    parts: list[ComparisonPart]
+    left_out: int  # pairs beyond those asked for most, where there are very many
+    several_timings: bool
+    reasons: list[str]  # why other pairs are not compared
+
+
+def compare_all(summary: Summary) -> Comparisons | None:
+    """All comparisons; None for a single policy id."""
+    if len(summary.results.contenders) < 2:
+        return None
+    reasons: list[str] = []
+    parts, left_out = [], 0
+    timings = by_timing(summary.results.cells)
+    for timing, cells in timings.items():
+        results = summary.results.among(cells)
+        every = list(itertools.combinations(results.contenders, 2))
+        wanted = every if len(every) <= MOST_COMPARED else _asked_first(summary, every)
+        left_out += len(every) - len(wanted)
+        pairs, why = comparable(results, wanted)
+        reasons += why
+        asked = _asked_first(summary, pairs)
+        found = comparisons(results, [*asked, *(one for one in _later_first(results, pairs) if one not in asked)])
+        shown, folded = (found, []) if len(found) <= MOST_PAIRS else (found[: len(asked)], found[len(asked) :])
+        by_suite = [[_difference(one, line) for line in one.suites] for one in shown if one.suites]
+        parts.append(ComparisonPart(timing, _totals(shown), by_suite, _totals(folded)))
+    return Comparisons(parts, left_out, len(timings) > 1, reasons)
+
+
+def real_time_gaps(summary: Summary) -> list[Difference]:
+    """A clock that runs on while the policy thinks (A) against one that waits (B); empty without such suites."""
+    return _totals(clock_gaps(summary.results))
+
+
+def _totals(found: Sequence[Comparison]) -> list[Difference]:
+    return [_difference(one, one.total) for one in found]
+
+
+def _difference(one: Comparison, line: Line) -> Difference:
+    decided, (low, high) = line.adjusted < ERROR_RATE, line.interval
+    glyph = difference_glyph(line.pairs.difference or 0.0, low, high, decided=decided)
+    return Difference(one.a, one.b, line.suite, line.pairs, (low, high), line.adjusted, decided, glyph)
+
+
+def _asked_first(summary: Summary, pairs: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
+    """Each checkpoint against the one before it, and of the policies' best ones the best against the others."""
+    cells = {cell.contender: (cell.policy, cell.step) for cell in summary.results.cells}
+    known = dict.fromkeys(_later_first(summary.results, pairs))
+    asked = [
+        (b, a)
+        for a, b in itertools.pairwise(summary.results.contenders)
+        if cells[a][0] == cells[b][0] and cells[a][1] is not None
+    ]  # the checkpoints of a policy are in the order of their steps
+    leaders: dict[str, str] = {}
+    for name in summary.best:
+        leaders.setdefault(cells[name][0], name)
+    best = summary.best[0]
+    asked += [pair for pair in known if best in pair and all(one in leaders.values() for one in pair)]
+    return [pair for pair in dict.fromkeys(asked) if pair in known]
+
+
+def _later_first(results: Results, pairs: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
+    """The pairs with the later checkpoint as A, so that what training brought is a gain."""
+    order = {name: number for number, name in enumerate(results.contenders)}
+    return [(a, b) if order[a] > order[b] else (b, a) for a, b in pairs]
