@@ -19,9 +19,9 @@ COMMIT = "0123456789abcdef0123456789abcdef01234567"
 NAMED = f"org/name@{COMMIT}"
 # What needs the family's packages, and comes before the checkpoint is looked for.
 BEFORE = {
-    "gr00t": ["vlagents_ray.policies.gr00t.network._use_checkout"],
+    "gr00t": ["vlagents_ray.policies.gr00t._use_checkout"],
     "octo": ["vlagents_ray.policies.octo.octo_model_class"],
-    "openpi": [f"vlagents_ray.policies.openpi.policy.{name}" for name in ("use_source", "train_config")],
+    "openpi": [f"vlagents_ray.policies.openpi.{name}" for name in ("use_source", "train_config")],
 }
 
 

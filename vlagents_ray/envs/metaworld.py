@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
-from vlagents_ray.envs.rendering.graphics import prepare_rendering
+from vlagents_ray.envs.graphics import prepare_rendering
 from vlagents_ray.envs.simulator import BenchmarkProtocol, MujocoCameras, SimulatorEnv, camera_names, require_cameras
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Obs

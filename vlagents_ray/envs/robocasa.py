@@ -18,8 +18,8 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
-from vlagents_ray.envs.rendering.render_probe import failing
-from vlagents_ray.envs.robosuite.base import RobosuiteEnv, importing_robosuite, seeded
+from vlagents_ray.envs.render_probe import failing
+from vlagents_ray.envs.robosuite import RobosuiteEnv, importing_robosuite, seeded
 from vlagents_ray.envs.simulator import BenchmarkProtocol
 from vlagents_ray.errors import ConfigError, EnvFailed
 from vlagents_ray.interface import Obs

@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.contract import ActionSpec
-from vlagents_ray.envs.maniskill import ManiSkill, factory
-from vlagents_ray.envs.maniskill.simulator import Moment, Simulator
-from vlagents_ray.envs.rendering.graphics import Renderer
+from vlagents_ray.envs.graphics import Renderer
+from vlagents_ray.envs.maniskill import ManiSkill
+from vlagents_ray.envs.maniskill.simulator import Moment, Simulator, registered_limit, step_limit
 from vlagents_ray.envs.simulator import SimulatorEnv
 from vlagents_ray.errors import ConfigError, EnvFailed
 from vlagents_ray.interface import Obs
@@ -106,8 +106,8 @@ class Simpler(SimulatorEnv):
         self.require_task(task)
         super().__init__(f"simpler/{task}", record_size=record_size)
         _find_assets(assets)
-        own_limit = factory.registered_limit(task)
-        self.max_steps = factory.step_limit(self._name, max_steps, own_limit)
+        own_limit = registered_limit(task)
+        self.max_steps = step_limit(self._name, max_steps, own_limit)
         self._deviations = [] if self.max_steps == own_limit else [f"max_steps is {max_steps}, not {own_limit}"]
         if shader != PROTOCOL.shader:
             self._deviations.append(f"shader is {shader}, not {PROTOCOL.shader}")

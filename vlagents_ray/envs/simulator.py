@@ -14,8 +14,8 @@ import numpy as np
 
 from vlagents_ray.contract import Contract
 from vlagents_ray.envs.base import EvalEnv, Options, one_row, require_known
-from vlagents_ray.envs.rendering.graphics import prepare_rendering
-from vlagents_ray.envs.rendering.render_probe import failing, without, without_egl
+from vlagents_ray.envs.graphics import prepare_rendering
+from vlagents_ray.envs.render_probe import failing, without, without_egl
 from vlagents_ray.errors import ConfigError, EnvFailed, NotReset
 from vlagents_ray.interface import HIGH_RES, Act, Obs
 from vlagents_ray.registry import require

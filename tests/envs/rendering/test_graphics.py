@@ -10,17 +10,17 @@ from pathlib import Path
 
 import pytest
 
-from vlagents_ray.envs.rendering import egl, graphics
-from vlagents_ray.envs.rendering.egl import EglDevice
-from vlagents_ray.envs.rendering.graphics import (
+from vlagents_ray.envs import graphics
+from vlagents_ray.envs.graphics import (
     EGL_DEVICE,
     GPUS,
+    EglDevice,
     Renderer,
     fitting,
     require_own,
 )
-from vlagents_ray.envs.rendering.render_probe import VulkanDevice, usable_devices
-from vlagents_ray.envs.robosuite.base import importing_robosuite
+from vlagents_ray.envs.render_probe import VulkanDevice, usable_devices
+from vlagents_ray.envs.robosuite import importing_robosuite
 from vlagents_ray.errors import ConfigError, EnvFailed
 
 LLVMPIPE = Renderer("llvmpipe (LLVM 15.0.6, 256 bits)", software=True, cuda=None)
@@ -51,7 +51,7 @@ def _nothing_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in (GPUS, EGL_DEVICE, "MUJOCO_GL", *graphics.VULKAN_DRIVERS):
         monkeypatch.setenv(name, "")  # so that what the test sets is undone
         monkeypatch.delenv(name)
-    monkeypatch.setattr(egl, "devices", lambda: TWO_GPUS)
+    monkeypatch.setattr(graphics, "devices", lambda: TWO_GPUS)
 
 
 def chosen(monkeypatch: pytest.MonkeyPatch, visible: str) -> str | None:
@@ -102,7 +102,7 @@ def test_the_nvidia_driver_that_sapien_names_by_itself_is_nobodys_wish(monkeypat
 
 
 def test_where_no_device_fits_none_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(egl, "devices", lambda: TWO_GPUS[:3])
+    monkeypatch.setattr(graphics, "devices", lambda: TWO_GPUS[:3])
     assert chosen(monkeypatch, "") is None
     assert fitting([EglDevice(0, software=True, cuda=None)], gpu=True) is None
 
@@ -150,8 +150,8 @@ def test_libero_without_a_gpu_and_without_software_says_so(monkeypatch: pytest.M
 
 DRAW = """
 from vlagents_ray.envs import make_env
-from vlagents_ray.envs.rendering import egl, graphics
-assert egl.drawing() is None
+from vlagents_ray.envs import graphics
+assert graphics.drawing() is None
 with make_env("gymnasium/Hopper-v5") as env:
     env.reset(seed=0)
     renderer = env.renderer()

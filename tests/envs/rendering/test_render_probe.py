@@ -6,9 +6,9 @@ import importlib.util
 from collections.abc import Iterator
 
 import pytest
+from vlagents_ray.envs.rendering import render_probe
 
 from vlagents_ray.envs.maniskill import ManiSkill
-from vlagents_ray.envs.rendering import render_probe
 
 needs_sapien = pytest.mark.skipif(importlib.util.find_spec("sapien") is None, reason="sapien is not installed")
 

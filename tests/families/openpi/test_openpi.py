@@ -173,7 +173,7 @@ def test_fast_says_what_openpis_own_policy_says_alone_and_in_company(
 
 
 def test_what_a_row_says_after_its_end_is_dropped() -> None:
-    from vlagents_ray.policies.openpi.models import JaxTokens
+    from vlagents_ray.policies.openpi import JaxTokens
 
     tokens = np.array([[5, 1, 7, 1], [5, 6, 7, 8]])
     np.testing.assert_array_equal(JaxTokens.ended(tokens), [[5, 1, 0, 0], [5, 6, 7, 8]])

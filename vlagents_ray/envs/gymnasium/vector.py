@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.contract import Contract
-from vlagents_ray.envs.batch import BatchEnv, Options, Steps, episodes_of, images_in_rows
+from vlagents_ray.envs.base import BatchEnv, Options, Steps, episodes_of, images_in_rows
 from vlagents_ray.envs.gymnasium.view import View, plain
 from vlagents_ray.errors import ConfigError, EnvFailed, NotReset, VLAgentsError
 from vlagents_ray.interface import Act, Obs

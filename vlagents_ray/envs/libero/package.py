@@ -16,9 +16,9 @@ import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
-from vlagents_ray.envs.rendering.graphics import prepare_rendering
-from vlagents_ray.envs.rendering.render_probe import failing
-from vlagents_ray.envs.robosuite.base import importing_robosuite
+from vlagents_ray.envs.graphics import prepare_rendering
+from vlagents_ray.envs.render_probe import failing
+from vlagents_ray.envs.robosuite import importing_robosuite
 from vlagents_ray.errors import EnvFailed, MissingDependency
 from vlagents_ray.registry import require
 

@@ -9,13 +9,10 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.contract import Contract
-from vlagents_ray.envs.base import BatchEnv, Options, Steps, one_row
-from vlagents_ray.envs.batch import episodes_of
-from vlagents_ray.envs.maniskill import factory
-from vlagents_ray.envs.maniskill.factory import INSTRUCTIONS
-from vlagents_ray.envs.maniskill.simulator import Simulator
-from vlagents_ray.envs.rendering.graphics import Renderer
-from vlagents_ray.envs.rendering.render_probe import render_probe, without
+from vlagents_ray.envs.base import BatchEnv, Options, Steps, episodes_of, one_row
+from vlagents_ray.envs.graphics import Renderer
+from vlagents_ray.envs.maniskill.simulator import INSTRUCTIONS, Simulator, registered_limit, sensor_settings, step_limit
+from vlagents_ray.envs.render_probe import render_probe, without
 from vlagents_ray.envs.simulator import SimulatorEnv
 from vlagents_ray.errors import ConfigError, NotReset
 from vlagents_ray.interface import Act, Obs
@@ -92,8 +89,8 @@ class ManiSkill(SimulatorEnv):
             record_size: Height and width of further views by the same cameras, for the record only.
         """
         super().__init__(f"maniskill/{task}", record_size=record_size)
-        self._own_limit = factory.registered_limit(task)
-        self.max_steps = factory.step_limit(self._name, max_steps, self._own_limit)
+        self._own_limit = registered_limit(task)
+        self.max_steps = step_limit(self._name, max_steps, self._own_limit)
         self._given_instruction = instruction
         self._reconfigure = reconfigure
         self._env = _simulator(
@@ -186,9 +183,9 @@ class ManiSkillBatch(BatchEnv):
             raise ConfigError(
                 f"maniskill/{task}: {sim_backend} simulates one environment, not {num_envs}; want physx_cuda"
             )
-        self._own_limit = factory.registered_limit(task)
+        self._own_limit = registered_limit(task)
         self.num_envs = num_envs
-        self.max_steps = factory.step_limit(f"maniskill/{task}", max_steps, self._own_limit)
+        self.max_steps = step_limit(f"maniskill/{task}", max_steps, self._own_limit)
         self._task = task
         self._instruction = instruction
         self._reconfigure = reconfigure
@@ -244,7 +241,7 @@ def _simulator(
     task: str, *, width: int = 224, height: int = 224, shader: str | None = None, **options: Any
 ) -> Simulator:
     name = f"maniskill/{task}"
-    sensors = factory.sensor_settings(name, width, height, shader)
+    sensors = sensor_settings(name, width, height, shader)
     return Simulator(name, task, obs_mode="rgb+state", sensors=sensors, **options)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.envs.batch import make_batch
+from vlagents_ray.envs.base import make_batch
 from vlagents_ray.errors import ConfigError, VLAgentsError
 from vlagents_ray.evaluate.artifacts.trajectory import Trajectory
 from vlagents_ray.evaluate.bundle.checks import Finding, recorded

@@ -7,7 +7,7 @@ import copy
 import itertools
 import logging
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from operator import attrgetter
@@ -34,7 +34,6 @@ from vlagents_ray.policies.base.model_inputs import (
     wanted_samples,
 )
 from vlagents_ray.policies.compilation import Compilation, quantize, require_whole
-from vlagents_ray.policies.determinism import require_deterministic
 from vlagents_ray.policies.loading import COMPILED_SIZES, LoadingReport, current_report, report_progress
 from vlagents_ray.validation import check_action
 
@@ -403,3 +402,36 @@ def _stacked(stated: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         name: _stacked(values) if isinstance(values[0], Mapping) else np.stack(values)
         for name, values in columns.items()
     }
+
+
+_INSTRUCTION = "go"
+_OTHER = "warm up"  # longer, as some models pad instructions to the longest one
+
+
+def require_deterministic(
+    chunks: Callable[[Sequence[Any]], list[np.ndarray]], example: Callable[[int, str], Any], size: int
+) -> None:
+    """Compare the chunks of one row alone, and in the first and in the last place among others.
+
+    Args:
+        chunks: Computes the chunks (H, D) of rows, at most `size` of them.
+        example: Makes a row with a seed and an instruction.
+        size: The size of all batches.
+
+    Raises:
+        ConfigError: They differ.
+    """
+
+    def others() -> list[Any]:
+        return [example(seed, _OTHER) for seed in range(1, size)]
+
+    def own() -> Any:
+        return example(0, _INSTRUCTION)
+
+    alone, first, last = chunks([own()])[0], chunks([own(), *others()])[0], chunks([*others(), own()])[-1]
+    if not (np.array_equal(alone, first) and np.array_equal(alone, last)):
+        error = max(float(np.abs(alone - one).max()) for one in (first, last))
+        raise ConfigError(
+            f"deterministic: a row's actions change by up to {error:.2g} with the others in a batch of {size}; want "
+            f"batch_sizes: [1] for this model on this device, or no `deterministic`"
+        )

@@ -19,15 +19,15 @@ EXPERTS: dict[str, str] = {
     "tabletop": "vlagents_ray.policies.experts.tabletop:TabletopExpert",
     "maniskill/PushCube-v1": "vlagents_ray.policies.experts.maniskill:PushCube",
     "maniskill/PickCube-v1": "vlagents_ray.policies.experts.maniskill:PickCube",
-    "aloha": "vlagents_ray.policies.experts.aloha:AlohaExpert",
-    "metaworld": "vlagents_ray.policies.experts.metaworld:MetaWorldExpert",
+    "aloha": "vlagents_ray.policies.experts.mujoco:AlohaExpert",
+    "metaworld": "vlagents_ray.policies.experts.mujoco:MetaWorldExpert",
     "pusht": "vlagents_ray.policies.experts.pusht:PushTExpert",
-    "rcs/pick": "vlagents_ray.policies.experts.rcs:RcsPick",
-    "gymnasium/FetchReach-v4": "vlagents_ray.policies.experts.fetch:FetchReach",
-    "gymnasium/FetchReachDense-v4": "vlagents_ray.policies.experts.fetch:FetchReach",
+    "rcs/pick": "vlagents_ray.policies.experts.mujoco:RcsPick",
+    "gymnasium/FetchReach-v4": "vlagents_ray.policies.experts.mujoco:FetchReach",
+    "gymnasium/FetchReachDense-v4": "vlagents_ray.policies.experts.mujoco:FetchReach",
     "libero": "vlagents_ray.policies.experts.osc_pose:LiberoExpert",
     "robosuite": "vlagents_ray.policies.experts.osc_pose:RobosuiteExpert",
-    "simpler": "vlagents_ray.policies.experts.simpler:SimplerExpert",
+    "simpler": "vlagents_ray.policies.experts.maniskill:SimplerExpert",
 }
 
 

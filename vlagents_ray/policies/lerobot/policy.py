@@ -29,12 +29,12 @@ from vlagents_ray.policies.base.model_inputs import (
 from vlagents_ray.policies.flow import OFFERED
 from vlagents_ray.policies.lerobot import checkpoint
 from vlagents_ray.policies.lerobot.config import LeRobotConfig
-from vlagents_ray.policies.lerobot.kinds.flow import Flow
-from vlagents_ray.policies.lerobot.kinds.kind import Kind
-from vlagents_ray.policies.lerobot.policy_types import (
+from vlagents_ray.policies.lerobot.kinds import (
     KINDS,
     MASKING,
     RESIZING,
+    Flow,
+    Kind,
 )
 from vlagents_ray.policies.lerobot.processors import STATE, Processors, own_processors
 from vlagents_ray.registry import require

@@ -15,7 +15,7 @@ from vlagents_ray.errors import ConfigError, MissingDependency
 from vlagents_ray.policies.base import Row
 from vlagents_ray.policies.base.model_code import CURE
 from vlagents_ray.policies.lerobot.config import LeRobotConfig
-from vlagents_ray.policies.lerobot.kinds.groot import groot_dataset, require_groot_statistics
+from vlagents_ray.policies.lerobot.kinds import groot_dataset, require_groot_statistics
 from vlagents_ray.policies.token_cache import cached_tokenizer
 from vlagents_ray.registry import require
 

@@ -20,8 +20,17 @@ from vlagents_ray.policies.adapters import Adapters
 from vlagents_ray.policies.base import Row, shared_frames
 from vlagents_ray.policies.base.model_inputs import camera_images, camera_specs, choose_cameras
 from vlagents_ray.policies.compilation import Compilation
-from vlagents_ray.policies.openvla.base import OFFERED, DecodedChunk, PreparedRow, PrismaticPolicy, middle, resized
-from vlagents_ray.policies.openvla.prismatic import Prismatic, PrismaticConfig, load_prismatic
+from vlagents_ray.policies.openvla.prismatic import (
+    OFFERED,
+    DecodedChunk,
+    PreparedRow,
+    Prismatic,
+    PrismaticConfig,
+    PrismaticPolicy,
+    load_prismatic,
+    middle,
+    resized,
+)
 from vlagents_ray.registry import require
 
 _IMAGE = "image"  # the model's only camera

@@ -24,8 +24,8 @@ from pathlib import Path
 from typing import Literal
 
 import vlagents_ray
-from vlagents_ray.envs.rendering import egl
-from vlagents_ray.envs.rendering.egl import EglDevice
+from vlagents_ray.envs import graphics
+from vlagents_ray.envs.graphics import EglDevice
 from vlagents_ray.errors import EnvFailed, VLAgentsError
 
 TIMEOUT_S = 60.0  # a software driver compiles its shaders in 3 to 10 s
@@ -232,7 +232,7 @@ def _require_contrast(image: object) -> None:
 
 def _main(api: str) -> None:
     device = _render_vulkan() if api == "vulkan" else _render_egl()
-    devices = [asdict(one) for one in egl.devices()] if api == "egl" else []
+    devices = [asdict(one) for one in graphics.devices()] if api == "egl" else []
     sys.stdout.write("\n" + json.dumps({"device": device, "devices": devices}) + "\n")
 
 

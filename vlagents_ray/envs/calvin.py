@@ -1,23 +1,36 @@
-"""A scene of CALVIN as an environment for evaluations; its simulator in PyBullet is made from a checkout."""
+"""CALVIN: five tasks one after another, told in words, at a table with drawer, sliding door, lights and blocks.
+
+with Calvin("D") as env:
+    obs, _ = env.reset(seed=0)
+    obs, reward, terminated, truncated, info = env.step(Act(action=np.array([0, 0, 0, 0, 0, 0, 1], np.float32)))
+"""
 
 from __future__ import annotations
 
+import ast
 import contextlib
+import copy
+import functools
 import importlib
 import io
+import itertools
+import logging
+import math
+import multiprocessing
 import os
 import sys
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
-from vlagents_ray.envs.calvin import chains
-from vlagents_ray.envs.rendering import egl
+from vlagents_ray.envs import graphics
 from vlagents_ray.envs.rendering.graphics import EGL_DEVICE, Renderer
 from vlagents_ray.envs.rendering.render_probe import EGL_CURE, without
 from vlagents_ray.envs.simulator import BenchmarkProtocol, SimulatorEnv
@@ -25,6 +38,99 @@ from vlagents_ray.errors import ConfigError, EnvFailed, NotReset
 from vlagents_ray.interface import Obs
 from vlagents_ray.ray_tools.git_state import code_in
 from vlagents_ray.registry import require
+
+NUMBER = 1000
+_LENGTH = 5
+_EVALUATION = Path("calvin_models/calvin_agent/evaluation")
+_FNV_PRIME = 0x01000193
+
+
+@dataclass(frozen=True, slots=True)
+class Chain:
+    """What an episode consists of."""
+
+    tasks: tuple[str, ...]  # CALVIN's names, e.g. "open_drawer"
+    robot: np.ndarray  # (15,) its `robot_obs`
+    scene: np.ndarray  # (24,) its `scene_obs`
+
+
+class Chains:
+    """The chains by their number, as `get_sequences(1000)` orders them.
+
+    CALVIN draws tasks at random until enough of the draws can be done one after another, for each of 192 initial states
+    with a seed of its own. That takes minutes for all; here the draws of a state are made when one of its chains is
+    asked for.
+    """
+
+    def __init__(self, checkout: Path) -> None:
+        """Read the code in `checkout`, a checkout of CALVIN."""
+        evaluation = checkout / _EVALUATION
+        utils = _definitions(
+            evaluation / "utils.py",
+            contextlib=contextlib,
+            logging=logging,
+            np=np,
+            pi=math.pi,
+            pyhash=SimpleNamespace(fnv1_32=lambda: fnv1_32),
+        )
+        self._state_of = utils["get_env_state_for_initial_condition"]
+        self._rules = rules = _definitions(
+            evaluation / "multistep_sequences.py",
+            ProcessPoolExecutor=_Places,
+            deepcopy=copy.deepcopy,
+            functools=functools,
+            logging=logging,
+            multiprocessing=multiprocessing,
+            np=np,
+            product=itertools.product,
+            temp_seed=utils["temp_seed"],
+        )
+        self._order: list[tuple[Mapping[str, Any], tuple[int, int]]] = rules["get_sequences"](NUMBER)
+        self._drawn: dict[int, tuple[np.random.RandomState, list[tuple[str, ...]]]] = {}
+
+    def __getitem__(self, number: int) -> Chain:
+        state, (seed, place) = self._order[number]
+        names, check = list(self._rules["tasks"]), self._rules["check_sequence"]
+        random, found = self._drawn.setdefault(seed, (np.random.RandomState(seed), []))
+        while len(found) <= place:
+            drawn = tuple(names[i] for i in random.permutation(len(names))[:_LENGTH])  # as `choice` without replacement
+            if check(state, drawn):
+                found.append(drawn)
+        return Chain(found[place], *self._state_of(state))
+
+
+class _Places:
+    """Stands for the pool of processes: in place of a state's chains it returns the seed and the place of each."""
+
+    def __init__(self, max_workers: int) -> None:
+        pass
+
+    def __enter__(self) -> _Places:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def map(self, _: Callable[..., Any], jobs: Iterable[tuple[Any, int, int]]) -> list[list[np.ndarray]]:
+        return [[np.array([seed, place]) for place in range(count)] for _, count, seed in jobs]
+
+
+def fnv1_32(text: str) -> int:
+    """Return pyhash's FNV-1, which begins with 0."""
+    found = 0
+    for byte in text.encode():
+        found = (found * _FNV_PRIME % 2**32) ^ byte
+    return found
+
+
+def _definitions(path: Path, **given: Any) -> dict[str, Any]:
+    """Execute a module of the checkout without its imports, whose names are `given`."""
+    tree = ast.parse(path.read_text(encoding="utf-8"), str(path))
+    tree.body = [node for node in tree.body if not isinstance(node, ast.Import | ast.ImportFrom)]
+    names = {"__name__": path.stem, **given}
+    exec(compile(tree, str(path), "exec"), names)  # noqa: S102 - it is the simulator's code, which is run in any case
+    return names
+
 
 VARIABLE = "CALVIN_SRC"
 _CURE = (
@@ -46,7 +152,7 @@ PROTOCOL = BenchmarkProtocol(
     success="the fifth task is solved, each within 360 steps and after the one before",
     begins="one of 1000 chains of five tasks, with its initial state; the arm in one pose",
     ends_on_success=True,
-    episodes=chains.NUMBER,
+    episodes=NUMBER,
 )
 _CAMERAS = {"static": CameraSpec(200, 200), "gripper": CameraSpec(84, 84)}
 _STATE = {  # parts of CALVIN's `robot_obs`, (15,), in order; its last number is the gripper's command
@@ -83,7 +189,7 @@ class Calvin(SimulatorEnv):
     suite = "calvin"
     _contract = CONTRACT
     several_tasks = True
-    init_states = chains.NUMBER
+    init_states = NUMBER
     _open: ClassVar[str | None] = None  # upstream's code takes the process's only simulation for its own
 
     def __init__(
@@ -115,8 +221,8 @@ class Calvin(SimulatorEnv):
             Calvin._open = self._name
             self._resources.callback(self._free, self._env)
             self._judge, self._words = read_tasks(self._checkout)
-            self._chains = chains.Chains(self._checkout)
-        self._chain: chains.Chain | None = None
+            self._chains = Chains(self._checkout)
+        self._chain: Chain | None = None
         self._done = 0  # tasks
         self._task_step = 0  # steps of the present task
         self._before: dict[str, Any] = {}  # CALVIN's information on the state in which the present task began
@@ -143,7 +249,11 @@ class Calvin(SimulatorEnv):
             find_checkout(None)
         except ConfigError as error:
             return str(error)
-        return None if egl.devices() else f"CALVIN finds no EGL device; {EGL_CURE}, or set the option renderer to tiny"
+        return (
+            None
+            if graphics.devices()
+            else f"CALVIN finds no EGL device; {EGL_CURE}, or set the option renderer to tiny"
+        )
 
     def renderer(self) -> Renderer | None:
         return super().renderer() if self._renderer == "egl" else None
@@ -216,7 +326,7 @@ class Calvin(SimulatorEnv):
             "tasks": list(self._playing().tasks),
         }
 
-    def _playing(self) -> chains.Chain:
+    def _playing(self) -> Chain:
         if self._chain is None:
             raise NotReset(f"{self._name}: step before reset; call reset(seed=...) first")
         return self._chain

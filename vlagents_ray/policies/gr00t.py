@@ -1,4 +1,4 @@
-"""The model and the processor of a GR00T checkpoint, with NVIDIA's code."""
+"""GR00T N1.6 and N1.7 with NVIDIA's own code, Isaac-GR00T."""
 
 from __future__ import annotations
 
@@ -8,22 +8,154 @@ import importlib.util
 import json
 import os
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
 
-from vlagents_ray.errors import ConfigError
-from vlagents_ray.policies.base import ModelConfig
+from vlagents_ray.contract import ActionSpec, Contract, StateSpec
+from vlagents_ray.errors import ConfigError, PolicyFailed
+from vlagents_ray.interface import Obs
+from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row
 from vlagents_ray.policies.base.accelerator import ensure_torchvision, torch_device, torch_dtype
 from vlagents_ray.policies.base.checkpoint import SavedTensors, find_checkpoint, require_loaded
 from vlagents_ray.policies.base.model_code import remote_code, use_source
-from vlagents_ray.policies.gr00t.embodiment import CONFIG, Embodiment
+from vlagents_ray.policies.base.model_inputs import (
+    GRIPPER,
+    camera_images,
+    camera_specs,
+    choose_cameras,
+    needs_gripper,
+    state_specs,
+    state_vector,
+)
 from vlagents_ray.registry import require
+
+CONFIG, STATISTICS = "processor_config.json", "statistics.json"
+_CONVERTED = {"RELATIVE": False, "DELTA": True}  # representations of actions -> whether decoded ones are deltas
+_SPACES = {"NON_EEF": "joint", "EEF": "ee_pose"}
+_ROTATIONS = {"XYZ_ROT6D": "rot6d", "XYZ_ROTVEC": "axis_angle"}
+_CURE = "save the checkpoint's processor with its dataset's statistics, as GR00T's training does"
+
+
+@dataclass(frozen=True)
+class Embodiment:
+    """The inputs and the actions of one robot of a checkpoint."""
+
+    value: str  # its name, by which GR00T's code finds it, as it does by that of its own `EmbodimentTag`
+    cameras: tuple[str, ...]
+    state: Mapping[str, int]  # groups and their widths, in the model's order
+    action: Mapping[str, int]
+    moments: Mapping[str, tuple[int, ...]]  # of "video" and "state": the observations read, 0 the newest, -1 before it
+    horizon: int  # rows of a chunk
+    spec: ActionSpec
+
+    @property
+    def history(self) -> int:
+        """The number of consecutive observations that the model reads from."""
+        return 1 - min(min(moments, default=0) for moments in self.moments.values())
+
+    @classmethod
+    def of(cls, folder: Path, name: str | None) -> Embodiment:
+        """Read an embodiment from the folder of a processor.
+
+        Args:
+            folder: With `processor_config.json` and `statistics.json`.
+            name: The embodiment's; None: the only one.
+
+        Raises:
+            ConfigError: There is no such embodiment, or its statistics are incomplete.
+        """
+        try:
+            settings = json.loads((folder / CONFIG).read_text(encoding="utf-8"))["processor_kwargs"]
+            statistics = json.loads((folder / STATISTICS).read_text(encoding="utf-8"))
+            configs = settings["modality_configs"]
+        except FileNotFoundError as error:
+            have = sorted(one.name for one in folder.iterdir())
+            raise ConfigError(
+                f"checkpoint {folder}: has no {Path(error.filename).name}, has {have}; {_CURE}"
+            ) from error
+        except (ValueError, KeyError, TypeError) as error:
+            raise ConfigError(
+                f"checkpoint {folder}: {CONFIG} and {STATISTICS} are not those of GR00T's processor "
+                f"({type(error).__name__}: {error}); {_CURE}"
+            ) from error
+        known = sorted(set(configs) & set(statistics))
+        chosen = name if name is not None else known[0] if len(known) == 1 else None
+        if chosen is None or chosen not in known:
+            others = sorted(set(configs) - set(statistics))
+            raise ConfigError(
+                f"embodiment: got {name!r}, want one of {known}"
+                f"{f'; {others} have no statistics in this checkpoint' if others else ''}"
+            )
+        config, numbers = configs[chosen], statistics[chosen]
+        names = ("q01", "q99") if settings.get("use_percentiles") else ("min", "max")
+        widths = {
+            kind: {group: _width(folder, numbers, kind, group, names) for group in config[kind]["modality_keys"]}
+            for kind in ("state", "action")
+        }
+        return cls(
+            chosen,
+            tuple(config["video"]["modality_keys"]),
+            widths["state"],
+            widths["action"],
+            {kind: tuple(config[kind]["delta_indices"]) for kind in ("video", "state")},
+            len(config["action"]["delta_indices"]),
+            _action(
+                config["action"].get("action_configs") or (),
+                sum(widths["action"].values()),
+                converted=bool(settings.get("use_relative_action")),
+            ),
+        )
+
+    def require_fits(self, config: Any) -> None:
+        """Raise `ConfigError` unless a model of this `config` has room for the state, the actions and their rows."""
+        for what, got, most in (
+            ("state", sum(self.state.values()), config.max_state_dim),
+            ("action", sum(self.action.values()), config.max_action_dim),
+            ("chunk", self.horizon, config.action_horizon),
+        ):
+            if got > most:
+                raise ConfigError(
+                    f"embodiment {self.value!r}: its {what} has {got} {'rows' if what == 'chunk' else 'numbers'}, the "
+                    f"model at most {most}: is the processor that of another checkpoint?"
+                )
+
+
+def _width(folder: Path, numbers: Mapping[str, Any], kind: str, group: str, names: tuple[str, str]) -> int:
+    """Return the width of a group of the state or of actions, whose bounds are finite."""
+    bounds = [np.asarray(numbers.get(kind, {}).get(group, {}).get(name, ()), np.float64) for name in names]
+    if bounds[0].ndim != 1 or not bounds[0].size or bounds[0].shape != bounds[1].shape:
+        raise ConfigError(
+            f"checkpoint {folder}: {STATISTICS} has no {list(names)} of {kind} {group!r}, has those of "
+            f"{sorted(numbers.get(kind, {}))}; without them its numbers have no units: {_CURE}"
+        )
+    if not np.isfinite(bounds).all():
+        raise ConfigError(f"checkpoint {folder}: {list(names)} of {kind} {group!r} are not all finite; {_CURE}")
+    return int(bounds[0].size)
+
+
+def _action(groups: Any, dim: int, *, converted: bool) -> ActionSpec:
+    """Describe the actions by their relative groups.
+
+    Checkpoints call everything else absolute, displacements such as LIBERO's as well, so that nothing is said of it.
+    GR00T converts relative groups to absolute ones if the processor says `use_relative_action`.
+    """
+    stated = [group for group in groups if converted and group["rep"] in _CONVERTED]
+    deltas = {_CONVERTED[group["rep"]] for group in stated}
+    spaces = {_SPACES.get(group["type"]) for group in stated}
+    rotations = {_ROTATIONS.get(group["format"]) for group in stated}
+    return ActionSpec(
+        dim=dim,
+        delta=deltas.pop() if len(deltas) == 1 else None,
+        space=spaces.pop() if len(spaces) == 1 else None,
+        rotation=rotations.pop() if len(rotations) == 1 else None,  # type: ignore[arg-type]
+    )
 
 
 class Gr00tConfig(ModelConfig):
@@ -285,3 +417,119 @@ def packed_attention(
         return attention(*rows, scale=scaling).transpose(1, 2).flatten(0, 1)[None], None
     parts = zip(*(one.split(list(seq_len_list), dim=2) for one in (query, key, value)), strict=True)
     return require("torch").cat([attention(*part, scale=scaling) for part in parts], dim=2).transpose(1, 2), None
+
+
+USUAL_CAMERAS = {"image": "front", "wrist_image": "wrist"}  # of LIBERO; others have the checkpoint's names
+GRIPPER_QPOS = "gripper_qpos"  # the part that a group `gripper` of several numbers is, as in LIBERO
+
+
+@dataclass(frozen=True)
+class SeenByGr00t:
+    """An observation by the embodiment's names, and the model's inputs of it if it is all that the model reads."""
+
+    images: dict[str, np.ndarray]  # (H, W, 3) uint8
+    state: dict[str, np.ndarray]  # (D,) float32
+    inputs: dict[str, Any] | None = None
+
+
+class Gr00t(ModelPolicy):
+    """The policy of a GR00T checkpoint, with one call of the model for many sessions."""
+
+    Config: ClassVar[type] = Gr00tConfig
+    config: Gr00tConfig
+    model: Gr00tNetwork | None
+
+    @property
+    def history(self) -> int:
+        return 1 if self.model is None else self.model.embodiment.history
+
+    @property
+    def state_dim(self) -> int | None:
+        """The length of the embodiment's state; None before the checkpoint is loaded."""
+        return None if self.model is None else sum(self.model.embodiment.state.values())
+
+    @property
+    def contract(self) -> Contract:
+        """The contract of the embodiment; before the checkpoint is loaded it states only the instruction."""
+        if self.model is None:
+            return Contract(instruction=True)
+        robot = self.model.embodiment
+        parts = self._parts(robot)
+        own = {part: StateSpec(width) for part, width in parts.items() if part != GRIPPER}
+        return Contract(
+            cameras=camera_specs(self._cameras(robot)),
+            state=own if self.config.state is None else state_specs(list(parts), self.state_dim),
+            gripper=needs_gripper(list(parts)),
+            instruction=True,
+            action=robot.spec,
+            chunk=self.chunk(robot.horizon),
+            history=self.history,
+        )
+
+    def load(self) -> Gr00tNetwork:
+        """Read the checkpoint; raises `ConfigError` for settings that do not fit it."""
+        network = Gr00tNetwork.load(self.config)
+        self._cameras(network.embodiment)
+        return network
+
+    def perceive(self, obs: Obs) -> SeenByGr00t:
+        """Return the images and the state by the embodiment's names, and, without a history, the model's inputs."""
+        network = self._loaded()
+        robot = network.embodiment
+        images = {name: image.copy() for name, image in camera_images(obs, self._cameras(robot)).items()}
+        vector = state_vector(obs, list(self._parts(robot)), self.state_dim)
+        ends = np.cumsum([0, *robot.state.values()])
+        state = {group: vector[a:b] for group, (a, b) in zip(robot.state, pairwise(ends), strict=True)}
+        if self.history > 1:
+            return SeenByGr00t(images, state)
+        moments = (len(robot.moments["video"]), len(robot.moments["state"]))
+        inputs = network.inputs([images] * moments[0], [state] * moments[1], self._begun().instruction)
+        return SeenByGr00t(images, state, inputs)
+
+    def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
+        """Compute the chunks of all rows whose observations GR00T's processor accepts."""
+        read = [self._inputs(row) for row in rows]
+        places = [place for place, one in enumerate(read) if not isinstance(one, Exception)]
+        found: list[Prediction | Exception] = list(read)  # type: ignore[arg-type]  # what is no error is replaced
+        if places:
+            chunks = self._loaded().chunks(
+                [rows[place].rng for place in places],
+                [read[place] for place in places],  # type: ignore[misc]
+                alike=self.config.deterministic,
+            )
+            for place, chunk in zip(places, chunks, strict=True):
+                found[place] = Prediction(chunk)
+        return found
+
+    def _inputs(self, row: Row) -> dict[str, Any] | Exception:
+        """Return the model's inputs of a row, or an exception for its session."""
+        newest = row.frames[-1]
+        if newest.inputs is not None:
+            return newest.inputs  # type: ignore[no-any-return]
+        network, frames = self._loaded(), row.history(self.history)
+        moments = network.embodiment.moments
+        try:
+            return network.inputs(
+                [frames[moment - 1].images for moment in moments["video"]],
+                [frames[moment - 1].state for moment in moments["state"]],
+                row.instruction,
+            )
+        except Exception as error:  # noqa: BLE001 - returned to the session of the observation
+            return error
+
+    def _parts(self, robot: Embodiment) -> dict[str, int | None]:
+        """Return the parts of the state that make up the model's, with their widths where these are known."""
+        if self.config.state is not None:
+            return dict.fromkeys(self.config.state)
+        return {
+            GRIPPER_QPOS if group == GRIPPER and width > 1 else group: width for group, width in robot.state.items()
+        }
+
+    def _cameras(self, robot: Embodiment) -> dict[str, str]:
+        usual = {name: USUAL_CAMERAS.get(name, name) for name in robot.cameras}
+        return choose_cameras(self.config.cameras, usual, list(robot.cameras))
+
+    def _loaded(self) -> Gr00tNetwork:
+        if self.model is None:
+            raise PolicyFailed("gr00t: act before initialize; the checkpoint is not loaded")
+        return self.model
