@@ -19,7 +19,7 @@ import numpy as np
 from pydantic import Field
 
 from vlagents_ray.contract import ActionSpec, Contract, StateSpec
-from vlagents_ray.errors import ConfigError, PolicyFailed
+from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row
 from vlagents_ray.policies.base.accelerator import ensure_torchvision, torch_device, torch_dtype
@@ -474,7 +474,7 @@ class Gr00t(ModelPolicy):
 
     def perceive(self, obs: Obs) -> SeenByGr00t:
         """Return the images and the state by the embodiment's names, and, without a history, the model's inputs."""
-        network = self._loaded()
+        network = self.loaded()
         robot = network.embodiment
         images = {name: image.copy() for name, image in camera_images(obs, self._cameras(robot)).items()}
         vector = state_vector(obs, list(self._parts(robot)), self.state_dim)
@@ -492,7 +492,7 @@ class Gr00t(ModelPolicy):
         places = [place for place, one in enumerate(read) if not isinstance(one, Exception)]
         found: list[Prediction | Exception] = list(read)  # type: ignore[arg-type]  # what is no error is replaced
         if places:
-            chunks = self._loaded().chunks(
+            chunks = self.loaded().chunks(
                 [rows[place].rng for place in places],
                 [read[place] for place in places],  # type: ignore[misc]
                 alike=self.config.deterministic,
@@ -506,7 +506,7 @@ class Gr00t(ModelPolicy):
         newest = row.frames[-1]
         if newest.inputs is not None:
             return newest.inputs  # type: ignore[no-any-return]
-        network, frames = self._loaded(), row.history(self.history)
+        network, frames = self.loaded(), row.history(self.history)
         moments = network.embodiment.moments
         try:
             return network.inputs(
@@ -528,8 +528,3 @@ class Gr00t(ModelPolicy):
     def _cameras(self, robot: Embodiment) -> dict[str, str]:
         usual = {name: USUAL_CAMERAS.get(name, name) for name in robot.cameras}
         return choose_cameras(self.config.cameras, usual, list(robot.cameras))
-
-    def _loaded(self) -> Gr00tNetwork:
-        if self.model is None:
-            raise PolicyFailed("gr00t: act before initialize; the checkpoint is not loaded")
-        return self.model

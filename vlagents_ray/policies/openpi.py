@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import Field
 
 from vlagents_ray.contract import ActionSpec, Contract, StateSpec
-from vlagents_ray.errors import ConfigError, InvalidObservation, PolicyFailed
+from vlagents_ray.errors import ConfigError, InvalidObservation
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row, shared_frames
 from vlagents_ray.policies.base.accelerator import jax_device, torch_device
@@ -248,6 +248,17 @@ _END = 1  # PaliGemma's end of sequence
 _LISTED = 5
 
 
+@dataclass(frozen=True, slots=True)
+class SampleBatch:
+    """What a model computes B chunks from."""
+
+    inputs: dict[str, Any]  # of P observations
+    noise: np.ndarray  # of each row
+    guide: Guide | None  # of the rows, if any follows a plan
+    owners: Sequence[int]  # the observation of each row; 0, 1, … unless the model `shares`
+    random: RandomSteps | None  # the result of `random_steps` for the rows
+
+
 class OpenPiModel(abc.ABC):
     """The interface of a model for the policy."""
 
@@ -255,23 +266,8 @@ class OpenPiModel(abc.ABC):
     shares = False  # whether several rows can be of one observation
 
     @abc.abstractmethod
-    def sample(
-        self,
-        batch: dict[str, Any],
-        noise: np.ndarray,
-        guide: Guide | None,
-        owners: Sequence[int],
-        random: RandomSteps | None,
-    ) -> np.ndarray:
-        """Compute actions (B, H, action_dim), or tokens (B, T).
-
-        Args:
-            batch: The inputs of P observations.
-            noise: That of each of the B rows.
-            guide: Of the rows, if any follows a plan.
-            owners: The observation of each row; 0, 1, … unless the model `shares`.
-            random: The result of `random_steps` for the rows.
-        """
+    def sample(self, batch: SampleBatch) -> np.ndarray:
+        """Compute actions (B, H, action_dim), or tokens (B, T)."""
 
     def random_steps(self, rows: Sequence[Row], noise_level: float) -> RandomSteps | None:
         """Return the random steps of rows of which something is wanted; None if there are none."""
@@ -330,23 +326,17 @@ class JaxFlow(OpenPiModel):
         self._encode, self._follow = jax.jit(encode), jax.jit(follow)
         self.noise_shape = (network.action_horizon, network.action_dim)
 
-    def sample(
-        self,
-        batch: dict[str, Any],
-        noise: np.ndarray,
-        guide: Guide | None,
-        owners: Sequence[int],
-        random: RandomSteps | None,
-    ) -> np.ndarray:
+    def sample(self, batch: SampleBatch) -> np.ndarray:
         """Compute actions (B, H, action_dim) float32; a batch without plans runs the same program without guidance."""
-        jax = require("jax")
+        jax, guide = require("jax"), batch.guide
         if guide is None:
-            none = np.zeros((*noise.shape[:2], 1), np.float32)
-            guide = Guide(np.zeros_like(noise), none, none)
-        batch, noise, plan = jax.device_put((batch, noise, (guide.plan, guide.frozen, guide.weight)), self._device)
-        encoded = self._encode(self._state, batch)
-        if list(owners) != list(range(len(encoded[0]))):
-            encoded = jax.tree.map(lambda one: one[np.asarray(owners)], encoded)
+            none = np.zeros((*batch.noise.shape[:2], 1), np.float32)
+            guide = Guide(np.zeros_like(batch.noise), none, none)
+        given = batch.inputs, batch.noise, (guide.plan, guide.frozen, guide.weight)
+        inputs, noise, plan = jax.device_put(given, self._device)
+        encoded = self._encode(self._state, inputs)
+        if list(batch.owners) != list(range(len(encoded[0]))):
+            encoded = jax.tree.map(lambda one: one[np.asarray(batch.owners)], encoded)
         return np.asarray(self._follow(self._state, encoded, noise, plan), np.float32)  # waits for the device
 
 
@@ -365,17 +355,10 @@ class JaxTokens(OpenPiModel):
 
         self._sample = jax.jit(sample)
 
-    def sample(
-        self,
-        batch: dict[str, Any],
-        noise: np.ndarray,
-        guide: Guide | None,
-        owners: Sequence[int],
-        random: RandomSteps | None,
-    ) -> np.ndarray:
+    def sample(self, batch: SampleBatch) -> np.ndarray:
         """Decode tokens, (B, T) int32."""
         jax = require("jax")
-        return self.ended(np.asarray(self._sample(self._state, jax.device_put(batch, self._device)), np.int32))
+        return self.ended(np.asarray(self._sample(self._state, jax.device_put(batch.inputs, self._device)), np.int32))
 
     @staticmethod
     def ended(tokens: np.ndarray) -> np.ndarray:
@@ -398,25 +381,18 @@ class TorchFlow(OpenPiModel):
         self._steps, self._limit = config.steps or _STEPS, config.guidance
         self.noise_shape: tuple[int, int] = (network.config.action_horizon, network.config.action_dim)
 
-    def sample(
-        self,
-        batch: dict[str, Any],
-        noise: np.ndarray,
-        guide: Guide | None,
-        owners: Sequence[int],
-        random: RandomSteps | None,
-    ) -> np.ndarray:
+    def sample(self, batch: SampleBatch) -> np.ndarray:
         """Compute actions (B, H, action_dim) float32."""
         jax, torch = require("jax"), require("torch")
-        observation = _observation(jax.tree.map(self._convert, batch))
-        start, changes = self._convert(noise), list[Change]()
-        if guide is not None:
-            changes.append(guide.to(self._convert).change(start, steps=self._steps, limit=self._limit))
-        if random is not None:
-            changes.append(random.change)
+        observation = _observation(jax.tree.map(self._convert, batch.inputs))
+        start, changes = self._convert(batch.noise), list[Change]()
+        if batch.guide is not None:
+            changes.append(batch.guide.to(self._convert).change(start, steps=self._steps, limit=self._limit))
+        if batch.random is not None:
+            changes.append(batch.random.change)
         with torch.inference_mode():
             inputs = self._network._preprocess_observation(observation, train=False)
-            flow = self._passes.sample(*inputs, noise=start, owners=owners, steps=self._steps, changes=changes)
+            flow = self._passes.sample(*inputs, noise=start, owners=batch.owners, steps=self._steps, changes=changes)
         return np.asarray(flow.float().cpu().numpy())
 
     def random_steps(self, rows: Sequence[Row], noise_level: float) -> RandomSteps | None:
@@ -575,7 +551,7 @@ class OpenPi(ModelPolicy):
 
     def perceive(self, obs: Obs) -> SeenObs:
         """Convert the observation to openpi's form, and by openpi's transforms to the model's inputs."""
-        loaded = self._loaded()
+        loaded = self.loaded()
         seen = loaded.robot.read(obs)
         return SeenObs(seen, loaded.transforms.read(seen, self._begun().instruction))
 
@@ -588,7 +564,7 @@ class OpenPi(ModelPolicy):
         # A valid row stands in for an invalid one, so that the number of rows remains a compiled one.
         spare = replace(spare, row=replace(spare.row, want=()))
         flows, stated = self._sample([spare if isinstance(one, Exception) else one for one in read])
-        actions = self._loaded().transforms.actions
+        actions = self.loaded().transforms.actions
         return [
             one
             if isinstance(one, Exception)
@@ -602,13 +578,13 @@ class OpenPi(ModelPolicy):
         The observations are padded to one of `batch_sizes`, as rows are.
         """
         each = list(range(len(rows)))
-        firsts, owners = shared_frames(rows) if self._loaded().model.shares else (each, each)
+        firsts, owners = shared_frames(rows) if self.loaded().model.shares else (each, each)
         size = next((size for size in self.config.batch_sizes or () if size >= len(firsts)), len(firsts))
         return firsts + firsts[-1:] * (size - len(firsts)), owners
 
     def _planned(self, row: Row) -> TransformedRow | Exception:
         """Return the row with its leftover actions in the model's units, or an exception for its session."""
-        loaded, seen = self._loaded(), row.frames[-1]
+        loaded, seen = self.loaded(), row.frames[-1]
         try:
             if row.leftover is not None:
                 row = replace(row, leftover=loaded.transforms.plan(seen.raw, row.instruction, row.leftover))
@@ -618,14 +594,15 @@ class OpenPi(ModelPolicy):
 
     def _sample(self, ready: Sequence[TransformedRow]) -> tuple[np.ndarray, dict[int, dict[str, Any]]]:
         """Return what the model computes for rows, and what is wanted of them, by their places."""
-        model, rows = self._loaded().model, [one.row for one in ready]
+        model, rows = self.loaded().model, [one.row for one in ready]
         firsts, owners = self._shared(rows)
         batch = require("jax").tree.map(lambda *leaves: np.stack(leaves), *(ready[i].inputs for i in firsts))
         shape = model.noise_shape
         guide = None if shape is None else Guide.of(rows, *shape)
         random = model.random_steps(rows, self.config.noise_level)
-        flows = model.sample(batch, np.stack([one.noise for one in ready]), guide, owners, random)
-        dim = self._loaded().robot.action.dim
+        noise = np.stack([one.noise for one in ready])
+        flows = model.sample(SampleBatch(batch, noise, guide, owners, random))
+        dim = self.loaded().robot.action.dim
         return flows, {} if random is None else random.stated(self.config.execute, dim)
 
     def _folder(self) -> Path:
@@ -633,11 +610,6 @@ class OpenPi(ModelPolicy):
         if _REMOTE not in name:
             return find_checkpoint(name, step, needs=["assets"])
         return find_checkpoint(str(require("openpi.shared.download").maybe_download(name.replace(STEP, str(step)))))
-
-    def _loaded(self) -> LoadedOpenPi:
-        if self.model is None:
-            raise PolicyFailed("openpi: act before initialize; the checkpoint is not loaded")
-        return self.model
 
 
 SOURCE = "OPENPI_SRC"  # the variable that names a checkout; PyPI's "openpi" is another project

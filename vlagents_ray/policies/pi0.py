@@ -17,7 +17,7 @@ import numpy as np
 from pydantic import Field
 
 from vlagents_ray.contract import ActionSpec, Contract
-from vlagents_ray.errors import ConfigError, InvalidObservation, PolicyFailed
+from vlagents_ray.errors import ConfigError, InvalidObservation
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row, shared_frames
 from vlagents_ray.policies.base.accelerator import ensure_torchvision, torch_device, torch_dtype
@@ -145,7 +145,7 @@ class Pi0(ModelPolicy):
             saved = dict(json.loads(file.read_text(encoding="utf-8"))) if file.is_file() else {}
         except (TypeError, ValueError) as error:
             raise ConfigError(f"{file}: is no processor's config ({error}); copy it again") from error
-        base = {name: list(getattr(self._loaded().processor, name)) for name in _STATISTICS}
+        base = {name: list(getattr(self.loaded().processor, name)) for name in _STATISTICS}
         other = [name for name in _STATISTICS if saved.get(name) not in (None, base[name])]
         if other:
             raise ConfigError(
@@ -158,7 +158,7 @@ class Pi0(ModelPolicy):
 
         It is called on several threads, and so never uses the tokenizer: padding is a state of that.
         """
-        processor = self._loaded().processor
+        processor = self.loaded().processor
         torch, side = require("torch"), processor.image_processor.pad_size
         found = camera_images(obs, self.cameras)
         images = [resize_with_pad(found[name], side["height"], side["width"]) for name in self.cameras]
@@ -199,7 +199,7 @@ class Pi0(ModelPolicy):
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction]:
         """Compute the chunks of all rows with one flow, and the images and instructions of each observation once."""
-        model, torch = self._loaded(), require("torch")
+        model, torch = self.loaded(), require("torch")
         shape = (model.network.config.chunk_size, model.network.config.max_action_dim)
 
         def convert(array: np.ndarray) -> Any:
@@ -217,16 +217,11 @@ class Pi0(ModelPolicy):
 
     @property
     def _steps(self) -> int:
-        return int(self.config.steps or self._loaded().network.config.num_inference_steps)
-
-    def _loaded(self) -> LoadedPi0:
-        if self.model is None:
-            raise PolicyFailed("pi0: act before initialize; the checkpoint is not loaded")
-        return self.model
+        return int(self.config.steps or self.loaded().network.config.num_inference_steps)
 
     def _inputs(self, rows: Sequence[Row]) -> Mapping[str, Any]:
         """Return tokens, images and states on the device."""
-        model, torch, frames = self._loaded(), require("torch"), [row.frames[-1] for row in rows]
+        model, torch, frames = self.loaded(), require("torch"), [row.frames[-1] for row in rows]
         batch = {key: torch.cat([frame[key] for frame in frames]) for key in frames[0]}
         return {
             key: value.to(model.device, model.dtype if value.is_floating_point() else None, non_blocking=True)
@@ -235,7 +230,7 @@ class Pi0(ModelPolicy):
 
     def _velocity(self, rows: Sequence[Row]) -> Callable[[Any, float], Any]:
         """Return the flow's velocity for the rows; what the samples of a session see is encoded once."""
-        model = self._loaded()
+        model = self.loaded()
         firsts, owners = shared_frames(rows)
         inputs = self._inputs([rows[i] for i in firsts])
         shared = owners if len(firsts) < len(rows) else None

@@ -51,22 +51,23 @@ class Detection:
     mask: np.ndarray | None = None  # (H, W) bool, from a detector that provides masks; else the box is segmented
 
 
-class Detector(Protocol):
-    """Detects objects by phrases."""
+class Part(Protocol):
+    """A part, which is made with an instance of its `Config`."""
 
     def load(self) -> None:
-        """Read the weights."""
+        """Read the weights; raises `ConfigError` if some are missing."""
+
+
+class Detector(Part, Protocol):
+    """Detects objects by phrases."""
 
     def detect(self, images: Images, phrases: Sequence[Sequence[str]]) -> list[list[Detection]]:
         """Return the objects of `phrases[i]` on `images[i]`, the best first."""
         ...
 
 
-class Segmenter(Protocol):
+class Segmenter(Part, Protocol):
     """Computes masks of objects."""
-
-    def load(self) -> None:
-        """Read the weights."""
 
     def segment(self, images: Images, boxes: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Return the mask of the object in each box: (N, H, W) bool for boxes (N, 4) px.
@@ -80,11 +81,8 @@ class Segmenter(Protocol):
         ...
 
 
-class Selector(Protocol):
+class Selector(Part, Protocol):
     """Selects the gripper's fingers."""
-
-    def load(self) -> None:
-        """Read the weights."""
 
     def select(self, images: Images, regions: Sequence[np.ndarray]) -> list[list[int]]:
         """Return the indices of the regions (M, H, W) of each image that make up the gripper.
@@ -94,11 +92,8 @@ class Selector(Protocol):
         ...
 
 
-class Tracker(Protocol):
+class Tracker(Part, Protocol):
     """Tracks segments from frame to frame."""
-
-    def load(self) -> None:
-        """Read the weights."""
 
     def begin(self, images: Images, masks: Sequence[np.ndarray]) -> list[Any]:
         """Return a memory of each image's segments, (N, H, W) bool with N >= 1, from which to track them."""
@@ -133,17 +128,35 @@ class PretrainedConfig(BaseModel, extra="forbid"):
     dtype: DType = Field(default="float32", description="of the weights")
 
 
-def load_pretrained(model: str, processor: str, config: PretrainedConfig) -> tuple[Any, Any]:
-    """Load a model and a processor by their class names in transformers.
+class Pretrained:
+    """A part with a model and a processor of transformers."""
 
-    Raises `ConfigError` if anything is missing.
-    """
-    ensure_torchvision()
-    transformers = require("transformers")
-    path = find_checkpoint(config.checkpoint, needs=("config.json", "*.safetensors", "*processor_config.json"))
-    device = torch_device(config.device)
-    loaded = from_pretrained(getattr(transformers, model), path, dtype=torch_dtype(config.dtype, device))
-    return loaded.to(device).eval(), getattr(transformers, processor).from_pretrained(path)
+    classes: ClassVar[tuple[str, str]]  # of the model and of the processor
+
+    def __init__(self, config: Any) -> None:
+        self._config = config
+        self._model: Any = None
+        self._processor: Any = None
+
+    def load(self) -> None:
+        """Read the weights; raises `ConfigError` if some are missing."""
+        ensure_torchvision()
+        transformers, config = require("transformers"), self._config
+        model, processor = (getattr(transformers, name) for name in self.classes)
+        path = find_checkpoint(config.checkpoint, needs=("config.json", "*.safetensors", "*processor_config.json"))
+        device = torch_device(config.device)
+        loaded = from_pretrained(model, path, dtype=torch_dtype(config.dtype, device))
+        self._model, self._processor = loaded.to(device).eval(), processor.from_pretrained(path)
+
+
+class Untrained:
+    """A part without weights."""
+
+    def __init__(self, config: Any) -> None:
+        self._config = config
+
+    def load(self) -> None:
+        """Do nothing."""
 
 
 def writable(images: Images) -> list[np.ndarray]:
@@ -228,16 +241,10 @@ class ColourConfig(BaseModel, extra="forbid"):
     smallest: float = Field(default=5e-4, ge=0, le=1, description="of a region, as a share of the image")
 
 
-class ColourDetector:
+class ColourDetector(Untrained):
     """Detects each connected region of the colours in a phrase: all that is red for "lift the red puck"."""
 
     Config: ClassVar[type] = ColourConfig
-
-    def __init__(self, config: ColourConfig) -> None:
-        self._config = config
-
-    def load(self) -> None:
-        """Do nothing: there are no weights."""
 
     def detect(self, images: Images, phrases: Sequence[Sequence[str]]) -> list[list[Detection]]:
         """Return regions by their size; a phrase without a colour has none."""
@@ -264,16 +271,10 @@ class FlatConfig(BaseModel, extra="forbid"):
     most: int = Field(default=256, ge=1, description="regions that are proposed, the largest first")
 
 
-class FlatSegmenter:
+class FlatSegmenter(Untrained):
     """Finds regions within which the colour changes little from pixel to pixel."""
 
     Config: ClassVar[type] = FlatConfig
-
-    def __init__(self, config: FlatConfig) -> None:
-        self._config = config
-
-    def load(self) -> None:
-        """Do nothing: there are no weights."""
 
     def segment(self, images: Images, boxes: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Return the content of each box, without the regions that extend beyond it."""
@@ -306,16 +307,10 @@ class CircleConfig(BaseModel, extra="forbid"):
     radius: float = Field(default=0.25, gt=0, description="in shorter sides of the image")
 
 
-class CircleSelector:
+class CircleSelector(Untrained):
     """Selects regions that lie wholly in a circle: for a fixed camera, and a robot that begins at home."""
 
     Config: ClassVar[type] = CircleConfig
-
-    def __init__(self, config: CircleConfig) -> None:
-        self._config = config
-
-    def load(self) -> None:
-        """Do nothing: there are no weights."""
 
     def select(self, images: Images, regions: Sequence[np.ndarray]) -> list[list[int]]:
         """Return those regions, whatever they show."""
@@ -347,16 +342,10 @@ class _Segment:
     mask: np.ndarray  # (H, W) bool, its last visible position
 
 
-class IouTracker:
+class IouTracker(Untrained):
     """Tracks the connected region in a segment's colours that best overlaps the segment's last position."""
 
     Config: ClassVar[type] = IouConfig
-
-    def __init__(self, config: IouConfig) -> None:
-        self._config = config
-
-    def load(self) -> None:
-        """Do nothing: there are no weights."""
 
     def begin(self, images: Images, masks: Sequence[np.ndarray]) -> list[Any]:
         """Return the colours of each segment."""

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import Field
 
-from vlagents_ray.policies.arro.parts import Detection, Images, PretrainedConfig, load_pretrained, overlap, writable
+from vlagents_ray.policies.arro.parts import Detection, Images, Pretrained, PretrainedConfig, overlap, writable
 from vlagents_ray.registry import require
 
 
@@ -22,24 +22,14 @@ class GroundingDinoConfig(PretrainedConfig):
     most: int = Field(default=4, ge=1, description="boxes of a phrase, the best first")
 
 
-class GroundingDinoDetector:
+class GroundingDinoDetector(Pretrained):
     """Detects boxes for phrases, or for the objects in a whole instruction.
 
     One forward pass for each size of images.
     """
 
     Config: ClassVar[type] = GroundingDinoConfig
-
-    def __init__(self, config: GroundingDinoConfig) -> None:
-        self._config = config
-        self._model: Any = None
-        self._processor: Any = None
-
-    def load(self) -> None:
-        """Read the weights; raises `ConfigError` if some are missing."""
-        self._model, self._processor = load_pretrained(
-            "GroundingDinoForObjectDetection", "GroundingDinoProcessor", self._config
-        )
+    classes = ("GroundingDinoForObjectDetection", "GroundingDinoProcessor")
 
     def detect(self, images: Images, phrases: Sequence[Sequence[str]]) -> list[list[Detection]]:
         """Return boxes, the best first; a box belongs to the phrase with the best of its words."""
@@ -129,19 +119,11 @@ class Sam2SegmenterConfig(Sam2Config):
     same: float = Field(default=0.7, ge=0, le=1, description="intersection over union of two masks of one region")
 
 
-class Sam2Segmenter:
+class Sam2Segmenter(Pretrained):
     """Computes masks for boxes and for a grid of points; all images in one forward pass of the image encoder."""
 
     Config: ClassVar[type] = Sam2SegmenterConfig
-
-    def __init__(self, config: Sam2SegmenterConfig) -> None:
-        self._config = config
-        self._model: Any = None
-        self._processor: Any = None
-
-    def load(self) -> None:
-        """Read the weights; raises `ConfigError` if some are missing."""
-        self._model, self._processor = load_pretrained("Sam2Model", "Sam2ImageProcessor", self._config)
+    classes = ("Sam2Model", "Sam2ImageProcessor")
 
     def segment(self, images: Images, boxes: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Return one mask for each box."""
@@ -198,22 +180,14 @@ class _TrackMemory:
     frame: int = 0
 
 
-class Sam2Tracker:
+class Sam2Tracker(Pretrained):
     """The video model with a memory for each session and camera.
 
     The image encoder, which takes most of the time, runs once for all images; memory attention runs object by object.
     """
 
     Config: ClassVar[type] = Sam2Config
-
-    def __init__(self, config: Sam2Config) -> None:
-        self._config = config
-        self._model: Any = None
-        self._processor: Any = None
-
-    def load(self) -> None:
-        """Read the weights; raises `ConfigError` if some are missing."""
-        self._model, self._processor = load_pretrained("Sam2VideoModel", "Sam2VideoProcessor", self._config)
+    classes = ("Sam2VideoModel", "Sam2VideoProcessor")
 
     def begin(self, images: Images, masks: Sequence[np.ndarray]) -> list[Any]:
         """Return a memory of the masks."""

@@ -86,6 +86,12 @@ class ModelPolicy(Agent, abc.ABC):
         if self.config.adapters and not self.adaptable:
             raise ConfigError(f"adapters: {type(self).__name__} does not offer them; merge each into its base")
 
+    def loaded(self) -> Any:
+        """Return `self.model`; raises `PolicyFailed` before `initialize`."""
+        if self.model is None:
+            raise PolicyFailed(f"{type(self).__name__}: act before initialize; the checkpoint is not loaded")
+        return self.model
+
     @property
     def history(self) -> int:
         """The largest number of observations of each session that `predict` uses."""

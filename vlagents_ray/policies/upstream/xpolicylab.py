@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from vlagents_ray.errors import MalformedMessage, PolicyUnavailable, VLAgentsError, shown
-from vlagents_ray.policies.upstream.client import Answer, ClientOptions, UpstreamClient, UpstreamSocket
+from vlagents_ray.policies.upstream.client import Answer, ClientOptions, WebSocketClient
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
 from vlagents_ray.protocol.observations import is_number
 from vlagents_ray.wire import msgpack, xpolicylab
@@ -131,26 +131,20 @@ def _text(name: Any) -> str:
 _EVALUATION = "vlagents-ray"
 
 
-class XPolicyLabClient(UpstreamClient):
+class XPolicyLabClient(WebSocketClient):
     """A client that resets the model where an episode begins."""
 
     keeps_sessions: ClassVar[bool] = True
     one_session: ClassVar[bool] = True
-    schemes: ClassVar[tuple[str, ...]] = ("ws", "wss")
     takes_key: ClassVar[bool] = False
 
     def __init__(self, options: ClientOptions) -> None:
         super().__init__(options)
-        self._socket = UpstreamSocket(options, {})
         self._trial: str | None = None
         self._step = 0
 
-    @property
-    def is_open(self) -> bool:
-        return self._socket.is_open
-
     def connect(self, timeout_s: float) -> dict[str, Any]:
-        self._socket.open(timeout_s)
+        self.open(timeout_s)
         try:
             self._call("hello", {}, timeout_s)
         except VLAgentsError as error:
@@ -168,15 +162,12 @@ class XPolicyLabClient(UpstreamClient):
         self._step += 1
         return [xpolicylab.read_actions(payload)]
 
-    def close(self) -> None:
-        self._socket.close()
-
     def _call(self, kind: str, payload: Mapping[str, Any], timeout_s: float) -> dict[str, Any]:
         """Send a request and return the payload of its reply; replies to older requests are skipped."""
         name, deadline = uuid.uuid4().hex, time.monotonic() + timeout_s
-        self._socket.send(xpolicylab.write_request(kind, name, payload, _EVALUATION, self._trial, self._step))
+        self.send(xpolicylab.write_request(kind, name, payload, _EVALUATION, self._trial, self._step))
         while True:
-            data = self._socket.recv(max(0.0, deadline - time.monotonic()))
+            data = self.recv(max(0.0, deadline - time.monotonic()))
             if isinstance(data, str):
                 self.close()
                 raise self.unreadable("a text", "a binary map")
