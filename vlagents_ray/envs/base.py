@@ -302,7 +302,6 @@ def one_row(act: Act, contract: Contract) -> np.ndarray:
     return action
 
 
-
 def make_batch(name: str, num_envs: int, **options: Any) -> BatchEnv:
     """Make several environments by name, in one simulator if the suite supports that with these options.
 

@@ -248,7 +248,7 @@ class Rcs(SimulatorEnv):
         instruction: str | None = None,
         max_steps: int | None = None,
     ) -> None:
-        """Make the environment; raises the errors of `make_env`.
+        """Make the environment; raises the errors of `make_env`. Other options are those of most `SimulatorEnv`s.
 
         Args:
             task: One of `tasks()`, or Gymnasium's id of a scene, "lab/shelf"; None is the first of `tasks()`.
@@ -257,12 +257,7 @@ class Rcs(SimulatorEnv):
             delta: Commands are relative to where the arm is.
             control_hz: Steps a second; None is the protocol's.
             binary_gripper: It opens or closes; False: the command is its opening.
-            width: Of each image, pixels.
-            height: Of each image, pixels.
             cameras: Which of the scene's to give; None is all.
-            record_size: (height, width) in pixels of a second view of each camera, for the record alone.
-            instruction: None is the task's.
-            max_steps: None is the protocol's limit.
         """
         task = self.tasks()[0] if task is None else task
         self._task = self._find(task, module)

@@ -165,7 +165,7 @@ class RoboCasa(RobosuiteEnv):
         ends_on_success: bool = True,
         record_size: Sequence[int] | None = None,
     ) -> None:
-        """Make the environment; raises the errors of `make_env`.
+        """Make the environment; raises the errors of `make_env`. Other options are those of most `SimulatorEnv`s.
 
         Args:
             task: RoboCasa's name, one of `tasks()`.
@@ -176,9 +176,6 @@ class RoboCasa(RobosuiteEnv):
             action_order: "base_first", the order of an action in RoboCasa365's datasets, or "arm_first": hand,
                 gripper, base, torso, mode, as RoboCasa's `convert_action` and LeRobot's environment have it.
             object_registries: The sets of objects that are drawn from; the protocol has both.
-            max_steps: The step limit; None is the protocol's for the task.
-            ends_on_success: As in the protocol; False: success at the end can be measured, too.
-            record_size: Height and width of further views by the same cameras, for recordings only.
         """
         self.require_task(task)
         super().__init__(f"robocasa/{task}", record_size=record_size, width=width, height=height, max_steps=max_steps)

@@ -270,17 +270,13 @@ class Robosuite(RobosuiteEnv):
         ends_on_success: bool = True,
         record_size: Sequence[int] | None = None,
     ) -> None:
-        """Make the environment; raises the errors of `make_env`.
+        """Make the environment; raises the errors of `make_env`. Other options are those of most `SimulatorEnv`s.
 
         Args:
             task: robosuite's name, one of `tasks()`.
             width: Width of each image, pixels; None is robomimic's for the task.
             height: Height of each image, pixels; None is robomimic's for the task.
             cameras: MuJoCo's names; None are robomimic's for the task.
-            instruction: The task in words; None is one for the task.
-            max_steps: The step limit; None is the protocol's for the task.
-            ends_on_success: As in robomimic; False: success at the end can be measured, too.
-            record_size: Height and width of further views by the same cameras, for recordings only.
         """
         self.require_task(task)
         super().__init__(f"robosuite/{task}", record_size=record_size, width=width, height=height, max_steps=max_steps)

@@ -90,18 +90,16 @@ class Simpler(SimulatorEnv):
         shader: str = PROTOCOL.shader,
         record_size: Sequence[int] | None = None,
     ) -> None:
-        """Make the environment; raises the errors of `make_env`.
+        """Make the environment; raises the errors of `make_env`. Other options are those of most `SimulatorEnv`s.
 
         Args:
             task: ManiSkill's id, one of `Simpler.tasks()`.
             assets: The folder that holds `data/`; None is `MS_ASSET_DIR`, or ~/.maniskill. ManiSkill
                 reads it once, so a process has one.
-            instruction: None is the task's.
             max_steps: None is the task's own limit, 60, or 120 for the eggplant.
             sim_backend: "physx_cpu" or "physx_cuda".
             render_backend: "cpu", "gpu", or "auto": the GPU if both SAPIEN and torch can use it.
             shader: ManiSkill's name; that of the protocol is "default".
-            record_size: Height and width of a further view by the same camera, for recordings only.
         """
         self.require_task(task)
         super().__init__(f"simpler/{task}", record_size=record_size)

@@ -53,6 +53,11 @@ class SimulatorEnv(EvalEnv):
     A subclass states the names below, makes its simulator in the constructor within `_making`, and registers with
     `_resources` what `close` calls. `_begin` begins an episode and `_advance` executes a step; both are called with a
     simulator that is open, and their errors become `EnvFailed`.
+
+    Most constructors have these options, of which None is the task's or the protocol's own value: `width` and `height`
+    of each image, pixels; `instruction`, the task in words; `max_steps`, the step limit; `ends_on_success`, whether
+    success ends the episode (without that, success at the end can be measured, too); `record_size`, height and width
+    of further views by the same cameras, for recordings only.
     """
 
     suite: ClassVar[str]

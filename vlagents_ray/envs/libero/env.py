@@ -67,21 +67,16 @@ class Libero(SimulatorEnv):
         assets: str | None = None,
         files: str | None = None,
     ) -> None:
-        """Make the environment; raises the errors of `make_env`.
+        """Make the environment; raises the errors of `make_env`. Other options are those of most `SimulatorEnv`s.
 
         Args:
             task: "SUITE/NUMBER", or "SUITE/NAME" with LIBERO's name.
-            width: Width of each image, pixels.
-            height: Height of each image, pixels.
-            record_size: (height, width) of further views of each camera, for recordings only.
-            max_steps: None is the protocol's for the suite.
             settling_steps: None is the protocol's.
             simulator_seed: Seed of whatever an initial state leaves open; None is the protocol's.
             stop_at_success: Report `terminated` when the task is solved.
             gripper_open: The action's last number that opens the gripper; None is LIBERO's -1. OpenVLA
                 says 1, and 0 to close, which openvla's evaluation turns into LIBERO's as this does.
             gripper_closed: The one that closes it; None is LIBERO's 1.
-            instruction: None is the task's own.
             assets: The folder with LIBERO's meshes and textures; None is what LIBERO_ASSETS names.
             files: The folder with `bddl_files` and `init_files` of suites that vary LIBERO's, such as LIBERO-PRO's;
                 None is what LIBERO_FILES names.

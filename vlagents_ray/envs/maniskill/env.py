@@ -70,23 +70,19 @@ class ManiSkill(SimulatorEnv):
         reconfigure: bool = True,
         record_size: Sequence[int] | None = None,
     ) -> None:
-        """Make the environment; raises the errors of `make_env`.
+        """Make the environment; raises the errors of `make_env`. Other options are those of most `SimulatorEnv`s.
 
         Args:
             task: ManiSkill's id.
-            width: Of each image, pixels.
-            height: Of each image, pixels.
             cameras: Which of the task's cameras to give; None is all.
             control_mode: None is `pd_ee_delta_pose`, or the robot's own default if it lacks that.
             instruction: None is the task's, see `instruction_for`.
-            max_steps: None is the task's own limit.
             sim_backend: "physx_cpu", the faster for a single environment, or "physx_cuda".
             render_backend: "cpu", "gpu", or "auto": the GPU if both SAPIEN and torch can use it.
             shader: ManiSkill's name, e.g. "minimal", "default"; None is the task's own.
             reward_mode: ManiSkill's name; None is the task's own.
             reconfigure: Rebuild the scene for each episode. Without it some tasks' dynamics
                 (PlugCharger, PushT) depend on the episode before; it saves about 15 ms a reset.
-            record_size: Height and width of further views by the same cameras, for the record only.
         """
         super().__init__(f"maniskill/{task}", record_size=record_size)
         self._own_limit = registered_limit(task)

@@ -17,6 +17,7 @@ from vlagents_ray.registry import require
 
 GRIPPER = "gripper"  # the part of the state that is `Obs.gripper`
 CLOSED = "gripper_closed"  # the part that is its closedness: 1 - `Obs.gripper`
+KEPT = 256  # instructions of which a policy keeps the tokens: more than a server has tasks, and at most some MB
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import inspect
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,9 @@ from vlagents_ray.dataset_contract import BYTES, STATISTICS, DatasetContract
 from vlagents_ray.errors import ConfigError, MissingDependency
 from vlagents_ray.policies.base import Row
 from vlagents_ray.policies.base.model_code import CURE
+from vlagents_ray.policies.base.model_inputs import KEPT
 from vlagents_ray.policies.lerobot.config import LeRobotConfig
 from vlagents_ray.policies.lerobot.kinds import groot_dataset, require_groot_statistics
-from vlagents_ray.policies.token_cache import cached_tokenizer
 from vlagents_ray.registry import require
 
 PIPELINES = ("policy_preprocessor.json", "policy_postprocessor.json")
@@ -306,3 +307,24 @@ def _saved_steps(file: Path) -> dict[str, Mapping[str, Any]]:
     """Map the registered name of each step of a pipeline to its settings."""
     steps = json.loads(file.read_text(encoding="utf-8")).get("steps", [])
     return {step.get("registry_name", step.get("class", "")): step.get("config", {}) for step in steps}
+
+
+def cached_tokenizer(tokenizer: Any, **settings: Any) -> Callable[[list[str]], dict[str, Any]]:
+    """Return a function from texts to the tensors (B, L) of a tokenizer of transformers, which keeps their rows.
+
+    All texts are padded to one length: a row that is padded to the longest text of its batch depends on the others.
+
+    Args:
+        tokenizer: The tokenizer.
+        settings: Further arguments of its calls, such as `max_length`.
+    """
+
+    @lru_cache(maxsize=KEPT)
+    def tokenized(text: str) -> dict[str, Any]:
+        return dict(tokenizer([text], padding="max_length", return_tensors="pt", **settings).items())
+
+    def call(texts: list[str]) -> dict[str, Any]:
+        rows = [tokenized(text) for text in texts]
+        return {name: require("torch").cat([row[name] for row in rows]) for name in rows[0]}
+
+    return call

@@ -13,9 +13,9 @@ import json
 import os
 import sys
 import types
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -30,7 +30,7 @@ from vlagents_ray.interface import Obs
 from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row
 from vlagents_ray.policies.base.accelerator import ensure_torchvision, torch_device, torch_dtype
 from vlagents_ray.policies.base.checkpoint import SavedTensors, find_checkpoint, require_loaded
-from vlagents_ray.policies.token_cache import TokenCache
+from vlagents_ray.policies.base.model_inputs import KEPT
 from vlagents_ray.registry import require
 
 Bounds = Literal["q99", "min_max"]  # of each dimension: 1st and 99th percentile, or minimum and maximum
@@ -162,7 +162,6 @@ class Prismatic:
     deterministic: bool  # whether longer prompts than that are refused
     padded_tokens: int  # the length to which shorter prompts are padded; 0: that of the longest one
     own: dict[str, Statistics] = field(default_factory=dict)  # of adapters that were trained on other datasets
-    prompts: TokenCache[list[int]] = field(default_factory=lambda: TokenCache(_size), repr=False)
 
     def pixels(self, image: np.ndarray) -> Any:
         """Convert an (H, W, 3) uint8 image to an input of the checkpoint's backbones, (C, S, S) float32 on the CPU."""
@@ -173,15 +172,22 @@ class Prismatic:
 
         Raises `InvalidObservation` if it is longer than in the model's training, or than all are padded to.
         """
-        [ids] = self.prompts.of([instruction], self._tokenized)
+        ids = self._tokenized(instruction)
         most = self.padded_tokens if self.deterministic else self.network.config.llm_max_length
         if len(ids) > most:
             raise InvalidObservation(f"instruction: got {len(ids)} tokens with the prompt, want {most} at most")
         return ids
 
-    def _tokenized(self, instructions: Sequence[str]) -> list[list[int]]:
-        prompts = [self.tokenizer(self.prompt.format(text.lower())).input_ids for text in instructions]
-        return [ids if ids[-1] == _SPACE else [*ids, _SPACE] for ids in prompts]
+    @cached_property
+    def _tokenized(self) -> Callable[[str], list[int]]:
+        """The tokens of an instruction, which is the same at each act of a session."""
+
+        @lru_cache(maxsize=KEPT)
+        def tokenized(instruction: str) -> list[int]:
+            ids: list[int] = self.tokenizer(self.prompt.format(instruction.lower())).input_ids
+            return ids if ids[-1] == _SPACE else [*ids, _SPACE]
+
+        return tokenized
 
     def to_device(self, arrays: Sequence[Any]) -> Any:
         """Stack tensors of one shape to a batch in the model's dtype; the copy to a GPU is asynchronous."""
@@ -195,10 +201,6 @@ class Prismatic:
         """Return the embeddings of tokens, (L, D)."""
         torch = require("torch")
         return self.network.get_input_embeddings()(torch.tensor(tokens, device=self.device))
-
-
-def _size(ids: list[int]) -> int:
-    return 36 * len(ids)  # 8 bytes in the list, 28 of the number
 
 
 def load_prismatic(config: PrismaticConfig, bounds: Bounds = "q99") -> Prismatic:
