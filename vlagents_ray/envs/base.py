@@ -28,11 +28,7 @@ Steps = tuple[list[Obs], list[float], list[bool], list[bool], list[dict[str, Any
 
 
 class Environment(ABC):
-    """What a single environment and a batch of them have in common.
-
-    An episode is a pure function of its seed and options: two resets with the same ones give the same first
-    observation, whatever happened before, in whichever process.
-    """
+    """What a single environment and a batch of them have in common."""
 
     max_steps: int
     """The task's step limit; `step` reports `truncated` when it is reached."""
@@ -267,10 +263,7 @@ def env_arguments(name: str, options: Mapping[str, Any]) -> tuple[type[EvalEnv],
 
 
 def known_contract(name: str, options: Mapping[str, Any]) -> Contract | None:
-    """Return the contract of the env `name` without making it; None if it cannot state one yet.
-
-    Raises the errors of `env_arguments`.
-    """
+    """Return the contract of the env `name` without making it; None if it cannot state one yet."""
     if not issubclass(env_class(name), EvalEnv):
         return None
     cls, arguments = env_arguments(name, options)
@@ -280,14 +273,7 @@ def known_contract(name: str, options: Mapping[str, Any]) -> Contract | None:
 
 
 def require_known(suite: str, task: str | None, known: Sequence[str], others: str = "") -> None:
-    """Raise `UnknownEnv` unless a task is known.
-
-    Args:
-        suite: The suite's name.
-        task: The task.
-        known: The known tasks.
-        others: Further allowed tasks, as the end of a list in words.
-    """
+    """Raise `UnknownEnv` unless a task is known; `others` are further allowed tasks, in words."""
     if task not in known:
         meant = did_you_mean(str(task), known)
         raise UnknownEnv(f"{suite} has no task {task!r}: want one of {list(known)}{others}{meant}")

@@ -345,16 +345,7 @@ def find_checkout(chosen: str | None) -> Path:
 
 
 def make_simulator(checkout: Path, scene: str, renderer: RendererName) -> Any:
-    """Make CALVIN's `PlayTableSimEnv` of a scene, with the cameras, arm and rates of its datasets.
-
-    Args:
-        checkout: The checkout.
-        scene: "A" to "D".
-        renderer: As upstream draws, through OpenGL ("egl"), or PyBullet's renderer in software ("tiny").
-
-    Raises:
-        EnvFailed: PyBullet cannot draw through EGL.
-    """
+    """Make CALVIN's `PlayTableSimEnv` of a scene, with the cameras, arm and rates of its datasets."""
     folder = str(checkout / _PACKAGE)
     if folder not in sys.path:
         sys.path.insert(0, folder)

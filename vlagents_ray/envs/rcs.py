@@ -138,10 +138,7 @@ def missing_packages(*packages: str) -> str | None:
 
 
 def creator(task: RcsTask, name: str) -> Any:
-    """RCS's maker of the scene that `task` names; `name` is the env's own, for messages.
-
-    Raises `MissingDependency` where RCS would download, and `UnknownEnv` or `ConfigError` for an id of something else.
-    """
+    """Return RCS's maker of a scene; raises `MissingDependency` where RCS would download."""
     reason = missing_packages("rcs", *({"duobench"} & {task.id.partition("/")[0]}))
     if reason is not None:
         raise MissingDependency(f"{name}: {reason}")

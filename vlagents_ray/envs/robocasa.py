@@ -170,8 +170,6 @@ class RoboCasa(RobosuiteEnv):
         Args:
             task: RoboCasa's name, one of `tasks()`.
             split: The kitchens and objects: "target" or "pretrain".
-            width: Width of each image, pixels; None is the protocol's.
-            height: Height of each image, pixels; None is the protocol's.
             cameras: RoboCasa's names; None are the protocol's three.
             action_order: "base_first", the order of an action in RoboCasa365's datasets, or "arm_first": hand,
                 gripper, base, torso, mode, as RoboCasa's `convert_action` and LeRobot's environment have it.

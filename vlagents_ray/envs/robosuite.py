@@ -157,10 +157,7 @@ def importing_robosuite(env: str) -> Iterator[None]:
 
 @contextmanager
 def _no_log_file() -> Iterator[None]:
-    """robosuite logs to one fixed file of the machine, which another user of it may own: then the import fails.
-
-    This also hides its advice about macros, which are not needed.
-    """
+    """Keep robosuite from its log file, one for the machine, which another user may own, and from its advice."""
 
     def nowhere(_filename: object) -> logging.Handler:
         return logging.NullHandler()
@@ -274,8 +271,6 @@ class Robosuite(RobosuiteEnv):
 
         Args:
             task: robosuite's name, one of `tasks()`.
-            width: Width of each image, pixels; None is robomimic's for the task.
-            height: Height of each image, pixels; None is robomimic's for the task.
             cameras: MuJoCo's names; None are robomimic's for the task.
         """
         self.require_task(task)

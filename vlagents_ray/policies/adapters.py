@@ -80,17 +80,7 @@ class Adapters:
         find: Callable[[str], tuple[Adapter, Path]],
         adapt: Callable[[str, Path], None],
     ) -> None:
-        """Read adapters, and have the layers of the network apply them from now on.
-
-        Args:
-            network: The torch module that they change.
-            sources: The folder or hub id of each adapter, by name.
-            find: Returns the adapter of a source, and its folder.
-            adapt: Called with the fingerprint and the folder of each adapter that fits.
-
-        Raises:
-            ConfigError: One is missing, or does not fit.
-        """
+        """Read adapters by name, and have the network's layers apply them; raises `ConfigError` if one does not fit."""
         import torch
 
         layers: dict[str, dict[int, tuple[Any, Any]]] = {}  # A and B by layer and place
@@ -116,11 +106,7 @@ class Adapters:
             self._device = weight.device
 
     def named(self, name: object) -> Adapter:
-        """Return the adapter of that name; for None, none.
-
-        Raises:
-            UnknownCheckpoint: There is no such adapter.
-        """
+        """Return the adapter of that name, for None none; raises `UnknownCheckpoint` if there is none."""
         if name is None:
             return Adapter()
         if not isinstance(name, str) or name not in self._named:
@@ -145,12 +131,7 @@ class Adapters:
 
     @contextmanager
     def rows(self, fingerprints: Iterable[str]) -> Iterator[None]:
-        """Have a pass of the network within this apply an adapter to each row.
-
-        Args:
-            fingerprints: The adapter of each row. In the first dimension, the inputs of linear layers have as many
-                entries for each row, usually one, and one row after the other.
-        """
+        """Apply an adapter to each row of the network's passes in this context; inputs have as many entries for each."""
         before = self._chosen
         self._chosen = self._tensor([self._places[one] for one in fingerprints])
         try:

@@ -40,11 +40,7 @@ def keep_torch_programs() -> None:
 
 
 def keep_jax_programs(jax: Any, platform: str) -> None:
-    """Let JAX keep its programs in the user's cache, unless `JAX_COMPILATION_CACHE_DIR` names another folder.
-
-    Args:
-        jax: The module.
-        platform: Of the device for which it compiles, such as "gpu"; nothing is kept for "cpu".
+    """Let JAX keep its programs for a GPU in the user's cache, unless `JAX_COMPILATION_CACHE_DIR` names another folder.
     """
     if platform == "cpu":
         return
@@ -131,11 +127,7 @@ class CaptureLock:
 
     @contextmanager
     def capture(self) -> Iterator[None]:
-        """Wait for running acts and pushes; none begins within this context.
-
-        Raises:
-            RuntimeError: This thread acts itself.
-        """
+        """Wait for running acts and pushes, none of which begins within this context."""
         if threading.get_ident() in self._acting:
             raise RuntimeError("a CUDA graph cannot be captured within an act; capture it in Agent.initialize")
         with self.pushes:
@@ -161,15 +153,7 @@ class CudaGraph:
     """
 
     def __init__(self, function: Callable[..., Any], tensors: Sequence[Any]) -> None:
-        """Capture a function, which must return a tensor, or a tuple of them, and have no other effect.
-
-        Args:
-            function: The function.
-            tensors: Its arguments, on one GPU, whose values do not matter.
-
-        Raises:
-            RuntimeError: The function cannot be captured, or none of its work was.
-        """
+        """Capture a function of tensors on one GPU without other effects; raises `RuntimeError` if that fails."""
         torch = require("torch")
         self._inputs, device = [tensor.clone() for tensor in tensors], tensors[0].device
         # The stream is named, since torch's own one is on the device of the first capture of the process. The current
@@ -217,11 +201,6 @@ class Compilation:
     backend: ClassVar[str] = "inductor"  # of torch.compile
 
     def __init__(self, mode: CompileMode) -> None:
-        """Compile nothing yet.
-
-        Args:
-            mode: Whether to compile; with "require", what cannot be compiled is an error.
-        """
         self.mode = mode
         self.sizes: list[int] = []  # batch sizes for which all cores are compiled, ascending
         self.building: int | None = None  # the batch size whose programs are being made

@@ -210,12 +210,7 @@ class DiffusionNetwork:
 
 
 def checkpoint_file(config: DiffusionPolicyConfig) -> Path:
-    """Find the .ckpt file.
-
-    Raises:
-        ConfigError: There is none, a folder has several, or it is of a hub id without the commit, whose pickle may be
-            another one tomorrow than the one that the user trusts.
-    """
+    """Find the .ckpt file; raises `ConfigError` also for a hub id without the commit, whose pickle may change."""
     path = find_checkpoint(config.checkpoint, config.checkpoint_step)
     commit = revision(path)
     if commit is not None and commit not in config.checkpoint:
@@ -287,12 +282,7 @@ _CONDITIONS = {"obs_as_cond": "cond", "obs_as_local_cond": "local_cond", "obs_as
 
 
 def compile_with(network: DiffusionNetwork, compilation: Compilation) -> None:
-    """Have a policy's module call its denoising network, and the encoder of its images, as compiled cores.
-
-    Args:
-        network: The module, whose `predict_action` calls both, and its inputs.
-        compilation: That of the policy.
-    """
+    """Compile a module's denoising network and the encoder of its images, which `predict_action` calls."""
     module = network.module
     _without_branches_on_values(module, network.device)
     condition = next((name for flag, name in _CONDITIONS.items() if getattr(module, flag, False)), "")

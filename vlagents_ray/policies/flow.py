@@ -161,11 +161,7 @@ class RandomSteps:
         return velocity
 
     def stated(self, execute: int | None, dim: int | None) -> dict[int, dict[str, Any]]:
-        """Return what is wanted of rows, by their places in the batch, after the last step.
-
-        Args:
-            execute: The rows of a chunk that are used; None: all.
-            dim: The numbers of a row that are used; None: all.
+        """Return what is wanted of rows, by their places, after the last step; None stands for all rows, all numbers.
         """
         stds = [step_std(step, self._steps, self._level) for step in range(self._steps)]
         logprob = sum(map(normal_logprob, self._chain[1:], self._means, stds))[:, :execute, :dim].cpu().numpy()
@@ -326,13 +322,7 @@ class Pi0Passes(FlowPasses):
     """The passes of openpi's PyTorch port of π0 and π0.5, which LeRobot has copied."""
 
     def __init__(self, model: Any, compilation: Compilation, *, stated: bool = True) -> None:
-        """Use the passes of a `PI0Pytorch` or `PI05Pytorch`.
-
-        Args:
-            model: The model.
-            compilation: That of the policy.
-            stated: Whether the model's `denoise_step` takes the state, which that of LeRobot's π0.5 does not.
-        """
+        """Use the passes of a `PI0Pytorch` or `PI05Pytorch`; `stated`: whether its `denoise_step` takes the state."""
         self._stated = stated
         model.paligemma_with_expert.paligemma.model.language_model.config._attn_implementation = "eager"
         super().__init__(model, compilation)

@@ -62,15 +62,7 @@ class Embodiment:
 
     @classmethod
     def of(cls, folder: Path, name: str | None) -> Embodiment:
-        """Read an embodiment from the folder of a processor.
-
-        Args:
-            folder: With `processor_config.json` and `statistics.json`.
-            name: The embodiment's; None: the only one.
-
-        Raises:
-            ConfigError: There is no such embodiment, or its statistics are incomplete.
-        """
+        """Read an embodiment, by default the only one, from a processor's folder; raises `ConfigError`."""
         try:
             settings = json.loads((folder / CONFIG).read_text(encoding="utf-8"))["processor_kwargs"]
             statistics = json.loads((folder / STATISTICS).read_text(encoding="utf-8"))
@@ -383,9 +375,7 @@ def built_without_flash_attention() -> Iterator[None]:
 
 
 def use_torch_attention(model: Any) -> None:
-    """Have the parts of a model that ask for flash-attention use torch's own.
-
-    N1.6's vision tower attends within each of several images that follow each other in one sequence.
+    """Have parts that ask for flash-attention use torch's; N1.6's vision tower attends within each of several images.
     """
     transformers = require("transformers.modeling_utils")
     for module in model.modules():

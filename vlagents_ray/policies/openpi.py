@@ -100,11 +100,7 @@ def choose_robot(
     state: Mapping[str, Mapping[str, int]] | None,
     layout: Layout | None,
 ) -> RobotConvention:
-    """Return the convention of the robot of one of openpi's configs, with the settings that override it.
-
-    Raises:
-        ConfigError: The config's transform is not one of openpi's own, and `cameras` and `state` are not both set.
-    """
+    """Return the convention of a config's robot with the settings that override it; raises `ConfigError` if unknown."""
     usual = ROBOTS.get(transform)
     if usual is None:
         if cameras is None or state is None:
@@ -362,10 +358,7 @@ class JaxTokens(OpenPiModel):
 
     @staticmethod
     def ended(tokens: np.ndarray) -> np.ndarray:
-        """Replace the tokens (B, T) after the end of each row by zeros, as in a batch of one.
-
-        openpi decodes until all rows have ended, and so continues rows of a batch after their end.
-        """
+        """Replace the tokens (B, T) after each row's end by zeros: openpi decodes until all rows have ended."""
         ends = tokens == _END
         return np.where(np.cumsum(ends, axis=1) - ends > 0, 0, tokens)
 

@@ -75,18 +75,7 @@ class Replay(Agent):
 
 
 def load_actions(path: Path, key: str | None = None) -> np.ndarray:
-    """Read recorded actions.
-
-    Args:
-        path: A .npy, .npz or .json file.
-        key: The array's name in a .npz or .json file with several.
-
-    Returns:
-        The actions, (T, D) float32.
-
-    Raises:
-        ConfigError: The file is missing, or has no such array of finite numbers.
-    """
+    """Return recorded actions, (T, D) float32, of a .npy, .npz or .json file; raises `ConfigError` if it has none."""
     if not path.is_file():
         raise ConfigError(f"recording {path}: no such file")
     readers = {".npy": _read_npy, ".npz": _read_npz, ".json": _read_json}

@@ -247,10 +247,7 @@ def load_predictor(config: VJepa2AcConfig, saved: Mapping[str, Any], width: int)
 
 @contextmanager
 def usual_attention() -> Iterator[None]:
-    """Have upstream's attention use torch's choice of a kernel as it is.
-
-    Upstream sets that choice to torch's default for each layer, by a deprecated function that cannot be compiled.
-    """
+    """Have upstream's attention use torch's choice of a kernel, which it sets by a function that cannot be compiled."""
     backend = require("torch").backends.cuda
     setter, backend.sdp_kernel = backend.sdp_kernel, nullcontext
     try:

@@ -443,12 +443,7 @@ NUMPY_CALLS: dict[Name, Call | None] = {Name("numpy", "dtype"): _dtype, Name("nu
 
 
 def read_pickled_array(data: bytes) -> np.ndarray:
-    """Return the numpy array that a pickle consists of, which views `data`.
-
-    Raises:
-        MalformedMessage: The pickle has anything but such an array, see `pickles`.
-        MessageTooLarge: It exceeds a limit.
-    """
+    """Return the numpy array that a pickle consists of, which views `data`."""
     found = read_pickle(data, DEFAULT_LIMITS, {}, NUMPY_CALLS)
     if not isinstance(found, np.ndarray):
         raise MalformedMessage(f"pickle: got {type(found).__name__}, want a numpy array")
@@ -527,13 +522,7 @@ _ARRAY, _KIND, _DTYPE = (
 
 
 def write_record(name: Name, fields: Mapping[str, Any]) -> bytes:
-    """Return the pickle of an object of a data class, in protocol 4.
-
-    Args:
-        name: The class.
-        fields: Its fields: numbers below 2**31, texts, truth values, None, arrays of plain numbers, and tuples, lists
-            and dicts of these.
-    """
+    """Return the pickle (protocol 4) of a data class; fields are plain values, arrays, and containers of these."""
     return b"".join((b"\x80\4", _named(name), b")\x81", written(fields), b"b."))
 
 

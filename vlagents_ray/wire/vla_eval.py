@@ -36,10 +36,7 @@ class _File(bytes):
 
 
 def decode(data: bytes, limits: Limits = DEFAULT_LIMITS) -> Message:
-    """Return the message in `data`, with its JPEG and PNG images still encoded, see `decode_images`.
-
-    Raises `MalformedMessage` or `MessageTooLarge`.
-    """
+    """Return the message in `data`, with its JPEG and PNG images still encoded, see `decode_images`."""
     taken = 0
 
     def array(node: dict[Any, Any]) -> Any:

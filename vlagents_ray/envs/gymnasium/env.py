@@ -98,25 +98,7 @@ def make(
     rows: int,
     max_steps: int | None,
 ) -> Any:
-    """Make an environment by its id.
-
-    Args:
-        name: The env's name, for messages.
-        task: The Gymnasium id.
-        module: The module that registers the id; None is the id's namespace.
-        kwargs: Arguments of `gymnasium.make` or `gymnasium.make_vec`; `render_mode` is "rgb_array" by default.
-        vectorization: One of `VECTORIZATIONS`; None if the id's registration decides.
-        rows: How many rows a VectorEnv gets.
-        max_steps: The step limit, instead of the registered one.
-
-    Returns:
-        A `gymnasium.Env`, or a `VectorRows`.
-
-    Raises:
-        UnknownEnv: There is no such id.
-        ConfigError: An argument does not fit it.
-        MissingDependency: The simulator is not installed.
-    """
+    """Make a `gymnasium.Env`, or `VectorRows`, by its id; see `Gymnasium` for the options and errors."""
     if vectorization not in (None, *VECTORIZATIONS):
         raise ConfigError(f"{name}: vectorization is {vectorization!r}, want one of {list(VECTORIZATIONS)}")
     # pygame, which several environments draw with, prints a greeting on import otherwise
@@ -443,20 +425,7 @@ class PushT(Gymnasium):
         max_steps: int | None = None,
         record_size: Sequence[int] | None = None,
     ) -> None:
-        """Make the environment.
-
-        Args:
-            task: What is observed, "image" or "keypoints".
-            width: The width to which the image is stretched, pixels.
-            height: The height to which the image is stretched, pixels.
-            max_steps: The step limit; 300 by default.
-            record_size: Height and width of further copies of the image, for recordings only.
-
-        Raises:
-            UnknownEnv: There is no such task.
-            ConfigError: An option has a wrong value.
-            MissingDependency: gym-pusht is not installed.
-        """
+        """Make the environment; images are stretched to `width` and `height`, pixels."""
         self.require_task(task)
         super().__init__(_ID, **_TASKS[task], width=width, height=height, max_steps=max_steps, record_size=record_size)
 

@@ -29,15 +29,7 @@ class VectorRows:
     """The rows of a VectorEnv; row 0 alone has the interface of a `gymnasium.Env`."""
 
     def __init__(self, name: str, vector: Any) -> None:
-        """Take a VectorEnv over.
-
-        Args:
-            name: Its name, for messages.
-            vector: The `gymnasium.vector.VectorEnv`, which `close` closes.
-
-        Raises:
-            ConfigError: It does not say what it does with a row whose episode is over.
-        """
+        """Take a VectorEnv over; raises `ConfigError` if its mode of autoreset is unknown."""
         mode = vector.metadata.get("autoreset_mode")
         self.autoreset = str(getattr(mode, "name", mode)).upper()  # an AutoresetMode, or its name
         if self.autoreset not in _MODES:
@@ -163,17 +155,7 @@ class GymnasiumBatch(BatchEnv):
         instruction: str,
         described: Mapping[str, Any],
     ) -> None:
-        """Take the VectorEnv of a `Gymnasium` over.
-
-        Args:
-            name: The env's name, for messages.
-            rows: The VectorEnv, which `close` closes.
-            view: How its observations and actions become ours.
-            contract: The contract of each environment.
-            max_steps: The step limit of each environment.
-            instruction: The task in words.
-            described: What `describe` returns.
-        """
+        """Take the VectorEnv of a `Gymnasium` over; `described` is what `describe` returns."""
         self.num_envs, self.max_steps, self.restarts = rows.num_envs, max_steps, rows.restarts
         self._name, self._rows, self._view, self._contract = name, rows, view, contract
         self._instruction, self._described = instruction, dict(described)

@@ -40,16 +40,7 @@ class View:
     """One environment's observations, actions and infos, by its spaces and the user's options."""
 
     def __init__(self, name: str, env: Any, mapped: Mapped) -> None:
-        """Look at the spaces.
-
-        Args:
-            name: The environment's name, for messages.
-            env: The environment, of which `observation_space`, `action_space` and `render_mode` are read.
-            mapped: The user's options.
-
-        Raises:
-            ConfigError: An option does not fit the spaces, or actions are no vectors.
-        """
+        """Read the spaces; raises `ConfigError` if an option does not fit them, or if actions are no vectors."""
         self._options = mapped
         self._low, self._high, self._dtype = bounds(env.action_space)
         if mapped.unit_actions and not np.isfinite([self._low, self._high]).all():
@@ -166,10 +157,7 @@ class Pick:
 
 
 def as_image(value: Any, name: str, size: tuple[int | None, int | None] = (None, None)) -> np.ndarray:
-    """`value` as (H, W, 3) uint8 RGB, a new array, stretched to `size` (height, width) in pixels.
-
-    None in `size` keeps that side. `ConfigError` if it is no such image.
-    """
+    """Return (H, W, 3) uint8 RGB as a new array, stretched to `size` (height, width), px; None keeps a side."""
     image = np.asarray(value)
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
         raise ConfigError(f"camera {name!r}: got {image.shape} {image.dtype}, want (H, W, 3) uint8 RGB")

@@ -167,16 +167,7 @@ def _varied_suites() -> dict[str, int]:
 
 
 def _varied_names(place: Path, suite: str, known: list[str]) -> list[str]:
-    """The names of a suite's tasks: in LIBERO's order where they are LIBERO's, and else by the alphabet.
-
-    Args:
-        place: The folder of variants.
-        suite: The suite.
-        known: The tasks of the suite that it varies, in LIBERO's order.
-
-    Raises:
-        UnknownEnv: The folder has no such suite.
-    """
+    """Return a suite's tasks, in LIBERO's order where they are LIBERO's, else by the alphabet; raises `UnknownEnv`."""
     here = {file.stem for file in place.glob(f"{_PROBLEMS}/{suite}/*.bddl")}
     if not here:
         have = sorted(one.name for one in place.glob(f"{_PROBLEMS}/*/"))
@@ -185,11 +176,7 @@ def _varied_names(place: Path, suite: str, known: list[str]) -> list[str]:
 
 
 def _read_variant(place: Path, suite: str, name: str) -> tuple[str, Path, Path]:
-    """A task's instruction, as its BDDL file gives it, that file, and the one of its initial states; imports LIBERO.
-
-    Raises:
-        ConfigError: The task wants an object or a scene that hf-libero does not have, or has no initial states.
-        EnvFailed: hf-libero cannot read the BDDL file.
+    """Return a task's instruction, its BDDL file and its initial states; raises `ConfigError` if it cannot be played.
     """
     problem = place / _PROBLEMS / suite / f"{name}.bddl"
     _require_playable(problem)
@@ -285,10 +272,7 @@ class LiberoProtocol:
 
     @classmethod
     def of(cls, suite: str, **changes: Any) -> LiberoProtocol:
-        """Return the protocol of a suite with changes; a change that is None is ignored.
-
-        A suite that varies one of the five has its step limit, as LIBERO-PRO's evaluation gives it.
-        """
+        """Return the protocol of a suite, or of the one that it varies, with the changes that are not None."""
         changed = {name: value for name, value in changes.items() if value is not None}
         return cls(**{"max_steps": SUITES[base_of(suite)].max_steps} | changed)
 

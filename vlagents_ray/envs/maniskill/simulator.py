@@ -46,10 +46,7 @@ INSTRUCTIONS: dict[str, str] = {
 
 
 def instruction_for(task: str) -> str:
-    """The task's instruction; for a task not in `INSTRUCTIONS` its name in words.
-
-    "PickSingleYCB-v1" becomes "pick single ycb".
-    """
+    """Return the task's instruction, or its name in words: "PickSingleYCB-v1" is "pick single ycb"."""
     if task in INSTRUCTIONS:
         return INSTRUCTIONS[task]
     words = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", re.sub(r"-v\d+$", "", task))

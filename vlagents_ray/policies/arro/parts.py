@@ -70,9 +70,7 @@ class Segmenter(Part, Protocol):
     """Computes masks of objects."""
 
     def segment(self, images: Images, boxes: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """Return the mask of the object in each box: (N, H, W) bool for boxes (N, 4) px.
-
-        All False where there is none.
+        """Return the mask of the object in each box, (N, H, W) bool for boxes (N, 4) px, all False where there is none.
         """
         ...
 
@@ -85,10 +83,7 @@ class Selector(Part, Protocol):
     """Selects the gripper's fingers."""
 
     def select(self, images: Images, regions: Sequence[np.ndarray]) -> list[list[int]]:
-        """Return the indices of the regions (M, H, W) of each image that make up the gripper.
-
-        None if it is not visible.
-        """
+        """Return the indices of the regions (M, H, W) of each image that make up the gripper; none if it is hidden."""
         ...
 
 

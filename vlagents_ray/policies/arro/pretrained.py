@@ -23,10 +23,7 @@ class GroundingDinoConfig(PretrainedConfig):
 
 
 class GroundingDinoDetector(Pretrained):
-    """Detects boxes for phrases, or for the objects in a whole instruction.
-
-    One forward pass for each size of images.
-    """
+    """Detects boxes for phrases, or for the objects in an instruction, in one pass for each size of images."""
 
     Config: ClassVar[type] = GroundingDinoConfig
     classes = ("GroundingDinoForObjectDetection", "GroundingDinoProcessor")

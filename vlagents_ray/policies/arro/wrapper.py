@@ -63,9 +63,7 @@ class Background:
         self._draw(1, 1)
 
     def behind(self, image: np.ndarray, mask: np.ndarray) -> np.ndarray:
-        """Return a new image: `image`, (H, W, 3) uint8, where `mask`, (H, W) bool, is True, and the background
-        elsewhere.
-        """
+        """Return a new (H, W, 3) uint8 image: `image` where `mask`, (H, W) bool, is True, else the background."""
         height, width = mask.shape
         if (height, width) not in self._drawn:
             self._drawn[height, width] = self._draw(height, width)
@@ -159,10 +157,7 @@ class Track:
         return list(dict.fromkeys([*lost, *(one for one in self.wanted if one not in self.labels)]))
 
     def shown(self, shape: tuple[int, int], keep_lost: int, grow: int) -> np.ndarray:
-        """Return the union of the segments, (H, W) bool.
-
-        A segment lost for at most `keep_lost` frames is at its last position.
-        """
+        """Return the union of the segments, (H, W) bool; one lost for at most `keep_lost` frames is where it was."""
         together = np.zeros(shape, bool)
         for mask, lost in zip(self.masks, self.lost, strict=True):
             if lost <= keep_lost:
@@ -274,12 +269,6 @@ class Arro(Wrapper):
     shared: ClassVar[tuple[str, ...]] = ("config", "tracking", "background")
 
     def __init__(self, agent: Agent, config: ArroConfig) -> None:
-        """Wrap a policy.
-
-        Args:
-            agent: The policy.
-            config: The cameras, the parts of their images to keep, and the models that find them.
-        """
         super().__init__(agent, config)
         self.tracking = Tracking(config)
         self.background = Background(config.background)

@@ -36,10 +36,7 @@ _used: ContextVar[list[Path] | None] = ContextVar("_used", default=None)
 
 @contextmanager
 def used_checkpoints() -> Iterator[list[Path]]:
-    """Yield a list that collects the paths found by `find_checkpoint` in this context.
-
-    A path within one replaces it.
-    """
+    """Yield a list of the paths that `find_checkpoint` finds in this context; a path within one replaces it."""
     found: list[Path] = []
     token = _used.set(found)
     try:
@@ -88,16 +85,7 @@ def _holds(folder: Path, path: Path) -> bool:
 
 
 def find_adapter(source: str, checkpoint: str, base: Sequence[Path], digest_of_base: str) -> tuple[Adapter, Path]:
-    """Return a LoRA adapter and its folder, found as `find_checkpoint` does.
-
-    Args:
-        source: The folder or hub id.
-        checkpoint: The base, as the policy's settings name it.
-        base: The files and folders of the base.
-        digest_of_base: Their digest.
-
-    Raises:
-        ConfigError: There is no such adapter, or it was trained on another base.
+    """Return a LoRA adapter and its folder; raises `ConfigError` if there is none, or it was trained on another base.
     """
     folder = find_checkpoint(source, needs=FILES)
     if not folder.is_dir():

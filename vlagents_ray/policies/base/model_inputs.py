@@ -42,10 +42,7 @@ class Row:
         return self.rng.standard_normal(shape, dtype=np.float32)
 
     def history(self, length: int) -> tuple[Any, ...]:
-        """Return the last `length` frames.
-
-        At the beginning of an episode its first frame stands for the missing ones.
-        """
+        """Return the last `length` frames; at the beginning of an episode its first one stands for the missing ones."""
         return (self.frames[0],) * (length - len(self.frames)) + self.frames[-length:]
 
 

@@ -108,10 +108,7 @@ class ModelPolicy(Agent, abc.ABC):
         return None
 
     def offered(self, names: tuple[str, ...]) -> tuple[str, ...] | None:
-        """Return, for the contract's `behaviour`, the names of what a family can state of its chunks.
-
-        None if there are none, or if an act is not a whole chunk.
-        """
+        """Return the names for the contract's `behaviour`; None if there are none, or if an act is no whole chunk."""
         return names if names and self.config.actions == "chunk" else None
 
     def chunk(self, horizon: int) -> int:
@@ -184,10 +181,7 @@ class ModelPolicy(Agent, abc.ABC):
         return None if self.config.actions == "queue" and self.history == 1 else self.perceive(obs)
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
-        """Return a chunk (H, D), or one action (D,), by `config.actions`, for each session.
-
-        One forward pass serves all sessions that need the model at this tick.
-        """
+        """Return a chunk (H, D), or one action (D,), for each session, from one forward pass for all that need one."""
         results: list[Act | Exception | None] = [None] * len(obs)
         rows: list[Row] = []
         owners: list[int] = []
@@ -417,16 +411,7 @@ _OTHER = "warm up"  # longer, as some models pad instructions to the longest one
 def require_deterministic(
     chunks: Callable[[Sequence[Any]], list[np.ndarray]], example: Callable[[int, str], Any], size: int
 ) -> None:
-    """Compare the chunks of one row alone, and in the first and in the last place among others.
-
-    Args:
-        chunks: Computes the chunks (H, D) of rows, at most `size` of them.
-        example: Makes a row with a seed and an instruction.
-        size: The size of all batches.
-
-    Raises:
-        ConfigError: They differ.
-    """
+    """Compare a row's chunk alone, and first and last among others; raises `ConfigError` if they differ."""
 
     def others() -> list[Any]:
         return [example(seed, _OTHER) for seed in range(1, size)]

@@ -59,11 +59,7 @@ def expert_for(env_name: str) -> Expert:
 
 
 def sim_vector(obs: Obs, size: int, env_name: str) -> np.ndarray:
-    """Return `info["sim_state"]` of an observation, (`size`,), as the env gives it.
-
-    Raises:
-        InvalidObservation: The observation has no such vector.
-    """
+    """Return `info["sim_state"]` of an observation, (`size`,); raises `InvalidObservation` if there is none."""
     state = obs.info.get("sim_state")
     if not isinstance(state, np.ndarray) or state.shape != (size,):
         got = f"shape {state.shape}" if isinstance(state, np.ndarray) else type(state).__name__

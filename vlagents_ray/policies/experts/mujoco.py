@@ -34,9 +34,7 @@ class HandPose:
 
 
 def joints(arm: str, pose: HandPose) -> list[float]:
-    """Return the joint angles of an arm and its gripper's position, 7 numbers, with the elbow above.
-
-    A pose out of reach becomes the nearest one in its direction.
+    """Return the joint angles of an arm and its gripper's position, 7 numbers; out of reach, those nearest to the pose.
     """
     base_x, base_y, facing = _BASES[arm]
     x, y = facing * (pose.xyz[0] - base_x), facing * (pose.xyz[1] - base_y)
@@ -65,12 +63,6 @@ class AlohaExpert:
         self._step = 0
 
     def reset(self, obs: Obs, instruction: str) -> None:
-        """Begin an episode.
-
-        Raises:
-            InvalidObservation: The observation lacks the objects' poses.
-            MissingState: The observation lacks a part of the arms' state.
-        """
         objects = sim_vector(obs, _OBJECTS[self._task], f"aloha/{self._task}")
         plan = (_transfer if self._task == "transfer_cube" else _insertion)(objects)
         self._way = {

@@ -60,11 +60,6 @@ class TabletopExpert:
         self._waited = 0
 
     def reset(self, obs: Obs, instruction: str) -> None:
-        """Begin an episode.
-
-        Raises:
-            InvalidObservation: The instruction is of another kind, or names an object that is not visible.
-        """
         self._plan = plan(_image(obs), instruction)
         self._instruction = instruction
         self._waited = 0

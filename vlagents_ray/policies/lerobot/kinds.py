@@ -169,10 +169,7 @@ class MultiTaskDit(Kind):
 
 
 class Flow(Kind):
-    """SmolVLA, π0 and π0.5: flow matching from noise of the sessions, guided by their leftovers.
-
-    What an observation is encoded to is shared by the samples of its session.
-    """
+    """SmolVLA, π0 and π0.5: flow matching from noise of the sessions, guided by their leftovers."""
 
     batched = True
     noise_level = 0.0  # as for `RandomSteps`
@@ -290,10 +287,7 @@ class SmolVLAPasses(FlowPasses):
         model.vlm_with_expert.embed_image = self._embed
 
     def encode_images(self, images: Sequence[Any]) -> list[Any]:
-        """Return the patches of images (P, 3, H, W) in the vision model's terms, (P, L, E).
-
-        The vision model itself looks for the patches of each image of a batch, which could not be compiled.
-        """
+        """Return the patches of images (P, 3, H, W) in the vision model's terms, (P, L, E)."""
         vision = self._vlm.vision_model
         places = vision.embeddings.position_embedding
         found = []
@@ -408,10 +402,7 @@ def _part(batch: Mapping[str, Any], places: Sequence[int], length: int, rows: in
 
 
 def require_groot_statistics(before: Sequence[Any], after: Sequence[Any], settings: Any) -> None:
-    """Raise `ConfigError` unless GR00T's processors scale state and actions by usable bounds of the policy's widths.
-
-    LeRobot passes what has no statistics on unchanged, and fills missing bounds with 0 and 1.
-    """
+    """Raise `ConfigError` unless GR00T's processors have usable bounds, for which LeRobot takes 0 and 1 if missing."""
     torch = require("torch")
     pack, decode = _step(before, "embodiment_tag"), _step(after, "env_action_dim")
     if pack is None or decode is None:

@@ -109,9 +109,7 @@ class Processors:
         return groot_dataset(self._before.steps) if numbers is None else DatasetContract.from_statistics(numbers)
 
     def require_statistics(self, settings: Any, inputs: Sequence[str]) -> None:
-        """Raise `ConfigError` unless all `inputs`, and the actions, are normalised as the policy was trained.
-
-        LeRobot passes features without statistics on unchanged.
+        """Raise `ConfigError` unless all `inputs`, and the actions, have the statistics that LeRobot would do without.
         """
         if self._groot:
             require_groot_statistics(self._before.steps, self._after.steps, settings)

@@ -86,9 +86,6 @@ class OpenVLAOFT(PrismaticPolicy):
 
     @property
     def contract(self) -> Contract:
-        """The cameras and states of training, an instruction, and chunks of the actions of the checkpoint's
-        datasets.
-        """
         return Contract(
             cameras=camera_specs(self._cameras),
             state=state_specs(self._state, self.state_dim),
@@ -296,9 +293,7 @@ class Parallel:
         return model.norm(embeddings)
 
     def _hidden(self, sequences: Sequence[tuple[Any, Any]], actions: Any = None) -> Any:
-        """Return hidden states (B, H * D, …) of the action tokens, which are `actions` or zeros.
-
-        Padded on the right.
+        """Return hidden states (B, H * D, …) of the action tokens, `actions` or zeros, of rows padded on the right.
         """
         torch = require("torch")
         count = self.horizon * self.dim
@@ -324,10 +319,7 @@ def _numpy(tensor: Any) -> np.ndarray:
 
 
 def denoise(noise: Any, predict: Callable[[int, Any], Any], trained: int, steps: int) -> Any:
-    """Return actions (B, H, D) in [-1, 1] from noise.
-
-    `predict` returns the noise in them at a time of training's scale.
-    """
+    """Return actions (B, H, D) in [-1, 1] from noise; `predict` returns the noise in them at a time of training."""
     kept = _kept(trained)
     for time, before in _times(trained, steps):
         guessed = predict(time, noise)

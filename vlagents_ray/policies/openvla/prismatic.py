@@ -98,10 +98,7 @@ class Statistics:
         return list(self._datasets)
 
     def key(self, wanted: str | None) -> str:
-        """Return the dataset of that name, with or without `_no_noops`; without a name, the only one.
-
-        Raises `InvalidObservation` with the known names if there is none, or more than one.
-        """
+        """Return the dataset of that name, with or without `_no_noops`; by default the only one."""
         if wanted is None and len(self._datasets) == 1:
             return next(iter(self._datasets))
         for name in (wanted, f"{wanted}_no_noops"):
@@ -168,10 +165,7 @@ class Prismatic:
         return self.processor.apply_transform(require("PIL.Image").fromarray(image))
 
     def tokens(self, instruction: str) -> list[int]:
-        """Return the prompt for an instruction, which the caller must not change.
-
-        Raises `InvalidObservation` if it is longer than in the model's training, or than all are padded to.
-        """
+        """Return the prompt for an instruction, not to be changed; raises `InvalidObservation` if it is too long."""
         ids = self._tokenized(instruction)
         most = self.padded_tokens if self.deterministic else self.network.config.llm_max_length
         if len(ids) > most:
@@ -377,9 +371,7 @@ def _from_source(root: Path) -> tuple[Any, Any]:
 
 @contextlib.contextmanager
 def _bare_packages(root: Path) -> Iterator[None]:
-    """Import from `root` without the packages' own `__init__`, which import all of training's packages, TensorFlow
-    too.
-    """
+    """Import from `root` without the packages' own `__init__`, which import TensorFlow and more."""
     before = _take_out()
     for name in _PACKAGES:
         package = types.ModuleType(name)

@@ -72,11 +72,7 @@ class UpstreamClient(abc.ABC):
 
     @abc.abstractmethod
     def connect(self, timeout_s: float) -> dict[str, Any]:
-        """Connect, and return what the upstream says about itself.
-
-        Raises:
-            PolicyUnavailable: It cannot be reached.
-        """
+        """Connect, and return what the upstream says about itself; raises `PolicyUnavailable` if it does not answer."""
 
     @property
     @abc.abstractmethod
@@ -196,11 +192,7 @@ class WebSocketClient(UpstreamClient):
             raise self.lost(error) from error
 
     def recv(self, timeout_s: float | None = None) -> bytes | str:
-        """Return the next message.
-
-        Raises:
-            ConnectionLost: The connection broke, or no message came in time.
-        """
+        """Return the next message; raises `ConnectionLost` if the connection broke, or none came in time."""
         wait_s = self.options.timeout_s if timeout_s is None else timeout_s
         try:
             return self._opened().recv(timeout=wait_s)

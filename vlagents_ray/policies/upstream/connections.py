@@ -59,12 +59,7 @@ class Lanes:
         self._pool = ThreadPoolExecutor(max(1, len(clients) - 1), "upstream")
 
     def start(self, timeout_s: float) -> None:
-        """Connect, and return when one upstream answers; the others are connected when they do.
-
-        Raises:
-            ContractMismatch: The first that answers is not the one that is wanted.
-            PolicyUnavailable: None answers in time.
-        """
+        """Return when one upstream answers; raises `ContractMismatch` if it is another one than is wanted."""
         for client in self._clients:
             self._connect_in_background(client)
         with self._changed:
@@ -245,12 +240,7 @@ class SessionConnections:
         self._connected(timeout_s).close()
 
     def begin(self, session: str) -> None:
-        """Connect for an episode of a session.
-
-        Raises:
-            NoReplica: No upstream answers within `retry_s`.
-            PolicyFailed: The upstream refuses the episode.
-        """
+        """Connect for an episode of a session; raises `NoReplica` if no upstream answers within `retry_s`."""
         client = self._connected(self._retry_s)
         if client.one_session:  # whose state the begin of this episode ends
             for other in list(self._clients):

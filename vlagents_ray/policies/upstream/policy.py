@@ -205,12 +205,7 @@ class Upstream(Agent):
         return contract
 
     def initialize(self) -> None:
-        """Connect to the upstreams, and compare the mapping with what they say about themselves.
-
-        Raises:
-            ContractMismatch: They differ.
-            PolicyUnavailable: None answers in time.
-        """
+        """Connect to the upstreams; raises `ContractMismatch` if their own statements differ from the mapping."""
         key = None
         if (name := self.config.key_env) is not None and not (key := os.environ.get(name)):
             raise ConfigError(f"key_env: the environment variable {name!r} is not set; set it where the replica runs")

@@ -39,16 +39,7 @@ class PolicyReply:
 def write_request(
     kind: str, message_id: str, payload: Mapping[str, Any], evaluation: str, trial: str | None, step: int
 ) -> bytes:
-    """Return a request.
-
-    Args:
-        kind: One of `REPLIES`.
-        message_id: Which the reply repeats.
-        payload: Its content.
-        evaluation: Name of the evaluation.
-        trial: Name of the episode.
-        step: Number of the observation in the episode.
-    """
+    """Return a request: a kind of `REPLIES`, the id that its reply repeats, its content, and its place."""
     message = {
         "message_type": kind,
         "message_id": message_id,
@@ -82,14 +73,7 @@ def read_reply(data: bytes, limits: Limits = DEFAULT_LIMITS) -> PolicyReply:
 
 
 def read_actions(payload: Mapping[str, Any]) -> np.ndarray | dict[str, np.ndarray]:
-    """Return the actions in the payload of an `infer_result`.
-
-    Returns:
-        (D,) or (H, D); or, if the server answers a map or one for each step, such by its names.
-
-    Raises:
-        MalformedMessage: They are none of these.
-    """
+    """Return the actions in the payload of an `infer_result`, (D,) or (H, D), or such by the server's names."""
     actions = payload.get("actions")
     if isinstance(actions, dict):
         return {_text(name): _numbers(value) for name, value in actions.items()}
