@@ -131,7 +131,7 @@ class Adapters:
 
     @contextmanager
     def rows(self, fingerprints: Iterable[str]) -> Iterator[None]:
-        """Apply an adapter to each row of the network's passes in this context; inputs have as many entries for each."""
+        """Apply an adapter to each row of the network's passes."""
         before = self._chosen
         self._chosen = self._tensor([self._places[one] for one in fingerprints])
         try:

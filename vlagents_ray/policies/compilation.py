@@ -40,8 +40,7 @@ def keep_torch_programs() -> None:
 
 
 def keep_jax_programs(jax: Any, platform: str) -> None:
-    """Let JAX keep its programs for a GPU in the user's cache, unless `JAX_COMPILATION_CACHE_DIR` names another folder.
-    """
+    """Let JAX keep its programs for a GPU in the user's cache, unless `JAX_COMPILATION_CACHE_DIR` is set."""
     if platform == "cpu":
         return
     chosen = getattr(jax.config, "jax_compilation_cache_dir", "an older JAX, without this setting")

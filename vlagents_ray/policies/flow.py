@@ -161,8 +161,7 @@ class RandomSteps:
         return velocity
 
     def stated(self, execute: int | None, dim: int | None) -> dict[int, dict[str, Any]]:
-        """Return what is wanted of rows, by their places, after the last step; None stands for all rows, all numbers.
-        """
+        """Return what is wanted of rows, by their places, after the last step; None: all rows, all numbers."""
         stds = [step_std(step, self._steps, self._level) for step in range(self._steps)]
         logprob = sum(map(normal_logprob, self._chain[1:], self._means, stds))[:, :execute, :dim].cpu().numpy()
         entropy = chain_entropy(self._steps, self._level) * logprob[0].size

@@ -375,8 +375,7 @@ def built_without_flash_attention() -> Iterator[None]:
 
 
 def use_torch_attention(model: Any) -> None:
-    """Have parts that ask for flash-attention use torch's; N1.6's vision tower attends within each of several images.
-    """
+    """Have parts that ask for flash-attention use torch's; N1.6's vision tower attends within each image."""
     transformers = require("transformers.modeling_utils")
     for module in model.modules():
         config: Any = getattr(module, "config", None)

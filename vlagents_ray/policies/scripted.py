@@ -34,8 +34,7 @@ class Scripted(Agent):
         return Contract()
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
-        """Begin an episode of the env `kwargs["env"]`, or of the config's `task`; raises `InvalidInput` without either.
-        """
+        """Begin an episode of the env `kwargs["env"]`, or of the config's `task`."""
         self._expert = None  # the previous episode's expert must not act if this fails
         env = kwargs.get("env") or self.config.task
         if not isinstance(env, str):

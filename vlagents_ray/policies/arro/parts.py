@@ -70,8 +70,7 @@ class Segmenter(Part, Protocol):
     """Computes masks of objects."""
 
     def segment(self, images: Images, boxes: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """Return the mask of the object in each box, (N, H, W) bool for boxes (N, 4) px, all False where there is none.
-        """
+        """Return the mask of the object in each box, (N, H, W) bool for boxes (N, 4) px; all False for none."""
         ...
 
     def propose(self, images: Images) -> list[np.ndarray]:

@@ -85,8 +85,7 @@ def _holds(folder: Path, path: Path) -> bool:
 
 
 def find_adapter(source: str, checkpoint: str, base: Sequence[Path], digest_of_base: str) -> tuple[Adapter, Path]:
-    """Return a LoRA adapter and its folder; raises `ConfigError` if there is none, or it was trained on another base.
-    """
+    """Return a LoRA adapter and its folder; raises `ConfigError` if it was trained on another base."""
     folder = find_checkpoint(source, needs=FILES)
     if not folder.is_dir():
         raise ConfigError(f"{folder}: got a file, want the folder with {', '.join(FILES)}, as PEFT saves it")

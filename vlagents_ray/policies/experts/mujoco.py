@@ -34,8 +34,7 @@ class HandPose:
 
 
 def joints(arm: str, pose: HandPose) -> list[float]:
-    """Return the joint angles of an arm and its gripper's position, 7 numbers; out of reach, those nearest to the pose.
-    """
+    """Return the joint angles of an arm and its gripper's position, 7 numbers; out of reach, the nearest ones."""
     base_x, base_y, facing = _BASES[arm]
     x, y = facing * (pose.xyz[0] - base_x), facing * (pose.xyz[1] - base_y)
     out = math.hypot(x, y) - _HAND * math.cos(pose.pitch)

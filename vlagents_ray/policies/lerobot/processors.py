@@ -109,8 +109,7 @@ class Processors:
         return groot_dataset(self._before.steps) if numbers is None else DatasetContract.from_statistics(numbers)
 
     def require_statistics(self, settings: Any, inputs: Sequence[str]) -> None:
-        """Raise `ConfigError` unless all `inputs`, and the actions, have the statistics that LeRobot would do without.
-        """
+        """Raise `ConfigError` unless all `inputs`, and the actions, have their statistics."""
         if self._groot:
             require_groot_statistics(self._before.steps, self._after.steps, settings)
             return

@@ -293,8 +293,7 @@ class Parallel:
         return model.norm(embeddings)
 
     def _hidden(self, sequences: Sequence[tuple[Any, Any]], actions: Any = None) -> Any:
-        """Return hidden states (B, H * D, …) of the action tokens, `actions` or zeros, of rows padded on the right.
-        """
+        """Return hidden states (B, H * D, …) of the action tokens, which are `actions` or zeros."""
         torch = require("torch")
         count = self.horizon * self.dim
         if actions is None:
