@@ -176,7 +176,7 @@ def _varied_names(place: Path, suite: str, known: list[str]) -> list[str]:
 
 
 def _read_variant(place: Path, suite: str, name: str) -> tuple[str, Path, Path]:
-    """Return a task's instruction, its BDDL file and its initial states; raises `ConfigError` if it cannot be played."""
+    """Return a task's instruction, its BDDL file and its initial states."""
     problem = place / _PROBLEMS / suite / f"{name}.bddl"
     _require_playable(problem)
     unspoken = re.sub(r"_language_\d+$", "", name)  # of the task whose instruction alone is another
