@@ -63,7 +63,6 @@ class Chains:
     """
 
     def __init__(self, checkout: Path) -> None:
-        """Read the code in `checkout`, a checkout of CALVIN."""
         evaluation = checkout / _EVALUATION
         utils = _definitions(
             evaluation / "utils.py",

@@ -78,7 +78,6 @@ class _Functions:
         self.gl_string = self._extension("glGetString", ctypes.c_char_p, ctypes.c_uint)
 
     def devices(self) -> list[tuple[int | None, EglDevice]]:
-        """List the devices with their handles."""
         handles, number = (ctypes.c_void_p * _MOST)(), ctypes.c_int()
         if not self._query(_MOST, handles, ctypes.byref(number)):
             return []
@@ -204,7 +203,6 @@ def require_own(renderer: Renderer) -> None:
 
 
 def _lavapipe() -> Path | None:
-    """Return the file that describes Mesa's software driver to Vulkan."""
     return next((path for folder in _ICD_FOLDERS for path in sorted(Path(folder).glob("lvp_icd*.json"))), None)
 
 

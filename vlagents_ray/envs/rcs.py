@@ -411,7 +411,6 @@ class Arms:
         self.has_gripper = self.single and bool(self._grippers)  # that `Obs.gripper` can tell
 
     def action_spec(self, *, delta: bool) -> ActionSpec:
-        """The contract of an action."""
         space, rotation = _COMMANDS[self._mode]
         return ActionSpec(
             dim=sum(self._sizes.values()) + len(self._grippers),
@@ -425,7 +424,6 @@ class Arms:
         )
 
     def command(self, row: np.ndarray) -> dict[str, dict[str, np.ndarray]]:
-        """A row, (D,), as RCS takes it."""
         commands: dict[str, dict[str, np.ndarray]] = {}
         rest = row.astype(np.float64)
         for name in self.names:

@@ -63,7 +63,6 @@ class RobosuiteEnv(SimulatorEnv):
         return super().describe() | {"control_mode": "OSC_POSE"}
 
     def _command(self, action: np.ndarray) -> np.ndarray:
-        """Turn an action of the contract into robosuite's."""
         return action
 
     def _sim_state(self, raw: Mapping[str, Any]) -> dict[str, np.ndarray]:
@@ -219,7 +218,6 @@ class RobosuiteTask:
 
     @property
     def protocol(self) -> BenchmarkProtocol:
-        """The protocol of the task."""
         return replace(_PROTOCOL, max_steps=self.max_steps)
 
 
@@ -342,7 +340,6 @@ class Robosuite(RobosuiteEnv):
         return list(TASKS)
 
     def _sim_state(self, raw: Mapping[str, Any]) -> dict[str, np.ndarray]:
-        """The positions and orientations of objects, and the place where one belongs."""
         env, found = self._env, super()._sim_state(raw)
         if hasattr(env, "target_bin_placements"):
             found["target_pos"] = np.array(env.target_bin_placements[env.object_id], np.float64)

@@ -138,7 +138,6 @@ class Simpler(SimulatorEnv):
 
     @classmethod
     def missing(cls) -> str | None:
-        """Say why SIMPLER cannot run here; its assets are in no package."""
         folder = Path(os.environ.get("MS_ASSET_DIR", Path.home() / ".maniskill"))
         return ManiSkill.missing() or _missing_assets(folder)
 
@@ -207,7 +206,6 @@ def _missing_assets(folder: Path) -> str | None:
 
 
 def _find_assets(wanted: str | None) -> None:
-    """Make ManiSkill look for assets in `wanted`, and check that they are there."""
     if wanted is not None and "mani_skill" not in sys.modules:
         os.environ["MS_ASSET_DIR"] = wanted
     used = require("mani_skill").ASSET_DIR.parent

@@ -222,7 +222,6 @@ class MujocoCameras:
         return views.pop(""), views
 
     def close(self) -> None:
-        """Free the renderers."""
         for renderer in self._renderers.values():
             renderer.close()
 
@@ -233,7 +232,6 @@ class MujocoCameras:
 
 
 def camera_names(model: Any) -> list[str]:
-    """Return the names of the cameras of a `mujoco.MjModel`."""
     return [model.camera(i).name for i in range(model.ncam)]
 
 

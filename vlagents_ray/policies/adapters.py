@@ -62,7 +62,6 @@ class Adapters:
     """The adapters of one network."""
 
     def __init__(self) -> None:
-        """Hold no adapter yet."""
         self._named: dict[str, Adapter] = {}
         self._places: dict[str, int] = {"": 0}  # by fingerprint: the place in the tensors of all adapters
         self._chosen: Any = None  # the places of the rows of the running pass, int64; None if no row has an adapter
@@ -70,7 +69,6 @@ class Adapters:
 
     @property
     def ids(self) -> dict[str, str]:
-        """The digest of each adapter with its base, by name."""
         return {name: adapter.weights for name, adapter in self._named.items()}
 
     def load(

@@ -119,7 +119,6 @@ class CaptureLock:
             self._acting.add(threading.get_ident())
 
     def __exit__(self, *_: object) -> None:
-        """End an act."""
         with self._changed:
             self._acting.discard(threading.get_ident())
             self._changed.notify_all()
@@ -174,7 +173,6 @@ class CudaGraph:
             raise RuntimeError("the CUDA graph is empty: all work ran on another stream, or on another device")
 
     def __call__(self, *tensors: Any) -> Any:
-        """Return the function's result for tensors of the captured shapes, in memory of its own."""
         for held, tensor in zip(self._inputs, tensors, strict=True):
             held.copy_(tensor, non_blocking=True)
         self._graph.replay()
@@ -263,7 +261,6 @@ class Core:
         self._shapes: dict[int, list[Any]] = {}  # of a row of each argument, for each program
 
     def __call__(self, *tensors: Any) -> Any:
-        """Return the core's result for a batch of any size."""
         rows, building = len(tensors[0]), self._owner.building
         tensors = tuple(map(_of_one_kind, tensors))
         if building is not None and rows == (self._rows or building):

@@ -84,7 +84,6 @@ class DiffusionPolicy(ModelPolicy):
 
     @property
     def contract(self) -> Contract:
-        """The contract; before the checkpoint is loaded it states only that there is no instruction."""
         network: DiffusionNetwork | None = self.model
         if network is None:
             return Contract(instruction=False)
@@ -102,11 +101,9 @@ class DiffusionPolicy(ModelPolicy):
 
     @property
     def state_dim(self) -> int | None:
-        """The total length of the checkpoint's vectors; None before it is loaded."""
         return None if self.model is None else sum(self.model.vectors.values())
 
     def load(self) -> DiffusionNetwork:
-        """Read the checkpoint; raises `ConfigError` for cameras that it does not have."""
         network = DiffusionNetwork.load(self.config)
         self._cameras(network)
         if self.config.compile:
@@ -125,7 +122,6 @@ class DiffusionPolicy(ModelPolicy):
         return seen | {name: vector[a:b] for name, (a, b) in zip(network.vectors, pairwise(ends), strict=True)}
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction]:
-        """Compute the chunks of a batch, with the noise of each row's session."""
         network: DiffusionNetwork = self.model
         torch = require("torch")
         histories = [row.history(self.history) for row in rows]

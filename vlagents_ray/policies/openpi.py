@@ -154,7 +154,6 @@ class Transforms:
         )
 
     def read(self, observation: dict[str, Any], instruction: str) -> dict[str, Any]:
-        """Return the model's inputs for one row."""
         inputs: dict[str, Any] = self.inputs(_with(observation, instruction))
         mask = np.asarray(inputs["tokenized_prompt_mask"])
         if mask.all():
@@ -352,7 +351,6 @@ class JaxTokens(OpenPiModel):
         self._sample = jax.jit(sample)
 
     def sample(self, batch: SampleBatch) -> np.ndarray:
-        """Decode tokens, (B, T) int32."""
         jax = require("jax")
         return self.ended(np.asarray(self._sample(self._state, jax.device_put(batch.inputs, self._device)), np.int32))
 
@@ -375,7 +373,6 @@ class TorchFlow(OpenPiModel):
         self.noise_shape: tuple[int, int] = (network.config.action_horizon, network.config.action_dim)
 
     def sample(self, batch: SampleBatch) -> np.ndarray:
-        """Compute actions (B, H, action_dim) float32."""
         jax, torch = require("jax"), require("torch")
         observation = _observation(jax.tree.map(self._convert, batch.inputs))
         start, changes = self._convert(batch.noise), list[Change]()
@@ -499,7 +496,6 @@ class OpenPi(ModelPolicy):
 
     @property
     def contract(self) -> Contract:
-        """The contract of the robot that the checkpoint's config names; empty before the checkpoint is loaded."""
         if self.model is None:
             return Contract()
         robot = self.model.robot
@@ -521,7 +517,6 @@ class OpenPi(ModelPolicy):
         return flows and self.config.actions == "chunk"
 
     def load(self) -> LoadedOpenPi:
-        """Load the checkpoint by the config with which it was trained."""
         use_source("openpi", SOURCE, self.config.source_dir, within=FOLDERS)
         config = train_config(self.config.config)
         folder = self._folder()
@@ -543,7 +538,6 @@ class OpenPi(ModelPolicy):
         return LoadedOpenPi(model, transforms, robot, config.model.action_horizon)
 
     def perceive(self, obs: Obs) -> SeenObs:
-        """Convert the observation to openpi's form, and by openpi's transforms to the model's inputs."""
         loaded = self.loaded()
         seen = loaded.robot.read(obs)
         return SeenObs(seen, loaded.transforms.read(seen, self._begun().instruction))

@@ -100,7 +100,6 @@ class Pi0(ModelPolicy):
 
     @property
     def contract(self) -> Contract:
-        """The contract; dimensions and the chunk's length are stated once the checkpoint is loaded."""
         loaded = self.model
         return Contract(
             cameras=camera_specs(self.cameras),
@@ -122,7 +121,6 @@ class Pi0(ModelPolicy):
         return self.config.actions == "chunk"
 
     def load(self) -> LoadedPi0:
-        """Load the model with every parameter of the checkpoint, and its processor with all statistics."""
         path = find_checkpoint(
             self.config.checkpoint,
             self.config.checkpoint_step,
@@ -198,7 +196,6 @@ class Pi0(ModelPolicy):
         self._begun().prompt = dict(tokens)
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction]:
-        """Compute the chunks of all rows with one flow, and the images and instructions of each observation once."""
         model, torch = self.loaded(), require("torch")
         shape = (model.network.config.chunk_size, model.network.config.max_action_dim)
 
@@ -220,7 +217,6 @@ class Pi0(ModelPolicy):
         return int(self.config.steps or self.loaded().network.config.num_inference_steps)
 
     def _inputs(self, rows: Sequence[Row]) -> Mapping[str, Any]:
-        """Return tokens, images and states on the device."""
         model, torch, frames = self.loaded(), require("torch"), [row.frames[-1] for row in rows]
         batch = {key: torch.cat([frame[key] for frame in frames]) for key in frames[0]}
         return {

@@ -41,7 +41,6 @@ class Replay(Agent):
 
     @property
     def contract(self) -> Contract:
-        """The contract; the action's dimension is stated once `initialize` has read the recording."""
         dim = None if self.actions is None else self.actions.shape[1]
         return Contract(action=ActionSpec(dim=dim), chunk=self.config.chunk)
 

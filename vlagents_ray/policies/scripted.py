@@ -30,7 +30,6 @@ class Scripted(Agent):
 
     @property
     def contract(self) -> Contract:
-        """An empty contract, as each session has another expert."""
         return Contract()
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:

@@ -264,7 +264,6 @@ def _only(folder: Path) -> Path:
 
 
 def _clean(part: Mapping[str, Any]) -> dict[str, Any]:
-    """Rename tensors to the names of the model itself."""
     cleaned = {}
     for name, tensor in part.items():
         for prefix in _PREFIXES:
@@ -460,7 +459,6 @@ class VJepa2Ac(ModelPolicy):
         )
 
     def load(self) -> WorldModel:
-        """Load encoder and predictor, with every parameter from the checkpoint."""
         saved = read_checkpoint(self.config)
         device = torch_device(self.config.device)
         dtype = torch_dtype(self.config.dtype, device, preferred="float32")  # upstream plans in float32

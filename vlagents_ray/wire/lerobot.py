@@ -272,7 +272,6 @@ def write_data(data: bytes) -> bytes:
 
 
 def method(name: str) -> str:
-    """Return the path of a method of the service."""
     return f"/{SERVICE}/{name}"
 
 
@@ -280,7 +279,6 @@ EMPTY = b""  # an `Empty`, and an `Actions` without a pickle
 
 
 def _head(number: int, length: int) -> bytes:
-    """Return what precedes the bytes of a field."""
     size = bytearray()
     while length > 0x7F:
         size.append(length & 0x7F | 0x80)
@@ -379,7 +377,6 @@ def features_of(mapping: KeyMapping) -> tuple[tuple[str, ...], tuple[str, ...]]:
 
 
 def write_instructions(instructions: PolicyInstructions) -> bytes:
-    """Return the pickle of policy instructions."""
     state: dict[str, Any] = {
         STATE: {"dtype": "float32", "shape": (len(instructions.state),), "names": list(instructions.state)}
     }

@@ -31,7 +31,6 @@ def decode(body: bytes, limits: Limits = DEFAULT_LIMITS) -> tuple[dict[str, Any]
 
 
 def encode(action: np.ndarray | Sequence[np.ndarray], twice: bool) -> bytes:
-    """Return the reply with one action, (D,), or several."""
     text = json_numpy.dumps(action)
     return (json.dumps(text) if twice else text).encode()
 
@@ -44,7 +43,6 @@ def _load(text: bytes, limits: Limits) -> dict[str, Any]:
 
 
 def encode_observation(observation: Mapping[str, Any]) -> bytes:
-    """Return the body of a request, encoded once."""
     return json_numpy.dumps(observation).encode()
 
 

@@ -122,7 +122,6 @@ class Outgoing:
         )
 
     def _vectors(self, obs: Obs) -> dict[str, np.ndarray]:
-        """Return their vectors by key."""
         pieces: dict[str, list[tuple[int, np.ndarray]]] = {}
         for name, parts in self.mapping.state.items():
             for matched, vector in _matching(name, name, obs.state, self.mapping.state):

@@ -126,12 +126,10 @@ def request(sequence: int, handler: Handler, boxed_args: tuple[int, Any]) -> byt
 
 
 def boxed_value(value: Any) -> tuple[int, Any]:
-    """Return the box of a value without references."""
     return _VALUE, value
 
 
 def boxed_tuple(*boxes: tuple[int, Any]) -> tuple[int, Any]:
-    """Return the box of a tuple of boxes."""
     return _TUPLE, boxes
 
 
@@ -232,7 +230,6 @@ class _BrineReader:
         self._items = 0
 
     def all(self) -> Any:
-        """Return the value that the message consists of."""
         value = self._value(0)
         if self._at != len(self._data):
             raise MalformedMessage("brine: more than one value in a message")
@@ -289,11 +286,9 @@ class _BrineReader:
         return int(digits)
 
     def length1(self) -> int:
-        """Read a length of one byte."""
         return self._take(1)[0]
 
     def length4(self) -> int:
-        """Read a length of four bytes."""
         return int(_U4.unpack(self._take(4))[0])
 
 

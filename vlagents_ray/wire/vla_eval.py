@@ -90,7 +90,6 @@ def decode_images(payload: dict[str, Any], budget: Budget) -> dict[str, Any]:
 
 
 def encode(message: Message) -> bytes:
-    """Return a message in the client's format."""
     fields = {
         "type": message.kind,
         "payload": message.payload,

@@ -261,7 +261,6 @@ class RemoteError:
 
 
 def get_root(sequence: int) -> bytes:
-    """Return the frame that asks for the reference to the server's root."""
     return rpyc.request(sequence, rpyc.Handler.GETROOT, rpyc.boxed_value(()))
 
 

@@ -141,7 +141,6 @@ def _registered(task: str, module: str | None) -> Any:
 
 
 def _vector_arguments(gymnasium: Any, spec: Any, vectorization: str, max_steps: int | None) -> dict[str, Any]:
-    """The arguments of `gymnasium.make_vec` by default."""
     arguments: dict[str, Any] = {"max_episode_steps": max_steps} if max_steps is not None else {}
     if vectorization != "vector_entry_point":
         mode = gymnasium.vector.AutoresetMode.DISABLED  # one row can begin an episode while the others go on
@@ -330,12 +329,10 @@ class Gymnasium(EvalEnv):
 
     @classmethod
     def _makes_vectors(cls, options: Mapping[str, Any]) -> bool:
-        """Whether the constructor makes a VectorEnv of its options."""
         task, module = options.get("task"), options.get("module")
         return options.get("vectorization") is not None or (task is not None and only_vectors(task, module))
 
     def _make(self, max_steps: int | None) -> Any:
-        """Make the environment: a `gymnasium.Env`, or `VectorRows` with `rows` of them."""
         return make(
             self._name,
             self._id,

@@ -49,15 +49,12 @@ class VectorRows:
         return self.autoreset == "DISABLED"
 
     def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Reset all rows; returns the first one's observation and info."""
         return self.reset_all([seed] * self.num_envs, options)[0]
 
     def step(self, action: np.ndarray) -> Row:
-        """Step all rows by one action; returns the first one's step."""
         return self.step_all(np.repeat(action[None], self.num_envs, axis=0))[0]
 
     def render(self) -> Any:
-        """Return the first row's picture."""
         return self.render_all()[0]
 
     def reset_all(
@@ -92,7 +89,6 @@ class VectorRows:
         return rows
 
     def render_all(self) -> Sequence[Any]:
-        """Return the picture of each row."""
         pictures: Sequence[Any] = self._vector.render()
         if pictures is None or len(pictures) != self.num_envs:
             got = None if pictures is None else len(pictures)

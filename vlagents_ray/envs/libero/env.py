@@ -175,7 +175,6 @@ def _turned(image: np.ndarray) -> np.ndarray:
 
 
 def _contract_of(protocol: LiberoProtocol) -> Contract:
-    """Return the contract of an env under a protocol; names and units are those of policies for LIBERO."""
     return Contract(
         cameras={name: CameraSpec(*protocol.image_size) for name in protocol.cameras},
         state={

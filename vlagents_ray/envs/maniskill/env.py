@@ -242,7 +242,6 @@ def _simulator(
 
 
 def _described(simulator: Simulator, reconfigure: bool, max_steps: int, own_limit: int | None) -> dict[str, Any]:
-    """Return what `describe` states, with the deviations of the settings from the protocol."""
     deviations = []
     if not reconfigure:
         deviations.append("reconfigure is False: scenes are kept from episode to episode")

@@ -220,7 +220,6 @@ class ManiSkillRobot:
 
     @property
     def gives(self) -> dict[str, StateSpec]:
-        """The parts of the state that `read` fills."""
         parts = {"joints": StateSpec(dim=len(self._arm), unit="rad")}
         if self._has_tool:
             parts["tquat"] = StateSpec(dim=7, unit="m+quat_xyzw")
@@ -229,7 +228,6 @@ class ManiSkillRobot:
 
     @property
     def has_gripper(self) -> bool:
-        """Whether the opening of the gripper is known."""
         return self._finger_m is not None
 
     def read(self, agent: Any) -> list[tuple[dict[str, np.ndarray], float | None]]:
@@ -258,7 +256,6 @@ def _tool(agent: Any) -> Any:
 
 
 def action_spec(control_mode: str, space: Any, *, has_gripper: bool) -> ActionSpec:
-    """The contract of a control mode; `space` is its Gymnasium box, (D,)."""
     normalized = bool((space.low == -1.0).all() and (space.high == 1.0).all())
     return ActionSpec(
         dim=int(space.shape[0]),
@@ -357,12 +354,10 @@ class Simulator:
 
     @property
     def action(self) -> ActionSpec:
-        """The specification of the control mode's actions."""
         env = self.alive()
         return action_spec(env.control_mode, env.single_action_space, has_gripper=self._robot.has_gripper)
 
     def contract(self, action: ActionSpec) -> Contract:
-        """Return the contract of each environment, with these actions."""
         return Contract(
             cameras=self.cameras,
             state=self._robot.gives,
@@ -373,7 +368,6 @@ class Simulator:
         )
 
     def instructions(self) -> list[str]:
-        """The task in words, for each environment."""
         env = self.alive()
         own = getattr(env, "get_language_instruction", None)
         return [str(text) for text in own()] if own is not None else [instruction_for(self._task)] * env.num_envs
@@ -428,12 +422,10 @@ class Simulator:
         return Moment(seen, success, [0.0] * len(seen))
 
     def renderer(self) -> Renderer | None:
-        """The Vulkan device that draws."""
         found = vulkan_device(on_gpu=self.alive().backend.render_device.is_cuda())
         return None if found is None else vulkan_renderer(found.name, found.cuda, asked_for=self._asked_for)
 
     def describe(self) -> dict[str, Any]:
-        """Versions, backends and modes, for the record."""
         env = self.alive()
         return {
             "simulator": "maniskill",
@@ -452,13 +444,11 @@ class Simulator:
         }
 
     def alive(self) -> Any:
-        """ManiSkill's environment; `EnvFailed` after `close`."""
         if self.env is None:
             raise EnvFailed(f"{self.name} is closed; make a new one")
         return self.env
 
     def close(self) -> None:
-        """Free it; safe to call twice."""
         env, self.env, self._record = self.env, None, None
         if env is not None:
             env.close()

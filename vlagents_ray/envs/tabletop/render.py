@@ -59,7 +59,6 @@ class TabletopRenderer:
         self._still_key: tuple[tuple[float, float, float], ...] = ()
 
     def begin(self, pads: list[Pad]) -> None:
-        """Draw the pads, which do not move in an episode."""
         self._floor_picture = self._background.copy()
         for pad in pads:
             self._blend(self._floor_picture, self._pads[pad.colour], pad.x, pad.y, 0.0)
@@ -232,12 +231,10 @@ class Canvas:
         return Sprite(paint.astype(np.uint16), (256 - alpha).astype(np.uint16), self._left, self._top)
 
     def ellipse(self, u: float, v: float, radius_u: float, radius_v: float) -> FloatArray:
-        """Coverage of an ellipse around (u, v)."""
         distance = np.hypot((self.u - u) / radius_u, (self.v - v) / radius_v) - 1
         return np.clip(0.5 - distance * min(radius_u, radius_v), 0, 1)
 
     def box(self, u: float, v: float, half_u: float, half_v: float, corner: float = 0.0) -> FloatArray:
-        """Coverage of a box around (u, v) whose corners are rounded with radius `corner`."""
         across = np.abs(self.u - u) - (half_u - corner)
         down = np.abs(self.v - v) - (half_v - corner)
         outside = np.hypot(np.maximum(across, 0), np.maximum(down, 0))

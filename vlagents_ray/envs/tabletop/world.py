@@ -178,7 +178,6 @@ class TabletopWorld:
         return height
 
     def _carried(self) -> list[Puck]:
-        """The held puck and what stands on it."""
         if self.held is None:
             return []
         carried = [self.held]

@@ -241,7 +241,6 @@ class ColourDetector(Untrained):
     Config: ClassVar[type] = ColourConfig
 
     def detect(self, images: Images, phrases: Sequence[Sequence[str]]) -> list[list[Detection]]:
-        """Return regions by their size; a phrase without a colour has none."""
         return [self._detections(image, asked) for image, asked in zip(images, phrases, strict=True)]
 
     def _detections(self, image: np.ndarray, phrases: Sequence[str]) -> list[Detection]:
@@ -271,11 +270,9 @@ class FlatSegmenter(Untrained):
     Config: ClassVar[type] = FlatConfig
 
     def segment(self, images: Images, boxes: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """Return the content of each box, without the regions that extend beyond it."""
         return [self._inside(image, around) for image, around in zip(images, boxes, strict=True)]
 
     def propose(self, images: Images) -> list[np.ndarray]:
-        """Return all regions that are not too small."""
         return [self._regions(image) for image in images]
 
     def _inside(self, image: np.ndarray, boxes: np.ndarray) -> np.ndarray:
@@ -307,7 +304,6 @@ class CircleSelector(Untrained):
     Config: ClassVar[type] = CircleConfig
 
     def select(self, images: Images, regions: Sequence[np.ndarray]) -> list[list[int]]:
-        """Return those regions, whatever they show."""
         chosen = []
         for image, masks in zip(images, regions, strict=True):
             height, width = image.shape[:2]
@@ -342,14 +338,12 @@ class IouTracker(Untrained):
     Config: ClassVar[type] = IouConfig
 
     def begin(self, images: Images, masks: Sequence[np.ndarray]) -> list[Any]:
-        """Return the colours of each segment."""
         return [
             [_Segment(_own_colours(shades, mask), int(np.count_nonzero(mask)), mask.copy()) for mask in own]
             for shades, own in zip(map(_shades, images), masks, strict=True)
         ]
 
     def follow(self, images: Images, memories: Sequence[Any]) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Search each segment around its last position."""
         followed = []
         for image, segments in zip(images, memories, strict=True):
             shades = _shades(image)

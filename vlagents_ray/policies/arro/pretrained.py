@@ -38,7 +38,6 @@ class GroundingDinoDetector(Pretrained):
         return found
 
     def _batch(self, images: Images, phrases: Sequence[Sequence[str]]) -> list[list[Detection]]:
-        """Detect objects on images of one size."""
         torch = require("torch")
         texts = [_text(asked) for asked in phrases]
         inputs = self._processor(images=writable(images), text=texts, padding=True, return_tensors="pt")
@@ -123,7 +122,6 @@ class Sam2Segmenter(Pretrained):
     classes = ("Sam2Model", "Sam2ImageProcessor")
 
     def segment(self, images: Images, boxes: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """Return one mask for each box."""
         torch = require("torch")
         made = []
         for image, embedded, own in zip(images, self._embedded(images), boxes, strict=True):
@@ -134,7 +132,6 @@ class Sam2Segmenter(Pretrained):
         return made
 
     def propose(self, images: Images) -> list[np.ndarray]:
-        """Return the regions under the points of the grid, the most certain first."""
         torch = require("torch")
         along = (np.arange(self._config.points, dtype=np.float32) + 0.5) * (self._side / self._config.points)
         grid = torch.as_tensor(np.stack(np.meshgrid(along, along), -1).reshape(1, -1, 1, 2), dtype=self._model.dtype)
@@ -158,7 +155,6 @@ class Sam2Segmenter(Pretrained):
         return int(self._processor.size["height"])
 
     def _embedded(self, images: Images) -> list[list[Any]]:
-        """Compute the features of each image."""
         with require("torch").inference_mode():
             levels = self._model.get_image_embeddings(_pixels(self._processor, images, self._model))
         return [[level[i : i + 1] for level in levels] for i in range(len(images))]
@@ -187,7 +183,6 @@ class Sam2Tracker(Pretrained):
     classes = ("Sam2VideoModel", "Sam2VideoProcessor")
 
     def begin(self, images: Images, masks: Sequence[np.ndarray]) -> list[Any]:
-        """Return a memory of the masks."""
         memories = []
         for own in masks:
             memory = _TrackMemory(
@@ -210,7 +205,6 @@ class Sam2Tracker(Pretrained):
         return followed
 
     def _advance(self, images: Images, memories: Sequence[_TrackMemory]) -> list[Any]:
-        """Run the model on the next frame of each memory."""
         pixels = _pixels(self._processor.image_processor, images, self._model)
         with require("torch").inference_mode():
             features = self._model.get_image_features(pixels, return_dict=True)

@@ -147,7 +147,6 @@ class Track:
 
     @property
     def seen(self) -> list[str]:
-        """Labels of the visible segments."""
         return [label for label, lost in zip(self.labels, self.lost, strict=True) if not lost]
 
     @property
@@ -165,7 +164,6 @@ class Track:
         return grown(together, grow)
 
     def move(self, masks: Iterable[np.ndarray], seen: np.ndarray) -> None:
-        """Take over the tracker's masks."""
         self.masks = [new if is_seen else old for new, old, is_seen in zip(masks, self.masks, seen, strict=True)]
         self.lost = [0 if is_seen else frames + 1 for frames, is_seen in zip(self.lost, seen, strict=True)]
 
@@ -181,7 +179,6 @@ class Tracking:
         self._keep_lost = config.keep_lost
 
     def load(self) -> None:
-        """Read the weights of all parts."""
         for part in (self._detector, self._segmenter, self._selector, self._tracker):
             if part is not None:
                 part.load()
@@ -194,7 +191,6 @@ class Tracking:
         return tracks
 
     def follow(self, images: Images, tracks: Sequence[Track]) -> None:
-        """Continue each track on its next image."""
         moving = [i for i, track in enumerate(tracks) if track.labels]
         moved = self._tracker.follow([images[i] for i in moving], [tracks[i].memory for i in moving])
         for i, (masks, seen) in zip(moving, moved, strict=True):
@@ -286,7 +282,6 @@ class Arro(Wrapper):
         )
 
     def initialize(self) -> None:
-        """Load the parts, then the inner agent."""
         with used_checkpoints() as parts:
             self.background.load()
             self.tracking.load()
@@ -345,7 +340,6 @@ class Arro(Wrapper):
         ]
 
     def _names(self, obs: Obs) -> list[str]:
-        """Return the cameras that are changed."""
         stated = self.agent.contract.cameras if self.agent.contract is not None else None
         names = list(self.config.cameras or stated or obs.cameras)
         for name in names:

@@ -60,7 +60,6 @@ def _unusable(library: str, said: str) -> ConfigError:
 
 
 def _described(torch: Any, device: Any) -> dict[str, Any]:
-    """Return what a torch device is, for metadata and log, as JSON values."""
     described = {"kind": device.type, "device": str(device), "torch": torch.__version__}
     if device.type != "cuda":
         return described

@@ -112,7 +112,6 @@ def _is_other(trained_on: str, checkpoint: str, base: Sequence[Path], digest_of_
 
 
 def _beside(path: Path) -> str:
-    """List the files where the checkpoint was expected, for an error message."""
     parent = next((p for p in path.parents if p.is_dir()), Path("/"))
     names = sorted(p.name for p in parent.iterdir())
     shown = ", ".join(names[:_LISTED]) + (" …" if len(names) > _LISTED else "")
@@ -142,7 +141,6 @@ def _from_hub(name: str) -> Path:
 
 
 def _revisions(hub: Any, repository: str) -> str:
-    """List the branches and tags of a repository, for an error message."""
     try:
         refs = hub.HfApi().list_repo_refs(repository)
         names = [one.name for one in (*refs.branches, *refs.tags)]

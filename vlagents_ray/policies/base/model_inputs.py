@@ -126,7 +126,6 @@ def state_specs(parts: Sequence[str], dim: int | None = None) -> dict[str, State
 
 
 def wanted_samples(obs: Obs, config: ModelConfig) -> int:
-    """Return how many samples of the action distribution the observation requests."""
     samples = count_in(obs, SAMPLES)
     if samples > config.max_samples:
         raise InvalidObservation(
@@ -168,7 +167,6 @@ def leftover_plan(obs: Obs, contract: Contract | None) -> np.ndarray:
 
 
 def count_in(obs: Obs, name: str) -> int:
-    """Return the integer of that name in `Obs.info`; 0 if there is none."""
     value = obs.info.get(name) or 0
     if not isinstance(value, int | np.integer) or value < 0:
         raise InvalidObservation(f"info[{name!r}]: got {value!r}, want an int from 0")

@@ -172,7 +172,6 @@ class ModelPolicy(Agent, abc.ABC):
         """Update the session's memory from an observation; called for each one, also if no chunk is requested."""
 
     def observe(self, obs: Obs) -> None:
-        """Add an observation to the history."""
         self.notice(obs)
         self._begun().frames.append(self.perceive(obs))
 
@@ -202,7 +201,6 @@ class ModelPolicy(Agent, abc.ABC):
         ]
 
     def close(self) -> None:
-        """Free the weights, and the programs that compute with them."""
         self.model, self.adapters, self.compilation = None, Adapters(), Compilation(self.config.compile)
 
     def _trainable(self) -> Any:
@@ -302,7 +300,6 @@ class ModelPolicy(Agent, abc.ABC):
         return Act(episode.plan.take().action, info=info)
 
     def _used(self, actions: np.ndarray) -> np.ndarray:
-        """Return the rows of a chunk that are used, (execute, D)."""
         return np.ascontiguousarray(actions[: self.config.execute], dtype=np.float32)
 
     def _distribution(self, own: Prediction, samples: list[Prediction]) -> dict[str, Any]:
@@ -341,11 +338,9 @@ class ModelPolicy(Agent, abc.ABC):
         return bool(fits)
 
     def _size(self, rows: int) -> int:
-        """Return the number of rows to which a pass of so many is padded."""
         return next((size for size in self.config.batch_sizes or () if size >= rows), rows)
 
     def _passes(self, rows: list[Row]) -> list[Prediction | Exception]:
-        """Compute all rows, in forward passes of the sizes that the config allows."""
         found: list[Prediction | Exception] = []
         most = self.most_rows
         for start in range(0, len(rows), most):
@@ -362,7 +357,6 @@ class ModelPolicy(Agent, abc.ABC):
         return found
 
     def _run_examples(self, size: int, seeds: Iterator[int]) -> None:
-        """Run a forward pass of that many rows with the next seeds; raises the first error of a row."""
         self._chunks([self._example(next(seeds)) for _ in range(size)])
 
     def _chunks(self, rows: Sequence[Row]) -> list[np.ndarray]:

@@ -29,12 +29,10 @@ class PushCube:
         self._hand = _Hand()
 
     def reset(self, obs: Obs, instruction: str) -> None:
-        """Begin an episode; raises `InvalidObservation` without PushCube's simulator state."""
         _sim_state(obs, self._name, 35)
         self._phase, self._hand = "over", _Hand()
 
     def act(self, obs: Obs) -> Act:
-        """The next action, (7,) float32."""
         state = _sim_state(obs, self._name, 35)  # qpos 9, qvel 9, tool pose 7, goal 3, cube pose 7
         tool, goal, cube = state[18:21], state[25:28], state[28:31]
         over = np.array([cube[0] - self._BEHIND_M, cube[1], self._OVER_M])
@@ -70,12 +68,10 @@ class PickCube:
         self._closing = 0
 
     def reset(self, obs: Obs, instruction: str) -> None:
-        """Begin an episode; raises `InvalidObservation` without PickCube's simulator state."""
         _sim_state(obs, self._name, 42)
         self._phase, self._closing, self._hand = "over", 0, _Hand()
 
     def act(self, obs: Obs) -> Act:
-        """The next action, (7,) float32."""
         # qpos 9, qvel 9, grasped 1, tool pose 7, goal 3, cube pose 7, tool to cube 3, cube to goal 3
         state = _sim_state(obs, self._name, 42)
         grasped, tool, goal, cube = state[18] > 0.5, state[19:22], state[26:29], state[29:32]
@@ -170,13 +166,11 @@ class SimplerExpert:
         self._turn = 0.0  # remaining rotation, rad
 
     def reset(self, obs: Obs, instruction: str) -> None:
-        """Begin an episode; raises `InvalidObservation` without the simulator's state."""
         places, yaw = self._state(obs)
         self._begin(0, places)
         self._turn = (yaw + np.pi / 2) % np.pi - np.pi / 2  # the fingers open across the object, in either direction
 
     def act(self, obs: Obs) -> Act:
-        """Compute the next action, (7,) float32."""
         places, _ = self._state(obs)
         _, _, gripper, commanded = places
         stage = _STAGES[self._stage]

@@ -71,7 +71,6 @@ class AlohaExpert:
         self._step = 0
 
     def act(self, obs: Obs) -> Act:
-        """Compute the next action, (14,) float32, from the number of the step alone."""
         if not self._way:
             raise NotReset("aloha expert: act before reset; call reset(obs, instruction) first")
         self._step += 1
@@ -141,11 +140,9 @@ class FetchReach:
         self._name = env_name
 
     def reset(self, obs: Obs, instruction: str) -> None:
-        """Begin an episode; raises `MissingState` for an observation without goals."""
         self._way(obs)
 
     def act(self, obs: Obs) -> Act:
-        """Compute the next action, (4,) float32."""
         action = np.zeros(4, dtype=np.float32)
         action[:3] = np.clip(_GAIN * self._way(obs) / _METRES_PER_UNIT, -1.0, 1.0)
         return Act(action=action)
@@ -174,11 +171,9 @@ class MetaWorldExpert:
         self._oracle = oracles[task]()
 
     def reset(self, obs: Obs, instruction: str) -> None:
-        """Begin an episode; raises `InvalidObservation` without the simulator's observation."""
         sim_vector(obs, _SIZE, self._name)
 
     def act(self, obs: Obs) -> Act:
-        """Compute the next action, (4,) float32 in [-1, 1]."""
         action = np.asarray(self._oracle.get_action(sim_vector(obs, _SIZE, self._name)), dtype=np.float32)
         return Act(action=np.clip(action, -1.0, 1.0))
 
@@ -208,13 +203,11 @@ class RcsPick:
         self._lay = np.zeros(3)
 
     def reset(self, obs: Obs, instruction: str) -> None:
-        """Begin an episode; raises `InvalidObservation` without the cuboid's pose."""
         self._phase, self._closing = "over", 0
         self._commanded = _tool(obs)
         self._lay = self._cuboid(obs)[:3]
 
     def act(self, obs: Obs) -> Act:
-        """Compute the next action, (8,) float32."""
         tool, cuboid = _tool(obs), self._cuboid(obs)
         over = cuboid[:3] + np.array([0.0, 0.0, self._OVER_M])
         if self._phase == "over" and np.linalg.norm(tool - over) < self._ARRIVED_M:

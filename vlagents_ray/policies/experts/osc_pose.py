@@ -54,7 +54,6 @@ class PickExpert(ABC):
         self._aim(hand, obs)
 
     def act(self, obs: Obs) -> Act:
-        """Compute the next action, (7,) float32."""
         if self._first is None:
             raise NotReset(f"{self._name}: act before reset; call reset(obs, instruction) first")
         hand, orientation = self._hand(obs)

@@ -152,7 +152,6 @@ class _SeenObject:
         self._hue = sextant * 60  # degrees, from -60
 
     def puck(self, colour: str) -> tuple[float, float]:
-        """Return the centre of a puck, (x, y) m."""
         return self._find(colour, "puck", _FULL, _PUCK_REACH, _PUCK_HEIGHT / 2)
 
     def pad(self, colour: str) -> tuple[float, float]:

@@ -297,7 +297,6 @@ class SmolVLAPasses(FlowPasses):
         return found
 
     def encode(self, tokens: Any, mask: Any, cameras: Any, state: Any, *patches: Any) -> tuple[Any, Any]:
-        """Return keys and values, and which tokens are there."""
         import torch  # the compiler follows a statement, and not `require`
 
         embedded, seen, causal = self.model.embed_prefix(patches, cameras.unbind(1), tokens, mask, state=state)
@@ -315,7 +314,6 @@ class SmolVLAPasses(FlowPasses):
         return torch.stack([torch.stack(layer, 1) for layer in layers], 1), seen.long()
 
     def velocity(self, encoded: Any, seen: Any, state: Any, actions: Any, times: Any) -> Any:
-        """Return the velocity (B, H, D)."""
         layers = encoded.unbind(1)
         if self._by_name:
             cache = {i: {"key_states": layer[:, 0], "value_states": layer[:, 1]} for i, layer in enumerate(layers)}

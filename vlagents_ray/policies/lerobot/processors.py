@@ -48,7 +48,6 @@ class Processors:
     """The pre- and post-processor, on the policy's device; raises `ConfigError` if they are incomplete."""
 
     def __init__(self, folder: Path, settings: Any, config: LeRobotConfig) -> None:
-        """Load the processors; `settings` is the policy's own config."""
         self._device = settings.device
         saved = [_saved_steps(folder / name) for name in PIPELINES]
         unknown = sorted(set(config.processors) - set().union(*saved))
@@ -154,7 +153,6 @@ class Processors:
 
     @property
     def invertible(self) -> bool:
-        """Whether `leftover` converts actions back to the policy's units."""
         return self._back is not None
 
     def leftover(self, row: Row) -> Any:

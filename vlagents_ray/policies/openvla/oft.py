@@ -216,12 +216,10 @@ class Parallel:
     steps: tuple[int, int]  # diffusion steps: in training, at inference
 
     def compile_with(self, compilation: Compilation) -> None:
-        """Compile the vision encoder and the language model."""
         self.encode_images = compilation.core("vision encoder", self.encode_images)  # type: ignore[method-assign]
         self.hidden_states = compilation.core("language model", self.hidden_states)  # type: ignore[method-assign]
 
     def regress(self, inputs: Sequence[ModelInput]) -> np.ndarray:
-        """Return chunks (B, H, D) in [-1, 1] of the regression head."""
         with require("torch").inference_mode():
             return _numpy(self._heads(self._hidden(self._sequences(inputs))))
 
@@ -401,16 +399,13 @@ class Mlp:
 
     @property
     def dim(self) -> int:
-        """The length of an action."""
         return len(self._weights["fc2.bias"])
 
     def to(self, **place: Any) -> Mlp:
-        """Move the tensors to a device and dtype."""
         self._weights = {key: tensor.to(**place) for key, tensor in self._weights.items()}
         return self
 
     def __call__(self, x: Any) -> Any:
-        """Map (…, in) to (…, dim)."""
         relu = require("torch").relu
         x = relu(_linear(self._weights, "fc1", _norm(self._weights, "layer_norm1", x)))
         for i in (0, 1):
@@ -427,16 +422,13 @@ class Projector:
 
     @property
     def dim(self) -> int:
-        """The length of the input."""
         return int(self._weights["fc1.weight"].shape[1])
 
     def to(self, **place: Any) -> Projector:
-        """Move the tensors to a device and dtype."""
         self._weights = {key: tensor.to(**place) for key, tensor in self._weights.items()}
         return self
 
     def __call__(self, x: Any) -> Any:
-        """Map (…, dim) to (…, D)."""
         gelu = require("torch").nn.functional.gelu
         return _linear(self._weights, "fc2", gelu(_linear(self._weights, "fc1", x)))
 
@@ -465,7 +457,6 @@ class Film:
         self._vits = vits
 
     def to(self, **place: Any) -> Film:
-        """Move the tensors to a device and dtype; the backbone moves with its model."""
         self._film = {key: tensor.to(**place) for key, tensor in self._film.items()}
         return self
 

@@ -49,7 +49,6 @@ class Scale:
 
     @property
     def dim(self) -> int:
-        """The number of dimensions, D."""
         return len(self.low)
 
     def restore(self, normalised: np.ndarray) -> np.ndarray:
@@ -94,7 +93,6 @@ class Statistics:
 
     @property
     def names(self) -> list[str]:
-        """The names of the datasets."""
         return list(self._datasets)
 
     def key(self, wanted: str | None) -> str:
@@ -198,7 +196,6 @@ class Prismatic:
 
 
 def load_prismatic(config: PrismaticConfig, bounds: Bounds = "q99") -> Prismatic:
-    """Read and verify a checkpoint; raises `ConfigError`."""
     path = find_checkpoint(config.checkpoint, config.checkpoint_step, _NEEDS)
     statistics = Statistics.of(path, bounds)
     statistics.require(config.unnorm_key)
@@ -417,7 +414,6 @@ class DecodedChunk:
     behaviour: dict[str, Any] = field(default_factory=dict)  # what is wanted of the row
 
     def prediction(self, scale: Scale) -> Prediction:
-        """Convert the answer to physical units."""
         return Prediction(
             scale.restore(self.values),
             None if self.mean is None else scale.restore(self.mean),
@@ -452,7 +448,6 @@ class PrismaticPolicy(ModelPolicy):
         return info
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
-        """Compute one chunk for each row."""
         results: dict[int, Prediction | Exception] = {}
         prepared: dict[int, PreparedRow] = {}
         for i, row in enumerate(rows):
@@ -520,7 +515,6 @@ class PrismaticPolicy(ModelPolicy):
         return None if self._statistics(adapter) is not self._statistics() else self.config.unnorm_key
 
     def _named(self, options: Mapping[str, Any], adapter: str) -> str | None:
-        """Return the dataset that `options` name, or None."""
         key = options.get(UNNORM_KEY)
         if key is None:
             return None

@@ -185,7 +185,6 @@ class WebSocketClient(UpstreamClient):
             raise self.unreachable(error) from error
 
     def send(self, message: bytes) -> None:
-        """Send a binary message; raises `ConnectionLost`."""
         try:
             self._opened().send(message)
         except (ConnectionClosed, OSError) as error:

@@ -98,7 +98,6 @@ class Lanes:
         return results
 
     def close(self) -> None:
-        """Close all connections."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
@@ -172,7 +171,6 @@ class Lanes:
         thread.start()
 
     def _connect(self, client: UpstreamClient) -> None:
-        """Connect until it works."""
         pause_s, logged = _FIRST_PAUSE_S, ""
         while not self._closed:
             try:
@@ -263,14 +261,12 @@ class SessionConnections:
         return [] if first is None else [first, *(other.result() for other in others)]
 
     def drop(self, session: str) -> None:
-        """Close the connection of a session that has ended."""
         with self._lock:
             client = self._clients.pop(session, None)
         if client is not None:
             threading.Thread(target=client.close, name="upstream-close", daemon=True).start()  # it may wait for a reply
 
     def close(self) -> None:
-        """Close all connections."""
         self._pool.shutdown()
         with self._lock:
             clients, self._clients = self._clients, {}

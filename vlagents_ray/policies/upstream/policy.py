@@ -153,7 +153,6 @@ class UpstreamConfig(BaseModel, extra="forbid"):
 
     @property
     def client(self) -> type[UpstreamClient]:
-        """The class of the protocol's clients."""
         return PROTOCOLS[self.protocol]
 
     @property
@@ -171,7 +170,6 @@ class UpstreamConfig(BaseModel, extra="forbid"):
         return PolicyInstructions(policy.policy_type, checkpoint, state, cameras, rows, policy.device)
 
     def keys(self) -> KeyMapping:
-        """Return the mapping; raises `ConfigError` if it is invalid."""
         return read_mapping(self.mapping if self.mapping is not None else str(self.client.mapping))
 
 
@@ -256,7 +254,6 @@ class Upstream(Agent):
         return results
 
     def close(self) -> None:
-        """Close the connections."""
         for connections in (self._lanes, self._sessions):
             if connections is not None:
                 connections.close()
@@ -269,7 +266,6 @@ class Upstream(Agent):
         return list(self._lanes.ask(observations))
 
     def _check(self, client: UpstreamClient, metadata: Mapping[str, Any]) -> None:
-        """Compare the mapping and the contract with what an upstream says about itself."""
         found = client.differences(metadata, self._outgoing)
         stated, chunk = self.config.contract.get("chunk"), client.chunk(metadata)
         if stated is not None and chunk is not None and stated != chunk:

@@ -76,7 +76,6 @@ class VlagentsClient(UpstreamClient):
         return value
 
     def _call(self, frame: bytes, deadline: float) -> Any:
-        """Send a request and return the value of its reply."""
         connection = self._socket
         if connection is None:
             raise self.closed()
