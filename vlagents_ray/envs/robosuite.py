@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
-from vlagents_ray.envs.rendering.graphics import EGL_DEVICE, GPUS
-from vlagents_ray.envs.rendering.render_probe import EGL_CURE
+from vlagents_ray.envs.graphics import EGL_DEVICE, GPUS
+from vlagents_ray.envs.render_probe import EGL_CURE
 from vlagents_ray.envs.simulator import BenchmarkProtocol, SimulatorEnv, Size
 from vlagents_ray.errors import ConfigError, EnvFailed
 from vlagents_ray.interface import HIGH_RES, Obs

@@ -31,10 +31,8 @@ from vlagents_ray.policies.base.model_inputs import (
     needs_gripper,
     state_vector,
 )
-from vlagents_ray.policies.base.realtime import Guide
 from vlagents_ray.policies.compilation import Compilation
-from vlagents_ray.policies.flow import OFFERED, Change, RandomSteps
-from vlagents_ray.policies.flow_passes import Pi0Passes
+from vlagents_ray.policies.flow import OFFERED, Change, Guide, Pi0Passes, RandomSteps
 from vlagents_ray.registry import require
 
 Layout = Literal["hwc", "chw"]

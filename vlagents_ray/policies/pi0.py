@@ -32,8 +32,7 @@ from vlagents_ray.policies.base.model_inputs import (
     state_specs,
     state_vector,
 )
-from vlagents_ray.policies.base.realtime import Guide
-from vlagents_ray.policies.flow import OFFERED, Change, RandomSteps, follow
+from vlagents_ray.policies.flow import OFFERED, Change, Guide, RandomSteps, follow
 from vlagents_ray.registry import require
 
 CAMERAS = ("base_0_rgb", "left_wrist_0_rgb", "right_wrist_0_rgb")  # openpi's names, in the order of the image tokens

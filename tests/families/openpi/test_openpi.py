@@ -12,7 +12,7 @@ from tests.families.openpi.marks import MARKS
 from vlagents_ray import Obs
 from vlagents_ray.errors import ConfigError, InvalidObservation, MissingCamera
 from vlagents_ray.interface import DELAY, DISTRIBUTION, LEFTOVER, SAMPLES
-from vlagents_ray.policies.openpi import policy as openpi_policy
+from vlagents_ray.policies import openpi as openpi_policy
 from vlagents_ray.serve.config.dialects import presets
 from vlagents_ray.testing import check_agent
 

@@ -18,8 +18,7 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.base import Row, shared_frames
 from vlagents_ray.policies.base.model_inputs import GRIPPER
 from vlagents_ray.policies.compilation import Compilation
-from vlagents_ray.policies.flow import Change, RandomSteps
-from vlagents_ray.policies.flow_passes import FlowPasses, Pi0Passes, cache_of, layers_of
+from vlagents_ray.policies.flow import Change, FlowPasses, Pi0Passes, RandomSteps, cache_of, layers_of
 from vlagents_ray.registry import require
 
 IMAGES = "observation.images"

@@ -19,7 +19,7 @@ from vlagents_ray.errors import MalformedMessage, PolicyUnavailable, VLAgentsErr
 from vlagents_ray.policies.upstream.client import Answer, ClientOptions, WebSocketClient
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
 from vlagents_ray.protocol.observations import is_number
-from vlagents_ray.wire import msgpack, xpolicylab
+from vlagents_ray.wire import msgpack
 
 REPLIES = {"hello": "hello_ack", "reset": "reset_result", "infer": "infer_result"}
 ERROR = "error"
@@ -142,24 +142,24 @@ class XPolicyLabClient(WebSocketClient):
 
     def ask(self, observations: Sequence[Mapping[str, Any]]) -> list[Answer]:
         [observation] = observations
-        payload = self._call("infer", xpolicylab.observed(observation), self.options.timeout_s)
+        payload = self._call("infer", observed(observation), self.options.timeout_s)
         self._step += 1
-        return [xpolicylab.read_actions(payload)]
+        return [read_actions(payload)]
 
     def _call(self, kind: str, payload: Mapping[str, Any], timeout_s: float) -> dict[str, Any]:
         """Send a request and return the payload of its reply; replies to older requests are skipped."""
         name, deadline = uuid.uuid4().hex, time.monotonic() + timeout_s
-        self.send(xpolicylab.write_request(kind, name, payload, _EVALUATION, self._trial, self._step))
+        self.send(write_request(kind, name, payload, _EVALUATION, self._trial, self._step))
         while True:
             data = self.recv(max(0.0, deadline - time.monotonic()))
             if isinstance(data, str):
                 self.close()
                 raise self.unreadable("a text", "a binary map")
-            reply = xpolicylab.read_reply(data, self.options.limits)
+            reply = read_reply(data, self.options.limits)
             if reply.message_id != name:
                 continue
-            if reply.kind == xpolicylab.ERROR:
+            if reply.kind == ERROR:
                 raise self.failed(reply.payload)
-            if reply.kind != xpolicylab.REPLIES[kind]:
-                raise self.unreadable(f"a message {reply.kind[:40]!r}", xpolicylab.REPLIES[kind])
+            if reply.kind != REPLIES[kind]:
+                raise self.unreadable(f"a message {reply.kind[:40]!r}", REPLIES[kind])
             return reply.payload

@@ -6,8 +6,8 @@ import importlib.util
 from collections.abc import Iterator
 
 import pytest
-from vlagents_ray.envs.rendering import render_probe
 
+from vlagents_ray.envs import render_probe
 from vlagents_ray.envs.maniskill import ManiSkill
 
 needs_sapien = pytest.mark.skipif(importlib.util.find_spec("sapien") is None, reason="sapien is not installed")

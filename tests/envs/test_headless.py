@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 
 import pytest
-from vlagents_ray.envs.rendering import graphics
+
+from vlagents_ray.envs import graphics
 
 
 @pytest.fixture(autouse=True)
