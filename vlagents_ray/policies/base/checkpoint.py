@@ -9,6 +9,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -160,7 +161,7 @@ class SavedTensors:
         """Open a .safetensors file, or a folder with one, or with several and their index."""
         files = [path] if path.is_file() else _safetensors(path)
         opened = [require("safetensors").safe_open(str(file), framework="pt") for file in files]
-        return cls({key: _PickleReader(file, key) for file in opened for key in file.keys()})  # noqa: SIM118 - no mapping
+        return cls({key: partial(file.get_tensor, key) for file in opened for key in file.keys()})  # noqa: SIM118 - no mapping
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._readers)
@@ -172,14 +173,6 @@ class SavedTensors:
         """Return the tensors under other names; those that `rename` maps to None are left out."""
         named = {rename(key): reader for key, reader in self._readers.items()}
         return SavedTensors({key: reader for key, reader in named.items() if key is not None})
-
-
-class _PickleReader:
-    def __init__(self, file: Any, key: str) -> None:
-        self._file, self._key = file, key
-
-    def __call__(self) -> Any:
-        return self._file.get_tensor(self._key)
 
 
 def _safetensors(folder: Path) -> list[Path]:

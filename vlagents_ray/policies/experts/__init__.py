@@ -58,13 +58,12 @@ def expert_for(env_name: str) -> Expert:
     return expert
 
 
-def sim_vector(obs: Obs, size: int, env_name: str) -> np.ndarray:
+def sim_vector(obs: Obs, size: int, env_name: str, cure: str = "this expert cannot act on images") -> np.ndarray:
     """Return `info["sim_state"]` of an observation, (`size`,); raises `InvalidObservation` if there is none."""
     state = obs.info.get("sim_state")
     if not isinstance(state, np.ndarray) or state.shape != (size,):
         got = f"shape {state.shape}" if isinstance(state, np.ndarray) else type(state).__name__
         raise InvalidObservation(
-            f"info['sim_state']: got {got}, want ({size},), as the env {env_name} gives it; "
-            f"this expert cannot act on images"
+            f"info['sim_state']: got {got}, want ({size},), as the env {env_name} gives it; {cure}"
         )
     return state

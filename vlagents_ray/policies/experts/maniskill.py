@@ -6,12 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vlagents_ray.errors import InvalidObservation
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.policies.experts import sim_vector
 
 _UNIT_M = 0.1  # motion commanded by an action of 1.0
 _OPEN, _CLOSED = 1.0, -1.0
+_CURE = "this expert is for the env's own robot, in the control mode pd_ee_delta_pose"
 
 
 class PushCube:
@@ -29,11 +29,12 @@ class PushCube:
         self._hand = _Hand()
 
     def reset(self, obs: Obs, instruction: str) -> None:
-        _sim_state(obs, self._name, 35)
+        sim_vector(obs, 35, self._name, _CURE)
         self._phase, self._hand = "over", _Hand()
 
     def act(self, obs: Obs) -> Act:
-        state = _sim_state(obs, self._name, 35)  # qpos 9, qvel 9, tool pose 7, goal 3, cube pose 7
+        # qpos 9, qvel 9, tool pose 7, goal 3, cube pose 7
+        state = sim_vector(obs, 35, self._name, _CURE).astype(np.float64)
         tool, goal, cube = state[18:21], state[25:28], state[28:31]
         over = np.array([cube[0] - self._BEHIND_M, cube[1], self._OVER_M])
         low = np.array([cube[0] - self._BEHIND_M, cube[1], self._LOW_M])
@@ -68,12 +69,12 @@ class PickCube:
         self._closing = 0
 
     def reset(self, obs: Obs, instruction: str) -> None:
-        _sim_state(obs, self._name, 42)
+        sim_vector(obs, 42, self._name, _CURE)
         self._phase, self._closing, self._hand = "over", 0, _Hand()
 
     def act(self, obs: Obs) -> Act:
         # qpos 9, qvel 9, grasped 1, tool pose 7, goal 3, cube pose 7, tool to cube 3, cube to goal 3
-        state = _sim_state(obs, self._name, 42)
+        state = sim_vector(obs, 42, self._name, _CURE).astype(np.float64)
         grasped, tool, goal, cube = state[18] > 0.5, state[19:22], state[26:29], state[29:32]
         if self._phase == "over" and np.linalg.norm(tool[:2] - cube[:2]) < 0.01:
             self._phase = "down"
@@ -115,17 +116,6 @@ class _Hand:
         action[6] = gripper
         self._at, self._commanded_m = tool, _UNIT_M * float(np.linalg.norm(action[:3]))
         return Act(action=action)
-
-
-def _sim_state(obs: Obs, env_name: str, size: int) -> np.ndarray:
-    state = obs.info.get("sim_state")
-    if not isinstance(state, np.ndarray) or state.shape != (size,):
-        got = f"shape {state.shape}" if isinstance(state, np.ndarray) else type(state).__name__
-        raise InvalidObservation(
-            f"info['sim_state']: got {got}, want ({size},) float32; this expert is for {env_name} with its "
-            f"own robot, in the control mode pd_ee_delta_pose"
-        )
-    return state.astype(np.float64)
 
 
 _TWIN_OPEN, _TWIN_CLOSED = 1.0, 0.0
