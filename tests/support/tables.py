@@ -15,6 +15,20 @@ from vlagents_ray.registry import ENVS, POLICIES, WRAPPERS, Adapter
 ROOT = Path(__file__).parents[2]
 
 
+def _listed(adapters: dict[str, Adapter]) -> Iterator[tuple[str, Adapter]]:
+    return ((name, one) for name, one in adapters.items() if one.about)
+
+
+def _link(name: str, text: str, one: Adapter, folder: str) -> str:
+    page = name if one.page is None else one.page
+    file, at, anchor = page.partition("#")
+    return f"[{text}]({folder}{file}.md{at}{anchor})" if page else text
+
+
+def _code(words: Iterable[str]) -> str:
+    return ", ".join(f"`{word}`" for word in words)
+
+
 def policies(folder: str = "") -> Iterator[str]:
     """Yield the rows of the policies; `folder` leads to docs/policies."""
     yield from ("| policy | models | source |", "|---|---|---|")
@@ -30,7 +44,7 @@ def environments(folder: str = "") -> Iterator[str]:
         packages = [f"`'.[{one.extra}]'`"] if one.extra else []
         packages += [f"`requirements/{file}.txt`" for file in one.requirements]
         wants = "; ".join(filter(None, (" or ".join(packages), one.wants)))
-        yield f"| {_link(name, f'`{name}{one.tasks}`', one, folder)} | {one.about} | {wants} |"
+        yield f"| {_link(name, f'`{name}{one.tasks}`', one, folder)} | {one.about} | {wants}".rstrip() + " |"
 
 
 _OWN_POLICY = "a class with `initialize`, `reset` and `act` | `vlagents-ray new policy NAME`"
@@ -78,20 +92,6 @@ def main() -> None:
     for file in (*TABLES, "mkdocs.yml"):
         path = ROOT / file
         path.write_text(with_tables(file, path.read_text()))
-
-
-def _listed(adapters: dict[str, Adapter]) -> Iterator[tuple[str, Adapter]]:
-    return ((name, one) for name, one in adapters.items() if one.about)
-
-
-def _link(name: str, text: str, one: Adapter, folder: str) -> str:
-    page = name if one.page is None else one.page
-    file, at, anchor = page.partition("#")
-    return f"[{text}]({folder}{file}.md{at}{anchor})" if page else text
-
-
-def _code(words: Iterable[str]) -> str:
-    return ", ".join(f"`{word}`" for word in words)
 
 
 if __name__ == "__main__":
