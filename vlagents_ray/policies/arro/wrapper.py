@@ -265,6 +265,12 @@ class Arro(Wrapper):
     shared: ClassVar[tuple[str, ...]] = ("config", "tracking", "background")
 
     def __init__(self, agent: Agent, config: ArroConfig) -> None:
+        """Wrap a policy.
+
+        Args:
+            agent: The policy.
+            config: The cameras, the parts of their images to keep, and the models that find them.
+        """
         super().__init__(agent, config)
         self.tracking = Tracking(config)
         self.background = Background(config.background)
