@@ -18,7 +18,7 @@ from needs import left_out, nothing_else, skip_what_is_missing
 from process_resources import pytest_pyfunc_call
 from xdist_workers import own_ray_folder, turn
 
-from vlagents_ray.envs.rendering.graphics import prepare_rendering
+from vlagents_ray.envs.graphics import prepare_rendering
 
 __all__ = ["pytest_make_collect_report", "pytest_pyfunc_call", "pytest_runtest_makereport"]
 

@@ -14,9 +14,9 @@ from page_commands import PAGES, commands, read_as_typed
 
 from vlagents_ray.cli.evaluate import read_run
 from vlagents_ray.envs import aloha, metaworld, robocasa
-from vlagents_ray.envs.calvin import env as calvin
-from vlagents_ray.envs.gymnasium.making import known
-from vlagents_ray.envs.robosuite.env import TASKS
+from vlagents_ray.envs import calvin
+from vlagents_ray.envs.gymnasium.env import known
+from vlagents_ray.envs.robosuite import TASKS
 from vlagents_ray.envs.simulator import BenchmarkProtocol
 from vlagents_ray.errors import BY_CODE, Overloaded, VLAgentsError
 from vlagents_ray.evaluate import EvalConfig

@@ -88,20 +88,22 @@ def test_every_optional_package_has_a_cure() -> None:
 def test_the_extras_and_files_that_cures_name_exist() -> None:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     assert set(registry._EXTRAS.values()) <= extras.keys()
-    files = {file for named in registry._POLICY_REQUIREMENTS.values() for file in named}
-    assert files == set(FAMILIES)
-    for file in files | set(registry._SIMULATOR_REQUIREMENTS.values()):
+    adapters = (registry.POLICIES | registry.WRAPPERS | registry.ENVS).values()
+    assert {one.extra for one in adapters if one.extra} <= extras.keys()
+    assert {one.requirements[0] for _, one in registry.families()} == set(FAMILIES)
+    for file in {file for one in adapters for file in one.requirements}:
         assert (ROOT / f"requirements/{file}.txt").exists()
 
 
 @pytest.mark.parametrize("package", ["torch", "transformers", "jax", "flax", "timm"])
+@pytest.mark.usefixtures("nothing_installed")
 def test_a_cure_names_each_file_that_lists_the_package(package: str) -> None:
     listed = [
         name
         for name in FAMILIES
         if re.search(rf"(?m)^{package}\b(?!-)", (ROOT / f"requirements/{name}.txt").read_text())
     ]
-    assert set(listed) <= set(registry._POLICY_REQUIREMENTS[package])
+    assert set(listed) <= set(re.findall(r"(\w+)\.txt", cure(package)))
 
 
 def test_an_unknown_name_raises_the_error_of_its_kind() -> None:

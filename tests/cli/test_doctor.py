@@ -11,8 +11,8 @@ from rich.console import Console
 
 from vlagents_ray.cli import doctor
 from vlagents_ray.cli.doctor import Check
-from vlagents_ray.envs.rendering import render_probe
-from vlagents_ray.envs.rendering.egl import EglDevice
+from vlagents_ray.envs import render_probe
+from vlagents_ray.envs.graphics import EglDevice
 from vlagents_ray.errors import MissingDependency
 from vlagents_ray.serve.ports import free_port
 

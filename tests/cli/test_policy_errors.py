@@ -20,7 +20,7 @@ from vlagents_ray.cli.main import app
 from vlagents_ray.cli.options import parse_settings
 from vlagents_ray.contract import Contract
 from vlagents_ray.envs import EvalEnv
-from vlagents_ray.envs.batch import SequentialBatch
+from vlagents_ray.envs.base import SequentialBatch
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.episode.episode import run_episodes
 from vlagents_ray.evaluate.episode.records import EpisodeResult

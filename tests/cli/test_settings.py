@@ -6,14 +6,20 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
+<<<<<<< HEAD
 from vlagents_ray.cli import listing, policies
+=======
+from vlagents_ray.cli.evaluation import policies
+>>>>>>> policies
 from vlagents_ray.cli.main import app
 from vlagents_ray.client.transports import base
+from vlagents_ray.registry import POLICIES
 from vlagents_ray.serve.ports import free_port
 
 ROOT = Path(__file__).parents[2]
@@ -149,7 +155,7 @@ def test_a_family_whose_packages_are_missing_is_said_before_anything_starts_or_i
     folder: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...]
 ) -> None:
     monkeypatch.chdir(folder)
-    monkeypatch.setitem(listing._NEEDS, "lerobot", (("no_such_package",), (), "hf.txt"))
+    monkeypatch.setitem(POLICIES, "lerobot", replace(POLICIES["lerobot"], needs=("no_such_package",)))
     monkeypatch.setattr(policies, "running_server", lambda *_, **__: pytest.fail("a server was started"))
     done = CliRunner().invoke(app, words)
     assert "policy 'lerobot': not in this environment (no_such_package): `vlagents-ray env make " in done.stderr

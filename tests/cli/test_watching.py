@@ -89,12 +89,17 @@ def test_an_episode_lost_in_any_round_ends_watching_with_status_1_and_no_round_e
 FAMILIES = sorted(
     name for name in POLICIES if issubclass(getattr(policy_class(name), "Config", None) or object, ModelConfig)
 )
-NEEDED = {"openpi": {"config": "pi0_droid"}}  # settings that a family has no default for, beside the checkpoint
+
+
+def needed(family: str) -> dict[str, Any]:
+    """Return a value for each setting without a default, beside the checkpoint: all of these are texts."""
+    fields = policy_class(family).Config.model_fields.items()
+    return {name: "any" for name, field in fields if field.is_required() and name != "checkpoint"}
 
 
 def swept(family: str, tmp_path: Path, place: str, **settings: Any) -> EvalConfig:
     """A sweep over one policy, whose settings are in the evaluation's file or in the deployment file."""
-    own = {"checkpoint": "/runs/{step}/pretrained_model", **NEEDED.get(family, {}), **settings}
+    own = {"checkpoint": "/runs/{step}/pretrained_model", **needed(family), **settings}
     policy: dict[str, Any] = {"name": "swept", "source": family, "config": own}
     if place == "deployment":
         file = tmp_path / "policy.yaml"

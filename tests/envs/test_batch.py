@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from vlagents_ray.envs import make_env
-from vlagents_ray.envs.batch import BatchEnv, SequentialBatch, make_batch
+from vlagents_ray.envs.base import BatchEnv, SequentialBatch, make_batch
 from vlagents_ray.envs.tabletop import Tabletop
 from vlagents_ray.errors import ConfigError, InvalidAction
 from vlagents_ray.interface import Act, Obs

@@ -8,9 +8,7 @@ import pytest
 
 from vlagents_ray.contract import CameraSpec
 from vlagents_ray.envs.base import known_contract, make_env
-from vlagents_ray.envs.calvin import Calvin
-from vlagents_ray.envs.calvin.chains import fnv1_32
-from vlagents_ray.envs.calvin.env import PROTOCOL
+from vlagents_ray.envs.calvin import PROTOCOL, Calvin, fnv1_32
 from vlagents_ray.errors import ConfigError, UnknownEnv
 
 

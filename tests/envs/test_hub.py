@@ -11,8 +11,7 @@ import pytest
 
 from vlagents_ray import registry
 from vlagents_ray.envs import make_env
-from vlagents_ray.envs.base import known_contract
-from vlagents_ray.envs.batch import make_batch
+from vlagents_ray.envs.base import known_contract, make_batch
 from vlagents_ray.envs.gymnasium.hub import EnvHub, HubFile
 from vlagents_ray.envs.gymnasium.vector import GymnasiumBatch
 from vlagents_ray.errors import ConfigError, EnvFailed, MissingDependency, UnknownEnv

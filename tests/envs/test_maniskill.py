@@ -11,8 +11,8 @@ import pytest
 
 from vlagents_ray.contract import CameraSpec
 from vlagents_ray.envs import make_env
-from vlagents_ray.envs.maniskill import ManiSkill, factory
-from vlagents_ray.envs.maniskill.factory import INSTRUCTIONS, instruction_for
+from vlagents_ray.envs.maniskill import ManiSkill, simulator
+from vlagents_ray.envs.maniskill.simulator import INSTRUCTIONS, instruction_for
 from vlagents_ray.errors import ConfigError, EnvFailed, InvalidAction, NotReset, UnknownEnv
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.testing import check_env
@@ -247,8 +247,8 @@ def test_the_gpu_renders_where_sapien_and_torch_can_use_it(
 ) -> None:
     monkeypatch.setattr("sapien.Device", lambda _: object())
     monkeypatch.setattr("torch.cuda.is_available", lambda: torch_has_cuda)
-    assert factory.render_backend("auto") == backend
-    assert factory.render_backend("cpu") == "cpu"
+    assert simulator.chosen_backend("auto") == backend
+    assert simulator.chosen_backend("cpu") == "cpu"
 
 
 def test_a_task_that_cannot_be_evaluated_is_refused() -> None:

@@ -6,7 +6,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from vlagents_ray.envs.batch import SequentialBatch, make_batch
+from vlagents_ray.envs.base import SequentialBatch, make_batch
 from vlagents_ray.envs.maniskill import ManiSkill
 from vlagents_ray.envs.maniskill.env import ManiSkillBatch
 from vlagents_ray.errors import ConfigError, NotReset

@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vlagents_ray.envs.maniskill.robot import action_spec, tool_in_base
+from vlagents_ray.envs.maniskill.simulator import action_spec, tool_in_base
 
 numbers = st.floats(-2.0, 2.0, width=32)
 quaternions = (

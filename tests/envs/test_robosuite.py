@@ -9,8 +9,7 @@ import pytest
 
 from vlagents_ray.contract import CameraSpec
 from vlagents_ray.envs.base import known_contract, make_env
-from vlagents_ray.envs.robosuite import Robosuite
-from vlagents_ray.envs.robosuite.env import TASKS
+from vlagents_ray.envs.robosuite import TASKS, Robosuite
 from vlagents_ray.errors import ConfigError, ContractMismatch, InvalidObservation, MissingState, NotReset, UnknownEnv
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.experts import expert_for

@@ -6,8 +6,7 @@ import math
 
 import pytest
 
-from vlagents_ray.envs.tabletop.goals import Goal
-from vlagents_ray.envs.tabletop.world import PUCK_HEIGHT, PUCK_RADIUS, STEP_LIMIT, Pad, Puck, TabletopWorld
+from vlagents_ray.envs.tabletop.world import PUCK_HEIGHT, PUCK_RADIUS, STEP_LIMIT, Goal, Pad, Puck, TabletopWorld
 
 OPEN, CLOSED = 1.0, 0.0
 

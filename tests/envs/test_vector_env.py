@@ -11,7 +11,7 @@ import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from vlagents_ray.envs import make_env
-from vlagents_ray.envs.batch import BatchEnv, make_batch
+from vlagents_ray.envs.base import BatchEnv, make_batch
 from vlagents_ray.envs.gymnasium.vector import GymnasiumBatch
 from vlagents_ray.errors import ConfigError, InvalidAction, NotReset
 from vlagents_ray.interface import Act, Obs

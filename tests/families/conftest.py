@@ -11,27 +11,15 @@ from pathlib import Path
 import pytest
 from verified import VerifyingTests
 
-# folder -> the package without which its tests cannot be imported
-_NEEDS = {
-    "arro": "transformers",
-    "calvin": "pybullet",
-    "diffusion_policy": "diffusers",
-    "gr00t": "diffusers",
-    "lerobot": "lerobot",
-    "libero": "libero",
-    "octo": "jax",
-    "openpi": "jax",
-    "openvla": "transformers",
-    "pi0": "transformers",
-    "rcs": "rcs",
-    "robocasa": "robocasa",
-    "robosuite": "robosuite",
-    "ros": "rclpy",
-    "vjepa2_ac": "transformers",
+from vlagents_ray.registry import ENVS, POLICIES, WRAPPERS
+
+# folder -> the packages without which its tests cannot be imported; the authors' source may come from a checkout
+_NEEDS = {name: one.needs[bool(one.checkouts) :] for name, one in (POLICIES | WRAPPERS | ENVS).items()} | {
+    "ros": ("rclpy",)
 }
 
 _FOLDERS = {test.parent.name for test in Path(__file__).parent.glob("*/test_*.py")}
-collect_ignore = [folder for folder in _FOLDERS if importlib.util.find_spec(_NEEDS[folder]) is None]
+collect_ignore = [folder for folder in _FOLDERS if not all(map(importlib.util.find_spec, _NEEDS[folder]))]
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

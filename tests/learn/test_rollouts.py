@@ -11,7 +11,7 @@ from flat_config import flat_config
 from in_process_pool import without_ray
 from in_process_replicas import Replicas
 
-from vlagents_ray.envs.batch import BatchEnv, SequentialBatch
+from vlagents_ray.envs.base import BatchEnv, SequentialBatch
 from vlagents_ray.errors import ConfigError, ConnectionLost, EnvFailed, PolicyFailed, UnknownEnv
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.plan.cases import cells

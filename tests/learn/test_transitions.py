@@ -13,7 +13,7 @@ import pytest
 from eval_fakes import LINE, Line, ToZero
 from flat_config import flat_config
 
-from vlagents_ray.envs.batch import SequentialBatch
+from vlagents_ray.envs.base import SequentialBatch
 from vlagents_ray.errors import EnvFailed, MissingDependency
 from vlagents_ray.evaluate.episode.episode import run_episodes
 from vlagents_ray.evaluate.episode.records import EpisodeResult

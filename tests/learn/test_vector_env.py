@@ -13,7 +13,7 @@ from gymnasium.utils import env_checker
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from vlagents_ray.contract import CameraSpec, Contract
-from vlagents_ray.envs.batch import SequentialBatch
+from vlagents_ray.envs.base import SequentialBatch
 from vlagents_ray.errors import ConfigError, EnvFailed, InvalidAction, InvalidInput, MissingDependency, NotReset
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
 from vlagents_ray.interface import Act, Obs

@@ -17,20 +17,19 @@ from vlagents_ray.registry import POLICIES, named_class
 
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
 NAMED = f"org/name@{COMMIT}"
-NEEDED = {"openpi": {"config": "pi0_droid"}, "diffusion_policy": {"trust_checkpoint": True}}
 # What needs the family's packages, and comes before the checkpoint is looked for.
 BEFORE = {
-    "gr00t": ["vlagents_ray.policies.gr00t.network._use_checkout"],
+    "gr00t": ["vlagents_ray.policies.gr00t._use_checkout"],
     "octo": ["vlagents_ray.policies.octo.octo_model_class"],
-    "openpi": [f"vlagents_ray.policies.openpi.policy.{name}" for name in ("use_source", "train_config")],
+    "openpi": [f"vlagents_ray.policies.openpi.{name}" for name in ("use_source", "train_config")],
 }
 
 
 def families() -> list[Any]:
     with_checkpoints = [
         name
-        for name, target in POLICIES.items()
-        if "checkpoint" in getattr(named_class(target, {}).Config, "model_fields", ())
+        for name, one in POLICIES.items()
+        if "checkpoint" in getattr(named_class(one.target, {}).Config, "model_fields", ())
     ]
     return [pytest.param(name, marks=pytest.mark.torch if name == "vjepa2_ac" else ()) for name in with_checkpoints]
 
@@ -54,7 +53,10 @@ def test_a_family_asks_for_the_commit(
 ) -> None:
     for function in BEFORE.get(family, ()):
         monkeypatch.setattr(function, lambda *_args, **_options: None)
-    policy = named_class(POLICIES[family], {}).from_config({"checkpoint": NAMED, **NEEDED.get(family, {})})
+    cls = named_class(POLICIES[family].target, {})
+    fields = cls.Config.model_fields
+    settings = {name: "any" for name, field in fields.items() if field.is_required()} | {"checkpoint": NAMED}
+    policy = cls.from_config(settings | ({"trust_checkpoint": True} if "trust_checkpoint" in fields else {}))
     with pytest.raises(ConfigError, match="nor to be had from the hub"):
         policy.initialize()
     assert asked == [("org/name", COMMIT)]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.envs import EvalEnv
-from vlagents_ray.envs.batch import SequentialBatch
+from vlagents_ray.envs.base import SequentialBatch
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.evaluate.episode.episode import EpisodeObserver, EpisodeSettings, Watch, run_episodes
 from vlagents_ray.evaluate.episode.records import EpisodeResult

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from eval_fakes import Line
 
-from vlagents_ray.envs.rendering.graphics import Renderer
+from vlagents_ray.envs.graphics import Renderer
 
 
 class Drawn(Line):

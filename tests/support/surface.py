@@ -120,8 +120,8 @@ def registered() -> Iterator[str]:
 
 def settings_of(kind: str) -> Iterator[str]:
     registry = importlib.import_module("vlagents_ray.registry")
-    for name, place in sorted(getattr(registry, kind).items()):
-        cls = _class(place)
+    for name, one in sorted(getattr(registry, kind).items(), key=lambda named: named[0]):
+        cls = _class(getattr(one, "target", one))
         config = getattr(cls, "Config", None)
         if config is None:
             yield f"{name}{_arguments(cls.__init__)}"

@@ -8,7 +8,7 @@ import numpy as np
 from in_process_episode import run_episode
 
 from vlagents_ray.envs import EvalEnv
-from vlagents_ray.envs.batch import SequentialBatch
+from vlagents_ray.envs.base import SequentialBatch
 from vlagents_ray.evaluate.episode.episode import options_of_reset
 from vlagents_ray.evaluate.episode.second_pass import PlayedEpisode
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey

@@ -22,6 +22,8 @@ from typing import Any
 
 import pytest
 
+from vlagents_ray.registry import families
+
 ROOT = Path(__file__).parents[2]
 FAMILIES = ROOT / "tests" / "families"
 PAGES = ROOT / "docs" / "policies"
@@ -36,15 +38,9 @@ WHAT = {
 }
 # Of each family with a page: the files in requirements/, and the packages and checkouts whose versions matter.
 RUN_WITH = {
-    "arro": ("hf", ("transformers", "torch")),
-    "diffusion_policy": ("diffusion_policy", ("DIFFUSION_POLICY_SRC", "diffusers", "torch")),
-    "gr00t": ("gr00t lerobot06", ("GR00T_SRC", "lerobot", "transformers", "torch")),
-    "lerobot": ("lerobot lerobot06", ("lerobot", "transformers", "torch")),
-    "octo": ("octo", ("OCTO_SRC", "jax", "flax")),
-    "openpi": ("openpi", ("OPENPI_SRC", "jax", "flax", "torch")),
-    "openvla": ("openvla", ("OPENVLA_SRC", "OPENVLA_OFT_SRC", "transformers", "torch")),
-    "pi0": ("hf", ("transformers", "torch")),
-    "vjepa2_ac": ("hf", ("VJEPA2_SRC", "transformers", "torch")),
+    name: (" ".join(one.requirements), (*one.checkouts, *one.needs[bool(one.checkouts) :]))
+    for name, one in families()
+    if one.page is None
 }
 
 

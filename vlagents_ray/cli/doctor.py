@@ -26,7 +26,7 @@ from vlagents_ray.registry import require
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from vlagents_ray.envs.rendering.render_probe import RenderProbe
+    from vlagents_ray.envs.render_probe import RenderProbe
 
 
 GB = 1e9
@@ -304,15 +304,15 @@ def gpu() -> Check:
 
 def vulkan() -> Check:
     """Check that SAPIEN, the engine of ManiSkill, renders a frame here."""
-    from vlagents_ray.envs.rendering.render_probe import render_probe
+    from vlagents_ray.envs.render_probe import render_probe
 
     return _rendered("ManiSkill", render_probe())
 
 
 def egl() -> Check:
     """Check that MuJoCo renders a frame here without a display, also for a worker without a GPU."""
-    from vlagents_ray.envs.rendering.graphics import SHARE, fitting
-    from vlagents_ray.envs.rendering.render_probe import egl_probe
+    from vlagents_ray.envs.graphics import SHARE, fitting
+    from vlagents_ray.envs.render_probe import egl_probe
 
     probe = egl_probe()
     found = _rendered("MuJoCo", probe)

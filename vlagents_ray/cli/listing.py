@@ -13,28 +13,13 @@ from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
 from vlagents_ray.errors import MissingDependency, VLAgentsError
-from vlagents_ray.registry import env_class, names, policy_class, wrapper_class
+from vlagents_ray.registry import env_class, families, names, policy_class, wrapper_class
 
 if TYPE_CHECKING:
     from ray.serve.schema import ServeDeploySchema
 
 
-# Of a model family: the modules that it needs, the variables one of which names a checkout in place of the first of
-# these, and the file in requirements/ that installs the rest.
-_NEEDS: dict[str, tuple[tuple[str, ...], tuple[str, ...], str]] = {
-    "diffusion_policy": (("diffusion_policy", "torch"), ("DIFFUSION_POLICY_SRC",), "diffusion_policy.txt"),
-    "gr00t": (("gr00t", "transformers", "torch"), ("GR00T_SRC",), "gr00t.txt"),
-    "lerobot": (("lerobot", "torch"), (), "lerobot.txt"),
-    "octo": (("octo", "jax"), ("OCTO_SRC",), "octo.txt"),
-    "openpi": (("openpi", "jax"), ("OPENPI_SRC",), "openpi.txt"),
-    "openvla": (("prismatic", "transformers", "torch"), ("OPENVLA_SRC", "OPENVLA_OFT_SRC"), "openvla.txt"),
-    "openvla_oft": (("prismatic", "transformers", "torch"), ("OPENVLA_OFT_SRC", "OPENVLA_SRC"), "openvla.txt"),
-    "pi0": (("transformers", "torch"), (), "hf.txt"),
-    "vjepa2_ac": (("transformers", "torch"), ("VJEPA2_SRC",), "hf.txt"),
-    "arro": (("transformers", "torch"), (), "hf.txt"),
-}
 _SHORT = 5  # most ranges of tasks that a line of the listing names
-_CHECKOUTS = {"VJEPA2_SRC": "src"}  # whose module is not among the first ones
 
 
 @dataclass(frozen=True)
@@ -131,13 +116,13 @@ def missing_packages(name: str, *, checkout: bool = True) -> str | None:
 
 def _lacking(name: str) -> tuple[list[str], list[str], str]:
     """Return what a family lacks: modules, variables one of which is to name a checkout; and its requirements file."""
-    modules, variables, requirements = _NEEDS.get(name, ((), (), ""))
-    given = [variable for variable in variables if os.environ.get(variable)]
-    from_checkout = bool(variables) and variables[0] not in _CHECKOUTS  # the first module is the checkout's
-    needed = [one for one in modules if not (given and from_checkout and one == modules[0])]
-    lacking = [one for one in needed if importlib.util.find_spec(one) is None]
-    no_source = bool(variables) and not given and (not from_checkout or modules[0] in lacking)
-    return lacking[no_source and from_checkout :], list(variables) if no_source else [], requirements
+    one = dict(families()).get(name)
+    if one is None:
+        return [], [], ""
+    given = any(os.environ.get(variable) for variable in one.checkouts)
+    lacking = [module for module in one.needs[given:] if importlib.util.find_spec(module) is None]
+    no_source = bool(one.checkouts) and not given and one.needs[0] in lacking
+    return lacking[no_source:], list(one.checkouts) if no_source else [], f"{one.requirements[0]}.txt"
 
 
 def settings_of(cls: type) -> Iterator[str]:

@@ -71,17 +71,11 @@ class Aloha(SimulatorEnv):
         ends_on_success: bool = True,
         record_size: Sequence[int] | None = None,
     ) -> None:
-        """Make the environment; raises the errors of `make_env`.
+        """Make the environment; raises the errors of `make_env`. Other options are those of most `SimulatorEnv`s.
 
         Args:
             task: "transfer_cube" or "insertion".
-            width: Width of each image, pixels.
-            height: Height of each image, pixels.
             cameras: MuJoCo's names: "top", "angle", "front_close", "left_wrist", "right_wrist", ….
-            instruction: The task in words; None is one for the task.
-            max_steps: The step limit.
-            ends_on_success: As in gym-aloha; False: success at the end can be measured, too.
-            record_size: Height and width of further views by the same cameras, for recordings only.
         """
         self.require_task(task)
         super().__init__(f"aloha/{task}", record_size=record_size, width=width, height=height, max_steps=max_steps)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
-from vlagents_ray.envs.rendering.graphics import prepare_rendering
+from vlagents_ray.envs.graphics import prepare_rendering
 from vlagents_ray.envs.simulator import BenchmarkProtocol, MujocoCameras, SimulatorEnv, camera_names, require_cameras
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Obs
@@ -67,19 +67,15 @@ class MetaWorld(SimulatorEnv):
         camera_positions: Mapping[str, Sequence[float]] | None = None,
         record_size: Sequence[int] | None = None,
     ) -> None:
-        """Make the environment; raises the errors of `make_env`.
+        """Make the environment; raises the errors of `make_env`. Other options are those of most `SimulatorEnv`s.
 
         Args:
             task: Meta-World's name.
-            width: Width of each image, pixels.
-            height: Height of each image, pixels.
             cameras: MuJoCo's names, e.g. "corner2", "gripperPOV".
             instruction: None is the task's name in words.
             max_steps: 500 at most.
             goals_seed: Seed of MT1, whose 50 initial states are then the task's; None: each episode's seed draws one.
-            ends_on_success: As in Meta-World's own evaluation; False: success at the end can be measured, too.
             camera_positions: Name -> (x, y, z) m, of cameras that stand elsewhere than in Meta-World.
-            record_size: Height and width of further views by the same cameras, for recordings only.
         """
         if max_steps > PROTOCOL.max_steps:
             raise ConfigError(f"metaworld: max_steps is {max_steps}, want at most {PROTOCOL.max_steps}: there it stops")

@@ -18,8 +18,8 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
-from vlagents_ray.envs.rendering.render_probe import failing
-from vlagents_ray.envs.robosuite.base import RobosuiteEnv, importing_robosuite, seeded
+from vlagents_ray.envs.render_probe import failing
+from vlagents_ray.envs.robosuite import RobosuiteEnv, importing_robosuite, seeded
 from vlagents_ray.envs.simulator import BenchmarkProtocol
 from vlagents_ray.errors import ConfigError, EnvFailed
 from vlagents_ray.interface import Obs
@@ -165,20 +165,15 @@ class RoboCasa(RobosuiteEnv):
         ends_on_success: bool = True,
         record_size: Sequence[int] | None = None,
     ) -> None:
-        """Make the environment; raises the errors of `make_env`.
+        """Make the environment; raises the errors of `make_env`. Other options are those of most `SimulatorEnv`s.
 
         Args:
             task: RoboCasa's name, one of `tasks()`.
             split: The kitchens and objects: "target" or "pretrain".
-            width: Width of each image, pixels; None is the protocol's.
-            height: Height of each image, pixels; None is the protocol's.
             cameras: RoboCasa's names; None are the protocol's three.
             action_order: "base_first", the order of an action in RoboCasa365's datasets, or "arm_first": hand,
                 gripper, base, torso, mode, as RoboCasa's `convert_action` and LeRobot's environment have it.
             object_registries: The sets of objects that are drawn from; the protocol has both.
-            max_steps: The step limit; None is the protocol's for the task.
-            ends_on_success: As in the protocol; False: success at the end can be measured, too.
-            record_size: Height and width of further views by the same cameras, for recordings only.
         """
         self.require_task(task)
         super().__init__(f"robocasa/{task}", record_size=record_size, width=width, height=height, max_steps=max_steps)

@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.contract import ActionSpec
-from vlagents_ray.envs.maniskill import ManiSkill, factory
-from vlagents_ray.envs.maniskill.simulator import Moment, Simulator
-from vlagents_ray.envs.rendering.graphics import Renderer
+from vlagents_ray.envs.graphics import Renderer
+from vlagents_ray.envs.maniskill import ManiSkill
+from vlagents_ray.envs.maniskill.simulator import Moment, Simulator, registered_limit, step_limit
 from vlagents_ray.envs.simulator import SimulatorEnv
 from vlagents_ray.errors import ConfigError, EnvFailed
 from vlagents_ray.interface import Obs
@@ -90,24 +90,22 @@ class Simpler(SimulatorEnv):
         shader: str = PROTOCOL.shader,
         record_size: Sequence[int] | None = None,
     ) -> None:
-        """Make the environment; raises the errors of `make_env`.
+        """Make the environment; raises the errors of `make_env`. Other options are those of most `SimulatorEnv`s.
 
         Args:
             task: ManiSkill's id, one of `Simpler.tasks()`.
             assets: The folder that holds `data/`; None is `MS_ASSET_DIR`, or ~/.maniskill. ManiSkill
                 reads it once, so a process has one.
-            instruction: None is the task's.
             max_steps: None is the task's own limit, 60, or 120 for the eggplant.
             sim_backend: "physx_cpu" or "physx_cuda".
             render_backend: "cpu", "gpu", or "auto": the GPU if both SAPIEN and torch can use it.
             shader: ManiSkill's name; that of the protocol is "default".
-            record_size: Height and width of a further view by the same camera, for recordings only.
         """
         self.require_task(task)
         super().__init__(f"simpler/{task}", record_size=record_size)
         _find_assets(assets)
-        own_limit = factory.registered_limit(task)
-        self.max_steps = factory.step_limit(self._name, max_steps, own_limit)
+        own_limit = registered_limit(task)
+        self.max_steps = step_limit(self._name, max_steps, own_limit)
         self._deviations = [] if self.max_steps == own_limit else [f"max_steps is {max_steps}, not {own_limit}"]
         if shader != PROTOCOL.shader:
             self._deviations.append(f"shader is {shader}, not {PROTOCOL.shader}")
@@ -140,7 +138,6 @@ class Simpler(SimulatorEnv):
 
     @classmethod
     def missing(cls) -> str | None:
-        """Say why SIMPLER cannot run here; its assets are in no package."""
         folder = Path(os.environ.get("MS_ASSET_DIR", Path.home() / ".maniskill"))
         return ManiSkill.missing() or _missing_assets(folder)
 
@@ -209,7 +206,6 @@ def _missing_assets(folder: Path) -> str | None:
 
 
 def _find_assets(wanted: str | None) -> None:
-    """Make ManiSkill look for assets in `wanted`, and check that they are there."""
     if wanted is not None and "mani_skill" not in sys.modules:
         os.environ["MS_ASSET_DIR"] = wanted
     used = require("mani_skill").ASSET_DIR.parent

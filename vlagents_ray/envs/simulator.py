@@ -14,8 +14,8 @@ import numpy as np
 
 from vlagents_ray.contract import Contract
 from vlagents_ray.envs.base import EvalEnv, Options, one_row, require_known
-from vlagents_ray.envs.rendering.graphics import prepare_rendering
-from vlagents_ray.envs.rendering.render_probe import failing, without, without_egl
+from vlagents_ray.envs.graphics import prepare_rendering
+from vlagents_ray.envs.render_probe import failing, without, without_egl
 from vlagents_ray.errors import ConfigError, EnvFailed, NotReset
 from vlagents_ray.interface import HIGH_RES, Act, Obs
 from vlagents_ray.registry import require
@@ -53,6 +53,11 @@ class SimulatorEnv(EvalEnv):
     A subclass states the names below, makes its simulator in the constructor within `_making`, and registers with
     `_resources` what `close` calls. `_begin` begins an episode and `_advance` executes a step; both are called with a
     simulator that is open, and their errors become `EnvFailed`.
+
+    Most constructors have these options, of which None is the task's or the protocol's own value: `width` and `height`
+    of each image, pixels; `instruction`, the task in words; `max_steps`, the step limit; `ends_on_success`, whether
+    success ends the episode (without that, success at the end can be measured, too); `record_size`, height and width
+    of further views by the same cameras, for recordings only.
     """
 
     suite: ClassVar[str]
@@ -69,16 +74,7 @@ class SimulatorEnv(EvalEnv):
     _steps: int | None = None  # of the episode; None before the first reset
 
     def __init__(self, name: str, *, record_size: Sequence[int] | None = None, **sizes: int | None) -> None:
-        """Check the options, and set what drivers read when a simulator is imported.
-
-        Args:
-            name: The env's name, for messages.
-            record_size: Height and width of further views by the same cameras, for recordings only.
-            sizes: Options that are at least 1, or None for their default, such as `width`.
-
-        Raises:
-            ConfigError: A size is less than 1.
-        """
+        """Check the options, of which `sizes` are at least 1 or None; set what drivers read when they are loaded."""
         self._name = name
         for option, value in sizes.items():
             if value is not None and value < 1:
@@ -208,19 +204,7 @@ class MujocoCameras:
         *,
         upside_down: Collection[str] = (),
     ) -> None:
-        """Make the renderers.
-
-        Args:
-            env: The env's name, for messages.
-            model: The `mujoco.MjModel`, whose frame buffer grows to the sizes.
-            cameras: The names of the cameras.
-            size: Height and width of the policy's images.
-            record_size: Height and width of the images for recordings; None for no such images.
-            upside_down: The cameras that are mounted upside down, whose images are turned.
-
-        Raises:
-            ConfigError: The model has no such camera.
-        """
+        """Make the renderers, for which the model's frame buffer grows; images of `upside_down` cameras are turned."""
         require_cameras(env, cameras, camera_names(model))
         self._cameras, self._upside_down = list(cameras), upside_down
         buffer = model.vis.global_
@@ -231,18 +215,13 @@ class MujocoCameras:
                 self._renderers[use] = require("mujoco").Renderer(model, *wanted)
 
     def render(self, data: Any) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Render the state of a `mujoco.MjData`.
-
-        Returns:
-            The images by camera, (H, W, 3) uint8 RGB, and the part of `Obs.info` with those for recordings.
-        """
+        """Render a `mujoco.MjData`: the images by camera, (H, W, 3) uint8, and `Obs.info` with those for recordings."""
         views = {
             use: {name: self._image(one, data, name) for name in self._cameras} for use, one in self._renderers.items()
         }
         return views.pop(""), views
 
     def close(self) -> None:
-        """Free the renderers."""
         for renderer in self._renderers.values():
             renderer.close()
 
@@ -253,7 +232,6 @@ class MujocoCameras:
 
 
 def camera_names(model: Any) -> list[str]:
-    """Return the names of the cameras of a `mujoco.MjModel`."""
     return [model.camera(i).name for i in range(model.ncam)]
 
 
@@ -265,18 +243,7 @@ def require_cameras(env: str, names: Collection[str], have: Collection[str]) -> 
 
 
 def record_size_of(size: Sequence[int] | None, env: str) -> Size | None:
-    """Check the option `record_size`: views for recordings, `info[HIGH_RES]`, which the policy does not get.
-
-    Args:
-        size: (height, width) in pixels, a list in settings files; None if there are no such views.
-        env: The env's name, for the message.
-
-    Returns:
-        The size; None if there are no such views.
-
-    Raises:
-        ConfigError: There can be no image of this size.
-    """
+    """Return the option `record_size` (height, width), px, as a tuple, or None; raises `ConfigError`."""
     if size is None:
         return None
     if len(size) != 2 or min(size) < 1:

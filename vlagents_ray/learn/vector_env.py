@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from vlagents_ray.contract import Contract
-from vlagents_ray.envs.batch import BatchEnv, make_batch
+from vlagents_ray.envs.base import BatchEnv, make_batch
 from vlagents_ray.errors import ConfigError, InvalidAction, InvalidInput, NotReset
 from vlagents_ray.evaluate.episode.episode import options_of_reset
 from vlagents_ray.evaluate.episode.failures import checked_obs, checked_step, env_side

@@ -62,7 +62,6 @@ class Adapters:
     """The adapters of one network."""
 
     def __init__(self) -> None:
-        """Hold no adapter yet."""
         self._named: dict[str, Adapter] = {}
         self._places: dict[str, int] = {"": 0}  # by fingerprint: the place in the tensors of all adapters
         self._chosen: Any = None  # the places of the rows of the running pass, int64; None if no row has an adapter
@@ -70,7 +69,6 @@ class Adapters:
 
     @property
     def ids(self) -> dict[str, str]:
-        """The digest of each adapter with its base, by name."""
         return {name: adapter.weights for name, adapter in self._named.items()}
 
     def load(
@@ -80,17 +78,7 @@ class Adapters:
         find: Callable[[str], tuple[Adapter, Path]],
         adapt: Callable[[str, Path], None],
     ) -> None:
-        """Read adapters, and have the layers of the network apply them from now on.
-
-        Args:
-            network: The torch module that they change.
-            sources: The folder or hub id of each adapter, by name.
-            find: Returns the adapter of a source, and its folder.
-            adapt: Called with the fingerprint and the folder of each adapter that fits.
-
-        Raises:
-            ConfigError: One is missing, or does not fit.
-        """
+        """Read adapters by name, and have the network's layers apply them; raises `ConfigError` if one does not fit."""
         import torch
 
         layers: dict[str, dict[int, tuple[Any, Any]]] = {}  # A and B by layer and place
@@ -116,11 +104,7 @@ class Adapters:
             self._device = weight.device
 
     def named(self, name: object) -> Adapter:
-        """Return the adapter of that name; for None, none.
-
-        Raises:
-            UnknownCheckpoint: There is no such adapter.
-        """
+        """Return the adapter of that name, for None none; raises `UnknownCheckpoint` if there is none."""
         if name is None:
             return Adapter()
         if not isinstance(name, str) or name not in self._named:
@@ -145,12 +129,7 @@ class Adapters:
 
     @contextmanager
     def rows(self, fingerprints: Iterable[str]) -> Iterator[None]:
-        """Have a pass of the network within this apply an adapter to each row.
-
-        Args:
-            fingerprints: The adapter of each row. In the first dimension, the inputs of linear layers have as many
-                entries for each row, usually one, and one row after the other.
-        """
+        """Apply an adapter to each row of the network's passes."""
         before = self._chosen
         self._chosen = self._tensor([self._places[one] for one in fingerprints])
         try:

@@ -40,12 +40,7 @@ def keep_torch_programs() -> None:
 
 
 def keep_jax_programs(jax: Any, platform: str) -> None:
-    """Let JAX keep its programs in the user's cache, unless `JAX_COMPILATION_CACHE_DIR` names another folder.
-
-    Args:
-        jax: The module.
-        platform: Of the device for which it compiles, such as "gpu"; nothing is kept for "cpu".
-    """
+    """Let JAX keep its programs for a GPU in the user's cache, unless `JAX_COMPILATION_CACHE_DIR` is set."""
     if platform == "cpu":
         return
     chosen = getattr(jax.config, "jax_compilation_cache_dir", "an older JAX, without this setting")
@@ -124,18 +119,13 @@ class CaptureLock:
             self._acting.add(threading.get_ident())
 
     def __exit__(self, *_: object) -> None:
-        """End an act."""
         with self._changed:
             self._acting.discard(threading.get_ident())
             self._changed.notify_all()
 
     @contextmanager
     def capture(self) -> Iterator[None]:
-        """Wait for running acts and pushes; none begins within this context.
-
-        Raises:
-            RuntimeError: This thread acts itself.
-        """
+        """Wait for running acts and pushes, none of which begins within this context."""
         if threading.get_ident() in self._acting:
             raise RuntimeError("a CUDA graph cannot be captured within an act; capture it in Agent.initialize")
         with self.pushes:
@@ -161,15 +151,7 @@ class CudaGraph:
     """
 
     def __init__(self, function: Callable[..., Any], tensors: Sequence[Any]) -> None:
-        """Capture a function, which must return a tensor, or a tuple of them, and have no other effect.
-
-        Args:
-            function: The function.
-            tensors: Its arguments, on one GPU, whose values do not matter.
-
-        Raises:
-            RuntimeError: The function cannot be captured, or none of its work was.
-        """
+        """Capture a function of tensors on one GPU without other effects; raises `RuntimeError` if that fails."""
         torch = require("torch")
         self._inputs, device = [tensor.clone() for tensor in tensors], tensors[0].device
         # The stream is named, since torch's own one is on the device of the first capture of the process. The current
@@ -191,7 +173,6 @@ class CudaGraph:
             raise RuntimeError("the CUDA graph is empty: all work ran on another stream, or on another device")
 
     def __call__(self, *tensors: Any) -> Any:
-        """Return the function's result for tensors of the captured shapes, in memory of its own."""
         for held, tensor in zip(self._inputs, tensors, strict=True):
             held.copy_(tensor, non_blocking=True)
         self._graph.replay()
@@ -217,11 +198,6 @@ class Compilation:
     backend: ClassVar[str] = "inductor"  # of torch.compile
 
     def __init__(self, mode: CompileMode) -> None:
-        """Compile nothing yet.
-
-        Args:
-            mode: Whether to compile; with "require", what cannot be compiled is an error.
-        """
         self.mode = mode
         self.sizes: list[int] = []  # batch sizes for which all cores are compiled, ascending
         self.building: int | None = None  # the batch size whose programs are being made
@@ -285,7 +261,6 @@ class Core:
         self._shapes: dict[int, list[Any]] = {}  # of a row of each argument, for each program
 
     def __call__(self, *tensors: Any) -> Any:
-        """Return the core's result for a batch of any size."""
         rows, building = len(tensors[0]), self._owner.building
         tensors = tuple(map(_of_one_kind, tensors))
         if building is not None and rows == (self._rows or building):

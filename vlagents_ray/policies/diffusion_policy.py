@@ -84,7 +84,6 @@ class DiffusionPolicy(ModelPolicy):
 
     @property
     def contract(self) -> Contract:
-        """The contract; before the checkpoint is loaded it states only that there is no instruction."""
         network: DiffusionNetwork | None = self.model
         if network is None:
             return Contract(instruction=False)
@@ -102,11 +101,9 @@ class DiffusionPolicy(ModelPolicy):
 
     @property
     def state_dim(self) -> int | None:
-        """The total length of the checkpoint's vectors; None before it is loaded."""
         return None if self.model is None else sum(self.model.vectors.values())
 
     def load(self) -> DiffusionNetwork:
-        """Read the checkpoint; raises `ConfigError` for cameras that it does not have."""
         network = DiffusionNetwork.load(self.config)
         self._cameras(network)
         if self.config.compile:
@@ -125,7 +122,6 @@ class DiffusionPolicy(ModelPolicy):
         return seen | {name: vector[a:b] for name, (a, b) in zip(network.vectors, pairwise(ends), strict=True)}
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction]:
-        """Compute the chunks of a batch, with the noise of each row's session."""
         network: DiffusionNetwork = self.model
         torch = require("torch")
         histories = [row.history(self.history) for row in rows]
@@ -210,12 +206,7 @@ class DiffusionNetwork:
 
 
 def checkpoint_file(config: DiffusionPolicyConfig) -> Path:
-    """Find the .ckpt file.
-
-    Raises:
-        ConfigError: There is none, a folder has several, or it is of a hub id without the commit, whose pickle may be
-            another one tomorrow than the one that the user trusts.
-    """
+    """Find the .ckpt file; raises `ConfigError` also for a hub id without the commit, whose pickle may change."""
     path = find_checkpoint(config.checkpoint, config.checkpoint_step)
     commit = revision(path)
     if commit is not None and commit not in config.checkpoint:
@@ -287,12 +278,7 @@ _CONDITIONS = {"obs_as_cond": "cond", "obs_as_local_cond": "local_cond", "obs_as
 
 
 def compile_with(network: DiffusionNetwork, compilation: Compilation) -> None:
-    """Have a policy's module call its denoising network, and the encoder of its images, as compiled cores.
-
-    Args:
-        network: The module, whose `predict_action` calls both, and its inputs.
-        compilation: That of the policy.
-    """
+    """Compile a module's denoising network and the encoder of its images, which `predict_action` calls."""
     module = network.module
     _without_branches_on_values(module, network.device)
     condition = next((name for flag, name in _CONDITIONS.items() if getattr(module, flag, False)), "")

@@ -11,13 +11,19 @@ of any library, and are differentiable there.
 
 from __future__ import annotations
 
+import abc
 import math
+import sys
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from vlagents_ray.policies.adapters import Adapters
 from vlagents_ray.policies.base.model_inputs import Row
+from vlagents_ray.policies.compilation import Compilation
+from vlagents_ray.registry import require
 
 OFFERED = ("logprob", "entropy", "replay")  # of chunks that come out of random steps
 _LOG_2_PI = math.log(2 * math.pi)
@@ -155,12 +161,7 @@ class RandomSteps:
         return velocity
 
     def stated(self, execute: int | None, dim: int | None) -> dict[int, dict[str, Any]]:
-        """Return what is wanted of rows, by their places in the batch, after the last step.
-
-        Args:
-            execute: The rows of a chunk that are used; None: all.
-            dim: The numbers of a row that are used; None: all.
-        """
+        """Return what is wanted of rows, by their places, after the last step; None: all rows, all numbers."""
         stds = [step_std(step, self._steps, self._level) for step in range(self._steps)]
         logprob = sum(map(normal_logprob, self._chain[1:], self._means, stds))[:, :execute, :dim].cpu().numpy()
         entropy = chain_entropy(self._steps, self._level) * logprob[0].size
@@ -171,3 +172,196 @@ class RandomSteps:
             said = {"logprob": logprob[place], "entropy": entropy, "replay": replay}
             found[i] = {name: said[name] for name in want}
         return found
+
+
+@dataclass(frozen=True, slots=True)
+class Guide:
+    """The plan that each row of a batch of chunks follows, as arrays of the library in which the model is written."""
+
+    plan: Any  # (B, H, D) in the model's units, i.e. normalised; zeros where there is no plan
+    frozen: Any  # (B, H, 1): 1.0 where a row will have been executed, else 0.0
+    weight: Any  # (B, H, 1) in [0, 1]: how closely a later row follows
+
+    @classmethod
+    def of(cls, rows: Sequence[Row], horizon: int, dim: int) -> Guide | None:
+        """Return the guide of the rows' `delay` and `leftover`, in the model's units; None if no row has any."""
+        if all(row.leftover is None for row in rows):
+            return None
+        plan = np.zeros((len(rows), horizon, dim), np.float32)
+        frozen = np.zeros((len(rows), horizon, 1), np.float32)
+        weight = np.zeros((len(rows), horizon, 1), np.float32)
+        for i, row in enumerate(rows):
+            if row.leftover is not None:
+                left = row.leftover[:horizon]
+                delay = min(max(row.delay, 0), len(left))
+                plan[i, : len(left), : left.shape[1]] = left
+                frozen[i, :delay] = 1.0
+                weight[i, delay:, 0] = _weights(delay, len(left), horizon)[delay:]
+        return cls(plan, frozen, weight)
+
+    def to(self, convert: Callable[[np.ndarray], Any]) -> Guide:
+        """Convert the arrays to another library, or move them to another device."""
+        return Guide(convert(self.plan), convert(self.frozen), convert(self.weight))
+
+    def change(self, noise: Any, *, steps: int, limit: float) -> Callable[[Any, Any, float], Any]:
+        """Return `steer` for a flow from some noise (B, H, D), as a function of velocity, noisy actions and time."""
+        return lambda velocity, actions, time: self.steer(velocity, actions, noise, time, steps=steps, limit=limit)
+
+    def steer(
+        self,
+        velocity: Any,
+        actions: Any,
+        noise: Any,
+        time: Any,
+        *,
+        steps: int,
+        limit: float,
+        lower: Callable[[Any, float], Any] = min,
+    ) -> Any:
+        """Return the velocity (B, H, D), corrected by the plan, at the noisy actions of this flow time.
+
+        The gain of the correction of a later row is at most `limit`, and at most the number of steps: with that, one
+        step goes all the way. `lower` returns the smaller of two numbers, for libraries whose `time` is not a plain
+        number.
+        """
+        spread = (1.0 - time) ** 2 + time**2
+        gain = lower(spread / (time * (1.0 - time) + 1e-6), min(limit, float(steps)))
+        pulled = velocity - gain * self.weight * (self.plan - (actions - time * velocity))
+        return self.frozen * (noise - self.plan) + (1.0 - self.frozen) * pulled
+
+
+def _weights(delay: int, length: int, horizon: int) -> np.ndarray:
+    """Return (horizon,): the paper's soft mask, from about 1 after the frozen rows down to 0 where the plan ends."""
+    behind = np.arange(horizon, dtype=np.float32)
+    share = np.clip((length - behind) / (length - delay + 1), 0.0, 1.0)
+    return np.asarray(share * np.expm1(share) / np.expm1(1.0), np.float32)
+
+
+class FlowPasses(abc.ABC):
+    """The passes of a model."""
+
+    def __init__(self, model: Any, compilation: Compilation) -> None:
+        """Use the passes of a model of openpi, or of LeRobot, in their compiled form if there is one."""
+        self.model = model
+        self.adapters = Adapters()  # of the policy
+        self.module = sys.modules[type(model).__module__]  # with the functions of its authors' own passes
+        self.attention_mask = self.module.make_att_2d_masks
+        self._encode = compilation.core("encode", self.encode)
+        self._velocity = compilation.core("velocity", self.velocity)
+
+    def encode_images(self, images: Sequence[Any]) -> Sequence[Any]:
+        """Return what `encode` gets of images (P, 3, H, W)."""
+        return images
+
+    @abc.abstractmethod
+    def encode(self, tokens: Any, mask: Any, cameras: Any, state: Any, *images: Any) -> tuple[Any, Any]:
+        """Return keys and values, and which of the tokens (P, L) are there, 1 or 0.
+
+        Args:
+            tokens: Of the instruction, (P, T) int64.
+            mask: (P, T) bool, which of them are no padding.
+            cameras: (P, N) bool, which of the images are there.
+            state: (P, S).
+            images: What `encode_images` returned for the N images.
+        """
+
+    @abc.abstractmethod
+    def velocity(self, encoded: Any, seen: Any, state: Any, actions: Any, times: Any) -> Any:
+        """Return the velocity (B, H, D) of noisy actions (B, H, D) at times (B,)."""
+
+    def sample(
+        self,
+        images: Sequence[Any],
+        cameras: Sequence[Any],
+        tokens: Any,
+        mask: Any,
+        state: Any = None,
+        *,
+        noise: Any,
+        owners: Sequence[int],
+        steps: int,
+        changes: Sequence[Change] = (),
+        fingerprints: Sequence[str] = (),
+    ) -> Any:
+        """Return actions (B, H, D).
+
+        Args:
+            images: Of P observations, (P, 3, H, W) for each of N cameras.
+            cameras: Which of them are there, (P,) bool for each camera.
+            tokens: See `encode`.
+            mask: See `encode`.
+            state: See `encode`; None for a model that has it in its prompt.
+            noise: (B, H, D).
+            owners: The observation of each row.
+            steps: Of the flow.
+            changes: See `follow`.
+            fingerprints: The adapter of each row, see `Row.adapter`; empty: none has one.
+        """
+        torch = require("torch")
+        firsts = [list(owners).index(place) for place in range(len(mask))] if fingerprints else []
+        if state is None:
+            state = mask[:, :0].float()
+        with self.adapters.rows([fingerprints[i] for i in firsts]):
+            encoded, seen = self._encode(
+                tokens, mask, torch.stack(list(cameras), 1), state, *self.encode_images(images)
+            )
+        if list(owners) != list(range(len(mask))):
+            index = torch.tensor(owners, device=mask.device)
+            encoded, seen, state = encoded[index], seen[index], state[index]
+
+        def velocity(actions: Any, time: float) -> Any:
+            times = torch.full((len(actions),), time, dtype=torch.float32, device=actions.device)
+            with self.adapters.rows(fingerprints):
+                return self._velocity(encoded, seen, state, actions, times)
+
+        return follow(velocity, noise, steps, *changes)
+
+
+class Pi0Passes(FlowPasses):
+    """The passes of openpi's PyTorch port of π0 and π0.5, which LeRobot has copied."""
+
+    def __init__(self, model: Any, compilation: Compilation, *, stated: bool = True) -> None:
+        """Use the passes of a `PI0Pytorch` or `PI05Pytorch`; `stated`: whether its `denoise_step` takes the state."""
+        self._stated = stated
+        model.paligemma_with_expert.paligemma.model.language_model.config._attn_implementation = "eager"
+        super().__init__(model, compilation)
+        own = getattr(model, "_prepare_attention_masks_4d", None)  # a function in newer versions of LeRobot
+        self._mask_4d = own or self.module.prepare_attention_masks_4d
+
+    def encode(self, tokens: Any, mask: Any, cameras: Any, state: Any, *images: Any) -> tuple[Any, Any]:
+        """Return keys and values, and which tokens are there; the state is not read."""
+        import torch  # the compiler follows a statement, and not `require`
+
+        embedded, seen, causal = self.model.embed_prefix(list(images), list(cameras.unbind(1)), tokens, mask)
+        _, cache = self.model.paligemma_with_expert.forward(
+            attention_mask=self._mask_4d(self.attention_mask(seen, causal)),
+            position_ids=seen.cumsum(1) - 1,
+            inputs_embeds=[embedded, None],
+            use_cache=True,
+        )
+        return torch.stack([torch.stack(layer, 1) for layer in layers_of(cache)], 1), seen.long()
+
+    def velocity(self, encoded: Any, seen: Any, state: Any, actions: Any, times: Any) -> Any:
+        """Return the velocity (B, H, D)."""
+        cache = cache_of(encoded.unbind(1))  # of this step alone
+        stated = {"state": state} if self._stated else {}
+        return self.model.denoise_step(
+            prefix_pad_masks=seen.bool(), past_key_values=cache, x_t=actions, timestep=times, **stated
+        )
+
+
+def layers_of(cache: Any) -> list[tuple[Any, Any]]:
+    """Return keys and values of each layer of a transformers `DynamicCache`; its versions differ in where they are."""
+    if hasattr(cache, "layers"):
+        return [(layer.keys, layer.values) for layer in cache.layers]
+    return [cache[number] for number in range(len(cache))]
+
+
+def cache_of(layers: Sequence[Any]) -> Any:
+    """Return a transformers `DynamicCache` with these keys and values, (B, 2, …) for each layer."""
+    from transformers import DynamicCache  # the compiler follows a statement, and not `require`
+
+    cache = DynamicCache()
+    for number, layer in enumerate(layers):
+        cache.update(layer[:, 0], layer[:, 1], number)
+    return cache

@@ -38,13 +38,7 @@ def loading_report(
     batch_sizes: Sequence[int] = COMPILED_SIZES,
     on_out_of_memory: Callable[[], None] = lambda: None,
 ) -> Iterator[LoadingReport]:
-    """Yield the report of the policy that is loaded in this context.
-
-    Args:
-        on_progress: Called with each step of a long load, on the thread that loads.
-        batch_sizes: For which a policy is compiled whose settings name none, ascending.
-        on_out_of_memory: Called each time that a forward pass of the policy does not fit into memory.
-    """
+    """Yield the report of the policy that is loaded in this context; see the fields of `LoadingReport`."""
     report = LoadingReport(on_progress, batch_sizes, on_out_of_memory=on_out_of_memory)
     token = _report.set(report)
     try:

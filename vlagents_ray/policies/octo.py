@@ -96,7 +96,6 @@ class Octo(ModelPolicy):
 
     @property
     def contract(self) -> Contract:
-        """The contract; cameras, state and the action's size are stated once the checkpoint is loaded."""
         instruction = {"language": True, "image": False}.get(self.config.goal)
         network: OctoNetwork | None = self.model
         if network is None:
@@ -114,11 +113,9 @@ class Octo(ModelPolicy):
 
     @property
     def state_dim(self) -> int | None:
-        """The length of the state vector; None if the checkpoint reads none, or is not loaded."""
         return None if self.model is None else self.model.proprio_dim
 
     def load(self) -> OctoNetwork:
-        """Read the checkpoint; raises `ConfigError` for settings that do not fit it."""
         config = self.config
         network = OctoNetwork.load(config)
         self._cameras(network)
@@ -149,7 +146,6 @@ class Octo(ModelPolicy):
         return info
 
     def perceive(self, obs: Obs) -> dict[str, np.ndarray]:
-        """Return the images and the state by Octo's names, in the sizes of its training."""
         network: OctoNetwork = self.model
         seen = {name: self._image(name, image) for name, image in camera_images(obs, self._cameras(network)).items()}
         if network.proprio_dim is not None:
@@ -288,7 +284,6 @@ class OctoNetwork:
         return network
 
     def shapes(self) -> Any:
-        """Return the shapes of the model's parameters."""
         jax = require("jax")
         example = self.model.example_batch
         init = partial(self.model.module.init, train=False)

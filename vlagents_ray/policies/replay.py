@@ -41,7 +41,6 @@ class Replay(Agent):
 
     @property
     def contract(self) -> Contract:
-        """The contract; the action's dimension is stated once `initialize` has read the recording."""
         dim = None if self.actions is None else self.actions.shape[1]
         return Contract(action=ActionSpec(dim=dim), chunk=self.config.chunk)
 
@@ -75,18 +74,7 @@ class Replay(Agent):
 
 
 def load_actions(path: Path, key: str | None = None) -> np.ndarray:
-    """Read recorded actions.
-
-    Args:
-        path: A .npy, .npz or .json file.
-        key: The array's name in a .npz or .json file with several.
-
-    Returns:
-        The actions, (T, D) float32.
-
-    Raises:
-        ConfigError: The file is missing, or has no such array of finite numbers.
-    """
+    """Return recorded actions, (T, D) float32, of a .npy, .npz or .json file; raises `ConfigError` if it has none."""
     if not path.is_file():
         raise ConfigError(f"recording {path}: no such file")
     readers = {".npy": _read_npy, ".npz": _read_npz, ".json": _read_json}

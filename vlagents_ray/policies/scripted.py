@@ -30,16 +30,10 @@ class Scripted(Agent):
 
     @property
     def contract(self) -> Contract:
-        """An empty contract, as each session has another expert."""
         return Contract()
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
-        """Begin an episode of the env `kwargs["env"]`, or of the config's `task`.
-
-        Raises:
-            InvalidInput: Neither of them is given.
-            ContractMismatch: There is no expert for the env.
-        """
+        """Begin an episode of the env `kwargs["env"]`, or of the config's `task`."""
         self._expert = None  # the previous episode's expert must not act if this fails
         env = kwargs.get("env") or self.config.task
         if not isinstance(env, str):

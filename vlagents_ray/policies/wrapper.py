@@ -29,18 +29,7 @@ class Wrapper(Agent, abc.ABC):
 
     @classmethod
     def around(cls, agent: Agent, settings: Mapping[str, Any]) -> Wrapper:
-        """Wrap an agent.
-
-        Args:
-            agent: The agent.
-            settings: The wrapper's settings in the deployment file.
-
-        Returns:
-            The wrapper.
-
-        Raises:
-            ConfigError: A setting is unknown or has a wrong value.
-        """
+        """Wrap an agent, with the wrapper's settings in the deployment file; raises `ConfigError` for wrong ones."""
         try:
             return cls(agent) if cls.Config is None and not settings else cls(agent, cls.Config(**settings))  # type: ignore[misc]
         except (TypeError, ValueError) as error:
@@ -49,23 +38,11 @@ class Wrapper(Agent, abc.ABC):
 
     @abc.abstractmethod
     def begin(self, obs: Obs, instruction: str | None) -> Obs:
-        """Begin an episode.
-
-        Args:
-            obs: The first observation.
-            instruction: The task in words.
-
-        Returns:
-            The observation for the inner agent.
-        """
+        """Begin an episode with its first observation; returns the observation for the inner agent."""
 
     @abc.abstractmethod
     def change_batch(self, obs: Sequence[Obs], sessions: Sequence[Wrapper]) -> list[Obs | Exception]:
-        """Change the observations of several sessions.
-
-        Args:
-            obs: One observation for each session.
-            sessions: The sessions' copies of the wrapper.
+        """Change an observation of each session, given the sessions' copies of the wrapper.
 
         Returns:
             The observations for the inner agent; an exception in the place of one fails that session's request alone.
@@ -77,29 +54,26 @@ class Wrapper(Agent, abc.ABC):
         return self.agent.contract
 
     def shared_objects(self) -> list[Any]:
-        """Return the shared objects of the wrapper and of the inner agent."""
         return [*super().shared_objects(), *self.agent.shared_objects()]
 
     def parameters(self) -> dict[str, Any]:
-        """Return what a learner trains of the inner agent."""
         return self.agent.parameters()
 
     def load_parameters(self, named: Mapping[str, Any]) -> None:
-        """Let the inner agent act with these values."""
         self.agent.load_parameters(named)
 
     def initialize(self) -> None:
-        """Load the inner agent."""
         self.agent.initialize()
         self.weights_id = self.agent.weights_id
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
-        """Begin an episode of the wrapper and of the inner agent."""
         return self.agent.reset(self.begin(obs, instruction), instruction, **kwargs)
 
     def observe(self, obs: Obs) -> None:
-        """Pass the changed observation to the inner agent's `observe`."""
-        self.agent.observe(self._change(obs))
+        [changed] = self.change_batch([obs], [self])
+        if isinstance(changed, Exception):
+            raise changed
+        self.agent.observe(changed)
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
         """Change the observations, and compute the inner agent's actions for those without an exception."""
@@ -112,35 +86,18 @@ class Wrapper(Agent, abc.ABC):
         return results
 
     def check_health(self) -> None:
-        """Check the health of the inner agent."""
         self.agent.check_health()
 
     def close(self) -> None:
-        """Close the inner agent."""
         self.agent.close()
-
-    def _change(self, obs: Obs) -> Obs:
-        [changed] = self.change_batch([obs], [self])
-        if isinstance(changed, Exception):
-            raise changed
-        return changed
 
 
 def build_agent(
     policy: str, config: Mapping[str, Any], wrappers: Sequence[str | Mapping[str, Mapping[str, Any]]] = ()
 ) -> Agent:
-    """Make a policy with its wrappers.
+    """Make a policy, named or "module:Class", with its wrappers; raises `ConfigError` for a wrong name or setting.
 
-    Args:
-        policy: The policy's name, or "module:Class".
-        config: The policy's settings.
-        wrappers: The names of wrappers, or {name: settings}; the first one gets the robot's observations.
-
-    Returns:
-        The outermost wrapper, or the policy if there are none.
-
-    Raises:
-        ConfigError: A name or a setting is unknown or wrong.
+    Wrappers are names, or {name: settings}; the first one gets the robot's observations, and is returned.
     """
     agent: Agent = policy_class(policy).from_config(config)
     for entry in reversed(wrappers):

@@ -19,17 +19,7 @@ _KEYS = {"__numpy__", "dtype", "shape"}
 
 
 def loads(text: str | bytes, limits: Limits, levels: int = 0) -> Any:
-    """Return the value of a document; arrays are read-only.
-
-    Args:
-        text: The document.
-        limits: The limits of its size, its number of values and their nesting.
-        levels: Levels of nesting that the document's format adds above the limited values.
-
-    Raises:
-        MalformedMessage: It is not JSON, or an array in it is invalid.
-        MessageTooLarge: It is over a limit.
-    """
+    """Return the value of a document, nested up to `levels` more than the limit; arrays are read-only."""
     if len(text) > limits.body_bytes:
         raise MessageTooLarge(f"document: got {len(text)} bytes, the limit is {limits.body_bytes}")
     marks: tuple[Any, ...] = (",", "[", "{") if isinstance(text, str) else (b",", b"[", b"{")

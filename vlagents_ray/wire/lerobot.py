@@ -65,13 +65,7 @@ class RobotObservation:
 
 
 def read_instructions(data: Buffer, limits: Limits) -> PolicyInstructions:
-    """Return the policy instructions in a pickle.
-
-    Raises:
-        MalformedMessage: The pickle has anything but these, see `pickles`.
-        MessageTooLarge: It exceeds a limit.
-        InvalidObservation: The robot's features are none of numbers and cameras, or are to be renamed.
-    """
+    """Return the policy instructions in a pickle; raises `InvalidObservation` for features that are not served."""
     stated = _pickled_fields(data, limits, SETUP)
     policy_type, checkpoint = (_text(stated, name) for name in ("policy_type", "pretrained_name_or_path"))
     rows, features, renames = (stated[name] for name in ("actions_per_chunk", "lerobot_features", "rename_map"))
@@ -103,12 +97,7 @@ def read_instructions(data: Buffer, limits: Limits) -> PolicyInstructions:
 
 
 def read_observation(data: Buffer, budget: Budget) -> RobotObservation:
-    """Return the observation in a pickle; its arrays view the pickle, and are counted in `budget`.
-
-    Raises:
-        MalformedMessage: The pickle has anything but an observation, see `pickles`.
-        MessageTooLarge: It exceeds a limit.
-    """
+    """Return the observation in a pickle, whose arrays view the pickle, and are counted in `budget`."""
     stated = _pickled_fields(data, budget.limits, OBSERVATION)
     timestamp, timestep, values, must_go = (stated[name] for name in _REQUESTS[OBSERVATION])
     if not is_number(timestamp) or not math.isfinite(timestamp):
@@ -283,7 +272,6 @@ def write_data(data: bytes) -> bytes:
 
 
 def method(name: str) -> str:
-    """Return the path of a method of the service."""
     return f"/{SERVICE}/{name}"
 
 
@@ -291,7 +279,6 @@ EMPTY = b""  # an `Empty`, and an `Actions` without a pickle
 
 
 def _head(number: int, length: int) -> bytes:
-    """Return what precedes the bytes of a field."""
     size = bytearray()
     while length > 0x7F:
         size.append(length & 0x7F | 0x80)
@@ -365,11 +352,7 @@ class TimedChunk:
 
 
 def features_of(mapping: KeyMapping) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the names of the state's numbers and of the cameras, which the server wants before the first observation.
-
-    Raises:
-        ConfigError: The mapping does not name them all, or has keys that LeRobot's server does not read.
-    """
+    """Return the names of the state's numbers and of the cameras; raises `ConfigError` if the mapping lacks some."""
     cameras = tuple(one.key.removeprefix(IMAGES) for one in mapping.cameras.values())
     for name, one in mapping.cameras.items():
         if "*" in name or not one.key.startswith(IMAGES):
@@ -394,7 +377,6 @@ def features_of(mapping: KeyMapping) -> tuple[tuple[str, ...], tuple[str, ...]]:
 
 
 def write_instructions(instructions: PolicyInstructions) -> bytes:
-    """Return the pickle of policy instructions."""
     state: dict[str, Any] = {
         STATE: {"dtype": "float32", "shape": (len(instructions.state),), "names": list(instructions.state)}
     }
@@ -443,12 +425,7 @@ def write_observation(
 
 
 def read_chunk(data: Buffer, limits: Limits = DEFAULT_LIMITS) -> TimedChunk:
-    """Return the chunk in a pickle.
-
-    Raises:
-        MalformedMessage: The pickle has anything but a chunk, see `pickles`.
-        MessageTooLarge: It exceeds a limit.
-    """
+    """Return the chunk in a pickle; raises `MalformedMessage` or `MessageTooLarge`."""
     actions = read_pickle(data, replace(limits, items=max(limits.items, _ITEMS)), _REPLIES, TORCH_CALLS)
     if not isinstance(actions, list) or not actions:
         raise MalformedMessage(f"actions: got {type(actions).__name__}, want a list of TimedAction")

@@ -155,7 +155,6 @@ def parts(value: Any, where: str) -> tuple[StateKey, ...]:
 
 
 def text(value: Any, where: str) -> str:
-    """Return a value that must be text."""
     if not isinstance(value, str):
         raise ConfigError(f"{where}: got {type(value).__name__}, want text")
     return value
@@ -221,7 +220,6 @@ def leaves(nested: Mapping[Any, Any], prefix: str = "") -> list[tuple[str, Any]]
 
 
 def reads(key: str, path: str) -> bool:
-    """Whether the key of a mapping stands for the value at `path`."""
     return any(matches(path, one) for one in key.split("|"))
 
 
@@ -292,7 +290,6 @@ def _eight_bits(key: str, image: np.ndarray) -> np.ndarray:
 
 
 def may_be_camera(value: Any) -> bool:
-    """Return whether a value may be an image."""
     return isinstance(value, np.ndarray) and value.ndim >= 3
 
 
@@ -319,7 +316,6 @@ def read_state(
 
 
 def read_vector(key: str, value: Any, limits: Limits) -> np.ndarray:
-    """Return a value as (D,) float32."""
     if isinstance(value, np.ndarray):
         value = np.atleast_1d(_newest(key, value, 1))
     elif isinstance(value, np.number):

@@ -90,7 +90,6 @@ def _refuse(code: int, _data: bytes) -> Any:
 
 
 def is_packed(node: Mapping[Any, Any]) -> bool:
-    """Return whether a map is an array."""
     return b"nd" in node or "nd" in node
 
 

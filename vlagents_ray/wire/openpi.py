@@ -18,10 +18,7 @@ from vlagents_ray.wire.msgpack import pack, unpack
 
 
 def decode(data: bytes, limits: Limits = DEFAULT_LIMITS) -> dict[str, Any]:
-    """Return the map in a message; arrays are read-only views, and an array of text becomes a list.
-
-    Raises `MalformedMessage` or `MessageTooLarge`.
-    """
+    """Return the map in a message; arrays are read-only views, and an array of text becomes a list."""
     value = decode_any(data, limits)
     if not isinstance(value, dict):
         raise MalformedMessage(f"message: got {type(value).__name__}, want a map")

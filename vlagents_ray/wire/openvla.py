@@ -19,10 +19,7 @@ from vlagents_ray.wire.mapping import ALOHA_ACTION, ALOHA_STATE, libero_state
 
 
 def decode(body: bytes, limits: Limits = DEFAULT_LIMITS) -> tuple[dict[str, Any], bool]:
-    """Return the observation in a request's body, and whether it was encoded twice.
-
-    Raises `MalformedMessage` or `MessageTooLarge`.
-    """
+    """Return the observation in a request's body, and whether it was encoded twice."""
     if len(body) > limits.body_bytes:
         raise MessageTooLarge(f"body: got {len(body)} bytes, the limit is {limits.body_bytes}")
     payload = _load(body, limits)
@@ -34,7 +31,6 @@ def decode(body: bytes, limits: Limits = DEFAULT_LIMITS) -> tuple[dict[str, Any]
 
 
 def encode(action: np.ndarray | Sequence[np.ndarray], twice: bool) -> bytes:
-    """Return the reply with one action, (D,), or several."""
     text = json_numpy.dumps(action)
     return (json.dumps(text) if twice else text).encode()
 
@@ -47,15 +43,11 @@ def _load(text: bytes, limits: Limits) -> dict[str, Any]:
 
 
 def encode_observation(observation: Mapping[str, Any]) -> bytes:
-    """Return the body of a request, encoded once."""
     return json_numpy.dumps(observation).encode()
 
 
 def decode_action(body: bytes, limits: Limits = DEFAULT_LIMITS) -> np.ndarray | None:
-    """Return the action in a reply, (D,) or (H, D); None if the reply is "error", as OpenVLA's own server says it.
-
-    Raises `MalformedMessage` or `MessageTooLarge`.
-    """
+    """Return the action in a reply, (D,) or (H, D); None if the reply is "error", as OpenVLA's own server says it."""
     value = json_numpy.loads(body, limits)
     if isinstance(value, str) and value != "error":  # encoded twice
         value = json_numpy.loads(value, limits)

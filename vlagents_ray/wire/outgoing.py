@@ -44,12 +44,7 @@ class Outgoing:
                 raise ConfigError(f"mapping.state.{name}: got {open_ended} parts without `stop`, want one at most")
 
     def observation(self, obs: Obs, instruction: str | None) -> dict[str, Any]:
-        """Return an observation as the other system's server reads it; its arrays may view those of `obs`.
-
-        Raises:
-            MissingCamera, MissingState: The mapping names a camera or a state that the observation lacks.
-            InvalidObservation: A vector has another length than the mapping says.
-        """
+        """Return an observation as the other system's server reads it; its arrays may view those of `obs`."""
         theirs: dict[str, Any] = {}
         for name, camera in self.mapping.cameras.items():
             for key, image in _matching(name, camera.key, obs.cameras, self.mapping.cameras):
@@ -66,11 +61,7 @@ class Outgoing:
         return theirs
 
     def rows(self, theirs: np.ndarray | Mapping[str, np.ndarray]) -> np.ndarray:
-        """Return their actions, (D,) or (H, D), or such by name, as one (D,) or (H, D) float32.
-
-        Raises:
-            InvalidAction: They are no such arrays of numbers, or not those that the mapping's `action` names.
-        """
+        """Return their actions, (D,) or (H, D), or such by name, as one (D,) or (H, D) float32."""
         if not isinstance(theirs, Mapping):
             return _numbers("action", theirs)
         named = {name: _numbers(name, value) for name, value in theirs.items()}
@@ -131,7 +122,6 @@ class Outgoing:
         )
 
     def _vectors(self, obs: Obs) -> dict[str, np.ndarray]:
-        """Return their vectors by key."""
         pieces: dict[str, list[tuple[int, np.ndarray]]] = {}
         for name, parts in self.mapping.state.items():
             for matched, vector in _matching(name, name, obs.state, self.mapping.state):

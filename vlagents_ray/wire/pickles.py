@@ -112,7 +112,6 @@ class _StackMachine:
         self._latest: tuple[Any, Any, Reduced] = None, None, Reduced()
 
     def whole(self) -> Any:
-        """Read the pickle to its end."""
         if self.take(1)[0] != _PROTO or self.take(1)[0] not in _PROTOCOLS:
             raise MalformedMessage(f"pickle: want one of protocol {_PROTOCOLS[0]} or {_PROTOCOLS[1]}")
         while (opcode := self.take(1)[0]) != _STOP:
@@ -127,7 +126,6 @@ class _StackMachine:
         return root
 
     def take(self, length: int) -> memoryview:
-        """Return the next bytes."""
         end = self._at + length
         if end > len(self._data):
             raise MalformedMessage("pickle: a message that ends too early")
@@ -136,17 +134,14 @@ class _StackMachine:
         return found
 
     def push(self, value: Any, depth: int = 0, items: int = 1) -> None:
-        """Put a value onto the stack."""
         if depth > self._limits.depth:
             raise MessageTooLarge(f"pickle: more than {self._limits.depth} levels of nesting")
         self._stack.append(_StackValue(value, depth, items))
 
     def pop(self) -> Any:
-        """Take the value at the top of the stack."""
         return self._entry().value
 
     def text(self, length: int) -> None:
-        """Read a text."""
         if length > self._limits.text:
             raise MessageTooLarge(f"pickle: a text of {length} bytes, the limit is {self._limits.text}")
         try:
@@ -155,19 +150,16 @@ class _StackMachine:
             raise MalformedMessage(f"pickle: a text that is not UTF-8 ({error.reason})") from error
 
     def integer(self) -> None:
-        """Read an integer of a stated number of bytes."""
         length = self.take(1)[0]
         if length > _INTEGER:
             raise MessageTooLarge(f"pickle: an integer of {length} bytes, the limit is {_INTEGER}")
         self.push(int.from_bytes(self.take(length), "little", signed=True))
 
     def mark(self) -> None:
-        """Begin a group of values."""
         self._below.append(self._stack)
         self._stack = []
 
     def remember(self) -> None:
-        """Put the value at the top of the stack into the memo, too."""
         self._memo.append(self._top())
 
     def recall(self, index: int) -> None:
@@ -182,7 +174,6 @@ class _StackMachine:
         self._stack.append(entry)
 
     def tuple_of(self, entries: Sequence[_StackValue]) -> None:
-        """Make a tuple of values."""
         self.push(
             tuple(_finished(entry.value) for entry in entries),
             _above(entries),
@@ -190,11 +181,9 @@ class _StackMachine:
         )
 
     def extend(self, entries: Sequence[_StackValue]) -> None:
-        """Append values to the list below them."""
         self._into(list, entries).extend(_finished(entry.value) for entry in entries)
 
     def update(self, entries: Sequence[_StackValue]) -> None:
-        """Put keys and values into the dict below them."""
         keys = [entry.value for entry in entries[::2]]
         if len(entries) % 2 or not all(type(key) is str for key in keys):
             raise MalformedMessage("pickle: want a dict with texts as keys")
@@ -202,7 +191,6 @@ class _StackMachine:
         self._into(dict, entries).update(zip(keys, values, strict=True))
 
     def last(self, number: int | None) -> list[_StackValue]:
-        """Take the last values, or all since the mark, from the stack."""
         if number is not None:
             return [self._entry() for _ in range(number)][::-1]
         if not self._below:
@@ -224,7 +212,6 @@ class _StackMachine:
         self.push(found)
 
     def reduce(self) -> None:
-        """Make the object that a call stands for."""
         arguments, name = self.pop(), self.pop()
         read = self._calls.get(name) if isinstance(name, Name) else None
         if read is None or type(arguments) is not tuple:
@@ -245,14 +232,12 @@ class _StackMachine:
         self.push(found)
 
     def new(self) -> None:
-        """Begin an object of a data class."""
         arguments, name = self.pop(), self.pop()
         if arguments != () or not isinstance(name, Name) or name not in self._records:
             raise MalformedMessage(f"pickle: got an object of {_kind(name)}, want one of LeRobot's messages")
         self.push(Record(name))
 
     def build(self) -> None:
-        """Describe the object below the value at the top."""
         state = self._entry()
         target = self._top().value
         if isinstance(target, Record) and target.fields is None and type(state.value) is dict:
@@ -443,12 +428,7 @@ NUMPY_CALLS: dict[Name, Call | None] = {Name("numpy", "dtype"): _dtype, Name("nu
 
 
 def read_pickled_array(data: bytes) -> np.ndarray:
-    """Return the numpy array that a pickle consists of, which views `data`.
-
-    Raises:
-        MalformedMessage: The pickle has anything but such an array, see `pickles`.
-        MessageTooLarge: It exceeds a limit.
-    """
+    """Return the numpy array that a pickle consists of, which views `data`."""
     found = read_pickle(data, DEFAULT_LIMITS, {}, NUMPY_CALLS)
     if not isinstance(found, np.ndarray):
         raise MalformedMessage(f"pickle: got {type(found).__name__}, want a numpy array")
@@ -527,18 +507,11 @@ _ARRAY, _KIND, _DTYPE = (
 
 
 def write_record(name: Name, fields: Mapping[str, Any]) -> bytes:
-    """Return the pickle of an object of a data class, in protocol 4.
-
-    Args:
-        name: The class.
-        fields: Its fields: numbers below 2**31, texts, truth values, None, arrays of plain numbers, and tuples, lists
-            and dicts of these.
-    """
+    """Return the pickle (protocol 4) of a data class; fields are plain values, arrays, and containers of these."""
     return b"".join((b"\x80\4", _named(name), b")\x81", written(fields), b"b."))
 
 
 def written(value: Any) -> bytes:
-    """Return the opcodes that push a value onto the stack."""
     if isinstance(value, str):
         return text(value)
     if isinstance(value, float):
@@ -557,7 +530,6 @@ def written(value: Any) -> bytes:
 
 
 def text(value: str) -> bytes:
-    """Return the opcodes that push a text."""
     data = value.encode()
     return b"X" + struct.pack("<I", len(data)) + data
 

@@ -71,11 +71,7 @@ def read_header(header: bytes | bytearray, limit: int) -> tuple[int, bool]:
 
 def read_call(body: bytes | bytearray, compressed: bool, limit: int) -> RpycCall | None:
     """Return the request in a frame's body, which follows the header; None if the message needs no reply."""
-    message = memoryview(body)[: -len(END)]
-    if compressed:
-        message = memoryview(_inflate(message, limit))
-    if len(message) == 0:
-        raise MalformedMessage("rpyc: an empty message")
+    message = _message(body, compressed, limit)
     kind = message[0]
     if kind in (_REPLY, _EXCEPTION):  # the server sends no requests, so it expects no replies
         return None
@@ -130,12 +126,10 @@ def request(sequence: int, handler: Handler, boxed_args: tuple[int, Any]) -> byt
 
 
 def boxed_value(value: Any) -> tuple[int, Any]:
-    """Return the box of a value without references."""
     return _VALUE, value
 
 
 def boxed_tuple(*boxes: tuple[int, Any]) -> tuple[int, Any]:
-    """Return the box of a tuple of boxes."""
     return _TUPLE, boxes
 
 
@@ -146,17 +140,23 @@ def boxed_reference(name: tuple[Any, ...]) -> tuple[int, Any]:
 
 def read_reply(body: bytes | bytearray, compressed: bool, limit: int) -> tuple[int, bool, Any] | None:
     """Return a reply's sequence number, whether it is one and no exception, and its content; None for a request."""
-    message = memoryview(body)[: -len(END)]
-    if compressed:
-        message = memoryview(_inflate(message, limit))
-    if len(message) == 0:
-        raise MalformedMessage("rpyc: an empty message")
+    message = _message(body, compressed, limit)
     if message[0] not in (_REPLY, _EXCEPTION):  # nothing is offered to a server, so its requests get no answer
         return None
     content = read_brine(message[1:])
     if not (isinstance(content, tuple) and len(content) == 2 and _is_int(content[0])):
         raise MalformedMessage("rpyc: want (sequence number, reply)")
     return content[0], message[0] == _REPLY, content[1]
+
+
+def _message(body: bytes | bytearray, compressed: bool, limit: int) -> memoryview:
+    """Return the message in a frame's body, which has one byte at least."""
+    message = memoryview(body)[: -len(END)]
+    if compressed:
+        message = memoryview(_inflate(message, limit))
+    if len(message) == 0:
+        raise MalformedMessage("rpyc: an empty message")
+    return message
 
 
 def _frame(kind: int, content: tuple[Any, ...]) -> bytes:
@@ -230,7 +230,6 @@ class _BrineReader:
         self._items = 0
 
     def all(self) -> Any:
-        """Return the value that the message consists of."""
         value = self._value(0)
         if self._at != len(self._data):
             raise MalformedMessage("brine: more than one value in a message")
@@ -287,11 +286,9 @@ class _BrineReader:
         return int(digits)
 
     def length1(self) -> int:
-        """Read a length of one byte."""
         return self._take(1)[0]
 
     def length4(self) -> int:
-        """Read a length of four bytes."""
         return int(_U4.unpack(self._take(4))[0])
 
 

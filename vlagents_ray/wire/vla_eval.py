@@ -36,10 +36,7 @@ class _File(bytes):
 
 
 def decode(data: bytes, limits: Limits = DEFAULT_LIMITS) -> Message:
-    """Return the message in `data`, with its JPEG and PNG images still encoded, see `decode_images`.
-
-    Raises `MalformedMessage` or `MessageTooLarge`.
-    """
+    """Return the message in `data`, with its JPEG and PNG images still encoded, see `decode_images`."""
     taken = 0
 
     def array(node: dict[Any, Any]) -> Any:
@@ -93,7 +90,6 @@ def decode_images(payload: dict[str, Any], budget: Budget) -> dict[str, Any]:
 
 
 def encode(message: Message) -> bytes:
-    """Return a message in the client's format."""
     fields = {
         "type": message.kind,
         "payload": message.payload,

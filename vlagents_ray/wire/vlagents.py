@@ -261,7 +261,6 @@ class RemoteError:
 
 
 def get_root(sequence: int) -> bytes:
-    """Return the frame that asks for the reference to the server's root."""
     return rpyc.request(sequence, rpyc.Handler.GETROOT, rpyc.boxed_value(()))
 
 
@@ -275,16 +274,7 @@ def call(sequence: int, root: tuple[Any, ...], method: str, *args: str) -> bytes
 
 
 def read_result(body: bytes | bytearray, compressed: bool, limit: int) -> tuple[int, Any] | None:
-    """Return the sequence number and the value of a reply; None if the message is none.
-
-    Args:
-        body: A frame's bytes after the header.
-        compressed: As the header says.
-        limit: Most bytes of the message once it is decompressed.
-
-    Returns:
-        The value: None, bool, number, text, bytes, tuple, or a `RemoteError`.
-    """
+    """Return a reply's sequence number, and its value or `RemoteError`; None if the message is none."""
     message = rpyc.read_reply(body, compressed, limit)
     if message is None:
         return None
@@ -297,12 +287,7 @@ def read_result(body: bytes | bytearray, compressed: bool, limit: int) -> tuple[
 
 
 def write_observation(observation: Mapping[str, Any]) -> str:
-    """Return the argument of `act`.
-
-    Args:
-        observation: `language_instruction`, and for each robot a map of its `cameras`, `joints`, `xyzrpy`, `tquat` and
-            `gripper`, (1,).
-    """
+    """Return the argument of `act`: the instruction, and each robot's cameras, state and gripper, (1,)."""
     robots = {name: _robot_fields(one) for name, one in observation.items() if isinstance(one, Mapping)}
     return json_numpy.dumps(
         {

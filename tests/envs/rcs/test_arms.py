@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from vlagents_ray.contract import ActionSpec
-from vlagents_ray.envs.rcs.env import Arms
+from vlagents_ray.envs.rcs import Arms
 
 _SIZES = {"joints": 7, "tquat": 7, "xyzrpy": 6}
 

@@ -13,7 +13,7 @@ from eval_fakes import Line, ToZero
 from in_process_episode import Watched, run_episode
 from in_process_replicas import Replicas
 
-from vlagents_ray.envs.batch import BatchEnv, SequentialBatch, make_batch
+from vlagents_ray.envs.base import BatchEnv, SequentialBatch, make_batch
 from vlagents_ray.envs.tabletop import Tabletop
 from vlagents_ray.errors import ConfigError, ConnectionLost, EnvFailed, VLAgentsError
 from vlagents_ray.evaluate.episode.episode import EpisodeSettings, run_episodes

@@ -10,7 +10,7 @@ import pytest
 from eval_fakes import Line
 
 from vlagents_ray.envs import EvalEnv
-from vlagents_ray.envs.batch import SequentialBatch
+from vlagents_ray.envs.base import SequentialBatch
 from vlagents_ray.evaluate.episode.second_pass import PlayedEpisode
 from vlagents_ray.interface import Act, Obs
 

@@ -7,7 +7,7 @@ import pytest
 from flat_config import flat_config
 
 from vlagents_ray.client.credentials import KEY_VARIABLE, Credentials
-from vlagents_ray.envs.rendering.graphics import GPUS
+from vlagents_ray.envs.graphics import GPUS
 from vlagents_ray.evaluate.plan.cases import EvalCase, cells
 from vlagents_ray.evaluate.workers.cluster import Placement, fewest, runtime_env, strategy
 from vlagents_ray.evaluate.workers.rollout import Rollout

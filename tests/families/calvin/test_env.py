@@ -14,9 +14,7 @@ import numpy as np
 import pytest
 from in_process_episode import run_episode
 
-from vlagents_ray.envs.calvin import Calvin
-from vlagents_ray.envs.calvin.chains import Chains, fnv1_32
-from vlagents_ray.envs.calvin.env import STEPS, quietly
+from vlagents_ray.envs.calvin import STEPS, Calvin, Chains, fnv1_32, quietly
 from vlagents_ray.errors import ConfigError, EnvFailed, NotReset
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
 from vlagents_ray.interface import Act, Agent, Obs

@@ -21,8 +21,7 @@ from vlagents_ray.contract import ActionSpec, CameraSpec, StateSpec
 from vlagents_ray.errors import MissingCamera
 from vlagents_ray.interface import DISTRIBUTION, SAMPLES, Act
 from vlagents_ray.policies.base.checkpoint import used_checkpoints
-from vlagents_ray.policies.gr00t import Gr00t
-from vlagents_ray.policies.gr00t.network import built_without_flash_attention, packed_attention
+from vlagents_ray.policies.gr00t import Gr00t, built_without_flash_attention, packed_attention
 from vlagents_ray.policies.sampling_rng import RowDraws
 from vlagents_ray.testing import check_agent
 

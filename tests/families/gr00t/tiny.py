@@ -26,7 +26,7 @@ _EAGLE = "gr00t/model/modules/nvidia/Eagle-Block2A-2B-v2"
 
 def checkout(folder: Path) -> Path:
     """Copy the code of the checkout that GR00T_SRC names, with a small backbone, and import from the copy."""
-    from vlagents_ray.policies.gr00t.network import _use_checkout
+    from vlagents_ray.policies.gr00t import _use_checkout
 
     shutil.copytree(Path(os.environ["GR00T_SRC"]) / "gr00t", folder / "gr00t")
     file = folder / _EAGLE / "config.json"
@@ -45,7 +45,7 @@ def save(folder: Path, kind: str = "relative") -> Path:
     from gr00t.model import MODEL_REGISTRY
     from transformers.modeling_utils import no_init_weights
 
-    from vlagents_ray.policies.gr00t.network import built_without_flash_attention
+    from vlagents_ray.policies.gr00t import built_without_flash_attention
 
     [(config_class, pipeline)] = MODEL_REGISTRY.items()
     model_class, processor_class = pipeline.model_class, pipeline.processor_class

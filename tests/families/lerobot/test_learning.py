@@ -17,7 +17,7 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import BEHAVIOUR, DISTRIBUTION, SAMPLES, WANT, Act
 from vlagents_ray.policies.base import Row
 from vlagents_ray.policies.lerobot import LeRobot
-from vlagents_ray.policies.lerobot.kinds import flow
+from vlagents_ray.policies.lerobot import kinds
 
 pytestmark = FILTERS
 
@@ -114,5 +114,5 @@ def test_the_samples_of_an_observation_are_of_one_reading_of_it(
 
     monkeypatch.setattr(model, "embed_prefix", counted)
     views = [view(0, **{SAMPLES: 8, WANT: ALL}), view(1), view(2, **{SAMPLES: 3})]
-    check_shared_readings(learnt, views, begun, flow, ATOL)
+    check_shared_readings(learnt, views, begun, kinds, ATOL)
     assert read == [3, 14]

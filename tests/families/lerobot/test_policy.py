@@ -15,7 +15,7 @@ from vlagents_ray import Obs
 from vlagents_ray.contract import CameraSpec, StateSpec
 from vlagents_ray.errors import InvalidObservation
 from vlagents_ray.interface import DISTRIBUTION, SAMPLES, Act
-from vlagents_ray.policies.lerobot import LeRobot, policy_types
+from vlagents_ray.policies.lerobot import LeRobot, kinds
 from vlagents_ray.testing import check_agent
 
 pytestmark = FILTERS
@@ -82,7 +82,7 @@ def test_the_samples_of_an_observation_of_x_vla_are_of_one_reading_of_it(
 
     monkeypatch.setattr(vlm, name, counted)
     views = [view(0, **{SAMPLES: 8}), view(1), view(2, **{SAMPLES: 3})]
-    check_shared_readings(policy, views, begun, policy_types, ATOL)
+    check_shared_readings(policy, views, begun, kinds, ATOL)
     assert read == [3, 14]
 
 

@@ -11,9 +11,8 @@ import torch
 from libero_episodes import STILL, world
 
 from vlagents_ray.envs.libero import Libero
-from vlagents_ray.envs.libero.benchmark_protocol import SUITES
 from vlagents_ray.envs.libero.package import package_folder
-from vlagents_ray.envs.libero.tasks import find_task, read_states, require_suite, task_names
+from vlagents_ray.envs.libero.tasks import SUITES, find_task, read_states, require_suite, task_names
 from vlagents_ray.errors import ConfigError, EnvFailed, MalformedMessage, UnknownEnv
 
 MILK = "pick_up_the_milk_and_place_it_in_the_basket"

@@ -12,7 +12,7 @@ from tests.families.openpi.marks import MARKS
 from vlagents_ray import Obs
 from vlagents_ray.errors import ConfigError, InvalidObservation, MissingCamera
 from vlagents_ray.interface import DELAY, DISTRIBUTION, LEFTOVER, SAMPLES
-from vlagents_ray.policies.openpi import policy as openpi_policy
+from vlagents_ray.policies import openpi as openpi_policy
 from vlagents_ray.serve.config.dialects import presets
 from vlagents_ray.testing import check_agent
 
@@ -173,7 +173,7 @@ def test_fast_says_what_openpis_own_policy_says_alone_and_in_company(
 
 
 def test_what_a_row_says_after_its_end_is_dropped() -> None:
-    from vlagents_ray.policies.openpi.models import JaxTokens
+    from vlagents_ray.policies.openpi import JaxTokens
 
     tokens = np.array([[5, 1, 7, 1], [5, 6, 7, 8]])
     np.testing.assert_array_equal(JaxTokens.ended(tokens), [[5, 1, 0, 0], [5, 6, 7, 8]])

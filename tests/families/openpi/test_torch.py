@@ -17,9 +17,8 @@ from tests.families.openpi.marks import MARKS
 from tests.families.openpi.test_openpi import BATCHED, WORDS, begun, seen, theirs
 from vlagents_ray.errors import ConfigError, InvalidObservation
 from vlagents_ray.interface import BEHAVIOUR, DELAY, DISTRIBUTION, LEFTOVER, SAMPLES, WANT
-from vlagents_ray.policies.openpi import OpenPi
-from vlagents_ray.policies.openpi import policy as openpi_policy
-from vlagents_ray.policies.openpi.models import _observation
+from vlagents_ray.policies import openpi as openpi_policy
+from vlagents_ray.policies.openpi import OpenPi, _observation
 
 pytestmark = MARKS
 PATCHED = all(importlib.util.find_spec(name) for name in ("transformers", "transformers.models.siglip.check"))

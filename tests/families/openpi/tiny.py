@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.policies.base.model_code import use_source
-from vlagents_ray.policies.openpi.policy import FOLDERS, SOURCE
+from vlagents_ray.policies.openpi import FOLDERS, SOURCE
 
 use_source("openpi", SOURCE, within=FOLDERS)
 import jax  # noqa: E402

@@ -21,8 +21,8 @@ from vlagents_ray.errors import InvalidObservation, MissingCamera, MissingState
 from vlagents_ray.interface import BEHAVIOUR, DISTRIBUTION, SAMPLES, WANT, Act
 from vlagents_ray.policies.base import Row
 from vlagents_ray.policies.openvla import oft
-from vlagents_ray.policies.openvla.base import middle, resized
 from vlagents_ray.policies.openvla.oft import OpenVLAOFT
+from vlagents_ray.policies.openvla.prismatic import middle, resized
 from vlagents_ray.testing import check_agent
 
 pytestmark = [pytest.mark.source("OPENVLA_OFT_SRC"), *LIBRARIES]

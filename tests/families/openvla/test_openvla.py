@@ -18,8 +18,8 @@ from tests.families.openvla.conftest import LIBRARIES, WORDS, begun, seen
 from tests.families.openvla.upstream import module
 from vlagents_ray.errors import InvalidObservation, MissingCamera
 from vlagents_ray.interface import BEHAVIOUR, DISTRIBUTION, SAMPLES, WANT, Act
-from vlagents_ray.policies.openvla.base import middle, resized
 from vlagents_ray.policies.openvla.policy import OpenVLA
+from vlagents_ray.policies.openvla.prismatic import middle, resized
 from vlagents_ray.testing import check_agent
 
 pytestmark = [pytest.mark.source("OPENVLA_SRC"), *LIBRARIES]

@@ -15,9 +15,9 @@ from shared_readings import check_shared_readings
 from tests.families.pi0 import tiny
 from tests.families.pi0.test_pi0 import BATCHED, begun, seen
 from vlagents_ray.interface import BEHAVIOUR, DISTRIBUTION, SAMPLES, WANT, Act
+from vlagents_ray.policies import pi0
 from vlagents_ray.policies.flow import logprob_of_chain
 from vlagents_ray.policies.pi0 import Pi0
-from vlagents_ray.policies.pi0 import policy as pi0
 
 ALL = ["logprob", "entropy", "replay"]
 LEVEL = 0.5

@@ -11,9 +11,7 @@ import numpy as np
 import pytest
 from in_process_episode import Always, play
 
-from vlagents_ray.envs.robosuite import Robosuite
-from vlagents_ray.envs.robosuite.base import seeded
-from vlagents_ray.envs.robosuite.env import _controllers
+from vlagents_ray.envs.robosuite import Robosuite, _controllers, seeded
 from vlagents_ray.errors import ConfigError, EnvFailed, NotReset
 from vlagents_ray.interface import HIGH_RES, Act
 from vlagents_ray.testing import check_env

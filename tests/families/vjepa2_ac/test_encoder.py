@@ -12,8 +12,7 @@ import torch
 from tests.families.vjepa2_ac.tiny import PATCH, SIDE, WIDTH, make_hf_encoder
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.compilation import Compilation
-from vlagents_ray.policies.vjepa2_ac import VJepa2AcConfig
-from vlagents_ray.policies.vjepa2_ac.network import Encoder, load_encoder, to_pixels
+from vlagents_ray.policies.vjepa2_ac import Encoder, VJepa2AcConfig, load_encoder, to_pixels
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from vlagents_ray.policies.base.model_inputs import Row
-from vlagents_ray.policies.base.realtime import Guide
+from vlagents_ray.policies.flow import Guide
 
 HORIZON, DIM, STEPS = 8, 3, 10
 TARGET = 2.0  # of the model, for each number of each row

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vlagents_ray.policies.gr00t.network import Gr00tNetwork
+from vlagents_ray.policies.gr00t import Gr00tNetwork
 
 
 class Processor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vlagents_ray.policies.openvla.base import middle, resized
+from vlagents_ray.policies.openvla.prismatic import middle, resized
 
 AT = ([0, 3, 57, 111, 160, 223], [0, 120, 31, 200, 77, 223])
 

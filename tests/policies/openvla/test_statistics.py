@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from vlagents_ray.errors import ConfigError, InvalidObservation
-from vlagents_ray.policies.openvla.statistics import Statistics
+from vlagents_ray.policies.openvla.prismatic import Statistics
 
 ACTION = {"q01": [-1.0, 0.0], "q99": [3.0, 1.0], "min": [-2.0, 0.0], "max": [4.0, 1.0], "mask": [True, False]}
 ONE = {"libero_goal_no_noops": {"action": ACTION, "proprio": {"q01": [0.0, 5.0], "q99": [2.0, 5.0]}}}

@@ -11,10 +11,9 @@ from upstream_servers import answer, pack_xpolicylab, upstream
 
 from vlagents_ray.errors import ConfigError, MalformedMessage, UnknownSession, VLAgentsError
 from vlagents_ray.interface import Obs
-from vlagents_ray.policies.upstream import Upstream
+from vlagents_ray.policies.upstream import Upstream, xpolicylab
 from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.serve.ports import free_port
-from vlagents_ray.wire import xpolicylab
 
 MAPPING = {
     "state": {"joints": "state/arm_joint_state"},

@@ -9,8 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.policies.vjepa2_ac import VJepa2Ac, VJepa2AcConfig
-from vlagents_ray.policies.vjepa2_ac.planner import DRAWN, moved, plan
+from vlagents_ray.policies.vjepa2_ac import DRAWN, VJepa2Ac, VJepa2AcConfig, moved, plan
 
 torch = pytest.importorskip("torch")
 pytestmark = pytest.mark.torch

@@ -1,20 +1,161 @@
-"""One environment of Gymnasium behind the interface of `EvalEnv`."""
+"""Environments of Gymnasium behind the interface of `EvalEnv`, and PushT by its published protocol."""
 
 from __future__ import annotations
 
+import importlib.util
+import os
+import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from vlagents_ray.contract import Contract
-from vlagents_ray.envs.base import BatchEnv, EvalEnv
-from vlagents_ray.envs.gymnasium.making import known, make, only_vectors
+from vlagents_ray.envs.base import BatchEnv, EvalEnv, require_known
+from vlagents_ray.envs.graphics import prepare_rendering
 from vlagents_ray.envs.gymnasium.vector import GymnasiumBatch, VectorRows
 from vlagents_ray.envs.gymnasium.view import SUCCESS_KEYS, Mapped, View, plain
-from vlagents_ray.envs.rendering.graphics import prepare_rendering
-from vlagents_ray.envs.simulator import record_size_of
+from vlagents_ray.envs.simulator import BenchmarkProtocol, record_size_of
 from vlagents_ray.errors import ConfigError, EnvFailed, MissingDependency, NotReset, UnknownEnv, VLAgentsError
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.registry import require
+
+VECTORIZATIONS = ("sync", "async", "vector_entry_point")
+
+
+@dataclass(frozen=True, slots=True)
+class Known:
+    """Defaults of the options of `Gymnasium` for one id; None uses the environment's own values."""
+
+    module: str | None = None  # registers the id
+    kwargs: Mapping[str, Any] = field(default_factory=dict)
+    cameras: Mapping[str, str] | None = None
+    instruction: str = ""
+    control_hz: float | None = None
+    protocol: BenchmarkProtocol | None = None
+
+
+def known(task: str) -> Known:
+    """Return the defaults for a Gymnasium id; empty ones if it is not known."""
+    if task == "gym_pusht/PushT-v0":
+        return _PUSHT
+    fetch = re.fullmatch(r"Fetch(\w+?)(?:Dense)?-v\d+", task)
+    if fetch is None or fetch[1] not in _FETCH_INSTRUCTIONS:
+        return Known()
+    return Known(
+        module="gymnasium_robotics",
+        instruction=_FETCH_INSTRUCTIONS[fetch[1]],
+        control_hz=_FETCH.control_hz,
+        protocol=_FETCH,
+    )
+
+
+_PUSHT = Known(
+    module="gym_pusht",
+    kwargs={"obs_type": "pixels_agent_pos"},
+    cameras={"front": "pixels"},
+    instruction="push the T-shaped block onto the green target",
+    control_hz=10.0,
+    protocol=BenchmarkProtocol(
+        name="PushT",
+        source="gym-pusht 0.1.8, PushTEnv; LeRobot 0.4.4, PushtEnv and EvalConfig",
+        max_steps=300,
+        control_hz=10.0,
+        control="absolute position",
+        success="the block covers more than 95 % of the target",
+        begins="where agent and block stand: the seed's; episode i has the first seed + i",
+        ends_on_success=True,
+        episodes=50,
+    ),
+)
+
+_FETCH_INSTRUCTIONS = {
+    "Reach": "move the gripper to the red target",
+    "Push": "push the block to the red target",
+    "Slide": "slide the puck to the red target",
+    "PickAndPlace": "pick up the block and move it to the red target",
+}
+_FETCH = BenchmarkProtocol(
+    name="Fetch",
+    source="Gymnasium-Robotics 1.4.2; Plappert et al. 2018, arXiv 1802.09464",
+    max_steps=50,
+    control_hz=25.0,
+    control="position of the gripper, delta",
+    success="gripper or object is within 5 cm of the target after the last step: success_at_end",
+    begins="where object and target are: the seed's",
+    ends_on_success=False,
+)
+
+
+def make(
+    name: str,
+    task: str,
+    *,
+    module: str | None,
+    kwargs: Mapping[str, Any],
+    vectorization: str | None,
+    rows: int,
+    max_steps: int | None,
+) -> Any:
+    """Make a `gymnasium.Env`, or `VectorRows`, by its id; see `Gymnasium` for the options and errors."""
+    if vectorization not in (None, *VECTORIZATIONS):
+        raise ConfigError(f"{name}: vectorization is {vectorization!r}, want one of {list(VECTORIZATIONS)}")
+    # pygame, which several environments draw with, prints a greeting on import otherwise
+    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+    gymnasium = require("gymnasium")
+    spec = _registered(task, module)
+    if vectorization is None and spec is not None and spec.entry_point is None:
+        vectorization = "vector_entry_point"
+    try:
+        if vectorization is None:
+            arguments = {"render_mode": "rgb_array", "disable_env_checker": True, **kwargs}
+            return gymnasium.make(task, max_episode_steps=max_steps, **arguments)
+        arguments = _vector_arguments(gymnasium, spec, vectorization, max_steps) | dict(kwargs)
+        vector = gymnasium.make_vec(task, num_envs=rows, vectorization_mode=vectorization, **arguments)
+    except gymnasium.error.DependencyNotInstalled as error:
+        raise MissingDependency(f"{name}: {error}") from error
+    except gymnasium.error.UnregisteredEnv as error:
+        raise UnknownEnv(f"{name}: {error}; set `module` to what registers it") from error
+    except gymnasium.error.Error as error:
+        raise ConfigError(f"{name}: {error}") from error
+    except TypeError as error:
+        raise ConfigError(f"{name}: {error}; check `kwargs`, got {dict(kwargs)}") from error
+    return VectorRows(name, vector)
+
+
+def only_vectors(task: str, module: str | None) -> bool:
+    """Whether an id is registered with a VectorEnv's entry point alone."""
+    spec = _registered(task, module)
+    return spec is not None and spec.entry_point is None
+
+
+def _registered(task: str, module: str | None) -> Any:
+    """Import what registers an id, and return its spec; None if it has none under exactly this id."""
+    registry = require("gymnasium").registry
+    if module is None and "/" in task and task not in registry:
+        module = task.partition("/")[0]
+    if module is not None:
+        require(module)
+    return registry.get(task)
+
+
+def _vector_arguments(gymnasium: Any, spec: Any, vectorization: str, max_steps: int | None) -> dict[str, Any]:
+    arguments: dict[str, Any] = {"max_episode_steps": max_steps} if max_steps is not None else {}
+    if vectorization != "vector_entry_point":
+        mode = gymnasium.vector.AutoresetMode.DISABLED  # one row can begin an episode while the others go on
+        return arguments | {
+            "render_mode": "rgb_array",
+            "disable_env_checker": True,
+            "vector_kwargs": {"autoreset_mode": mode},
+        }
+    entry = getattr(spec, "vector_entry_point", None)
+    if isinstance(entry, str):
+        entry = gymnasium.envs.registration.load_env_creator(entry)
+    if spec is not None and spec.max_episode_steps is None:
+        arguments = {}  # its entry point need not take a limit
+    renders = "rgb_array" in (getattr(entry, "metadata", None) or {}).get("render_modes", ())
+    return arguments | ({"render_mode": "rgb_array"} if renders else {})
 
 
 class Gymnasium(EvalEnv):
@@ -188,12 +329,10 @@ class Gymnasium(EvalEnv):
 
     @classmethod
     def _makes_vectors(cls, options: Mapping[str, Any]) -> bool:
-        """Whether the constructor makes a VectorEnv of its options."""
         task, module = options.get("task"), options.get("module")
         return options.get("vectorization") is not None or (task is not None and only_vectors(task, module))
 
     def _make(self, max_steps: int | None) -> Any:
-        """Make the environment: a `gymnasium.Env`, or `VectorRows` with `rows` of them."""
         return make(
             self._name,
             self._id,
@@ -253,3 +392,56 @@ class Gymnasium(EvalEnv):
 
     def _observe(self, nested: Any) -> Obs:
         return self._view.observe(nested, lambda: self._call("render"))
+
+
+_ID = "gym_pusht/PushT-v0"
+# What is observed in each task: options of `Gymnasium`.
+_TASKS: dict[str, Mapping[str, Any]] = {
+    "image": {},
+    "keypoints": {"kwargs": {"obs_type": "environment_state_agent_pos"}, "cameras": {}},
+}
+
+
+class PushT(Gymnasium):
+    """PushT by its published protocol, "image" or "keypoints".
+
+    Observation: `state["agent_pos"]`, (2,) in pixels of the field, 512 by 512. With "image" also "front", (96, 96, 3)
+    by default; with "keypoints" `state["environment_state"]`, (16,), x and y of eight points of the block, in pixels.
+    In `info["sim_state"]`, (7,) float64, what the simulator knows: x, y of the agent and its velocity, pixels and
+    pixels/s; x, y and angle of the block, pixels and rad.
+
+    Action: (2,) in [0, 512]: where the disc shall go, in the same pixels.
+    """
+
+    def __init__(
+        self,
+        task: str = "image",
+        *,
+        width: int | None = None,
+        height: int | None = None,
+        max_steps: int | None = None,
+        record_size: Sequence[int] | None = None,
+    ) -> None:
+        """Make the environment; images are stretched to `width` and `height`, pixels."""
+        self.require_task(task)
+        super().__init__(_ID, **_TASKS[task], width=width, height=height, max_steps=max_steps, record_size=record_size)
+
+    @classmethod
+    def tasks(cls) -> list[str]:
+        return list(_TASKS)
+
+    @classmethod
+    def require_task(cls, task: str | None) -> None:
+        require_known("pusht", task or "image", cls.tasks())
+
+    @classmethod
+    def missing(cls) -> str | None:
+        if importlib.util.find_spec("gym_pusht") is None:
+            return "gym_pusht is not installed; pip install 'vlagents-ray[pusht]'"
+        return None
+
+    def _observe(self, nested: Any) -> Obs:
+        obs = super()._observe(nested)
+        agent, block = self._env.unwrapped.agent, self._env.unwrapped.block
+        obs.info["sim_state"] = np.array([*agent.position, *agent.velocity, *block.position, block.angle])
+        return obs

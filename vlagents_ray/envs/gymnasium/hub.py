@@ -88,17 +88,8 @@ class EnvHub(Gymnasium):
             part: One of several that the repository makes, SUITE/ID; None if it makes one.
             use_async_envs: As the repository's `make_env` takes it: usually a process for each row.
             cameras: As for `Gymnasium`, and so are the others.
-            state: See `Gymnasium`.
-            gripper: See `Gymnasium`.
-            gripper_range: See `Gymnasium`.
-            success: See `Gymnasium`.
             instruction: The task in words; None is what the environment states as `task_description` or `task`.
-            control_hz: See `Gymnasium`.
-            unit_actions: See `Gymnasium`.
-            width: See `Gymnasium`.
-            height: See `Gymnasium`.
             max_steps: The step limit; None is the environment's own.
-            record_size: See `Gymnasium`.
 
         Raises:
             UnknownEnv: The name is not one of a file at a commit, or the repository does not have it.

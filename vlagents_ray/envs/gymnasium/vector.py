@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.contract import Contract
-from vlagents_ray.envs.batch import BatchEnv, Options, Steps, episodes_of, images_in_rows
+from vlagents_ray.envs.base import BatchEnv, Options, Steps, episodes_of, images_in_rows
 from vlagents_ray.envs.gymnasium.view import View, plain
 from vlagents_ray.errors import ConfigError, EnvFailed, NotReset, VLAgentsError
 from vlagents_ray.interface import Act, Obs
@@ -29,15 +29,7 @@ class VectorRows:
     """The rows of a VectorEnv; row 0 alone has the interface of a `gymnasium.Env`."""
 
     def __init__(self, name: str, vector: Any) -> None:
-        """Take a VectorEnv over.
-
-        Args:
-            name: Its name, for messages.
-            vector: The `gymnasium.vector.VectorEnv`, which `close` closes.
-
-        Raises:
-            ConfigError: It does not say what it does with a row whose episode is over.
-        """
+        """Take a VectorEnv over; raises `ConfigError` if its mode of autoreset is unknown."""
         mode = vector.metadata.get("autoreset_mode")
         self.autoreset = str(getattr(mode, "name", mode)).upper()  # an AutoresetMode, or its name
         if self.autoreset not in _MODES:
@@ -57,15 +49,12 @@ class VectorRows:
         return self.autoreset == "DISABLED"
 
     def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Reset all rows; returns the first one's observation and info."""
         return self.reset_all([seed] * self.num_envs, options)[0]
 
     def step(self, action: np.ndarray) -> Row:
-        """Step all rows by one action; returns the first one's step."""
         return self.step_all(np.repeat(action[None], self.num_envs, axis=0))[0]
 
     def render(self) -> Any:
-        """Return the first row's picture."""
         return self.render_all()[0]
 
     def reset_all(
@@ -100,7 +89,6 @@ class VectorRows:
         return rows
 
     def render_all(self) -> Sequence[Any]:
-        """Return the picture of each row."""
         pictures: Sequence[Any] = self._vector.render()
         if pictures is None or len(pictures) != self.num_envs:
             got = None if pictures is None else len(pictures)
@@ -163,17 +151,7 @@ class GymnasiumBatch(BatchEnv):
         instruction: str,
         described: Mapping[str, Any],
     ) -> None:
-        """Take the VectorEnv of a `Gymnasium` over.
-
-        Args:
-            name: The env's name, for messages.
-            rows: The VectorEnv, which `close` closes.
-            view: How its observations and actions become ours.
-            contract: The contract of each environment.
-            max_steps: The step limit of each environment.
-            instruction: The task in words.
-            described: What `describe` returns.
-        """
+        """Take the VectorEnv of a `Gymnasium` over; `described` is what `describe` returns."""
         self.num_envs, self.max_steps, self.restarts = rows.num_envs, max_steps, rows.restarts
         self._name, self._rows, self._view, self._contract = name, rows, view, contract
         self._instruction, self._described = instruction, dict(described)

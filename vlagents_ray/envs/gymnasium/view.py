@@ -40,16 +40,7 @@ class View:
     """One environment's observations, actions and infos, by its spaces and the user's options."""
 
     def __init__(self, name: str, env: Any, mapped: Mapped) -> None:
-        """Look at the spaces.
-
-        Args:
-            name: The environment's name, for messages.
-            env: The environment, of which `observation_space`, `action_space` and `render_mode` are read.
-            mapped: The user's options.
-
-        Raises:
-            ConfigError: An option does not fit the spaces, or actions are no vectors.
-        """
+        """Read the spaces; raises `ConfigError` if an option does not fit them, or if actions are no vectors."""
         self._options = mapped
         self._low, self._high, self._dtype = bounds(env.action_space)
         if mapped.unit_actions and not np.isfinite([self._low, self._high]).all():
@@ -64,7 +55,6 @@ class View:
 
     @property
     def renders(self) -> bool:
-        """Whether a camera is the environment's own renderer."""
         return any(pick.text == RENDER for pick in self._cameras.values())
 
     def observe(self, nested: Any, render: Callable[[], Any]) -> Obs:
@@ -91,12 +81,10 @@ class View:
         return clipped
 
     def idle(self) -> np.ndarray:
-        """Return an action for an environment whose episode is over, (D,)."""
         still: np.ndarray = np.clip(np.zeros_like(self._low), self._low, self._high).astype(self._dtype)
         return still
 
     def succeeded(self, info: Mapping[str, Any], terminated: bool) -> bool:
-        """Whether the task is solved after a step."""
         success = self._options.success
         if success == TERMINATED:
             return terminated
@@ -105,7 +93,6 @@ class View:
         return any(bool(info.get(key, False)) for key in SUCCESS_KEYS)
 
     def contract(self, obs: Obs, *, instruction: bool, control_hz: float | None) -> Contract:
-        """Return the contract of an environment that gives `obs`."""
         low, high = (-1.0, 1.0) if self._options.unit_actions else (uniform(self._low), uniform(self._high))
         return Contract(
             cameras={name: CameraSpec(*image.shape[:2]) for name, image in obs.cameras.items()},
@@ -148,7 +135,6 @@ class Pick:
         return nested
 
     def vector(self, nested: Any) -> np.ndarray:
-        """The value as (D,) float32, a new array."""
         array = np.array(self.value(nested), dtype=np.float32)
         if array.ndim > 1:
             raise ConfigError(f"path {self.text!r}: got shape {array.shape}, want (D,)")
@@ -158,7 +144,6 @@ class Pick:
         return found
 
     def number(self, nested: Any) -> float:
-        """The value as one number."""
         vector = self.vector(nested)
         if vector.size != 1:
             raise ConfigError(f"path {self.text!r}: got {vector.size} numbers, want one, as in '{self.text}[0:1]'")
@@ -166,10 +151,7 @@ class Pick:
 
 
 def as_image(value: Any, name: str, size: tuple[int | None, int | None] = (None, None)) -> np.ndarray:
-    """`value` as (H, W, 3) uint8 RGB, a new array, stretched to `size` (height, width) in pixels.
-
-    None in `size` keeps that side. `ConfigError` if it is no such image.
-    """
+    """Return (H, W, 3) uint8 RGB as a new array, stretched to `size` (height, width), px; None keeps a side."""
     image = np.asarray(value)
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
         raise ConfigError(f"camera {name!r}: got {image.shape} {image.dtype}, want (H, W, 3) uint8 RGB")

@@ -4,7 +4,7 @@
         obs, _ = env.reset(seed=0, options={"init_state": 3})
         obs, reward, terminated, truncated, info = env.step(Act(action=np.zeros(7, np.float32)))
 
-The protocol is in `benchmark_protocol.py`. The scenes' meshes and textures are in no package: `Libero.missing()` says
+The protocol is in `tasks.py`. The scenes' meshes and textures are in no package: `Libero.missing()` says
 how to download them.
 """
 

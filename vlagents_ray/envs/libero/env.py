@@ -4,19 +4,28 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
-from vlagents_ray.envs.libero.benchmark_protocol import LiberoProtocol
 from vlagents_ray.envs.libero.package import assets_digest, find_assets
-from vlagents_ray.envs.libero.simulation import LiberoSimulation, SimulatorObs
-from vlagents_ray.envs.libero.tasks import files_digest, find_task, read_states, require_suite, task_names
-from vlagents_ray.envs.robosuite.base import gripper_opening
+from vlagents_ray.envs.libero.tasks import (
+    LiberoProtocol,
+    LiberoTask,
+    files_digest,
+    find_task,
+    read_states,
+    require_suite,
+    task_names,
+)
+from vlagents_ray.envs.robosuite import CameraRenderer, gripper_opening, seeded
 from vlagents_ray.envs.simulator import SimulatorEnv
 from vlagents_ray.errors import ConfigError, EnvFailed
 from vlagents_ray.interface import HIGH_RES, Obs
+from vlagents_ray.registry import require
 
 
 class Libero(SimulatorEnv):
@@ -58,21 +67,16 @@ class Libero(SimulatorEnv):
         assets: str | None = None,
         files: str | None = None,
     ) -> None:
-        """Make the environment; raises the errors of `make_env`.
+        """Make the environment; raises the errors of `make_env`. Other options are those of most `SimulatorEnv`s.
 
         Args:
             task: "SUITE/NUMBER", or "SUITE/NAME" with LIBERO's name.
-            width: Width of each image, pixels.
-            height: Height of each image, pixels.
-            record_size: (height, width) of further views of each camera, for recordings only.
-            max_steps: None is the protocol's for the suite.
             settling_steps: None is the protocol's.
             simulator_seed: Seed of whatever an initial state leaves open; None is the protocol's.
             stop_at_success: Report `terminated` when the task is solved.
             gripper_open: The action's last number that opens the gripper; None is LIBERO's -1. OpenVLA
                 says 1, and 0 to close, which openvla's evaluation turns into LIBERO's as this does.
             gripper_closed: The one that closes it; None is LIBERO's 1.
-            instruction: None is the task's own.
             assets: The folder with LIBERO's meshes and textures; None is what LIBERO_ASSETS names.
             files: The folder with `bddl_files` and `init_files` of suites that vary LIBERO's, such as LIBERO-PRO's;
                 None is what LIBERO_FILES names.
@@ -171,7 +175,6 @@ def _turned(image: np.ndarray) -> np.ndarray:
 
 
 def _contract_of(protocol: LiberoProtocol) -> Contract:
-    """Return the contract of an env under a protocol; names and units are those of policies for LIBERO."""
     return Contract(
         cameras={name: CameraSpec(*protocol.image_size) for name in protocol.cameras},
         state={
@@ -220,3 +223,97 @@ def axis_angle(quaternion: np.ndarray) -> np.ndarray:
         return np.zeros(3)
     turned: np.ndarray = np.asarray(quaternion[:3], np.float64) * 2.0 * math.acos(w) / sine
     return turned
+
+
+_ATTEMPTS = 1000  # to place the scene's objects; one is enough nearly always
+
+
+@dataclass(frozen=True, slots=True)
+class SimulatorObs:
+    """The simulator's observation after a step."""
+
+    raw: Mapping[str, Any]  # robosuite's observation
+    views: Mapping[str, np.ndarray]  # MuJoCo's camera -> (H, W, 3) uint8, upside down, in the size for the record
+    success: bool
+
+
+class LiberoSimulation:
+    """Steps the simulator by the protocol, and renders only images that are used."""
+
+    def __init__(
+        self, task: LiberoTask, protocol: LiberoProtocol, assets: Path, record_size: tuple[int, int] | None
+    ) -> None:
+        self._package: Any = require("libero.libero")
+        self._assets = assets
+        self._protocol = protocol
+        self._use_assets()
+        self._env: Any = require("libero.libero.envs").OffScreenRenderEnv(
+            bddl_file_name=str(task.problem),
+            controller=protocol.controller,
+            control_freq=protocol.control_hz,
+            camera_names=list(protocol.cameras.values()),
+            camera_heights=protocol.image_size[0],
+            camera_widths=protocol.image_size[1],
+            horizon=protocol.settling_steps + protocol.max_steps + 1,  # robosuite's own limit stays out of the way
+        )
+        self._cameras = CameraRenderer(self._env.env, record_size)
+
+    def begin(self, state: np.ndarray) -> SimulatorObs:
+        """Seed, reset, set the initial `state`, (D,) float64, and let the objects settle."""
+        settling = self._protocol.settling_steps
+        self._use_assets()
+        self._cameras.make_current()  # the last episode's rendering resources are freed in their own context
+        self._cameras.open = False
+        with seeded(self._protocol.simulator_seed):
+            self._reset()
+            self._cameras.open = settling == 0
+            raw = self._env.set_init_state(state)
+            success = bool(self._env.check_success())
+            for i in range(settling):
+                self._cameras.open = i == settling - 1
+                raw, _, success, _ = self._env.step(list(self._protocol.settling_action))
+        self._cameras.open = True
+        return SimulatorObs(raw, self._cameras.views, bool(success))
+
+    def step(self, action: np.ndarray, *, look: bool = True) -> SimulatorObs:
+        """Execute an action, (7,) float64, clipped to [-1, 1] by the controller; without `look` nothing is rendered."""
+        self._cameras.open = look
+        raw, _, success, _ = self._env.step(action)
+        return SimulatorObs(raw, self._cameras.views, bool(success))
+
+    @property
+    def goal(self) -> list[list[str]]:
+        """The goal's predicates, all of which must hold, e.g. [["on", "akita_black_bowl_1", "plate_1"]]."""
+        return [[str(word) for word in predicate] for predicate in self._env.env.parsed_problem["goal_state"]]
+
+    def positions(self) -> dict[str, np.ndarray]:
+        """Return the positions of all objects and other parts of the goal, (3,) float64, m in the world's frame."""
+        domain = self._env.env
+        states = domain.object_states_dict
+        named = {*domain.objects_dict, *(name for _, *names in self.goal for name in names)}
+        return {
+            name: np.array(states[name].get_geom_state()["pos"], np.float64) for name in sorted(named & set(states))
+        }
+
+    def flat_state(self) -> np.ndarray:
+        """MuJoCo's time, qpos and qvel, (D,) float64, as the initial states are written."""
+        state: np.ndarray = self._env.get_sim_state()
+        return state
+
+    def close(self) -> None:
+        self._cameras.make_current()
+        self._env.close()
+
+    def _reset(self) -> None:
+        """Do the work of `OffScreenRenderEnv.reset`, which itself repeats it after any error, without end."""
+        crowded = require("robosuite.utils.errors").RandomizationError
+        for _ in range(_ATTEMPTS):
+            try:
+                self._env.env.reset()
+            except crowded:  # the drawn places overlap: draw again
+                continue
+            return
+        raise EnvFailed(f"the scene's objects found no place in {_ATTEMPTS} draws")
+
+    def _use_assets(self) -> None:
+        self._package._assets_path_cache = str(self._assets)  # global in the process: another env may have set it

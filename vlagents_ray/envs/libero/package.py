@@ -16,9 +16,9 @@ import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
-from vlagents_ray.envs.rendering.graphics import prepare_rendering
-from vlagents_ray.envs.rendering.render_probe import failing
-from vlagents_ray.envs.robosuite.base import importing_robosuite
+from vlagents_ray.envs.graphics import prepare_rendering
+from vlagents_ray.envs.render_probe import failing
+from vlagents_ray.envs.robosuite import importing_robosuite
 from vlagents_ray.errors import EnvFailed, MissingDependency
 from vlagents_ray.registry import require
 
@@ -83,17 +83,7 @@ def _own_config(folder: Path) -> Iterator[None]:
 
 
 def find_assets(chosen: str | None = None) -> Path:
-    """Find the folder of the assets: `chosen`, or the one that `LIBERO_ASSETS` names, or that of hf-libero itself.
-
-    Args:
-        chosen: The folder in the env's options; None if it has none.
-
-    Returns:
-        The folder.
-
-    Raises:
-        EnvFailed: There is no such folder, or it lacks a part; the message has the command for the download.
-    """
+    """Return the assets' folder: `chosen`, that of `LIBERO_ASSETS`, or hf-libero's own; raises `EnvFailed`."""
     named = chosen or os.environ.get(VARIABLE)
     places = [Path(named)] if named else [package_folder() / "assets", Path.home() / _CACHE]
     folder = next((place for place in places if place.is_dir()), None)

@@ -10,18 +10,19 @@ from __future__ import annotations
 
 import codecs
 import hashlib
+import json
 import os
 import re
 import zipfile
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
-from vlagents_ray.envs.libero.benchmark_protocol import SUITES, base_of
 from vlagents_ray.envs.libero.package import import_libero
-from vlagents_ray.envs.rendering.render_probe import failing
+from vlagents_ray.envs.render_probe import failing
 from vlagents_ray.errors import ConfigError, UnknownEnv
 from vlagents_ray.naming import did_you_mean
 from vlagents_ray.registry import require
@@ -166,16 +167,7 @@ def _varied_suites() -> dict[str, int]:
 
 
 def _varied_names(place: Path, suite: str, known: list[str]) -> list[str]:
-    """The names of a suite's tasks: in LIBERO's order where they are LIBERO's, and else by the alphabet.
-
-    Args:
-        place: The folder of variants.
-        suite: The suite.
-        known: The tasks of the suite that it varies, in LIBERO's order.
-
-    Raises:
-        UnknownEnv: The folder has no such suite.
-    """
+    """Return a suite's tasks, in LIBERO's order where they are LIBERO's, else by the alphabet; raises `UnknownEnv`."""
     here = {file.stem for file in place.glob(f"{_PROBLEMS}/{suite}/*.bddl")}
     if not here:
         have = sorted(one.name for one in place.glob(f"{_PROBLEMS}/*/"))
@@ -184,12 +176,7 @@ def _varied_names(place: Path, suite: str, known: list[str]) -> list[str]:
 
 
 def _read_variant(place: Path, suite: str, name: str) -> tuple[str, Path, Path]:
-    """A task's instruction, as its BDDL file gives it, that file, and the one of its initial states; imports LIBERO.
-
-    Raises:
-        ConfigError: The task wants an object or a scene that hf-libero does not have, or has no initial states.
-        EnvFailed: hf-libero cannot read the BDDL file.
-    """
+    """Return a task's instruction, its BDDL file and its initial states."""
     problem = place / _PROBLEMS / suite / f"{name}.bddl"
     _require_playable(problem)
     unspoken = re.sub(r"_language_\d+$", "", name)  # of the task whose instruction alone is another
@@ -223,3 +210,78 @@ def _require_playable(problem: Path) -> None:
             f"libero: {problem} wants {lacks}, which hf-libero does not have: such objects, tables and lights need the "
             f"code of LIBERO-PRO or LIBERO-Plus; choose a variant of positions, instructions or goals"
         )
+
+
+SETTLE = "settle"
+CONTROL_HZ = 20.0  # robosuite's default, and the rate of the demonstrations
+
+
+@dataclass(frozen=True, slots=True)
+class Suite:
+    """One of LIBERO's five suites."""
+
+    tasks: int
+    max_steps: int  # openpi, examples/libero/main.py; openvla, run_libero_eval.py: above the longest demonstration
+
+
+SUITES: Mapping[str, Suite] = {
+    "libero_spatial": Suite(10, 220),  # longest demonstration: 193
+    "libero_object": Suite(10, 280),  # 254
+    "libero_goal": Suite(10, 300),  # 270
+    "libero_10": Suite(10, 520),  # 505
+    "libero_90": Suite(90, 400),  # 373
+}
+
+
+def base_of(suite: str) -> str:
+    """The one of the five suites that `suite` is or varies, "libero_goal" of "libero_goal_swap"; "" if it is none."""
+    return next((base for base in SUITES if suite == base or suite.startswith(f"{base}_")), "")
+
+
+@dataclass(frozen=True, slots=True)
+class LiberoProtocol:
+    """The conventions of an episode; comments say where openpi and OpenVLA differ.
+
+    `max_steps` counts the policy's actions alone: peers count to `max_steps` plus the settling ones.
+
+    The simulator draws whatever an initial state does not determine, such as the place of a cabinet, from
+    `simulator_seed`. It is seeded again for each episode, so that an episode does not depend on those
+    before it; openpi (7) and OpenVLA (0) seed once a task, so that their scenes shift a little from
+    episode to episode.
+
+    MuJoCo's images are upside down. The demonstrations' were turned by 180 degrees for training (OpenVLA,
+    regenerate_libero_dataset.py; openpi takes them over), not flipped: they are upright, and mirrored left
+    to right. Policies expect that.
+    """
+
+    max_steps: int
+    settling_steps: int = 10  # openpi and OpenVLA: the objects fall into place
+    settling_action: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0)  # still, gripper open
+    image_size: tuple[int, int] = (256, 256)  # height, width: rendered so by both; policies resize
+    cameras: Mapping[str, str] = field(default_factory=lambda: {"front": "agentview", "wrist": "robot0_eye_in_hand"})
+    turned_180: Literal[True] = True
+    simulator_seed: int = 7  # openpi's
+    begins: tuple[str, ...] = ("seed", "reset", "set_init_state", SETTLE)  # in this order, for every episode
+    control_hz: float = CONTROL_HZ
+    controller: str = "OSC_POSE"  # LIBERO's default: 0.05 m and 0.5 rad a unit, in the robot base's axes
+    gripper_open: float = -1.0  # of a policy's action: robosuite's, openpi's; OpenVLA's are 1 and 0
+    gripper_closed: float = 1.0
+    success: str = "the goal predicates hold after a step"  # LIBERO's `done`
+    stop_at_success: bool = True  # both end the episode there
+
+    @classmethod
+    def of(cls, suite: str, **changes: Any) -> LiberoProtocol:
+        """Return the protocol of a suite, or of the one that it varies, with the changes that are not None."""
+        changed = {name: value for name, value in changes.items() if value is not None}
+        return cls(**{"max_steps": SUITES[base_of(suite)].max_steps} | changed)
+
+    def to_json(self, suite: str) -> dict[str, Any]:
+        """Return plain JSON values; `deviations` lists the differences from the published protocol of `suite`."""
+        published = LiberoProtocol.of(suite)
+        deviations = [
+            f"{f.name}: {getattr(self, f.name)}, the protocol says {getattr(published, f.name)}"
+            for f in fields(self)
+            if getattr(self, f.name) != getattr(published, f.name)
+        ]
+        plain: dict[str, Any] = json.loads(json.dumps(asdict(self) | {"deviations": deviations}))
+        return plain

@@ -9,13 +9,10 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.contract import Contract
-from vlagents_ray.envs.base import BatchEnv, Options, Steps, one_row
-from vlagents_ray.envs.batch import episodes_of
-from vlagents_ray.envs.maniskill import factory
-from vlagents_ray.envs.maniskill.factory import INSTRUCTIONS
-from vlagents_ray.envs.maniskill.simulator import Simulator
-from vlagents_ray.envs.rendering.graphics import Renderer
-from vlagents_ray.envs.rendering.render_probe import render_probe, without
+from vlagents_ray.envs.base import BatchEnv, Options, Steps, episodes_of, one_row
+from vlagents_ray.envs.graphics import Renderer
+from vlagents_ray.envs.maniskill.simulator import INSTRUCTIONS, Simulator, registered_limit, sensor_settings, step_limit
+from vlagents_ray.envs.render_probe import render_probe, without
 from vlagents_ray.envs.simulator import SimulatorEnv
 from vlagents_ray.errors import ConfigError, NotReset
 from vlagents_ray.interface import Act, Obs
@@ -73,27 +70,23 @@ class ManiSkill(SimulatorEnv):
         reconfigure: bool = True,
         record_size: Sequence[int] | None = None,
     ) -> None:
-        """Make the environment; raises the errors of `make_env`.
+        """Make the environment; raises the errors of `make_env`. Other options are those of most `SimulatorEnv`s.
 
         Args:
             task: ManiSkill's id.
-            width: Of each image, pixels.
-            height: Of each image, pixels.
             cameras: Which of the task's cameras to give; None is all.
             control_mode: None is `pd_ee_delta_pose`, or the robot's own default if it lacks that.
             instruction: None is the task's, see `instruction_for`.
-            max_steps: None is the task's own limit.
             sim_backend: "physx_cpu", the faster for a single environment, or "physx_cuda".
             render_backend: "cpu", "gpu", or "auto": the GPU if both SAPIEN and torch can use it.
             shader: ManiSkill's name, e.g. "minimal", "default"; None is the task's own.
             reward_mode: ManiSkill's name; None is the task's own.
             reconfigure: Rebuild the scene for each episode. Without it some tasks' dynamics
                 (PlugCharger, PushT) depend on the episode before; it saves about 15 ms a reset.
-            record_size: Height and width of further views by the same cameras, for the record only.
         """
         super().__init__(f"maniskill/{task}", record_size=record_size)
-        self._own_limit = factory.registered_limit(task)
-        self.max_steps = factory.step_limit(self._name, max_steps, self._own_limit)
+        self._own_limit = registered_limit(task)
+        self.max_steps = step_limit(self._name, max_steps, self._own_limit)
         self._given_instruction = instruction
         self._reconfigure = reconfigure
         self._env = _simulator(
@@ -186,9 +179,9 @@ class ManiSkillBatch(BatchEnv):
             raise ConfigError(
                 f"maniskill/{task}: {sim_backend} simulates one environment, not {num_envs}; want physx_cuda"
             )
-        self._own_limit = factory.registered_limit(task)
+        self._own_limit = registered_limit(task)
         self.num_envs = num_envs
-        self.max_steps = factory.step_limit(f"maniskill/{task}", max_steps, self._own_limit)
+        self.max_steps = step_limit(f"maniskill/{task}", max_steps, self._own_limit)
         self._task = task
         self._instruction = instruction
         self._reconfigure = reconfigure
@@ -244,12 +237,11 @@ def _simulator(
     task: str, *, width: int = 224, height: int = 224, shader: str | None = None, **options: Any
 ) -> Simulator:
     name = f"maniskill/{task}"
-    sensors = factory.sensor_settings(name, width, height, shader)
+    sensors = sensor_settings(name, width, height, shader)
     return Simulator(name, task, obs_mode="rgb+state", sensors=sensors, **options)
 
 
 def _described(simulator: Simulator, reconfigure: bool, max_steps: int, own_limit: int | None) -> dict[str, Any]:
-    """Return what `describe` states, with the deviations of the settings from the protocol."""
     deviations = []
     if not reconfigure:
         deviations.append("reconfigure is False: scenes are kept from episode to episode")

@@ -1,9 +1,17 @@
-"""A ManiSkill simulator with one environment or several."""
+"""ManiSkill's tasks in words, and the construction of its environments in processes without a terminal."""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
+import gc
+import io
+import logging
+import math
+import re
+import sys
+import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import version
@@ -11,16 +19,285 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.contract import ActionSpec, CameraSpec, Contract
-from vlagents_ray.envs.maniskill import factory
-from vlagents_ray.envs.maniskill.factory import instruction_for
-from vlagents_ray.envs.maniskill.robot import ManiSkillRobot, action_spec
-from vlagents_ray.envs.rendering.graphics import Renderer, vulkan_renderer
-from vlagents_ray.envs.rendering.render_probe import failing, vulkan_device
+from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
+from vlagents_ray.envs.graphics import Renderer, prepare_rendering, vulkan_renderer
+from vlagents_ray.envs.render_probe import failing, vulkan_cure, vulkan_device
 from vlagents_ray.envs.simulator import Size, require_cameras
-from vlagents_ray.errors import ConfigError, EnvFailed
+from vlagents_ray.errors import ConfigError, EnvFailed, UnknownEnv
 from vlagents_ray.interface import HIGH_RES, Obs
 from vlagents_ray.registry import require
+
+DEFAULT_CONTROL_MODE = "pd_ee_delta_pose"
+
+# The tasks whose assets come with the package.
+INSTRUCTIONS: dict[str, str] = {
+    "LiftPegUpright-v1": "lift the peg and stand it upright on the table",
+    "PegInsertionSide-v1": "pick up the peg and insert its orange end into the hole in the box",
+    "PickCube-v1": "pick up the red cube and move it to the goal",
+    "PlugCharger-v1": "pick up the charger and plug it into the receptacle",
+    "PokeCube-v1": "poke the cube with the peg and push it onto the red and white target",
+    "PullCube-v1": "pull the cube onto the red and white target",
+    "PullCubeTool-v1": "pick up the L-shaped tool and pull the cube towards the robot with it",
+    "PushCube-v1": "push the cube onto the red and white target",
+    "PushT-v1": "push the T-shaped block onto the T-shaped target",
+    "RollBall-v1": "roll the ball onto the red and white target",
+    "StackCube-v1": "pick up the red cube and stack it on the green cube",
+}
+
+
+def instruction_for(task: str) -> str:
+    """Return the task's instruction, or its name in words: "PickSingleYCB-v1" is "pick single ycb"."""
+    if task in INSTRUCTIONS:
+        return INSTRUCTIONS[task]
+    words = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", re.sub(r"-v\d+$", "", task))
+    return " ".join(words).lower()
+
+
+def registered_limit(task: str) -> int | None:
+    """The step limit that ManiSkill registers for `task`; imports ManiSkill and readies the process for it."""
+    prepare_rendering()
+    require("sapien")
+    require("mani_skill.envs")
+    _prepare_process()
+    registered = require("mani_skill.utils.registration").REGISTERED_ENVS
+    if task not in registered:
+        raise UnknownEnv(f"maniskill has no task {task!r}: want one of {sorted(INSTRUCTIONS)}, or another of its ids")
+    limit: int | None = registered[task].max_episode_steps
+    return limit
+
+
+def step_limit(env: str, wanted: int | None, own: int | None) -> int:
+    """`wanted`, or `own`, which is the task's; `ConfigError` if there is none."""
+    limit = own if wanted is None else wanted
+    if limit is None:
+        raise ConfigError(f"{env} has no step limit of its own; set max_steps")
+    if limit < 1:
+        raise ConfigError(f"{env}: max_steps is {limit}, want at least 1")
+    return limit
+
+
+def sensor_settings(env: str, width: int, height: int, shader: str | None) -> dict[str, Any]:
+    """ManiSkill's settings of all cameras; a shader of None is the task's own."""
+    for name, value in (("width", width), ("height", height)):
+        if value < 1:
+            raise ConfigError(f"{env}: {name} is {value}, want at least 1")
+    return {"width": width, "height": height} | ({"shader_pack": shader} if shader else {})
+
+
+def chosen_backend(wanted: str) -> str:
+    """`wanted`, or for "auto" the GPU if SAPIEN can render there and torch can wait for it, else the CPU."""
+    if wanted != "auto":
+        return wanted
+    try:
+        require("sapien").Device("cuda")
+    except RuntimeError:  # how SAPIEN says that there is none
+        return "cpu"
+    return "gpu" if require("torch").cuda.is_available() else "cpu"
+
+
+def make_bare(task: str, control_mode: str | None, *, sim_backend: str, render_backend: str, **options: Any) -> Any:
+    """The bare environment, without Gymnasium's wrappers; options that are None are left to ManiSkill.
+
+    `control_mode` None is the default one, or the robot's own if it lacks that. Raises `ConfigError`
+    for a control mode that the robot lacks, else `EnvFailed`.
+    """
+    given = {name: value for name, value in options.items() if value is not None}
+    given |= {"sim_backend": sim_backend, "render_backend": render_backend}
+    gymnasium = require("gymnasium")
+    with _no_prompts(task), _named_errors(task), warnings.catch_warnings():
+        # the digital twin of the cubes makes a tensor from a list of arrays: 24 rows, once
+        warnings.filterwarnings("ignore", "Creating a tensor from a list of numpy", UserWarning)
+        _keep_renderer(sim_backend, render_backend)
+        try:
+            return gymnasium.make(task, control_mode=control_mode or DEFAULT_CONTROL_MODE, **given).unwrapped
+        except AssertionError as error:
+            if "not in supported modes" not in str(error):
+                raise
+            if control_mode is not None:
+                raise ConfigError(f"maniskill/{task}: control_mode {error}") from error
+        return gymnasium.make(task, **given).unwrapped
+
+
+@contextlib.contextmanager
+def _named_errors(task: str) -> Iterator[None]:
+    try:
+        yield
+    except ConfigError:
+        raise
+    except Exception as error:
+        about_vulkan = re.search(r"vk::|rendering device|Vulkan", str(error))
+        cure = f"; {vulkan_cure()}" if about_vulkan else ""
+        raise EnvFailed(f"maniskill/{task} could not be made: {type(error).__name__}: {error}{cure}") from error
+
+
+@contextlib.contextmanager
+def _no_prompts(task: str) -> Iterator[None]:
+    """ManiSkill asks on stdin whether to download missing assets, and exits when the answer is no."""
+    output = io.StringIO()
+    stdin, sys.stdin = sys.stdin, io.StringIO("n\n")
+    try:
+        with contextlib.redirect_stdout(output):
+            yield
+    except SystemExit as error:
+        lacks = next((line for line in output.getvalue().splitlines() if "found" in line), "it did not say which")
+        robot = re.match(r"Robot (\S+) ", lacks)
+        raise EnvFailed(
+            f"maniskill/{task}: assets are missing ({lacks.partition(' Would you')[0]}); download them with: "
+            f"python -m mani_skill.utils.download_asset {robot[1] if robot else task}"
+        ) from error
+    finally:
+        sys.stdin = stdin
+        sys.stdout.write(output.getvalue())
+
+
+@functools.cache
+def _prepare_process() -> None:
+    """Once a process: make rebuilding a scene cheap, and keep repeated warnings out of the log."""
+    # ManiSkill collects garbage at each reconfiguration. Most of that time, 150 ms, goes into
+    # looking at the modules just imported, which are not garbage.
+    gc.collect()
+    gc.freeze()
+    logging.getLogger("mani_skill ").addFilter(_not_about_its_own_code)  # the name ends with a space
+
+
+@functools.cache
+def _keep_renderer(sim_backend: str, render_backend: str) -> object:
+    """Hold one renderer for the life of the process.
+
+    SAPIEN gives its device and compiled shaders back with the last scene that uses them; making the
+    next environment would cost 5 s again, instead of 0.1 s.
+    """
+    import sapien.render
+
+    parse = require("mani_skill.envs.utils.system.backend").parse_sim_and_render_backend
+    device = parse(sim_backend, render_backend).render_device
+    return None if device is None else sapien.render.RenderSystem(device)
+
+
+def _not_about_its_own_code(record: logging.LogRecord) -> bool:
+    """Some tasks and robots warn so in each reconfiguration: nothing a user could change."""
+    return not record.getMessage().startswith(("No initial pose set for ", "Mimic targets dictionary is missing"))
+
+
+# Where a finger's joint stands when closed and when open, in metres, by ManiSkill's name of the robot. In the
+# action, their controllers take the last component as -1 closed, 1 open. Other robots state no gripper.
+_FINGER_M = {
+    "panda": (0.0, 0.04),
+    "panda_wristcam": (0.0, 0.04),
+    "widowx250s_bridgedataset_flat_table": (0.015, 0.037),
+    "widowx250s_bridgedataset_sink": (0.015, 0.037),
+}
+_TOOL_LINK = "ee_gripper_link"  # of robots for which ManiSkill names no tool centre point
+
+# The part of the action that moves the arm, as written in mani_skill/agents/controllers. The
+# rotation of "pd_ee_*pose" is intrinsic XYZ Euler in the base frame; see `ManiSkill` for its sign.
+_EE_POSE = {"space": "ee_pose", "rotation": "euler_xyz", "frame": "base"}
+_EE_POSITION = {"space": "ee_position", "rotation": "none", "frame": "base"}
+_JOINT: dict[str, Any] = {"space": "joint", "rotation": "none"}
+CONTROL_MODES: dict[str, dict[str, Any]] = {
+    "pd_ee_delta_pose": {**_EE_POSE, "delta": True},
+    "pd_ee_target_delta_pose": {**_EE_POSE, "delta": True},
+    "pd_ee_pose": {**_EE_POSE, "delta": False},
+    "pd_ee_delta_pos": {**_EE_POSITION, "delta": True},
+    "pd_ee_target_delta_pos": {**_EE_POSITION, "delta": True},
+    "pd_joint_pos": {**_JOINT, "delta": False},
+    "pd_joint_delta_pos": {**_JOINT, "delta": True},
+    "pd_joint_target_delta_pos": {**_JOINT, "delta": True},
+    "pd_joint_vel": {"space": "joint_velocity", "rotation": "none"},
+}
+
+
+class ManiSkillRobot:
+    """Reads proprioception from ManiSkill's `agent`, which is a new object after each reconfiguration."""
+
+    def __init__(self, agent: Any) -> None:
+        names = [joint.name for joint in agent.robot.active_joints]
+        arm = getattr(agent, "arm_joint_names", names)
+        self._arm = np.array([names.index(name) for name in arm])
+        self._finger_m = _FINGER_M.get(agent.uid)
+        self._fingers = np.array([names.index(name) for name in getattr(agent, "gripper_joint_names", ())], dtype=int)
+        self._has_tool = _tool(agent) is not None
+
+    @property
+    def gives(self) -> dict[str, StateSpec]:
+        parts = {"joints": StateSpec(dim=len(self._arm), unit="rad")}
+        if self._has_tool:
+            parts["tquat"] = StateSpec(dim=7, unit="m+quat_xyzw")
+            parts["xyzrpy"] = StateSpec(dim=6, unit="m+rad")
+        return parts
+
+    @property
+    def has_gripper(self) -> bool:
+        return self._finger_m is not None
+
+    def read(self, agent: Any) -> list[tuple[dict[str, np.ndarray], float | None]]:
+        """Return the state of each environment, each part (D,) float32, and the gripper in [0, 1], 1 = open."""
+        rows = agent.robot.get_qpos().cpu().numpy()
+        states = [{"joints": qpos[self._arm]} for qpos in rows]
+        if self._has_tool:
+            bases = agent.robot.pose.raw_pose.cpu().numpy()
+            tools = _tool(agent).pose.raw_pose.cpu().numpy()
+            for state, base, tool in zip(states, bases, tools, strict=True):
+                state["tquat"], state["xyzrpy"] = tool_in_base(base, tool)
+        return [(state, self._opening(qpos)) for state, qpos in zip(states, rows, strict=True)]
+
+    def _opening(self, qpos: np.ndarray) -> float | None:
+        if self._finger_m is None:
+            return None
+        closed, opened = self._finger_m
+        opening = (float(qpos[self._fingers].mean()) - closed) / (opened - closed)
+        return min(max(opening, 0.0), 1.0)
+
+
+def _tool(agent: Any) -> Any:
+    """The link whose pose is the tool's; None if there is none."""
+    tcp = getattr(agent, "tcp", None)
+    return agent.robot.links_map.get(_TOOL_LINK) if tcp is None else tcp
+
+
+def action_spec(control_mode: str, space: Any, *, has_gripper: bool) -> ActionSpec:
+    normalized = bool((space.low == -1.0).all() and (space.high == 1.0).all())
+    return ActionSpec(
+        dim=int(space.shape[0]),
+        gripper_open=1.0 if has_gripper else None,
+        gripper_closed=-1.0 if has_gripper else None,
+        low=-1.0 if normalized else None,
+        high=1.0 if normalized else None,
+        **CONTROL_MODES.get(control_mode, {}),
+    )
+
+
+_LOCKED = 1e-4  # of the cosine of a pitch
+
+
+def tool_in_base(base: np.ndarray, tool: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two (7,) world poses, metres and quaternion wxyz, as SAPIEN writes them, to the tool's pose in the base frame.
+
+    Returns `tquat` (7,), metres and quaternion xyzw with w >= 0, and `xyzrpy` (6,), metres and
+    radians, where R = Rz(yaw) Ry(pitch) Rx(roll); both float32.
+    """
+    bw, bx, by, bz = (float(v) for v in base[3:])
+    tw, tx, ty, tz = (float(v) for v in tool[3:])
+    # conj(base) * tool
+    w = bw * tw + bx * tx + by * ty + bz * tz
+    x = bw * tx - bx * tw - by * tz + bz * ty
+    y = bw * ty + bx * tz - by * tw - bz * tx
+    z = bw * tz - bx * ty + by * tx - bz * tw
+    if w < 0.0:
+        w, x, y, z = -w, -x, -y, -z
+    px, py, pz = (float(t - b) for t, b in zip(tool[:3], base[:3], strict=True))
+    # the offset turned by conj(base): v + 2 u x (u x v - bw v) with u the base's vector part
+    cx, cy, cz = by * pz - bz * py - bw * px, bz * px - bx * pz - bw * py, bx * py - by * px - bw * pz
+    px, py, pz = px + 2 * (by * cz - bz * cy), py + 2 * (bz * cx - bx * cz), pz + 2 * (bx * cy - by * cx)
+    rolls = 2 * (w * x + y * z), 1 - 2 * (x * x + y * y)  # the sine and the cosine of it, times the pitch's cosine
+    pitch = math.asin(min(max(2 * (w * y - z * x), -1.0), 1.0))
+    if math.hypot(*rolls) < _LOCKED:  # gimbal lock: only the sum or the difference of roll and yaw is determined
+        roll, yaw = 0.0, math.copysign(2.0, -pitch) * math.atan2(x, w)
+        yaw = math.remainder(yaw, 2 * math.pi)
+    else:
+        roll, yaw = math.atan2(*rolls), math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    tquat = np.array([px, py, pz, x, y, z, w], dtype=np.float32)
+    return tquat, np.array([px, py, pz, roll, pitch, yaw], dtype=np.float32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,14 +332,14 @@ class Simulator:
         self._task = task
         self._asked_for = render_backend != "auto"
         self._record: RecordCameras | None = None
-        self.env: Any = factory.make(
+        self.env: Any = make_bare(
             task,
             control_mode,
             num_envs=num_envs,
             obs_mode=obs_mode,
             reward_mode=reward_mode,
             sim_backend=sim_backend,
-            render_backend=factory.render_backend(render_backend),
+            render_backend=chosen_backend(render_backend),
             sensor_configs=dict(sensors),
         )
         try:
@@ -77,12 +354,10 @@ class Simulator:
 
     @property
     def action(self) -> ActionSpec:
-        """The specification of the control mode's actions."""
         env = self.alive()
         return action_spec(env.control_mode, env.single_action_space, has_gripper=self._robot.has_gripper)
 
     def contract(self, action: ActionSpec) -> Contract:
-        """Return the contract of each environment, with these actions."""
         return Contract(
             cameras=self.cameras,
             state=self._robot.gives,
@@ -93,7 +368,6 @@ class Simulator:
         )
 
     def instructions(self) -> list[str]:
-        """The task in words, for each environment."""
         env = self.alive()
         own = getattr(env, "get_language_instruction", None)
         return [str(text) for text in own()] if own is not None else [instruction_for(self._task)] * env.num_envs
@@ -148,12 +422,10 @@ class Simulator:
         return Moment(seen, success, [0.0] * len(seen))
 
     def renderer(self) -> Renderer | None:
-        """The Vulkan device that draws."""
         found = vulkan_device(on_gpu=self.alive().backend.render_device.is_cuda())
         return None if found is None else vulkan_renderer(found.name, found.cuda, asked_for=self._asked_for)
 
     def describe(self) -> dict[str, Any]:
-        """Versions, backends and modes, for the record."""
         env = self.alive()
         return {
             "simulator": "maniskill",
@@ -172,13 +444,11 @@ class Simulator:
         }
 
     def alive(self) -> Any:
-        """ManiSkill's environment; `EnvFailed` after `close`."""
         if self.env is None:
             raise EnvFailed(f"{self.name} is closed; make a new one")
         return self.env
 
     def close(self) -> None:
-        """Free it; safe to call twice."""
         env, self.env, self._record = self.env, None, None
         if env is not None:
             env.close()

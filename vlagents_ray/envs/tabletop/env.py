@@ -10,9 +10,8 @@ import numpy as np
 
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.envs.base import EvalEnv, one_row, require_known
-from vlagents_ray.envs.tabletop.goals import PUCKS, Goal, Task, draw_episode, goals
 from vlagents_ray.envs.tabletop.render import ELEVATION, VIEW, TabletopRenderer
-from vlagents_ray.envs.tabletop.world import STEP_LIMIT, TabletopWorld
+from vlagents_ray.envs.tabletop.world import PUCKS, STEP_LIMIT, Goal, TabletopWorld, Task, draw_episode, goals
 from vlagents_ray.errors import ConfigError, NotReset
 from vlagents_ray.interface import Act, Obs
 

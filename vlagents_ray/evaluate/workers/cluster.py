@@ -20,7 +20,7 @@ from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from vlagents_ray.client.credentials import withheld
 from vlagents_ray.client.transports.serve_handle import ReplicaNodes
-from vlagents_ray.envs.rendering.graphics import GPUS, SHARE
+from vlagents_ray.envs.graphics import GPUS, SHARE
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.episode.records import WorkerInfo
 from vlagents_ray.evaluate.plan.cases import EvalCase

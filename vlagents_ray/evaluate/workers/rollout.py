@@ -24,8 +24,8 @@ from vlagents_ray.client.credentials import Credentials
 from vlagents_ray.client.transports.plasma import this_node
 from vlagents_ray.contract import require_match
 from vlagents_ray.envs import make_env
-from vlagents_ray.envs.batch import BatchEnv, SequentialBatch, make_batch
-from vlagents_ray.envs.rendering.graphics import require_own
+from vlagents_ray.envs.base import BatchEnv, SequentialBatch, make_batch
+from vlagents_ray.envs.graphics import require_own
 from vlagents_ray.errors import ConfigError, EnvFailed, MissingDependency, VLAgentsError
 from vlagents_ray.evaluate.artifacts.recorder import Artifacts, EpisodeRecorder, RecorderFactory, Recording
 from vlagents_ray.evaluate.episode.episode import (

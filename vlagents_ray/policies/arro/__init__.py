@@ -5,7 +5,6 @@ among regions of the image. A tracker follows these segments from frame to frame
 over. Detector, segmenter, selector and tracker are exchangeable: `vlagents_ray.policies.arro.parts`.
 """
 
-from vlagents_ray.policies.arro.tracking import ArroConfig
-from vlagents_ray.policies.arro.wrapper import Arro
+from vlagents_ray.policies.arro.wrapper import Arro, ArroConfig
 
 __all__ = ["Arro", "ArroConfig"]

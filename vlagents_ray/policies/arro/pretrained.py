@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import Field
 
-from vlagents_ray.policies.arro.parts import Detection, Images, PretrainedConfig, load_pretrained, overlap, writable
+from vlagents_ray.policies.arro.parts import Detection, Images, Pretrained, PretrainedConfig, overlap, writable
 from vlagents_ray.registry import require
 
 
@@ -22,24 +22,11 @@ class GroundingDinoConfig(PretrainedConfig):
     most: int = Field(default=4, ge=1, description="boxes of a phrase, the best first")
 
 
-class GroundingDinoDetector:
-    """Detects boxes for phrases, or for the objects in a whole instruction.
-
-    One forward pass for each size of images.
-    """
+class GroundingDinoDetector(Pretrained):
+    """Detects boxes for phrases, or for the objects in an instruction, in one pass for each size of images."""
 
     Config: ClassVar[type] = GroundingDinoConfig
-
-    def __init__(self, config: GroundingDinoConfig) -> None:
-        self._config = config
-        self._model: Any = None
-        self._processor: Any = None
-
-    def load(self) -> None:
-        """Read the weights; raises `ConfigError` if some are missing."""
-        self._model, self._processor = load_pretrained(
-            "GroundingDinoForObjectDetection", "GroundingDinoProcessor", self._config
-        )
+    classes = ("GroundingDinoForObjectDetection", "GroundingDinoProcessor")
 
     def detect(self, images: Images, phrases: Sequence[Sequence[str]]) -> list[list[Detection]]:
         """Return boxes, the best first; a box belongs to the phrase with the best of its words."""
@@ -51,7 +38,6 @@ class GroundingDinoDetector:
         return found
 
     def _batch(self, images: Images, phrases: Sequence[Sequence[str]]) -> list[list[Detection]]:
-        """Detect objects on images of one size."""
         torch = require("torch")
         texts = [_text(asked) for asked in phrases]
         inputs = self._processor(images=writable(images), text=texts, padding=True, return_tensors="pt")
@@ -129,22 +115,13 @@ class Sam2SegmenterConfig(Sam2Config):
     same: float = Field(default=0.7, ge=0, le=1, description="intersection over union of two masks of one region")
 
 
-class Sam2Segmenter:
+class Sam2Segmenter(Pretrained):
     """Computes masks for boxes and for a grid of points; all images in one forward pass of the image encoder."""
 
     Config: ClassVar[type] = Sam2SegmenterConfig
-
-    def __init__(self, config: Sam2SegmenterConfig) -> None:
-        self._config = config
-        self._model: Any = None
-        self._processor: Any = None
-
-    def load(self) -> None:
-        """Read the weights; raises `ConfigError` if some are missing."""
-        self._model, self._processor = load_pretrained("Sam2Model", "Sam2ImageProcessor", self._config)
+    classes = ("Sam2Model", "Sam2ImageProcessor")
 
     def segment(self, images: Images, boxes: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """Return one mask for each box."""
         torch = require("torch")
         made = []
         for image, embedded, own in zip(images, self._embedded(images), boxes, strict=True):
@@ -155,7 +132,6 @@ class Sam2Segmenter:
         return made
 
     def propose(self, images: Images) -> list[np.ndarray]:
-        """Return the regions under the points of the grid, the most certain first."""
         torch = require("torch")
         along = (np.arange(self._config.points, dtype=np.float32) + 0.5) * (self._side / self._config.points)
         grid = torch.as_tensor(np.stack(np.meshgrid(along, along), -1).reshape(1, -1, 1, 2), dtype=self._model.dtype)
@@ -179,7 +155,6 @@ class Sam2Segmenter:
         return int(self._processor.size["height"])
 
     def _embedded(self, images: Images) -> list[list[Any]]:
-        """Compute the features of each image."""
         with require("torch").inference_mode():
             levels = self._model.get_image_embeddings(_pixels(self._processor, images, self._model))
         return [[level[i : i + 1] for level in levels] for i in range(len(images))]
@@ -198,25 +173,16 @@ class _TrackMemory:
     frame: int = 0
 
 
-class Sam2Tracker:
+class Sam2Tracker(Pretrained):
     """The video model with a memory for each session and camera.
 
     The image encoder, which takes most of the time, runs once for all images; memory attention runs object by object.
     """
 
     Config: ClassVar[type] = Sam2Config
-
-    def __init__(self, config: Sam2Config) -> None:
-        self._config = config
-        self._model: Any = None
-        self._processor: Any = None
-
-    def load(self) -> None:
-        """Read the weights; raises `ConfigError` if some are missing."""
-        self._model, self._processor = load_pretrained("Sam2VideoModel", "Sam2VideoProcessor", self._config)
+    classes = ("Sam2VideoModel", "Sam2VideoProcessor")
 
     def begin(self, images: Images, masks: Sequence[np.ndarray]) -> list[Any]:
-        """Return a memory of the masks."""
         memories = []
         for own in masks:
             memory = _TrackMemory(
@@ -239,7 +205,6 @@ class Sam2Tracker:
         return followed
 
     def _advance(self, images: Images, memories: Sequence[_TrackMemory]) -> list[Any]:
-        """Run the model on the next frame of each memory."""
         pixels = _pixels(self._processor.image_processor, images, self._model)
         with require("torch").inference_mode():
             features = self._model.get_image_features(pixels, return_dict=True)

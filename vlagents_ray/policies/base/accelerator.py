@@ -28,10 +28,7 @@ _GPU_ERROR = re.compile(r"CUDA error|CUDA_ERROR_|CUDNN_STATUS_|CUBLAS_STATUS_|HI
 
 
 def torch_device(name: str = "auto") -> Any:
-    """Return the `torch.device` of a name; "auto" takes CUDA if available, and a CPU only where no GPU is meant.
-
-    Raises `ConfigError` for a missing device.
-    """
+    """Return the `torch.device` of a name; "auto" takes a CPU only where no GPU is meant; raises `ConfigError`."""
     torch = require("torch")
     given = name == "auto" and bool(_given_gpus())
     try:
@@ -63,7 +60,6 @@ def _unusable(library: str, said: str) -> ConfigError:
 
 
 def _described(torch: Any, device: Any) -> dict[str, Any]:
-    """Return what a torch device is, for metadata and log, as JSON values."""
     described = {"kind": device.type, "device": str(device), "torch": torch.__version__}
     if device.type != "cuda":
         return described

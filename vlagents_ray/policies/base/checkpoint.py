@@ -9,6 +9,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -36,10 +37,7 @@ _used: ContextVar[list[Path] | None] = ContextVar("_used", default=None)
 
 @contextmanager
 def used_checkpoints() -> Iterator[list[Path]]:
-    """Yield a list that collects the paths found by `find_checkpoint` in this context.
-
-    A path within one replaces it.
-    """
+    """Yield a list of the paths that `find_checkpoint` finds in this context; a path within one replaces it."""
     found: list[Path] = []
     token = _used.set(found)
     try:
@@ -88,17 +86,7 @@ def _holds(folder: Path, path: Path) -> bool:
 
 
 def find_adapter(source: str, checkpoint: str, base: Sequence[Path], digest_of_base: str) -> tuple[Adapter, Path]:
-    """Return a LoRA adapter and its folder, found as `find_checkpoint` does.
-
-    Args:
-        source: The folder or hub id.
-        checkpoint: The base, as the policy's settings name it.
-        base: The files and folders of the base.
-        digest_of_base: Their digest.
-
-    Raises:
-        ConfigError: There is no such adapter, or it was trained on another base.
-    """
+    """Return a LoRA adapter and its folder; raises `ConfigError` if it was trained on another base."""
     folder = find_checkpoint(source, needs=FILES)
     if not folder.is_dir():
         raise ConfigError(f"{folder}: got a file, want the folder with {', '.join(FILES)}, as PEFT saves it")
@@ -125,7 +113,6 @@ def _is_other(trained_on: str, checkpoint: str, base: Sequence[Path], digest_of_
 
 
 def _beside(path: Path) -> str:
-    """List the files where the checkpoint was expected, for an error message."""
     parent = next((p for p in path.parents if p.is_dir()), Path("/"))
     names = sorted(p.name for p in parent.iterdir())
     shown = ", ".join(names[:_LISTED]) + (" …" if len(names) > _LISTED else "")
@@ -155,7 +142,6 @@ def _from_hub(name: str) -> Path:
 
 
 def _revisions(hub: Any, repository: str) -> str:
-    """List the branches and tags of a repository, for an error message."""
     try:
         refs = hub.HfApi().list_repo_refs(repository)
         names = [one.name for one in (*refs.branches, *refs.tags)]
@@ -175,7 +161,7 @@ class SavedTensors:
         """Open a .safetensors file, or a folder with one, or with several and their index."""
         files = [path] if path.is_file() else _safetensors(path)
         opened = [require("safetensors").safe_open(str(file), framework="pt") for file in files]
-        return cls({key: _PickleReader(file, key) for file in opened for key in file.keys()})  # noqa: SIM118 - no mapping
+        return cls({key: partial(file.get_tensor, key) for file in opened for key in file.keys()})  # noqa: SIM118 - no mapping
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._readers)
@@ -187,14 +173,6 @@ class SavedTensors:
         """Return the tensors under other names; those that `rename` maps to None are left out."""
         named = {rename(key): reader for key, reader in self._readers.items()}
         return SavedTensors({key: reader for key, reader in named.items() if key is not None})
-
-
-class _PickleReader:
-    def __init__(self, file: Any, key: str) -> None:
-        self._file, self._key = file, key
-
-    def __call__(self) -> Any:
-        return self._file.get_tensor(self._key)
 
 
 def _safetensors(folder: Path) -> list[Path]:

@@ -124,12 +124,7 @@ def weights_of(paths: Sequence[Path]) -> dict[str, str | None] | None:
 
 
 def with_parts(policy: dict[str, Any] | None, parts: Sequence[Path]) -> dict[str, Any] | None:
-    """Return the `Agent.weights_id` of a policy that acts with the files and folders `parts` beside its own.
-
-    Args:
-        policy: That of the policy alone.
-        parts: Files of other models, such as those that change what the policy sees.
-    """
+    """Return the `Agent.weights_id` of a policy that acts with files and folders of other models beside its own."""
     if not parts:
         return policy
     own = policy or {"digest": None, "revision": None}

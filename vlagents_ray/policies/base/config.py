@@ -120,5 +120,4 @@ class ModelConfig(BaseModel, extra="forbid"):
 
     @property
     def rows(self) -> int:
-        """The largest number of rows of one forward pass."""
         return self.batch_sizes[-1] if self.batch_sizes else self.max_rows

@@ -47,10 +47,7 @@ class _Finder:
 
 
 def _torchvision(execute: Execute, module: ModuleType) -> None:
-    """Declare the operators that the import looks up and that are missing.
-
-    That suffices for transforms and models; calls of the operators still fail, as they must.
-    """
+    """Declare the missing operators that the import looks up; calls of them still fail, as they must."""
     torch = importlib.import_module("torch")
     try:
         execute(module)

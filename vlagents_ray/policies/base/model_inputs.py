@@ -17,6 +17,7 @@ from vlagents_ray.registry import require
 
 GRIPPER = "gripper"  # the part of the state that is `Obs.gripper`
 CLOSED = "gripper_closed"  # the part that is its closedness: 1 - `Obs.gripper`
+KEPT = 256  # instructions of which a policy keeps the tokens: more than a server has tasks, and at most some MB
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,10 +42,7 @@ class Row:
         return self.rng.standard_normal(shape, dtype=np.float32)
 
     def history(self, length: int) -> tuple[Any, ...]:
-        """Return the last `length` frames.
-
-        At the beginning of an episode its first frame stands for the missing ones.
-        """
+        """Return the last `length` frames; at the beginning of an episode its first one stands for the missing ones."""
         return (self.frames[0],) * (length - len(self.frames)) + self.frames[-length:]
 
 
@@ -128,7 +126,6 @@ def state_specs(parts: Sequence[str], dim: int | None = None) -> dict[str, State
 
 
 def wanted_samples(obs: Obs, config: ModelConfig) -> int:
-    """Return how many samples of the action distribution the observation requests."""
     samples = count_in(obs, SAMPLES)
     if samples > config.max_samples:
         raise InvalidObservation(
@@ -170,7 +167,6 @@ def leftover_plan(obs: Obs, contract: Contract | None) -> np.ndarray:
 
 
 def count_in(obs: Obs, name: str) -> int:
-    """Return the integer of that name in `Obs.info`; 0 if there is none."""
     value = obs.info.get(name) or 0
     if not isinstance(value, int | np.integer) or value < 0:
         raise InvalidObservation(f"info[{name!r}]: got {value!r}, want an int from 0")

@@ -7,7 +7,7 @@ import copy
 import itertools
 import logging
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from operator import attrgetter
@@ -34,7 +34,6 @@ from vlagents_ray.policies.base.model_inputs import (
     wanted_samples,
 )
 from vlagents_ray.policies.compilation import Compilation, quantize, require_whole
-from vlagents_ray.policies.determinism import require_deterministic
 from vlagents_ray.policies.loading import COMPILED_SIZES, LoadingReport, current_report, report_progress
 from vlagents_ray.validation import check_action
 
@@ -87,6 +86,12 @@ class ModelPolicy(Agent, abc.ABC):
         if self.config.adapters and not self.adaptable:
             raise ConfigError(f"adapters: {type(self).__name__} does not offer them; merge each into its base")
 
+    def loaded(self) -> Any:
+        """Return `self.model`; raises `PolicyFailed` before `initialize`."""
+        if self.model is None:
+            raise PolicyFailed(f"{type(self).__name__}: act before initialize; the checkpoint is not loaded")
+        return self.model
+
     @property
     def history(self) -> int:
         """The largest number of observations of each session that `predict` uses."""
@@ -103,10 +108,7 @@ class ModelPolicy(Agent, abc.ABC):
         return None
 
     def offered(self, names: tuple[str, ...]) -> tuple[str, ...] | None:
-        """Return, for the contract's `behaviour`, the names of what a family can state of its chunks.
-
-        None if there are none, or if an act is not a whole chunk.
-        """
+        """Return the names for the contract's `behaviour`; None if there are none, or if an act is no whole chunk."""
         return names if names and self.config.actions == "chunk" else None
 
     def chunk(self, horizon: int) -> int:
@@ -170,7 +172,6 @@ class ModelPolicy(Agent, abc.ABC):
         """Update the session's memory from an observation; called for each one, also if no chunk is requested."""
 
     def observe(self, obs: Obs) -> None:
-        """Add an observation to the history."""
         self.notice(obs)
         self._begun().frames.append(self.perceive(obs))
 
@@ -179,10 +180,7 @@ class ModelPolicy(Agent, abc.ABC):
         return None if self.config.actions == "queue" and self.history == 1 else self.perceive(obs)
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
-        """Return a chunk (H, D), or one action (D,), by `config.actions`, for each session.
-
-        One forward pass serves all sessions that need the model at this tick.
-        """
+        """Return a chunk (H, D), or one action (D,), for each session, from one forward pass for all that need one."""
         results: list[Act | Exception | None] = [None] * len(obs)
         rows: list[Row] = []
         owners: list[int] = []
@@ -203,7 +201,6 @@ class ModelPolicy(Agent, abc.ABC):
         ]
 
     def close(self) -> None:
-        """Free the weights, and the programs that compute with them."""
         self.model, self.adapters, self.compilation = None, Adapters(), Compilation(self.config.compile)
 
     def _trainable(self) -> Any:
@@ -303,7 +300,6 @@ class ModelPolicy(Agent, abc.ABC):
         return Act(episode.plan.take().action, info=info)
 
     def _used(self, actions: np.ndarray) -> np.ndarray:
-        """Return the rows of a chunk that are used, (execute, D)."""
         return np.ascontiguousarray(actions[: self.config.execute], dtype=np.float32)
 
     def _distribution(self, own: Prediction, samples: list[Prediction]) -> dict[str, Any]:
@@ -342,11 +338,9 @@ class ModelPolicy(Agent, abc.ABC):
         return bool(fits)
 
     def _size(self, rows: int) -> int:
-        """Return the number of rows to which a pass of so many is padded."""
         return next((size for size in self.config.batch_sizes or () if size >= rows), rows)
 
     def _passes(self, rows: list[Row]) -> list[Prediction | Exception]:
-        """Compute all rows, in forward passes of the sizes that the config allows."""
         found: list[Prediction | Exception] = []
         most = self.most_rows
         for start in range(0, len(rows), most):
@@ -363,7 +357,6 @@ class ModelPolicy(Agent, abc.ABC):
         return found
 
     def _run_examples(self, size: int, seeds: Iterator[int]) -> None:
-        """Run a forward pass of that many rows with the next seeds; raises the first error of a row."""
         self._chunks([self._example(next(seeds)) for _ in range(size)])
 
     def _chunks(self, rows: Sequence[Row]) -> list[np.ndarray]:
@@ -403,3 +396,27 @@ def _stacked(stated: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         name: _stacked(values) if isinstance(values[0], Mapping) else np.stack(values)
         for name, values in columns.items()
     }
+
+
+_INSTRUCTION = "go"
+_OTHER = "warm up"  # longer, as some models pad instructions to the longest one
+
+
+def require_deterministic(
+    chunks: Callable[[Sequence[Any]], list[np.ndarray]], example: Callable[[int, str], Any], size: int
+) -> None:
+    """Compare a row's chunk alone, and first and last among others; raises `ConfigError` if they differ."""
+
+    def others() -> list[Any]:
+        return [example(seed, _OTHER) for seed in range(1, size)]
+
+    def own() -> Any:
+        return example(0, _INSTRUCTION)
+
+    alone, first, last = chunks([own()])[0], chunks([own(), *others()])[0], chunks([*others(), own()])[-1]
+    if not (np.array_equal(alone, first) and np.array_equal(alone, last)):
+        error = max(float(np.abs(alone - one).max()) for one in (first, last))
+        raise ConfigError(
+            f"deterministic: a row's actions change by up to {error:.2g} with the others in a batch of {size}; want "
+            f"batch_sizes: [1] for this model on this device, or no `deterministic`"
+        )

@@ -159,7 +159,6 @@ def _imports(source: bytes, package: str) -> Iterator[str]:
 
 
 def _texts(value: Any, name: str = "") -> Iterator[tuple[str, str]]:
-    """Yield each text in nested settings, with the name of its setting."""
     if isinstance(value, str | Path):
         yield name, str(value)
     elif isinstance(value, Mapping):

@@ -19,15 +19,15 @@ EXPERTS: dict[str, str] = {
     "tabletop": "vlagents_ray.policies.experts.tabletop:TabletopExpert",
     "maniskill/PushCube-v1": "vlagents_ray.policies.experts.maniskill:PushCube",
     "maniskill/PickCube-v1": "vlagents_ray.policies.experts.maniskill:PickCube",
-    "aloha": "vlagents_ray.policies.experts.aloha:AlohaExpert",
-    "metaworld": "vlagents_ray.policies.experts.metaworld:MetaWorldExpert",
+    "aloha": "vlagents_ray.policies.experts.mujoco:AlohaExpert",
+    "metaworld": "vlagents_ray.policies.experts.mujoco:MetaWorldExpert",
     "pusht": "vlagents_ray.policies.experts.pusht:PushTExpert",
-    "rcs/pick": "vlagents_ray.policies.experts.rcs:RcsPick",
-    "gymnasium/FetchReach-v4": "vlagents_ray.policies.experts.fetch:FetchReach",
-    "gymnasium/FetchReachDense-v4": "vlagents_ray.policies.experts.fetch:FetchReach",
+    "rcs/pick": "vlagents_ray.policies.experts.mujoco:RcsPick",
+    "gymnasium/FetchReach-v4": "vlagents_ray.policies.experts.mujoco:FetchReach",
+    "gymnasium/FetchReachDense-v4": "vlagents_ray.policies.experts.mujoco:FetchReach",
     "libero": "vlagents_ray.policies.experts.osc_pose:LiberoExpert",
     "robosuite": "vlagents_ray.policies.experts.osc_pose:RobosuiteExpert",
-    "simpler": "vlagents_ray.policies.experts.simpler:SimplerExpert",
+    "simpler": "vlagents_ray.policies.experts.maniskill:SimplerExpert",
 }
 
 
@@ -58,17 +58,12 @@ def expert_for(env_name: str) -> Expert:
     return expert
 
 
-def sim_vector(obs: Obs, size: int, env_name: str) -> np.ndarray:
-    """Return `info["sim_state"]` of an observation, (`size`,), as the env gives it.
-
-    Raises:
-        InvalidObservation: The observation has no such vector.
-    """
+def sim_vector(obs: Obs, size: int, env_name: str, cure: str = "this expert cannot act on images") -> np.ndarray:
+    """Return `info["sim_state"]` of an observation, (`size`,); raises `InvalidObservation` if there is none."""
     state = obs.info.get("sim_state")
     if not isinstance(state, np.ndarray) or state.shape != (size,):
         got = f"shape {state.shape}" if isinstance(state, np.ndarray) else type(state).__name__
         raise InvalidObservation(
-            f"info['sim_state']: got {got}, want ({size},), as the env {env_name} gives it; "
-            f"this expert cannot act on images"
+            f"info['sim_state']: got {got}, want ({size},), as the env {env_name} gives it; {cure}"
         )
     return state

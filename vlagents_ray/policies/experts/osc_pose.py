@@ -49,19 +49,11 @@ class PickExpert(ABC):
         self._target, self._turned = np.zeros(3), np.eye(3)  # of the hand in this phase: (3,) m, (3, 3)
 
     def reset(self, obs: Obs, instruction: str) -> None:
-        """Begin an episode.
-
-        Raises:
-            InvalidObservation: The observation has no simulator state of this env.
-            MissingState: The observation lacks a part of the hand's state.
-            ContractMismatch: The goal is not of picking and placing an object.
-        """
         hand, self._first = self._hand(obs)
         self._phase, self._spent, self._turned = 0, 0, self._first
         self._aim(hand, obs)
 
     def act(self, obs: Obs) -> Act:
-        """Compute the next action, (7,) float32."""
         if self._first is None:
             raise NotReset(f"{self._name}: act before reset; call reset(obs, instruction) first")
         hand, orientation = self._hand(obs)
@@ -275,16 +267,7 @@ def _towards(
     *,
     per_m: float,
 ) -> Act:
-    """Compute the action that moves the hand towards a pose.
-
-    Args:
-        hand: Where the hand is, (3,) m.
-        orientation: How it is held, (3, 3).
-        target: Where it shall be, (3,) m.
-        upright: How it shall be held, (3, 3).
-        gripper: -1 open, 1 closed.
-        per_m: Units of the action for a metre of the remaining distance; 20 command all of it.
-    """
+    """Compute the action that moves the hand from a position (3,) m and an orientation (3, 3) towards a pose."""
     move = np.clip((target - hand) * per_m, -1.0, 1.0)
     turn = np.clip(_rotation_vector(upright @ orientation.T) * _PER_RAD, -_MOST_TURN, _MOST_TURN)
     return Act(np.concatenate([move, turn, [gripper]]).astype(np.float32))

@@ -36,7 +36,7 @@ class _Step(NamedTuple):
 
 
 class PushTExpert:
-    """Needs `info["sim_state"]`, as `vlagents_ray.envs.gymnasium.pusht` gives it; actions are (2,) in [0, 512] px.
+    """Needs `info["sim_state"]`, as `vlagents_ray.envs.gymnasium.env` gives it; actions are (2,) in [0, 512] px.
 
     A push goes straight towards the block, from one of some places around it, at one of three speeds. The expert
     chooses the push, and the step at which it ends, that brings the block's corners nearest to the target's.
@@ -57,7 +57,6 @@ class PushTExpert:
         self._expected = np.zeros(_SIZE)
 
     def reset(self, obs: Obs, instruction: str) -> None:
-        """Begin an episode; raises `InvalidObservation` without the simulator's state."""
         sim_vector(obs, _SIZE, self._name)
         self._plan.clear()
 
@@ -71,7 +70,6 @@ class PushTExpert:
         return Act(step.action)
 
     def _best_push(self, state: np.ndarray) -> list[_Step]:
-        """Return the steps of the way to the best push, and of the push itself."""
         block = self._shapely.Polygon(self._placed(state[4:]))
         around = block.buffer(self._reach)
         still = np.clip(state[:2], 0, _FIELD_PX).astype(np.float32)

@@ -60,11 +60,6 @@ class TabletopExpert:
         self._waited = 0
 
     def reset(self, obs: Obs, instruction: str) -> None:
-        """Begin an episode.
-
-        Raises:
-            InvalidObservation: The instruction is of another kind, or names an object that is not visible.
-        """
         self._plan = plan(_image(obs), instruction)
         self._instruction = instruction
         self._waited = 0
@@ -157,7 +152,6 @@ class _SeenObject:
         self._hue = sextant * 60  # degrees, from -60
 
     def puck(self, colour: str) -> tuple[float, float]:
-        """Return the centre of a puck, (x, y) m."""
         return self._find(colour, "puck", _FULL, _PUCK_REACH, _PUCK_HEIGHT / 2)
 
     def pad(self, colour: str) -> tuple[float, float]:

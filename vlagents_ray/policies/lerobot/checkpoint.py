@@ -16,9 +16,7 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.base.accelerator import ensure_torchvision
 from vlagents_ray.policies.base.checkpoint import SavedTensors, find_checkpoint, require_loaded
 from vlagents_ray.policies.lerobot.config import LeRobotConfig, is_new, other_version, refusal
-from vlagents_ray.policies.lerobot.kinds.diffusion import Diffusion
-from vlagents_ray.policies.lerobot.kinds.flow import Flow
-from vlagents_ray.policies.lerobot.policy_types import KINDS
+from vlagents_ray.policies.lerobot.kinds import KINDS, Diffusion, Flow
 from vlagents_ray.policies.lerobot.processors import PIPELINES, require_known_steps
 from vlagents_ray.registry import require
 

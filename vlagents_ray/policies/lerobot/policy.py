@@ -29,12 +29,12 @@ from vlagents_ray.policies.base.model_inputs import (
 from vlagents_ray.policies.flow import OFFERED
 from vlagents_ray.policies.lerobot import checkpoint
 from vlagents_ray.policies.lerobot.config import LeRobotConfig
-from vlagents_ray.policies.lerobot.kinds.flow import Flow
-from vlagents_ray.policies.lerobot.kinds.kind import Kind
-from vlagents_ray.policies.lerobot.policy_types import (
+from vlagents_ray.policies.lerobot.kinds import (
     KINDS,
     MASKING,
     RESIZING,
+    Flow,
+    Kind,
 )
 from vlagents_ray.policies.lerobot.processors import STATE, Processors, own_processors
 from vlagents_ray.registry import require
@@ -73,7 +73,6 @@ class LeRobot(ModelPolicy):
 
     @property
     def contract(self) -> Contract | None:
-        """The contract of the checkpoint; None before it is loaded."""
         return None if self.model is None else self.model.contract
 
     @property
@@ -98,7 +97,6 @@ class LeRobot(ModelPolicy):
         return None if feature is None else int(feature.shape[0])
 
     def load(self) -> LoadedLeRobot:
-        """Read the checkpoint; raises `ConfigError` if a part of it is missing, unknown or random."""
         with remote_code(allowed=self.config.trust_remote_code):
             return self._loaded(checkpoint.find(self.config))
 
@@ -174,7 +172,6 @@ class LeRobot(ModelPolicy):
         model.own[adapter] = own
 
     def perceive(self, obs: Obs) -> dict[str, np.ndarray]:
-        """Return images by the policy's keys, (H, W, 3) uint8, and its state vectors, float32."""
         model: LoadedLeRobot = self.model
         frame = {key: image.copy() for key, image in camera_images(obs, model.cameras).items()}
         if model.state:
@@ -184,7 +181,6 @@ class LeRobot(ModelPolicy):
         return frame
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
-        """Compute the chunks, in one pass for all rows with images of one size unless the type cannot batch."""
         predictions: dict[int, Prediction | Exception] = {}
         for members in self._groups(rows):
             missing = len(rows) - len(members) if self.config.deterministic and self.model.kind.batched else 0
@@ -208,7 +204,6 @@ class LeRobot(ModelPolicy):
         return list(groups.values())
 
     def _draw(self, rows: list[Row]) -> list[Prediction]:
-        """Compute the chunks of rows, (horizon, D) float32."""
         torch, model = require("torch"), self.model
         kind, settings = model.kind, model.kind.config
         leftovers = [model.own.get(row.adapter, model.processors).leftover(row) for row in rows]
@@ -304,7 +299,6 @@ def _alike(parts: Sequence[Sequence[float]], whole: Sequence[float]) -> bool:
 def _cameras(
     settings: Any, config: LeRobotConfig, renames: dict[str, str], trained: Mapping[str, str]
 ) -> dict[str, str]:
-    """Map the policy's observation key of each camera to our name."""
     names = {key: _short(key) for key in settings.image_features if _EMPTY not in key}
     if unknown := sorted(set(config.masked_cameras) - set(names.values())):
         raise ConfigError(f"masked_cameras: got {unknown}, want some of {sorted(names.values())}")

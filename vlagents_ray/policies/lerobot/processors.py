@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import inspect
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,9 @@ from vlagents_ray.dataset_contract import BYTES, STATISTICS, DatasetContract
 from vlagents_ray.errors import ConfigError, MissingDependency
 from vlagents_ray.policies.base import Row
 from vlagents_ray.policies.base.model_code import CURE
+from vlagents_ray.policies.base.model_inputs import KEPT
 from vlagents_ray.policies.lerobot.config import LeRobotConfig
-from vlagents_ray.policies.lerobot.kinds.groot import groot_dataset, require_groot_statistics
-from vlagents_ray.policies.token_cache import cached_tokenizer
+from vlagents_ray.policies.lerobot.kinds import groot_dataset, require_groot_statistics
 from vlagents_ray.registry import require
 
 PIPELINES = ("policy_preprocessor.json", "policy_postprocessor.json")
@@ -47,7 +48,6 @@ class Processors:
     """The pre- and post-processor, on the policy's device; raises `ConfigError` if they are incomplete."""
 
     def __init__(self, folder: Path, settings: Any, config: LeRobotConfig) -> None:
-        """Load the processors; `settings` is the policy's own config."""
         self._device = settings.device
         saved = [_saved_steps(folder / name) for name in PIPELINES]
         unknown = sorted(set(config.processors) - set().union(*saved))
@@ -108,10 +108,7 @@ class Processors:
         return groot_dataset(self._before.steps) if numbers is None else DatasetContract.from_statistics(numbers)
 
     def require_statistics(self, settings: Any, inputs: Sequence[str]) -> None:
-        """Raise `ConfigError` unless all `inputs`, and the actions, are normalised as the policy was trained.
-
-        LeRobot passes features without statistics on unchanged.
-        """
+        """Raise `ConfigError` unless all `inputs`, and the actions, have their statistics."""
         if self._groot:
             require_groot_statistics(self._before.steps, self._after.steps, settings)
             return
@@ -156,7 +153,6 @@ class Processors:
 
     @property
     def invertible(self) -> bool:
-        """Whether `leftover` converts actions back to the policy's units."""
         return self._back is not None
 
     def leftover(self, row: Row) -> Any:
@@ -306,3 +302,24 @@ def _saved_steps(file: Path) -> dict[str, Mapping[str, Any]]:
     """Map the registered name of each step of a pipeline to its settings."""
     steps = json.loads(file.read_text(encoding="utf-8")).get("steps", [])
     return {step.get("registry_name", step.get("class", "")): step.get("config", {}) for step in steps}
+
+
+def cached_tokenizer(tokenizer: Any, **settings: Any) -> Callable[[list[str]], dict[str, Any]]:
+    """Return a function from texts to the tensors (B, L) of a tokenizer of transformers, which keeps their rows.
+
+    All texts are padded to one length: a row that is padded to the longest text of its batch depends on the others.
+
+    Args:
+        tokenizer: The tokenizer.
+        settings: Further arguments of its calls, such as `max_length`.
+    """
+
+    @lru_cache(maxsize=KEPT)
+    def tokenized(text: str) -> dict[str, Any]:
+        return dict(tokenizer([text], padding="max_length", return_tensors="pt", **settings).items())
+
+    def call(texts: list[str]) -> dict[str, Any]:
+        rows = [tokenized(text) for text in texts]
+        return {name: require("torch").cat([row[name] for row in rows]) for name in rows[0]}
+
+    return call

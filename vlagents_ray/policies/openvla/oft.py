@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -21,18 +24,21 @@ from vlagents_ray.policies.base.model_inputs import (
     state_specs,
     state_vector,
 )
-from vlagents_ray.policies.openvla.base import OFFERED, DecodedChunk, PreparedRow, PrismaticPolicy, middle, resized
-from vlagents_ray.policies.openvla.parallel import (
-    Film,
-    Mlp,
-    ModelInput,
-    Parallel,
-    Projector,
-    read_component,
-    require_unused,
+from vlagents_ray.policies.compilation import Compilation
+from vlagents_ray.policies.openvla.prismatic import (
+    OFFERED,
+    Bounds,
+    DecodedChunk,
+    PreparedRow,
+    Prismatic,
+    PrismaticConfig,
+    PrismaticPolicy,
+    Statistics,
+    load_prismatic,
+    middle,
+    resized,
 )
-from vlagents_ray.policies.openvla.prismatic import Prismatic, PrismaticConfig, load_prismatic
-from vlagents_ray.policies.openvla.statistics import Bounds, Statistics
+from vlagents_ray.registry import require
 
 _PRIMARY = "full_image"
 _CAMERAS = (_PRIMARY, "wrist_image", "left_wrist_image", "right_wrist_image")  # in their order in training
@@ -80,9 +86,6 @@ class OpenVLAOFT(PrismaticPolicy):
 
     @property
     def contract(self) -> Contract:
-        """The cameras and states of training, an instruction, and chunks of the actions of the checkpoint's
-        datasets.
-        """
         return Contract(
             cameras=camera_specs(self._cameras),
             state=state_specs(self._state, self.state_dim),
@@ -182,3 +185,322 @@ def _action_dim(statistics: Statistics, unnorm_key: str | None, head: Mlp | None
             f"unnorm_key to the dataset that the head was trained on"
         )
     return dims.pop()
+
+
+_STOP = 2  # Llama's end of text, which follows the actions in training
+
+
+@dataclass(frozen=True)
+class ModelInput:
+    """The inputs for one chunk."""
+
+    pictures: tuple[Any, ...]  # (C, S, S) float32 each, in the order of training
+    tokens: list[int]
+    proprio: np.ndarray | None  # (P,) in [-1, 1]
+
+
+@dataclass
+class Parallel:
+    """A checkpoint of OFT: OpenVLA's, and its components; components that it was trained without are None.
+
+    `encode_images` and `hidden_states` are functions of tensors, which `compile_with` replaces by their compiled forms.
+    """
+
+    base: Prismatic
+    horizon: int  # H, the number of rows of a chunk
+    dim: int  # D, the length of a row
+    head: Mlp | None  # None: action tokens
+    proprio: Projector | None
+    noisy: Projector | None  # embeds noisy actions: the head is a diffusion head
+    film: Film | None
+    steps: tuple[int, int]  # diffusion steps: in training, at inference
+
+    def compile_with(self, compilation: Compilation) -> None:
+        self.encode_images = compilation.core("vision encoder", self.encode_images)  # type: ignore[method-assign]
+        self.hidden_states = compilation.core("language model", self.hidden_states)  # type: ignore[method-assign]
+
+    def regress(self, inputs: Sequence[ModelInput]) -> np.ndarray:
+        with require("torch").inference_mode():
+            return _numpy(self._heads(self._hidden(self._sequences(inputs))))
+
+    def denoise(self, inputs: Sequence[ModelInput], owners: Sequence[int], noise: np.ndarray) -> np.ndarray:
+        """Return chunks (B, H, D) in [-1, 1] of the diffusion head, from noise of that shape.
+
+        `owners` (B,) names the input of each chunk; its images are encoded once.
+        """
+        torch = require("torch")
+        with torch.inference_mode():
+            sequences = self._sequences(inputs)
+            seen = [sequences[owner] for owner in owners]
+            start = self.base.to_device(torch.from_numpy(noise))
+            return _numpy(denoise(start, lambda time, noisy: self._noise(seen, time, noisy), *self.steps))
+
+    def choose(self, inputs: Sequence[ModelInput], owners: Sequence[int], draws: np.ndarray) -> tuple[Any, Any]:
+        """Return the tokens (B, H, D) of chunks, and the logits (B, H, D, V) by which they were chosen.
+
+        `owners` (B,) names the input of each chunk, which is computed once; `draws` (B, H, D) are those of
+        `ActionBins.choose`.
+        """
+        torch = require("torch")
+        with torch.inference_mode():
+            hidden = self._hidden(self._sequences(inputs)).unflatten(1, (self.horizon, self.dim))
+            logits = self.base.network.language_model.lm_head(hidden).float()[list(owners)]
+            return self.base.bins.choose(logits, torch.tensor(draws, device=self.base.device)), logits
+
+    def _heads(self, hidden: Any) -> Any:
+        return self.head(hidden.reshape(len(hidden), self.horizon, -1))  # type: ignore[misc]
+
+    def _noise(self, seen: Sequence[tuple[Any, Any]], time: int, actions: Any) -> Any:
+        now = time_embedding(time, seen[0][0].shape[-1], actions.device).to(actions.dtype)[None]
+        noisy = self.noisy(actions.flatten(1)[..., None])  # type: ignore[misc]
+        return self._heads(self._hidden([(require("torch").cat([s, now]), w) for s, w in seen], noisy))
+
+    def _sequences(self, inputs: Sequence[ModelInput]) -> list[tuple[Any, Any]]:
+        """Return, for each input, the embeddings of images and state (P, D), and of the words (L, D)."""
+        torch = require("torch")
+        words = [self.base.embed([*model_input.tokens, _STOP]) for model_input in inputs]
+        views = len(inputs[0].pictures)
+        pixels = self.base.to_device([picture for model_input in inputs for picture in model_input.pictures])
+        language = torch.stack([one.mean(0) for one in words])
+        seen = self.encode_images(pixels.unflatten(0, (len(inputs), views)), language)
+        if self.proprio is not None:
+            states = self.base.to_device([torch.from_numpy(model_input.proprio) for model_input in inputs])
+            seen = torch.cat([seen, self.proprio(states)[:, None]], 1)
+        return list(zip(seen, words, strict=True))
+
+    def encode_images(self, pixels: Any, language: Any) -> Any:
+        """Return the embeddings (P, N, D) of images (P, views, C, S, S); `language` is the mean of words (P, D)."""
+        views = pixels.shape[1]
+        images = pixels.flatten(0, 1)
+        if self.film is None:
+            patches = self.base.network.vision_backbone(images)
+        else:
+            patches = self.film(images, language.repeat_interleave(views, 0))
+        return self.base.network.projector(patches).unflatten(0, (len(pixels), views)).flatten(1, 2)
+
+    def hidden_states(self, embeddings: Any, lengths: Any) -> Any:
+        """Return hidden states (B, L, D) of sequences (B, L, D), each token attending to all of its row's length."""
+        import torch  # the compiler follows a statement, and not `require`
+
+        model, length = self.base.network.language_model.model, embeddings.shape[1]
+        places = lengths.new_ones(1, length).cumsum(1) - 1
+        hidden = (places >= lengths[:, None])[:, None, None].expand(-1, 1, length, -1)
+        mask = embeddings.new_zeros(1).expand(hidden.shape).masked_fill(hidden, torch.finfo(embeddings.dtype).min)
+        for layer in model.layers:
+            [embeddings] = layer(embeddings, attention_mask=mask, position_ids=places)
+        return model.norm(embeddings)
+
+    def _hidden(self, sequences: Sequence[tuple[Any, Any]], actions: Any = None) -> Any:
+        """Return hidden states (B, H * D, …) of the action tokens, which are `actions` or zeros."""
+        torch = require("torch")
+        count = self.horizon * self.dim
+        if actions is None:
+            actions = sequences[0][0].new_zeros(len(sequences), count, sequences[0][0].shape[-1])
+        rows = [
+            torch.cat([words[:1], seen, words[1:-1], tokens, words[-1:]])
+            for (seen, words), tokens in zip(sequences, actions, strict=True)
+        ]
+        embeddings = torch.nn.utils.rnn.pad_sequence(rows, batch_first=True)
+        missing = max(0, self.base.padded_tokens - max(len(words) for _, words in sequences))
+        embeddings = torch.nn.functional.pad(embeddings, (0, 0, 0, missing))
+        lengths = torch.tensor([len(row) for row in rows], device=self.base.device)
+        hidden = self.hidden_states(embeddings, lengths)
+        starts = lengths - count - 2  # the token before an action predicts it, as in training
+        places = starts[:, None] + torch.arange(count, device=self.base.device)
+        return hidden[torch.arange(len(rows))[:, None], places]
+
+
+def _numpy(tensor: Any) -> np.ndarray:
+    array: np.ndarray = tensor.float().cpu().numpy()
+    return array
+
+
+def denoise(noise: Any, predict: Callable[[int, Any], Any], trained: int, steps: int) -> Any:
+    """Return actions (B, H, D) in [-1, 1] from noise; `predict` returns the noise in them at a time of training."""
+    kept = _kept(trained)
+    for time, before in _times(trained, steps):
+        guessed = predict(time, noise)
+        clean = (noise - (1 - kept[time]) ** 0.5 * guessed) / kept[time] ** 0.5
+        left = kept[before] if before >= 0 else 1.0
+        noise = left**0.5 * clean.clamp(-1, 1) + (1 - left) ** 0.5 * guessed
+    return noise
+
+
+def time_embedding(time: int, dim: int, device: Any) -> Any:
+    """Return (dim,) float32, sines and then cosines."""
+    torch = require("torch")
+    half = dim // 2
+    rates = torch.exp(torch.arange(half, device=device) * -math.log(10000) / (half - 1))
+    return torch.cat([(time * rates).sin(), (time * rates).cos()])
+
+
+def _times(trained: int, steps: int) -> Iterator[tuple[int, int]]:
+    stride = trained // steps
+    for i in reversed(range(steps)):
+        yield i * stride, (i - 1) * stride
+
+
+def _kept(trained: int) -> list[float]:
+    """Return the share of the signal that remains at each time of training."""
+
+    def alpha(x: float) -> float:
+        return math.cos((x + 0.008) / 1.008 * math.pi / 2) ** 2
+
+    betas = [min(1 - alpha((i + 1) / trained) / alpha(i / trained), 0.999) for i in range(trained)]
+    kept: list[float] = np.cumprod(1 - np.array(betas, np.float32)).tolist()
+    return kept
+
+
+Weights = Mapping[str, Any]  # tensors by name
+
+_MLP = ("layer_norm1", "fc1", *(f"mlp_resnet_blocks.{i}.ffn.{j}" for i in (0, 1) for j in (0, 1)), "layer_norm2", "fc2")
+_WRAPPED = "module."  # prefix of all names after distributed training
+_LORA_ALPHA = 16  # upstream's scale is min(rank, 16) / rank
+
+
+def read_component(folder: Path, name: str) -> dict[str, Any]:
+    """Return the tensors of the only file `name--*_checkpoint.pt`; raises `ConfigError` if there is none or several."""
+    files = sorted(path.name for path in folder.glob(f"{name}--*checkpoint.pt"))
+    if len(files) != 1:
+        have = sorted(path.name for path in folder.glob("*.pt"))
+        raise ConfigError(
+            f"checkpoint {folder}: got {files or have} for {name!r}, want one file {name}--STEP_checkpoint.pt; copy it "
+            f"there, or check `head`, `film` and `state` against how the checkpoint was trained"
+        )
+    saved = require("torch").load(folder / files[0], map_location="cpu", weights_only=True)
+    return {key.removeprefix(_WRAPPED): tensor for key, tensor in saved.items()}
+
+
+def require_unused(folder: Path, names: Iterable[str]) -> None:
+    """Raise `ConfigError` if a component exists that the settings leave out."""
+    for name in names:
+        if any(folder.glob(f"{name}--*")):
+            raise ConfigError(
+                f"checkpoint {folder}: has {name}--…, which these settings do not use; set `head`, `film` and `state` "
+                f"to how the checkpoint was trained, or move the file away"
+            )
+
+
+def _exactly(found: Weights, layers: Iterable[str], what: str) -> Weights:
+    want = {f"{layer}.{part}" for layer in layers for part in ("weight", "bias")}
+    if set(found) != want:
+        raise ConfigError(
+            f"{what}: misses {sorted(want - set(found))}, has {sorted(set(found) - want)} too; is it of another kind?"
+        )
+    return found
+
+
+class Mlp:
+    """A head: an MLP with residual blocks over the hidden states of one row's action tokens."""
+
+    def __init__(self, saved: Weights, prefix: str) -> None:
+        own = _exactly(saved, [f"{prefix}.{layer}" for layer in _MLP], "action_head")
+        self._weights = {key.removeprefix(f"{prefix}."): tensor for key, tensor in own.items()}
+
+    @property
+    def dim(self) -> int:
+        return len(self._weights["fc2.bias"])
+
+    def to(self, **place: Any) -> Mlp:
+        self._weights = {key: tensor.to(**place) for key, tensor in self._weights.items()}
+        return self
+
+    def __call__(self, x: Any) -> Any:
+        relu = require("torch").relu
+        x = relu(_linear(self._weights, "fc1", _norm(self._weights, "layer_norm1", x)))
+        for i in (0, 1):
+            block = f"mlp_resnet_blocks.{i}.ffn"
+            x = x + relu(_linear(self._weights, f"{block}.1", _norm(self._weights, f"{block}.0", x)))
+        return _linear(self._weights, "fc2", _norm(self._weights, "layer_norm2", x))
+
+
+class Projector:
+    """Maps numbers to embeddings of the language model: two layers with GELU between them."""
+
+    def __init__(self, saved: Weights, what: str) -> None:
+        self._weights = _exactly(saved, ("fc1", "fc2"), what)
+
+    @property
+    def dim(self) -> int:
+        return int(self._weights["fc1.weight"].shape[1])
+
+    def to(self, **place: Any) -> Projector:
+        self._weights = {key: tensor.to(**place) for key, tensor in self._weights.items()}
+        return self
+
+    def __call__(self, x: Any) -> Any:
+        gelu = require("torch").nn.functional.gelu
+        return _linear(self._weights, "fc2", gelu(_linear(self._weights, "fc1", x)))
+
+
+class Film:
+    """Vision backbones whose blocks are scaled and shifted by the instruction (arXiv 1709.07871)."""
+
+    def __init__(self, saved: Weights, backbone: Any) -> None:
+        """Take FiLM's tensors from `saved`, and load the others into the backbone."""
+        plain, self._film = {}, {}
+        for key, tensor in _merged(saved).items():
+            name = key.removeprefix("vision_backbone.")
+            if ".scale." in name or ".shift." in name:
+                self._film[name] = tensor
+            else:
+                plain[name.replace(".block.", ".")] = tensor
+        try:
+            backbone.load_state_dict(plain)
+        except RuntimeError as error:
+            raise ConfigError(f"vision_backbone: not the checkpoint's ({error})") from error
+        vits = {n: getattr(backbone, n) for n in ("featurizer", "fused_featurizer") if hasattr(backbone, n)}
+        layers = [
+            f"{n}.blocks.{i}.{way}" for n, v in vits.items() for i in range(len(v.blocks)) for way in ("scale", "shift")
+        ]
+        _exactly(self._film, layers, "vision_backbone")
+        self._vits = vits
+
+    def to(self, **place: Any) -> Film:
+        self._film = {key: tensor.to(**place) for key, tensor in self._film.items()}
+        return self
+
+    def __call__(self, pixels: Any, language: Any) -> Any:
+        """Return patches (B, P, V) of pixels (B, C, S, S) for instructions (B, D), each the mean of its embeddings."""
+        import torch  # the compiler follows a statement, and not `require`
+
+        parts = pixels.split(3, dim=1)
+        return torch.cat([self._see(name, part, language) for name, part in zip(self._vits, parts, strict=True)], dim=2)
+
+    def _see(self, name: str, pixels: Any, language: Any) -> Any:
+        """Return the output of the second to last block, which OpenVLA uses."""
+        vit = self._vits[name]
+        x = vit.norm_pre(vit.patch_drop(vit._pos_embed(vit.patch_embed(pixels))))
+        for i, block in enumerate(vit.blocks[:-1]):
+            layer = f"{name}.blocks.{i}"
+            scale, shift = (_linear(self._film, f"{layer}.{way}", language)[:, None] for way in ("scale", "shift"))
+            x = x + block.ls1(block.attn(block.norm1(x)))
+            x = x * (1 + scale) + shift
+            x = x + block.ls2(block.mlp(block.norm2(x)))
+        return x[:, vit.num_prefix_tokens :]
+
+
+def _merged(saved: Weights) -> dict[str, Any]:
+    """Add the low-rank adapters to their layers, also to convolutions: OFT+ saves them separately."""
+    merged = {key.replace(".base_layer.", "."): tensor for key, tensor in saved.items() if ".lora_" not in key}
+    for key, down in saved.items():
+        if ".lora_A." in key:
+            up = saved[key.replace(".lora_A.", ".lora_B.")]
+            rank = len(down)
+            name = key.partition(".lora_A.")[0] + ".weight"
+            added = up.flatten(1).float() @ down.flatten(1).float() * (min(rank, _LORA_ALPHA) / rank)
+            merged[name] = (merged[name].float() + added.view_as(merged[name])).to(merged[name].dtype)
+    return merged
+
+
+def _linear(weights: Weights, layer: str, x: Any) -> Any:
+    import torch
+
+    return torch.nn.functional.linear(x, weights[f"{layer}.weight"], weights[f"{layer}.bias"])
+
+
+def _norm(weights: Weights, layer: str, x: Any) -> Any:
+    import torch
+
+    bias = weights[f"{layer}.bias"]
+    return torch.nn.functional.layer_norm(x, bias.shape, weights[f"{layer}.weight"], bias)

@@ -20,8 +20,17 @@ from vlagents_ray.policies.adapters import Adapters
 from vlagents_ray.policies.base import Row, shared_frames
 from vlagents_ray.policies.base.model_inputs import camera_images, camera_specs, choose_cameras
 from vlagents_ray.policies.compilation import Compilation
-from vlagents_ray.policies.openvla.base import OFFERED, DecodedChunk, PreparedRow, PrismaticPolicy, middle, resized
-from vlagents_ray.policies.openvla.prismatic import Prismatic, PrismaticConfig, load_prismatic
+from vlagents_ray.policies.openvla.prismatic import (
+    OFFERED,
+    DecodedChunk,
+    PreparedRow,
+    Prismatic,
+    PrismaticConfig,
+    PrismaticPolicy,
+    load_prismatic,
+    middle,
+    resized,
+)
 from vlagents_ray.registry import require
 
 _IMAGE = "image"  # the model's only camera
@@ -52,7 +61,6 @@ class OpenVLA(PrismaticPolicy):
 
     @property
     def contract(self) -> Contract:
-        """One camera and an instruction; the actions of the checkpoint's datasets."""
         return Contract(
             cameras=camera_specs(self._cameras),
             state={},
@@ -64,14 +72,12 @@ class OpenVLA(PrismaticPolicy):
         )
 
     def load(self) -> TokenDecoder:
-        """Read the checkpoint."""
         base = load_prismatic(self.config)
         decoder = TokenDecoder(base, max(base.statistics.action_dims(self.config.unnorm_key)), self.adapters)
         decoder.compile_with(self.compilation)
         return decoder
 
     def perceive(self, obs: Obs) -> Any:
-        """Return the image as the input of the backbones, (C, S, S) float32."""
         image = camera_images(obs, self._cameras)[_IMAGE]
         if self.config.center_crop:
             image = middle(resized(image))
@@ -107,7 +113,6 @@ class TokenDecoder:
     adapters: Adapters = field(default_factory=Adapters)  # of the policy
 
     def compile_with(self, compilation: Compilation) -> None:
-        """Compile the vision encoder and the language model."""
         self.encode_images = compilation.core("vision encoder", self.encode_images)  # type: ignore[method-assign]
         self.prefill = compilation.core("language model", self.prefill)  # type: ignore[method-assign]
         self.continue_from = compilation.core("next token", self.continue_from)  # type: ignore[method-assign]

@@ -1,8 +1,10 @@
-"""The model of both policies: a checkpoint in OpenVLA's format for transformers, and all its parts."""
+"""The model of both policies, and what they share: the checkpoint, its statistics, images and prompts."""
 
 from __future__ import annotations
 
+import abc
 import contextlib
+import copy
 import hashlib
 import importlib
 import importlib.util
@@ -11,23 +13,124 @@ import json
 import os
 import sys
 import types
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
-from functools import lru_cache
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import simplejpeg
 from pydantic import Field, model_validator
 from typing_extensions import Self
 
-from vlagents_ray.errors import ConfigError, InvalidObservation
-from vlagents_ray.policies.base import ModelConfig
+from vlagents_ray.contract import ActionSpec
+from vlagents_ray.errors import ConfigError, InvalidObservation, NotReset
+from vlagents_ray.interface import Obs
+from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row
 from vlagents_ray.policies.base.accelerator import ensure_torchvision, torch_device, torch_dtype
 from vlagents_ray.policies.base.checkpoint import SavedTensors, find_checkpoint, require_loaded
-from vlagents_ray.policies.openvla.statistics import Bounds, Statistics
-from vlagents_ray.policies.token_cache import TokenCache
+from vlagents_ray.policies.base.model_inputs import KEPT
 from vlagents_ray.registry import require
+
+Bounds = Literal["q99", "min_max"]  # of each dimension: 1st and 99th percentile, or minimum and maximum
+FILE = "dataset_statistics.json"  # written by fine-tuning; it overrides the statistics in config.json
+_KEYS = {"q99": ("q01", "q99"), "min_max": ("min", "max")}
+_EPSILON = 1e-8  # upstream's value, for dimensions that never moved
+
+
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """The conversion between [-1, 1] and physical units, for each dimension."""
+
+    low: np.ndarray  # (D,) float64
+    high: np.ndarray  # (D,)
+    mask: np.ndarray  # (D,) bool; the other dimensions, such as the gripper, are not normalised
+
+    @property
+    def dim(self) -> int:
+        return len(self.low)
+
+    def restore(self, normalised: np.ndarray) -> np.ndarray:
+        """Convert (…, D) in [-1, 1] to physical units, float32."""
+        values = 0.5 * (normalised + 1) * (self.high - self.low) + self.low
+        return np.where(self.mask, values, normalised).astype(np.float32)
+
+    def restore_spread(self, normalised: np.ndarray) -> np.ndarray:
+        """Convert standard deviations (…, D) to physical units, float32."""
+        return np.where(self.mask, 0.5 * normalised * (self.high - self.low), normalised).astype(np.float32)
+
+    def normalise(self, values: np.ndarray) -> np.ndarray:
+        """Convert (…, D) in physical units to [-1, 1], float32, clipped at the ends of the range."""
+        scaled = 2 * (values - self.low) / (self.high - self.low + _EPSILON) - 1
+        return np.clip(np.where(self.mask, scaled, values), -1, 1).astype(np.float32)
+
+
+class Statistics:
+    """The statistics of every dataset that a checkpoint was trained on, by its name, the `unnorm_key`."""
+
+    def __init__(self, datasets: Mapping[str, Any], bounds: Bounds = "q99") -> None:
+        self._datasets = datasets
+        self.bounds = bounds
+
+    @classmethod
+    def of(cls, checkpoint: Path, bounds: Bounds = "q99") -> Statistics:
+        """Read the statistics in the folder; raises `ConfigError` if there are none."""
+        own = (checkpoint / FILE).is_file()
+        file = checkpoint / (FILE if own else "config.json")
+        try:
+            found = json.loads(file.read_text(encoding="utf-8"))
+        except ValueError as error:
+            raise ConfigError(f"{file}: is no JSON ({error}); copy it again") from error
+        if not own:
+            found = found.get("norm_stats")
+        if not found or not isinstance(found, dict):
+            raise ConfigError(
+                f"checkpoint {checkpoint}: got no normalisation statistics, want {FILE}, or norm_stats in config.json; "
+                f"copy it from where the training run saved it"
+            )
+        return cls(found, bounds)
+
+    @property
+    def names(self) -> list[str]:
+        return list(self._datasets)
+
+    def key(self, wanted: str | None) -> str:
+        """Return the dataset of that name, with or without `_no_noops`; by default the only one."""
+        if wanted is None and len(self._datasets) == 1:
+            return next(iter(self._datasets))
+        for name in (wanted, f"{wanted}_no_noops"):
+            if name in self._datasets:
+                return str(name)
+        raise InvalidObservation(
+            f"unnorm_key: got {wanted!r}, want one of the checkpoint's datasets {sorted(self._datasets)}; set it in "
+            f"the policy's config, in reset(..., unnorm_key=...) or in an observation's info"
+        )
+
+    def scale(self, key: str, part: Literal["action", "proprio"] = "action") -> Scale:
+        """Return the ranges of a dataset's actions or proprioception; raises `ConfigError` if it lacks them."""
+        found = self._datasets[key].get(part, {})
+        low, high = _KEYS[self.bounds]
+        if low not in found or high not in found:
+            raise ConfigError(
+                f"statistics of {key!r}: {part} has {sorted(found)}, want {low!r} and {high!r}; "
+                f"were they saved by another version, or with other normalisation bounds?"
+            )
+        mask = found.get("mask", [True] * len(found[low]))
+        return Scale(np.array(found[low], float), np.array(found[high], float), np.array(mask, bool))
+
+    def action_dims(self, wanted: str | None = None) -> set[int]:
+        """Return the lengths of the actions of the dataset `wanted`, or of all datasets."""
+        return {self.scale(key).dim for key in (self._datasets if wanted is None else [self.key(wanted)])}
+
+    def require(self, wanted: str | None) -> None:
+        """Raise `ConfigError` unless the dataset that a deployment names exists."""
+        try:
+            if wanted is not None:
+                self.scale(self.key(wanted))
+        except InvalidObservation as error:
+            raise ConfigError(str(error)) from error
+
 
 _NEEDS = ("config.json", "preprocessor_config.json", "tokenizer_config.json", "*.safetensors")
 _SPACE = 29871  # Llama's token of an empty word, which is between "Out:" and the action in training
@@ -54,26 +157,29 @@ class Prismatic:
     deterministic: bool  # whether longer prompts than that are refused
     padded_tokens: int  # the length to which shorter prompts are padded; 0: that of the longest one
     own: dict[str, Statistics] = field(default_factory=dict)  # of adapters that were trained on other datasets
-    prompts: TokenCache[list[int]] = field(default_factory=lambda: TokenCache(_size), repr=False)
 
     def pixels(self, image: np.ndarray) -> Any:
         """Convert an (H, W, 3) uint8 image to an input of the checkpoint's backbones, (C, S, S) float32 on the CPU."""
         return self.processor.apply_transform(require("PIL.Image").fromarray(image))
 
     def tokens(self, instruction: str) -> list[int]:
-        """Return the prompt for an instruction, which the caller must not change.
-
-        Raises `InvalidObservation` if it is longer than in the model's training, or than all are padded to.
-        """
-        [ids] = self.prompts.of([instruction], self._tokenized)
+        """Return the prompt for an instruction, not to be changed; raises `InvalidObservation` if it is too long."""
+        ids = self._tokenized(instruction)
         most = self.padded_tokens if self.deterministic else self.network.config.llm_max_length
         if len(ids) > most:
             raise InvalidObservation(f"instruction: got {len(ids)} tokens with the prompt, want {most} at most")
         return ids
 
-    def _tokenized(self, instructions: Sequence[str]) -> list[list[int]]:
-        prompts = [self.tokenizer(self.prompt.format(text.lower())).input_ids for text in instructions]
-        return [ids if ids[-1] == _SPACE else [*ids, _SPACE] for ids in prompts]
+    @cached_property
+    def _tokenized(self) -> Callable[[str], list[int]]:
+        """The tokens of an instruction, which is the same at each act of a session."""
+
+        @lru_cache(maxsize=KEPT)
+        def tokenized(instruction: str) -> list[int]:
+            ids: list[int] = self.tokenizer(self.prompt.format(instruction.lower())).input_ids
+            return ids if ids[-1] == _SPACE else [*ids, _SPACE]
+
+        return tokenized
 
     def to_device(self, arrays: Sequence[Any]) -> Any:
         """Stack tensors of one shape to a batch in the model's dtype; the copy to a GPU is asynchronous."""
@@ -89,12 +195,7 @@ class Prismatic:
         return self.network.get_input_embeddings()(torch.tensor(tokens, device=self.device))
 
 
-def _size(ids: list[int]) -> int:
-    return 36 * len(ids)  # 8 bytes in the list, 28 of the number
-
-
 def load_prismatic(config: PrismaticConfig, bounds: Bounds = "q99") -> Prismatic:
-    """Read and verify a checkpoint; raises `ConfigError`."""
     path = find_checkpoint(config.checkpoint, config.checkpoint_step, _NEEDS)
     statistics = Statistics.of(path, bounds)
     statistics.require(config.unnorm_key)
@@ -267,9 +368,7 @@ def _from_source(root: Path) -> tuple[Any, Any]:
 
 @contextlib.contextmanager
 def _bare_packages(root: Path) -> Iterator[None]:
-    """Import from `root` without the packages' own `__init__`, which import all of training's packages, TensorFlow
-    too.
-    """
+    """Import from `root` without the packages' own `__init__`, which import TensorFlow and more."""
     before = _take_out()
     for name in _PACKAGES:
         package = types.ModuleType(name)
@@ -289,3 +388,208 @@ def _bare_packages(root: Path) -> Iterator[None]:
 def _take_out() -> dict[str, types.ModuleType]:
     names = [name for name in sys.modules if name.partition(".")[0] == "prismatic"]
     return {name: sys.modules.pop(name) for name in names}
+
+
+UNNORM_KEY = "unnorm_key"  # key of reset's options and of an observation's info, as sent by OpenVLA's clients
+OFFERED = ("logprob", "entropy", "replay")  # of action tokens
+_SINGLE_ARM = 7  # six numbers of a motion, and one of the gripper
+
+
+@dataclass(frozen=True, slots=True)
+class PreparedRow:
+    """A valid row, ready for the model."""
+
+    row: Row
+    scale: Scale  # the scale of its dataset's actions
+    model_input: Any
+
+
+@dataclass(frozen=True, slots=True)
+class DecodedChunk:
+    """A chunk (H, D) in [-1, 1], and the distribution whose mode it is, where the model states one."""
+
+    values: np.ndarray
+    mean: np.ndarray | None = None
+    spread: np.ndarray | None = None
+    behaviour: dict[str, Any] = field(default_factory=dict)  # what is wanted of the row
+
+    def prediction(self, scale: Scale) -> Prediction:
+        return Prediction(
+            scale.restore(self.values),
+            None if self.mean is None else scale.restore(self.mean),
+            None if self.spread is None else scale.restore_spread(self.spread),
+            self.behaviour,
+        )
+
+
+class PrismaticPolicy(ModelPolicy):
+    """Computes all valid rows of a batch together, each in the units of its own dataset."""
+
+    config: Any
+    network = "model.base.network"
+
+    @property
+    @abc.abstractmethod
+    def _checkpoint(self) -> Prismatic | None:
+        """The checkpoint; None before it is loaded."""
+
+    @abc.abstractmethod
+    def _model_input(self, row: Row, key: str) -> Any:
+        """Return the model's input for a row with that dataset; an error fails that row only."""
+
+    @abc.abstractmethod
+    def _compute(self, prepared: Sequence[PreparedRow]) -> list[DecodedChunk]:
+        """Compute all rows in one batch."""
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        """Begin an episode; `kwargs` may contain `unnorm_key`, the dataset of its actions."""
+        info = super().reset(obs, instruction, **kwargs)
+        self._begun().memory[UNNORM_KEY] = self._named(kwargs, self._begun().adapter)
+        return info
+
+    def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
+        results: dict[int, Prediction | Exception] = {}
+        prepared: dict[int, PreparedRow] = {}
+        for i, row in enumerate(rows):
+            try:
+                key = self._key(row)
+                scale = self._statistics(row.adapter).scale(key)
+                prepared[i] = PreparedRow(row, scale, self._model_input(row, key))
+            except Exception as error:  # noqa: BLE001 - handed to the session whose request failed
+                results[i] = error
+        entries = list(prepared.values())
+        if entries and self.config.deterministic:  # as many as without errors
+            entries += [copy.deepcopy(entries[-1]) for _ in range(len(rows) - len(entries))]
+        answers = self._compute(entries)[: len(prepared)] if entries else []
+        for (i, entry), answer in zip(prepared.items(), answers, strict=True):
+            results[i] = answer.prediction(entry.scale)
+        return [results[i] for i in range(len(rows))]
+
+    def _example(self, seed: int, instruction: str = "warm up") -> Row:
+        """Return a row of any dataset; sessions may name theirs later."""
+        row = super()._example(seed, instruction)
+        datasets = self._statistics(row.adapter)
+        return replace(row, memory={UNNORM_KEY: self._default(row.adapter) or datasets.names[0]})
+
+    def adapt(self, adapter: str, folder: Path) -> None:
+        """Keep the statistics of the adapter's datasets, if they lie beside it."""
+        if not (folder / FILE).is_file():
+            return
+        own, base = Statistics.of(folder, self._statistics().bounds), self._statistics()
+        dims = own.action_dims(), base.action_dims(self.config.unnorm_key)
+        if not dims[0] <= dims[1]:
+            raise ConfigError(
+                f"{folder / FILE}: got actions of {sorted(dims[0])} numbers, want {sorted(dims[1])}, as the base's; "
+                f"merge the adapter into its base, and serve that as a checkpoint of its own"
+            )
+        self._checkpoint.own[adapter] = own  # type: ignore[union-attr]
+
+    def _decoded(
+        self, bins: ActionBins, prepared: Sequence[PreparedRow], tokens: Any, logits: Any
+    ) -> list[DecodedChunk]:
+        """Return the chunks of action tokens (B, H, D) that were chosen by logits (B, H, D, V)."""
+        parts = bins.values(tokens), *bins.moments(logits)
+        chunks = []
+        for i, entry in enumerate(prepared):
+            values, mean, spread = (part[i, :, : entry.scale.dim] for part in parts)
+            chunks.append(DecodedChunk(values, mean, spread, self._stated(bins, entry, tokens[i], logits[i])))
+        return chunks
+
+    def _stated(self, bins: ActionBins, entry: PreparedRow, tokens: Any, logits: Any) -> dict[str, Any]:
+        """Return what is wanted of a row with tokens (H, D), drawn from the bins by logits (H, D, V)."""
+        if not entry.row.want:
+            return {}
+        tokens = tokens[:, : entry.scale.dim]
+        logprob, entropy = map(self._used, bins.stated(tokens, logits[:, : entry.scale.dim]))
+        said = {"logprob": logprob, "entropy": float(entropy.sum()), "replay": {"tokens": tokens.cpu().numpy()}}
+        return {name: said[name] for name in entry.row.want}
+
+    def _statistics(self, adapter: str = "") -> Statistics:
+        checkpoint = self._checkpoint
+        if checkpoint is None:
+            raise NotReset(f"{type(self).__name__}: not loaded; call initialize() first")
+        return checkpoint.own.get(adapter, checkpoint.statistics)
+
+    def _default(self, adapter: str) -> str | None:
+        """Return the dataset of the settings; None for an adapter with datasets of its own."""
+        return None if self._statistics(adapter) is not self._statistics() else self.config.unnorm_key
+
+    def _named(self, options: Mapping[str, Any], adapter: str) -> str | None:
+        key = options.get(UNNORM_KEY)
+        if key is None:
+            return None
+        if not isinstance(key, str):
+            raise InvalidObservation(f"unnorm_key: got {type(key).__name__}, want a dataset's name")
+        return self._statistics(adapter).key(key)
+
+    def _key(self, row: Row) -> str:
+        """Return the dataset of a row: the observation's, the episode's, the config's, or the only one."""
+        named = self._named(row.info, row.adapter) or row.memory.get(UNNORM_KEY) or self._default(row.adapter)
+        return self._statistics(row.adapter).key(named)
+
+    def _action(self) -> ActionSpec:
+        """Describe an action: its meaning depends on the dataset, except for the gripper of a single arm."""
+        dims = set() if self._checkpoint is None else self._statistics().action_dims(self.config.unnorm_key)
+        dim = dims.pop() if len(dims) == 1 else None
+        single = dim == _SINGLE_ARM
+        return ActionSpec(dim=dim, gripper_open=1.0 if single else None, gripper_closed=0.0 if single else None)
+
+
+SIDE = 224  # px; the size of all images in OpenVLA's training data
+CROP_AREA = 0.9  # share of the area that the random crops of training kept
+_LOBES = 3  # of the Lanczos kernel
+
+
+def resized(image: np.ndarray) -> np.ndarray:
+    """Resize an (H, W, 3) uint8 image to (224, 224, 3) by JPEG of quality 95 and Lanczos; that size stays unchanged."""
+    height, width = image.shape[:2]
+    if (height, width) == (SIDE, SIDE):
+        return image
+    pixels = _apply(_lanczos(height), _lanczos(width), _through_jpeg(image).astype(np.float32))
+    return _uint8(np.round(pixels), 255)
+
+
+def middle(image: np.ndarray) -> np.ndarray:
+    """Crop the central nine tenths of the area of an (H, W, 3) uint8 image, and scale them to (224, 224, 3)."""
+    height, width = image.shape[:2]
+    pixels = _apply(_crop(height), _crop(width), image.astype(np.float32) / 255)
+    return _uint8(pixels * 255.5, 255.5)  # TensorFlow's conversion: add a half, then truncate
+
+
+def _uint8(pixels: np.ndarray, most: float) -> np.ndarray:
+    return np.asarray(np.clip(pixels, 0, most), np.uint8)
+
+
+def _through_jpeg(image: np.ndarray) -> np.ndarray:
+    """Compress and decompress the image by the algorithms that TensorFlow chooses.
+
+    Its encoder is Pillow's exact one, its decoder the fast one; simplejpeg's encoder would be off by up to 18.
+    """
+    file = io.BytesIO()
+    require("PIL.Image").fromarray(image).save(file, "JPEG", quality=95, subsampling="4:2:0")
+    decoded: np.ndarray = simplejpeg.decode_jpeg(file.getvalue(), "RGB", fastdct=True, fastupsample=False)
+    return decoded
+
+
+def _apply(rows: np.ndarray, columns: np.ndarray, image: np.ndarray) -> np.ndarray:
+    """Resample (H, W, 3) by (224, H) and (224, W) weights."""
+    turned = np.tensordot(rows, image, (1, 0))  # (224, W, 3)
+    return np.asarray(np.tensordot(turned, columns, (1, 1)).transpose(0, 2, 1))
+
+
+@lru_cache(maxsize=16)
+def _lanczos(size: int) -> np.ndarray:
+    """Return weights (224, size); kernels are wider where the image shrinks, so that it does not alias."""
+    scale = size / SIDE
+    centres = (np.arange(SIDE) + 0.5) * scale
+    x = ((np.arange(size) + 0.5) - centres[:, None]) / max(scale, 1.0)
+    weights = np.where(np.abs(x) < _LOBES, np.sinc(x) * np.sinc(x / _LOBES), 0.0)
+    return np.asarray(weights / weights.sum(1, keepdims=True), np.float32)
+
+
+@lru_cache(maxsize=16)
+def _crop(size: int) -> np.ndarray:
+    """Return weights (224, size) that scale the centre up, by linear interpolation between the two nearest pixels."""
+    side = CROP_AREA**0.5
+    at = (1 - side) / 2 * (size - 1) + np.arange(SIDE) * (side * (size - 1) / (SIDE - 1))
+    return np.asarray(np.maximum(0.0, 1.0 - np.abs(np.arange(size) - at[:, None])), np.float32)

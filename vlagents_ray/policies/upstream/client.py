@@ -72,11 +72,7 @@ class UpstreamClient(abc.ABC):
 
     @abc.abstractmethod
     def connect(self, timeout_s: float) -> dict[str, Any]:
-        """Connect, and return what the upstream says about itself.
-
-        Raises:
-            PolicyUnavailable: It cannot be reached.
-        """
+        """Connect, and return what the upstream says about itself; raises `PolicyUnavailable` if it does not answer."""
 
     @property
     @abc.abstractmethod
@@ -113,14 +109,26 @@ class UpstreamClient(abc.ABC):
         logger.error("upstream %s answered with an error: %s", self.options.url, str(text)[:_LOGGED])
         return PolicyFailed(f"upstream {self.options.url}: it answered with an error, which the server's log has")
 
+    def closed(self) -> ConnectionLost:
+        """Return the error of a request over a closed connection."""
+        return ConnectionLost(f"upstream {self.options.url}: the connection is closed")
+
+    def unreachable(self, error: Exception) -> PolicyUnavailable:
+        """Return the error of an upstream that does not answer."""
+        return PolicyUnavailable(f"upstream {self.options.url}: cannot connect ({error}); is it running?")
+
+    def lost(self, reason: object) -> ConnectionLost:
+        """Close the connection, and return the error of its loss."""
+        self.close()
+        late = isinstance(reason, TimeoutError)
+        text = f"no answer within {self.options.timeout_s:g} s" if late else reason
+        return ConnectionLost(f"upstream {self.options.url}: {text}")
+
     def unreadable(self, got: object, want: str) -> MalformedMessage:
         """Return the error for an answer that is not what the protocol says."""
         return MalformedMessage(
             f"upstream {self.options.url}: got {got}, want {want}; does it speak the protocol of the deployment?"
         )
-
-
-# A WebSocket to an upstream.
 
 
 _LOG = logging.getLogger("vlagents_ray.upstream.websocket")
@@ -131,33 +139,36 @@ _REFUSED = (401, 403)
 _NO_PINGS: dict[str, Any] = {"ping_interval": None} if "ping_interval" in inspect.signature(connect).parameters else {}
 
 
-class UpstreamSocket:
-    """A WebSocket to an upstream, which bounds the size of messages and the time of waiting.
+class WebSocketClient(UpstreamClient):
+    """A client over a WebSocket, which bounds the size of messages and the time of waiting.
 
     A thread of its own answers the upstream's pings, so that a connection stays open while no session acts.
     """
 
-    def __init__(self, options: ClientOptions, headers: dict[str, str]) -> None:
-        self._options = options
-        self._headers = headers
+    schemes: ClassVar[tuple[str, ...]] = ("ws", "wss")
+    key_scheme: ClassVar[str] = "Bearer"
+    """The word before the API key in the header `Authorization`."""
+
+    def __init__(self, options: ClientOptions) -> None:
+        super().__init__(options)
+        self._headers = {} if options.key is None else {"Authorization": f"{self.key_scheme} {options.key}"}
         self._connection: ClientConnection | None = None
         self._open = contextlib.ExitStack()
 
     @property
     def is_open(self) -> bool:
-        """Whether messages can be sent."""
         return self._connection is not None and self._connection.protocol.state is State.OPEN
 
     def open(self, timeout_s: float) -> None:
         """Connect; raises `PolicyUnavailable` if it cannot be reached, `Unauthorized` if it refuses the key."""
-        url = self._options.url
+        url = self.options.url
         try:
             opening = connect(
                 url,
                 open_timeout=timeout_s,
                 close_timeout=_CLOSE_S,
                 compression=None,
-                max_size=self._options.limits.body_bytes,
+                max_size=self.options.limits.body_bytes,
                 additional_headers=self._headers,
                 logger=_LOG,
                 **_NO_PINGS,
@@ -171,39 +182,29 @@ class UpstreamSocket:
                 ) from error
             raise PolicyUnavailable(f"upstream {url}: refused with HTTP {error.response.status_code}") from error
         except (OSError, InvalidHandshake, ConnectionClosed, TimeoutError) as error:
-            raise PolicyUnavailable(f"upstream {url}: cannot connect ({error}); is it running?") from error
+            raise self.unreachable(error) from error
 
     def send(self, message: bytes) -> None:
-        """Send a binary message; raises `ConnectionLost`."""
         try:
             self._opened().send(message)
         except (ConnectionClosed, OSError) as error:
-            raise self._lost(str(error)) from error
+            raise self.lost(error) from error
 
     def recv(self, timeout_s: float | None = None) -> bytes | str:
-        """Return the next message.
-
-        Raises:
-            ConnectionLost: The connection broke, or no message came in time.
-        """
-        wait_s = self._options.timeout_s if timeout_s is None else timeout_s
+        """Return the next message; raises `ConnectionLost` if the connection broke, or none came in time."""
+        wait_s = self.options.timeout_s if timeout_s is None else timeout_s
         try:
             return self._opened().recv(timeout=wait_s)
         except TimeoutError as error:
-            raise self._lost(f"no answer within {wait_s:.3g} s") from error
+            raise self.lost(f"no answer within {wait_s:.3g} s") from error
         except (ConnectionClosed, OSError) as error:
-            raise self._lost(str(error)) from error
+            raise self.lost(error) from error
 
     def close(self) -> None:
-        """Close the connection."""
         self._connection = None
         self._open.close()
 
     def _opened(self) -> ClientConnection:
         if self._connection is None:
-            raise ConnectionLost(f"upstream {self._options.url}: the connection is closed")
+            raise self.closed()
         return self._connection
-
-    def _lost(self, text: str) -> ConnectionLost:
-        self.close()
-        return ConnectionLost(f"upstream {self._options.url}: {text}")

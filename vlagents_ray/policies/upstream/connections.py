@@ -59,12 +59,7 @@ class Lanes:
         self._pool = ThreadPoolExecutor(max(1, len(clients) - 1), "upstream")
 
     def start(self, timeout_s: float) -> None:
-        """Connect, and return when one upstream answers; the others are connected when they do.
-
-        Raises:
-            ContractMismatch: The first that answers is not the one that is wanted.
-            PolicyUnavailable: None answers in time.
-        """
+        """Return when one upstream answers; raises `ContractMismatch` if it is another one than is wanted."""
         for client in self._clients:
             self._connect_in_background(client)
         with self._changed:
@@ -103,7 +98,6 @@ class Lanes:
         return results
 
     def close(self) -> None:
-        """Close all connections."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
@@ -177,7 +171,6 @@ class Lanes:
         thread.start()
 
     def _connect(self, client: UpstreamClient) -> None:
-        """Connect until it works."""
         pause_s, logged = _FIRST_PAUSE_S, ""
         while not self._closed:
             try:
@@ -245,12 +238,7 @@ class SessionConnections:
         self._connected(timeout_s).close()
 
     def begin(self, session: str) -> None:
-        """Connect for an episode of a session.
-
-        Raises:
-            NoReplica: No upstream answers within `retry_s`.
-            PolicyFailed: The upstream refuses the episode.
-        """
+        """Connect for an episode of a session; raises `NoReplica` if no upstream answers within `retry_s`."""
         client = self._connected(self._retry_s)
         if client.one_session:  # whose state the begin of this episode ends
             for other in list(self._clients):
@@ -273,14 +261,12 @@ class SessionConnections:
         return [] if first is None else [first, *(other.result() for other in others)]
 
     def drop(self, session: str) -> None:
-        """Close the connection of a session that has ended."""
         with self._lock:
             client = self._clients.pop(session, None)
         if client is not None:
             threading.Thread(target=client.close, name="upstream-close", daemon=True).start()  # it may wait for a reply
 
     def close(self) -> None:
-        """Close all connections."""
         self._pool.shutdown()
         with self._lock:
             clients, self._clients = self._clients, {}

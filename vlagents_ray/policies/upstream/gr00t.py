@@ -6,7 +6,7 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
-from vlagents_ray.errors import ConnectionLost, InvalidObservation, PolicyUnavailable, VLAgentsError
+from vlagents_ray.errors import InvalidObservation, VLAgentsError
 from vlagents_ray.policies.upstream.client import Answer, ClientOptions, UpstreamClient
 from vlagents_ray.registry import require
 from vlagents_ray.wire import gr00t as wire
@@ -54,7 +54,7 @@ class GR00TClient(UpstreamClient):
             modalities = wire.read_modalities(reply)
         except (zmq.ZMQError, VLAgentsError) as error:
             self.close()
-            raise PolicyUnavailable(f"upstream {self.options.url}: cannot connect ({error}); is it running?") from error
+            raise self.unreachable(error) from error
         if (language := modalities.get("language")) is not None and language.keys:
             self._text_key = language.keys[0]
         return {name: {"keys": list(one.keys), "steps": list(one.steps)} for name, one in modalities.items()}
@@ -113,7 +113,7 @@ class GR00TClient(UpstreamClient):
 
     def _call(self, endpoint: str, data: Any, timeout_s: float) -> Any:
         if self._socket is None:
-            raise ConnectionLost(f"upstream {self.options.url}: the connection is closed")
+            raise self.closed()
         deadline = time.monotonic() + timeout_s
         try:
             self._wait(self._zmq.POLLOUT, deadline, "it takes no connection")
@@ -121,8 +121,7 @@ class GR00TClient(UpstreamClient):
             self._wait(self._zmq.POLLIN, deadline, "no answer")
             payload = self._socket.recv(self._zmq.NOBLOCK)
         except self._zmq.ZMQError as error:
-            self.close()
-            raise ConnectionLost(f"upstream {self.options.url}: {error}") from error
+            raise self.lost(error) from error
         reply = wire.read(payload, self.options.limits)
         if isinstance(reply, dict) and "error" in reply:
             raise self.failed(reply["error"])
@@ -137,9 +136,8 @@ class GR00TClient(UpstreamClient):
         ready = dict(poller.poll(max(0.0, deadline - begun) * 1e3))
         if self._socket in ready:
             return
-        self.close()
-        why = "the connection ended" if self._monitor in ready else f"{what} within {deadline - begun:.3g} s"
-        raise ConnectionLost(f"upstream {self.options.url}: {why}")
+        ended = self._monitor in ready
+        raise self.lost("the connection ended" if ended else f"{what} within {deadline - begun:.3g} s")
 
 
 def _is_flat(reply: Any) -> bool:

@@ -13,7 +13,6 @@ from vlagents_ray.errors import ConnectionLost, PolicyUnavailable, VLAgentsError
 from vlagents_ray.policies.upstream.client import Answer, ClientOptions, UpstreamClient
 from vlagents_ray.registry import require
 from vlagents_ray.wire import lerobot
-from vlagents_ray.wire import lerobot as wire
 
 _LOST = ("UNAVAILABLE", "DEADLINE_EXCEEDED", "CANCELLED")  # the other status codes are answers
 _OPTIONS = [
@@ -77,7 +76,7 @@ class LeRobotClient(UpstreamClient):
         try:
             self._call(unary["Ready"], lerobot.EMPTY, timeout_s)
             channel.subscribe(watch)
-            setup = lerobot.write_data(wire.write_instructions(instructions))
+            setup = lerobot.write_data(lerobot.write_instructions(instructions))
             self._call(unary["SendPolicyInstructions"], setup, self.options.load_s)
         except ConnectionLost as error:
             raise PolicyUnavailable(f"{error}; is it running?") from error
@@ -90,17 +89,16 @@ class LeRobotClient(UpstreamClient):
     def ask(self, observations: Sequence[Mapping[str, Any]]) -> list[Answer]:
         [observation] = observations
         if self._observe is None or self._act is None or self.options.instructions is None:
-            raise ConnectionLost(f"upstream {self.options.url}: the connection is closed")
+            raise self.closed()
         deadline, now, self._step = time.monotonic() + self.options.timeout_s, time.time(), self._step + 1
-        data = wire.write_observation(observation, self.options.instructions, now, self._step)
+        data = lerobot.write_observation(observation, self.options.instructions, now, self._step)
         self._call(self._observe, lerobot.write_observation_parts(data), self.options.timeout_s)
         reply = lerobot.read_data(self._call(self._act, lerobot.EMPTY, max(0.0, deadline - time.monotonic())))
         if not reply and not self.is_open:
-            self.close()
-            raise ConnectionLost(f"upstream {self.options.url}: it was restarted, and has no policy yet")
+            raise self.lost("it was restarted, and has no policy yet")
         if not reply:
             raise self.failed("no actions: its own log says why, unless another client took them")
-        chunk = wire.read_chunk(reply, self.options.limits)
+        chunk = lerobot.read_chunk(reply, self.options.limits)
         if (chunk.timestamp, chunk.timestep) != (now, self._step):
             raise self.failed("the actions of another client's observation; it has one client at a time")
         return [chunk.rows]
@@ -124,8 +122,5 @@ class LeRobotClient(UpstreamClient):
             code, text = error.code().name, error.details()
             if code not in _LOST:
                 raise self.failed(f"{code}: {text}") from error
-            self.close()
             late = code == "DEADLINE_EXCEEDED"
-            raise ConnectionLost(
-                f"upstream {self.options.url}: {f'no answer within {timeout_s:.3g} s' if late else text}"
-            ) from error
+            raise self.lost(f"no answer within {timeout_s:.3g} s" if late else text) from error

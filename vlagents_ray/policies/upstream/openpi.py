@@ -9,37 +9,27 @@ from typing import Any, ClassVar
 import numpy as np
 
 from vlagents_ray.errors import PolicyUnavailable, VLAgentsError
-from vlagents_ray.policies.upstream.client import Answer, ClientOptions, UpstreamClient, UpstreamSocket
+from vlagents_ray.policies.upstream.client import Answer, ClientOptions, WebSocketClient
 from vlagents_ray.wire import openpi
 from vlagents_ray.wire.outgoing import Outgoing
 
 _RESET = "reset successful"  # what RoboArena's servers answer to `reset`
 
 
-class OpenPiClient(UpstreamClient):
+class OpenPiClient(WebSocketClient):
     """A client of a server that speaks openpi's protocol, which keeps nothing between two observations."""
 
-    schemes: ClassVar[tuple[str, ...]] = ("ws", "wss")
-
-    def __init__(self, options: ClientOptions) -> None:
-        super().__init__(options)
-        # as openpi_client.websocket_client_policy sends it
-        headers = {} if options.key is None else {"Authorization": f"Api-Key {options.key}"}
-        self._socket = UpstreamSocket(options, headers)
+    key_scheme = "Api-Key"  # as openpi_client.websocket_client_policy sends it
 
     @staticmethod
     def is_nested(key: str) -> bool:
         """Return whether a key is a path: openpi's keys under `observation/` are not, `images/cam_high` is."""
         return not key.startswith("observation/")
 
-    @property
-    def is_open(self) -> bool:
-        return self._socket.is_open
-
     def connect(self, timeout_s: float) -> dict[str, Any]:
-        self._socket.open(timeout_s)
+        self.open(timeout_s)
         try:
-            return self._map(self._socket.recv(timeout_s))
+            return self._map(self.recv(timeout_s))
         except VLAgentsError as error:
             self.close()
             raise PolicyUnavailable(f"{error}; its first message must be its metadata") from error
@@ -48,12 +38,9 @@ class OpenPiClient(UpstreamClient):
         [observation] = observations
         return [self._actions(self._call(observation))]
 
-    def close(self) -> None:
-        self._socket.close()
-
     def _call(self, message: Mapping[str, Any]) -> Any:
-        self._socket.send(openpi.encode(message))
-        return self._read(self._socket.recv())
+        self.send(openpi.encode(message))
+        return self._read(self.recv())
 
     def _read(self, data: bytes | str) -> Any:
         return self._map(data)
@@ -102,8 +89,8 @@ class RoboArenaClient(OpenPiClient):
 
     def begin(self) -> None:
         self._session = uuid.uuid4().hex
-        self._socket.send(openpi.encode({"endpoint": "reset"}))
-        answer = self._socket.recv()
+        self.send(openpi.encode({"endpoint": "reset"}))
+        answer = self.recv()
         if answer != _RESET:
             self._read(answer)  # vLLM-Omni answers a map; any other text is an error
 

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 from urllib.parse import urlsplit
 
-from vlagents_ray.errors import ConnectionLost, MessageTooLarge, PolicyUnavailable
+from vlagents_ray.errors import ConnectionLost, MessageTooLarge
 from vlagents_ray.policies.upstream.client import Answer, ClientOptions, UpstreamClient
 from vlagents_ray.wire import openvla
 
@@ -56,7 +56,7 @@ class OpenVLAClient(UpstreamClient):
             connection.connect()
         except OSError as error:
             connection.close()
-            raise PolicyUnavailable(f"upstream {self.options.url}: cannot connect ({error}); is it running?") from error
+            raise self.unreachable(error) from error
         connection.sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         connection.sock.settimeout(self.options.timeout_s)
         connection.auto_open = 0
@@ -66,16 +66,14 @@ class OpenVLAClient(UpstreamClient):
     def ask(self, observations: Sequence[Mapping[str, Any]]) -> list[Answer]:
         [observation] = observations
         if self._connection is None:
-            raise ConnectionLost(f"upstream {self.options.url}: the connection is closed")
+            raise self.closed()
         most = self.options.limits.body_bytes
         try:
             self._connection.request("POST", self._path, openvla.encode_observation(observation), self._headers)
             response = self._connection.getresponse()
             body = response.read(most + 1)
         except (http.client.HTTPException, OSError) as error:
-            self.close()
-            text = f"no answer within {self.options.timeout_s:g} s" if isinstance(error, TimeoutError) else str(error)
-            raise ConnectionLost(f"upstream {self.options.url}: {text}") from error
+            raise self.lost(error) from error
         if len(body) > most:
             self.close()
             raise MessageTooLarge(f"upstream {self.options.url}: an answer of more than {most} bytes")

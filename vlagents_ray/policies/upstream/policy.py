@@ -1,4 +1,4 @@
-"""Another policy server's model as a policy."""
+"""Another policy server's model as a policy: its settings, and the policy itself."""
 
 from __future__ import annotations
 
@@ -8,15 +8,170 @@ import uuid
 import weakref
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
+from urllib.parse import urlsplit
+
+from pydantic import BaseModel, Field, field_validator, model_validator
+from typing_extensions import Self
 
 from vlagents_ray.contract import Contract
-from vlagents_ray.errors import ConfigError, ContractMismatch, NotReset
+from vlagents_ray.errors import ConfigError, ContractMismatch, NotReset, VLAgentsError
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.policies.upstream.client import ClientOptions, UpstreamClient
-from vlagents_ray.policies.upstream.config import UpstreamConfig
 from vlagents_ray.policies.upstream.connections import Lanes, SessionConnections
+from vlagents_ray.policies.upstream.gr00t import GR00TClient
+from vlagents_ray.policies.upstream.lerobot import LeRobotClient
+from vlagents_ray.policies.upstream.openpi import OpenPiBatchClient, OpenPiClient, RoboArenaClient
+from vlagents_ray.policies.upstream.openvla import OpenVLAClient
+from vlagents_ray.policies.upstream.vla_eval import VlaEvalClient
+from vlagents_ray.policies.upstream.vlagents import VlagentsClient
+from vlagents_ray.policies.upstream.xpolicylab import XPolicyLabClient
+from vlagents_ray.wire.lerobot import PolicyInstructions, features_of
+from vlagents_ray.wire.mapping import KeyMapping
 from vlagents_ray.wire.outgoing import Outgoing
+from vlagents_ray.wire.presets import read_mapping
+
+PROTOCOLS: dict[str, type[UpstreamClient]] = {
+    "openpi": OpenPiClient,
+    "openpi-batch": OpenPiBatchClient,
+    "roboarena": RoboArenaClient,
+    "gr00t": GR00TClient,
+    "openvla": OpenVLAClient,
+    "vla_eval": VlaEvalClient,
+    "vlagents": VlagentsClient,
+    "lerobot": LeRobotClient,
+    "xpolicylab": XPolicyLabClient,
+}
+
+
+class LoadedPolicy(BaseModel, extra="forbid"):
+    """What LeRobot's server loads for its client, as the options of LeRobot's `robot_client` state it."""
+
+    policy_type: str = Field(description="e.g. act, smolvla, pi0")
+    pretrained_name_or_path: str = Field(description="of the checkpoint, as the server's machine finds it")
+    actions_per_chunk: int = Field(ge=1, description="rows of a chunk that the server sends, at most")
+    device: str = Field(default="cuda", description="on which the server computes")
+
+    @field_validator("policy_type")
+    @classmethod
+    def _needs_one_observation(cls, value: str) -> str:
+        if value in ("diffusion", "tdmpc", "vqbet"):  # async_inference/policy_server.py, LeRobot 0.4.4 and 0.6.1
+            raise ValueError(
+                f"got {value}, want a policy whose chunk depends on one observation: LeRobot's server asks for a chunk "
+                "without the earlier ones; serve the checkpoint here, with `policy: lerobot`"
+            )
+        return value
+
+
+class UpstreamConfig(BaseModel, extra="forbid"):
+    """Where the other policy server is, how it is asked, and how long it is waited for."""
+
+    protocol: Literal[
+        "openpi", "openpi-batch", "roboarena", "gr00t", "openvla", "vla_eval", "vlagents", "lerobot", "xpolicylab"
+    ]
+    urls: list[str] = Field(
+        min_length=1,
+        max_length=64,
+        description="of servers with the same model, e.g. ws://gpu-box:8000, tcp://gpu-box:5555 (gr00t), "
+        "http://gpu-box:8000 (openvla), grpc://gpu-box:8080 (lerobot); a batch is spread over them",
+    )
+    mapping: str | dict[str, Any] | None = Field(
+        default=None,
+        description="our names of the upstream's keys: a preset's name, or an object, as for dialects; default: the "
+        "protocol's own, except for openpi, whose robots have different keys",
+    )
+    contract: dict[str, Any] = Field(
+        default_factory=dict,
+        description="what is known about the model beyond the mapping, e.g. action: {dim: 7}, chunk",
+    )
+    sessions: Literal["none", "connection"] | None = Field(
+        default=None,
+        description="none: the model keeps nothing between two observations, and connections are shared; connection: a "
+        "session has a connection of its own, and is reset; default: connection for roboarena, vla_eval and xpolicylab",
+    )
+    connections: int = Field(
+        default=1, ge=1, le=64, description="to each URL, over which a batch is spread too; for `sessions: none`"
+    )
+    lerobot: LoadedPolicy | None = Field(default=None, description="what the server loads; for `protocol: lerobot`")
+    timeout_s: float = Field(default=30.0, gt=0, description="for an answer; then the connection counts as lost, s")
+    retry_s: float = Field(
+        default=2.0, ge=0, description="for a lost upstream to return, before a request is answered with 503, s"
+    )
+    connect_timeout_s: float = Field(
+        default=600.0,
+        gt=0,
+        description="for the first upstream to answer at the start, and for LeRobot's server to load, s",
+    )
+    key_env: str | None = Field(
+        default=None, description="name of the environment variable with the upstream's API key"
+    )
+
+    @field_validator("contract")
+    @classmethod
+    def _readable(cls, value: dict[str, Any]) -> dict[str, Any]:
+        try:
+            Contract.from_json(value)
+        except VLAgentsError as error:
+            raise ValueError(str(error)) from error
+        return value
+
+    @model_validator(mode="after")
+    def _fit(self) -> Self:
+        for url in self.urls:
+            parts = urlsplit(url)
+            if parts.scheme not in self.client.schemes or not parts.hostname:
+                want = " or ".join(f"{scheme}://HOST:PORT" for scheme in self.client.schemes)
+                raise ValueError(f"urls: got {url!r}, want {want} for {self.protocol}")
+            if parts.username is not None or parts.password is not None:
+                raise ValueError(
+                    "urls: got a name or a password in one; put the key into a variable, and name it in key_env"
+                )
+        if self.key_env is not None and not self.client.takes_key:
+            raise ValueError(f"key_env: {self.protocol} has no place for a key; remove it")
+        if self.mapping is None and self.client.mapping is None:
+            raise ValueError(
+                f"mapping: {self.protocol} has none of its own; give an object, or a preset, such as openpi-libero for "
+                f"openpi"
+            )
+        if (self.lerobot is not None) is not (self.protocol == "lerobot"):
+            want = "what the server loads" if self.lerobot is None else f"nothing for {self.protocol}"
+            raise ValueError(f"lerobot: want {want}")
+        if self.client.one_client and (
+            self.connections > 1 or self.keeps_sessions or len(set(self.urls)) < len(self.urls)
+        ):
+            raise ValueError(
+                f"{self.protocol}: its server has one client at a time, so that it takes one connection to each URL, "
+                "each URL once, and `sessions: none`; name more servers in urls instead"
+            )
+        if self.client.one_session and self.keeps_sessions and len(self.urls) > 1:
+            raise ValueError(
+                f"{self.protocol}: its server keeps one session, so that `sessions: connection` takes one URL; "
+                "set `sessions: none` if the model keeps nothing between two observations"
+            )
+        self.instructions()
+        return self
+
+    @property
+    def client(self) -> type[UpstreamClient]:
+        return PROTOCOLS[self.protocol]
+
+    @property
+    def keeps_sessions(self) -> bool:
+        """Whether each session has a connection of its own."""
+        return self.client.keeps_sessions if self.sessions is None else self.sessions == "connection"
+
+    def instructions(self) -> PolicyInstructions | None:
+        """Return what LeRobot's server is told; raises `ConfigError` if the mapping does not say all of it."""
+        keys, policy = self.keys(), self.lerobot
+        if policy is None:
+            return None
+        state, cameras = features_of(keys)
+        checkpoint, rows = policy.pretrained_name_or_path, policy.actions_per_chunk
+        return PolicyInstructions(policy.policy_type, checkpoint, state, cameras, rows, policy.device)
+
+    def keys(self) -> KeyMapping:
+        return read_mapping(self.mapping if self.mapping is not None else str(self.client.mapping))
+
 
 UPSTREAM_MS = "upstream_ms"  # in `Act.info`: the time that the upstreams needed for the batch, ms
 
@@ -48,12 +203,7 @@ class Upstream(Agent):
         return contract
 
     def initialize(self) -> None:
-        """Connect to the upstreams, and compare the mapping with what they say about themselves.
-
-        Raises:
-            ContractMismatch: They differ.
-            PolicyUnavailable: None answers in time.
-        """
+        """Connect to the upstreams; raises `ContractMismatch` if their own statements differ from the mapping."""
         key = None
         if (name := self.config.key_env) is not None and not (key := os.environ.get(name)):
             raise ConfigError(f"key_env: the environment variable {name!r} is not set; set it where the replica runs")
@@ -104,7 +254,6 @@ class Upstream(Agent):
         return results
 
     def close(self) -> None:
-        """Close the connections."""
         for connections in (self._lanes, self._sessions):
             if connections is not None:
                 connections.close()
@@ -117,7 +266,6 @@ class Upstream(Agent):
         return list(self._lanes.ask(observations))
 
     def _check(self, client: UpstreamClient, metadata: Mapping[str, Any]) -> None:
-        """Compare the mapping and the contract with what an upstream says about itself."""
         found = client.differences(metadata, self._outgoing)
         stated, chunk = self.config.contract.get("chunk"), client.chunk(metadata)
         if stated is not None and chunk is not None and stated != chunk:

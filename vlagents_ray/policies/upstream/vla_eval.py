@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from vlagents_ray.errors import PolicyUnavailable, VLAgentsError
-from vlagents_ray.policies.upstream.client import Answer, ClientOptions, UpstreamClient, UpstreamSocket
+from vlagents_ray.policies.upstream.client import Answer, ClientOptions, WebSocketClient
 from vlagents_ray.wire import vla_eval
 from vlagents_ray.wire.outgoing import Outgoing
 from vlagents_ray.wire.vla_eval import Message
@@ -18,26 +18,19 @@ from vlagents_ray.wire.vla_eval import Message
 _STATED = ("model_server", "harness_version", "protocol_version", "observation_params", "action_spec")
 
 
-class VlaEvalClient(UpstreamClient):
+class VlaEvalClient(WebSocketClient):
     """A client that says where episodes begin, and asks for one action a step."""
 
     keeps_sessions: ClassVar[bool] = True
     mapping: ClassVar[str | None] = "vla-eval"
-    schemes: ClassVar[tuple[str, ...]] = ("ws", "wss")
 
     def __init__(self, options: ClientOptions) -> None:
         super().__init__(options)
-        headers = {} if options.key is None else {"Authorization": f"Bearer {options.key}"}
-        self._socket = UpstreamSocket(options, headers)
         self._seq = 0
         self._begun = -1  # the number of the last begin of an episode
 
-    @property
-    def is_open(self) -> bool:
-        return self._socket.is_open
-
     def connect(self, timeout_s: float) -> dict[str, Any]:
-        self._socket.open(timeout_s)
+        self.open(timeout_s)
         version = importlib.metadata.version("vlagents-ray")
         try:
             self._send(
@@ -70,9 +63,6 @@ class VlaEvalClient(UpstreamClient):
             raise self.unreadable(sorted(map(str, payload))[:8], "a payload with an array `actions`")
         return [actions]
 
-    def close(self) -> None:
-        self._socket.close()
-
     def differences(self, metadata: Mapping[str, Any], outgoing: Outgoing) -> list[str]:
         params = metadata.get("observation_params")
         wants_state = isinstance(params, dict) and params.get("send_state") is True
@@ -82,13 +72,13 @@ class VlaEvalClient(UpstreamClient):
 
     def _send(self, kind: vla_eval.Kind, payload: dict[str, Any]) -> None:
         self._seq += 1
-        self._socket.send(vla_eval.encode(Message(kind, payload, self._seq)))
+        self.send(vla_eval.encode(Message(kind, payload, self._seq)))
 
     def _answer(self, kind: vla_eval.Kind, timeout_s: float) -> dict[str, Any]:
         """Return the payload of the answer to the last message; older answers are skipped."""
         deadline = time.monotonic() + timeout_s
         while True:
-            data = self._socket.recv(max(0.0, deadline - time.monotonic()))
+            data = self.recv(max(0.0, deadline - time.monotonic()))
             if isinstance(data, str):
                 self.close()
                 raise self.unreadable("a text", "a binary map")

@@ -50,7 +50,7 @@ class VlagentsClient(UpstreamClient):
             self.close()
             if isinstance(error, PolicyUnavailable) and not isinstance(error, ConnectionLost):
                 raise
-            raise PolicyUnavailable(f"upstream {self.options.url}: cannot connect ({error}); is it running?") from error
+            raise self.unreachable(error) from error
 
     def ask(self, observations: Sequence[Mapping[str, Any]]) -> list[Answer]:
         [observation] = observations
@@ -76,10 +76,9 @@ class VlagentsClient(UpstreamClient):
         return value
 
     def _call(self, frame: bytes, deadline: float) -> Any:
-        """Send a request and return the value of its reply."""
         connection = self._socket
         if connection is None:
-            raise ConnectionLost(f"upstream {self.options.url}: the connection is closed")
+            raise self.closed()
         try:
             connection.settimeout(_left(deadline))
             connection.sendall(frame)
@@ -92,9 +91,7 @@ class VlagentsClient(UpstreamClient):
                 if found is not None and found[0] == self._sequence:
                     return found[1]
         except OSError as error:
-            self.close()
-            text = f"no answer within {self.options.timeout_s:g} s" if isinstance(error, TimeoutError) else str(error)
-            raise ConnectionLost(f"upstream {self.options.url}: {text}") from error
+            raise self.lost(error) from error
         except VLAgentsError:
             self.close()  # the place in the stream is lost
             raise

@@ -1,0 +1,174 @@
+"""On which device a worker draws: with fakes of other machines' devices, and for real on this one's."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from vlagents_ray.envs import graphics
+from vlagents_ray.envs.graphics import (
+    EGL_DEVICE,
+    GPUS,
+    EglDevice,
+    Renderer,
+    fitting,
+    require_own,
+)
+from vlagents_ray.envs.render_probe import VulkanDevice, usable_devices
+from vlagents_ray.envs.robosuite import importing_robosuite
+from vlagents_ray.errors import ConfigError, EnvFailed
+
+LLVMPIPE = Renderer("llvmpipe (LLVM 15.0.6, 256 bits)", software=True, cuda=None)
+NVIDIA = Renderer("NVIDIA H200/PCIe/SSE2", software=False, cuda=0)
+OTHERS = Renderer("NVIDIA H200/PCIe/SSE2", software=False, cuda=None)
+# EGL counts otherwise than CUDA, has a device that CUDA does not know, and Mesa's last.
+TWO_GPUS = [
+    EglDevice(0, software=False, cuda=1),
+    EglDevice(1, software=False, cuda=0),
+    EglDevice(2, software=False, cuda=None),
+    EglDevice(3, software=True, cuda=None),
+]
+SUMMARY = """GPU: NVIDIA H200
+  Supported: 1
+  Present:   0
+  cudaId:    0
+GPU: NVIDIA T4
+  Supported: 0
+  cudaId:    1
+GPU: llvmpipe (LLVM 15.0.6, 256 bits)
+  Supported: 1
+  cudaId:    -1
+"""
+
+
+@pytest.fixture(autouse=True)
+def _nothing_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in (GPUS, EGL_DEVICE, "MUJOCO_GL", *graphics.VULKAN_DRIVERS):
+        monkeypatch.setenv(name, "")  # so that what the test sets is undone
+        monkeypatch.delenv(name)
+    monkeypatch.setattr(graphics, "devices", lambda: TWO_GPUS)
+
+
+def chosen(monkeypatch: pytest.MonkeyPatch, visible: str) -> str | None:
+    monkeypatch.setenv(GPUS, visible)
+    graphics.choose_devices()
+    return os.environ.get(EGL_DEVICE)
+
+
+@pytest.mark.parametrize("visible", ["1", "GPU-8c9a", "0,1"])
+def test_a_worker_with_a_gpu_draws_on_what_egl_calls_that_gpu(monkeypatch: pytest.MonkeyPatch, visible: str) -> None:
+    assert chosen(monkeypatch, visible) == "1"
+
+
+@pytest.mark.parametrize("visible", ["", "-1"])
+def test_a_worker_without_a_gpu_draws_in_software(monkeypatch: pytest.MonkeyPatch, visible: str) -> None:
+    assert chosen(monkeypatch, visible) == "3"
+
+
+def test_a_process_that_nobody_gave_or_forbade_gpus_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    graphics.choose_devices()
+    assert EGL_DEVICE not in os.environ
+    monkeypatch.setattr(graphics, "_lavapipe", lambda: Path("/lvp_icd.json"))
+    assert graphics.VULKAN_DRIVERS[0] not in os.environ
+    require_own(OTHERS)
+
+
+def test_vulkan_is_left_with_its_software_driver_where_there_is_no_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(graphics, "_lavapipe", lambda: Path("/lvp_icd.json"))
+    chosen(monkeypatch, "0")
+    assert graphics.VULKAN_DRIVERS[0] not in os.environ
+    chosen(monkeypatch, "")
+    assert os.environ[graphics.VULKAN_DRIVERS[0]] == "/lvp_icd.json"
+
+
+def test_what_the_user_chose_stays_and_is_no_mistake(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(EGL_DEVICE, "0")
+    monkeypatch.setenv(graphics.VULKAN_DRIVERS[1], "/other.json")
+    assert chosen(monkeypatch, "") == "0"
+    assert graphics.VULKAN_DRIVERS[0] not in os.environ
+    require_own(graphics.vulkan_renderer("NVIDIA H200", None))
+
+
+def test_the_nvidia_driver_that_sapien_names_by_itself_is_nobodys_wish(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(GPUS, "")
+    monkeypatch.setenv(graphics.VULKAN_DRIVERS[0], "/venv/sapien/vulkan_library/nvidia_icd.json")
+    with pytest.raises(ConfigError, match="given no GPU"):
+        require_own(graphics.vulkan_renderer("NVIDIA H200", None))
+
+
+def test_where_no_device_fits_none_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(graphics, "devices", lambda: TWO_GPUS[:3])
+    assert chosen(monkeypatch, "") is None
+    assert fitting([EglDevice(0, software=True, cuda=None)], gpu=True) is None
+
+
+def test_drawing_on_a_gpu_that_a_policy_may_use_is_an_error_with_its_cure(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(GPUS, "")
+    require_own(LLVMPIPE)
+    for gpu in (NVIDIA, OTHERS):
+        with pytest.raises(ConfigError, match=r"given no GPU .* renders on 'NVIDIA H200.*worker: \{gpus: 0.25\}"):
+            require_own(gpu)
+
+
+def test_drawing_on_anything_but_the_gpu_that_was_given_is_an_error_with_its_cure(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv(GPUS, "3")
+    require_own(NVIDIA)
+    for other in (LLVMPIPE, OTHERS):
+        with pytest.raises(ConfigError, match=r"given the GPU 3, but its env renders on .*libnvidia-gl"):
+            require_own(other)
+
+
+def test_sapiens_devices_are_read_from_its_summary() -> None:
+    assert usable_devices(SUMMARY) == [
+        VulkanDevice("NVIDIA H200", 0),
+        VulkanDevice("llvmpipe (LLVM 15.0.6, 256 bits)", None),
+    ]
+
+
+def test_robosuite_sees_the_number_that_egl_has_for_the_gpu_while_it_is_imported(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    chosen(monkeypatch, "7")
+    with importing_robosuite("libero"):
+        assert os.environ[GPUS] == os.environ[EGL_DEVICE] == "1"
+    assert os.environ[GPUS] == "7"
+
+
+def test_libero_without_a_gpu_and_without_software_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MUJOCO_GL", "egl")
+    monkeypatch.setenv(GPUS, "")
+    with pytest.raises(EnvFailed, match="no EGL device that renders in software"), importing_robosuite("libero"):
+        pass
+
+
+DRAW = """
+from vlagents_ray.envs import make_env
+from vlagents_ray.envs import graphics
+assert graphics.drawing() is None
+with make_env("gymnasium/Hopper-v5") as env:
+    env.reset(seed=0)
+    renderer = env.renderer()
+    assert renderer is not None and renderer.software, renderer
+    graphics.require_own(renderer)
+    print(renderer.name)
+"""
+
+
+@pytest.mark.skipif(importlib.util.find_spec("mujoco") is None, reason="mujoco is not installed")
+def test_mujoco_without_a_gpu_really_draws_in_software() -> None:
+    child = subprocess.run(
+        [sys.executable, "-c", DRAW],
+        env=os.environ | {GPUS: "", "PYTHONPATH": os.pathsep.join(sys.path)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert child.returncode == 0, child.stderr
+    assert child.stdout.splitlines()[-1].startswith(("llvmpipe", "softpipe"))

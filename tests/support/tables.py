@@ -1,0 +1,98 @@
+"""The tables of README and docs/ about policies and environments: `python tests/support/tables.py` writes them.
+
+They are made from the registry, and lie between `<!-- table: NAME -->` and `<!-- /table -->`. So are the pages in the
+navigation of mkdocs.yml.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from vlagents_ray.registry import ENVS, POLICIES, WRAPPERS, Adapter
+
+ROOT = Path(__file__).parents[2]
+
+
+def _listed(adapters: dict[str, Adapter]) -> Iterator[tuple[str, Adapter]]:
+    return ((name, one) for name, one in adapters.items() if one.about)
+
+
+def _link(name: str, text: str, one: Adapter, folder: str) -> str:
+    page = name if one.page is None else one.page
+    file, at, anchor = page.partition("#")
+    return f"[{text}]({folder}{file}.md{at}{anchor})" if page else text
+
+
+def _code(words: Iterable[str]) -> str:
+    return ", ".join(f"`{word}`" for word in words)
+
+
+def policies(folder: str = "") -> Iterator[str]:
+    """Yield the rows of the policies; `folder` leads to docs/policies."""
+    yield from ("| policy | models | source |", "|---|---|---|")
+    for name, one in _listed(POLICIES):
+        source = f"a checkout, {_code(one.checkouts)}" if one.checkouts else "PyPI"
+        yield f"| {_link(name, f'`{name}`', one, folder)} | {one.about} | {one.wants or source} |"
+
+
+def environments(folder: str = "") -> Iterator[str]:
+    """Yield the rows of the environments; `folder` leads to docs/benchmarks."""
+    yield from ("| environment | tasks | wants |", "|---|---|---|")
+    for name, one in _listed(ENVS):
+        packages = [f"`'.[{one.extra}]'`"] if one.extra else []
+        packages += [f"`requirements/{file}.txt`" for file in one.requirements]
+        wants = "; ".join(filter(None, (" or ".join(packages), one.wants)))
+        yield f"| {_link(name, f'`{name}{one.tasks}`', one, folder)} | {one.about} | {wants}".rstrip() + " |"
+
+
+_OWN_POLICY = "a class with `initialize`, `reset` and `act` | `vlagents-ray new policy NAME`"
+_OWN_ENV = "a subclass of `EvalEnv` | `vlagents-ray new env NAME`"
+TABLES: dict[str, dict[str, list[str]]] = {
+    "README.md": {
+        "policies": [
+            *policies("docs/policies/"),
+            f"| [your own](docs/own_policy.md) | {_OWN_POLICY} |",
+        ],
+        "environments": [
+            *environments("docs/benchmarks/"),
+            f"| [your own](docs/benchmarks/index.md#an-environment-of-your-own) | {_OWN_ENV} |",
+        ],
+    },
+    "docs/policies/index.md": {"policies": list(policies())},
+    "docs/benchmarks/index.md": {"environments": list(environments())},
+}
+
+
+def with_tables(file: str, text: str) -> str:
+    """Return the text of a page with its tables, or that of mkdocs.yml with the pages of the adapters."""
+    if file == "mkdocs.yml":
+        for folder, kinds in (("policies", (POLICIES, WRAPPERS)), ("benchmarks", (ENVS,))):
+            found = dict.fromkeys(page_of(name, one) for kind in kinds for name, one in _listed(kind))
+            pages = "".join(f"          - {folder}/{page}.md\n" for page in found if page)
+            index = f"          - {folder}/index.md\n"
+            text = re.sub(f"{index}(?:          - {folder}/.*\n)*", lambda _, new=index + pages: new, text)
+        return text
+    for name, rows in TABLES[file].items():
+        begin, end = f"<!-- table: {name} -->", "<!-- /table -->"
+        if text.count(begin) != 1:
+            raise ValueError(f"{file}: want {begin} once, and {end} after its table")
+        new = "\n".join([begin, *rows, end])
+        text = re.sub(f"{begin}.*?{end}", lambda _, new=new: new, text, flags=re.DOTALL)
+    return text
+
+
+def page_of(name: str, one: Adapter) -> str:
+    """Return the name of an adapter's page; empty if it has none."""
+    return name if one.page is None else one.page.partition("#")[0]
+
+
+def main() -> None:
+    for file in (*TABLES, "mkdocs.yml"):
+        path = ROOT / file
+        path.write_text(with_tables(file, path.read_text()))
+
+
+if __name__ == "__main__":
+    main()

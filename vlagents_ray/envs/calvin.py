@@ -1,0 +1,398 @@
+"""CALVIN: five tasks one after another, told in words, at a table with drawer, sliding door, lights and blocks.
+
+with Calvin("D") as env:
+    obs, _ = env.reset(seed=0)
+    obs, reward, terminated, truncated, info = env.step(Act(action=np.array([0, 0, 0, 0, 0, 0, 1], np.float32)))
+"""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import copy
+import functools
+import importlib
+import io
+import itertools
+import logging
+import math
+import multiprocessing
+import os
+import sys
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+
+from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
+from vlagents_ray.envs import graphics
+from vlagents_ray.envs.graphics import EGL_DEVICE, Renderer
+from vlagents_ray.envs.render_probe import EGL_CURE, without
+from vlagents_ray.envs.simulator import BenchmarkProtocol, SimulatorEnv
+from vlagents_ray.errors import ConfigError, EnvFailed, NotReset
+from vlagents_ray.interface import Obs
+from vlagents_ray.ray_tools.git_state import code_in
+from vlagents_ray.registry import require
+
+NUMBER = 1000
+_LENGTH = 5
+_EVALUATION = Path("calvin_models/calvin_agent/evaluation")
+_FNV_PRIME = 0x01000193
+
+
+@dataclass(frozen=True, slots=True)
+class Chain:
+    """What an episode consists of."""
+
+    tasks: tuple[str, ...]  # CALVIN's names, e.g. "open_drawer"
+    robot: np.ndarray  # (15,) its `robot_obs`
+    scene: np.ndarray  # (24,) its `scene_obs`
+
+
+class Chains:
+    """The chains by their number, as `get_sequences(1000)` orders them.
+
+    CALVIN draws tasks at random until enough of the draws can be done one after another, for each of 192 initial states
+    with a seed of its own. That takes minutes for all; here the draws of a state are made when one of its chains is
+    asked for.
+    """
+
+    def __init__(self, checkout: Path) -> None:
+        evaluation = checkout / _EVALUATION
+        utils = _definitions(
+            evaluation / "utils.py",
+            contextlib=contextlib,
+            logging=logging,
+            np=np,
+            pi=math.pi,
+            pyhash=SimpleNamespace(fnv1_32=lambda: fnv1_32),
+        )
+        self._state_of = utils["get_env_state_for_initial_condition"]
+        self._rules = rules = _definitions(
+            evaluation / "multistep_sequences.py",
+            ProcessPoolExecutor=_Places,
+            deepcopy=copy.deepcopy,
+            functools=functools,
+            logging=logging,
+            multiprocessing=multiprocessing,
+            np=np,
+            product=itertools.product,
+            temp_seed=utils["temp_seed"],
+        )
+        self._order: list[tuple[Mapping[str, Any], tuple[int, int]]] = rules["get_sequences"](NUMBER)
+        self._drawn: dict[int, tuple[np.random.RandomState, list[tuple[str, ...]]]] = {}
+
+    def __getitem__(self, number: int) -> Chain:
+        state, (seed, place) = self._order[number]
+        names, check = list(self._rules["tasks"]), self._rules["check_sequence"]
+        random, found = self._drawn.setdefault(seed, (np.random.RandomState(seed), []))
+        while len(found) <= place:
+            drawn = tuple(names[i] for i in random.permutation(len(names))[:_LENGTH])  # as `choice` without replacement
+            if check(state, drawn):
+                found.append(drawn)
+        return Chain(found[place], *self._state_of(state))
+
+
+class _Places:
+    """Stands for the pool of processes: in place of a state's chains it returns the seed and the place of each."""
+
+    def __init__(self, max_workers: int) -> None:
+        pass
+
+    def __enter__(self) -> _Places:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def map(self, _: Callable[..., Any], jobs: Iterable[tuple[Any, int, int]]) -> list[list[np.ndarray]]:
+        return [[np.array([seed, place]) for place in range(count)] for _, count, seed in jobs]
+
+
+def fnv1_32(text: str) -> int:
+    """Return pyhash's FNV-1, which begins with 0."""
+    found = 0
+    for byte in text.encode():
+        found = (found * _FNV_PRIME % 2**32) ^ byte
+    return found
+
+
+def _definitions(path: Path, **given: Any) -> dict[str, Any]:
+    """Execute a module of the checkout without its imports, whose names are `given`."""
+    tree = ast.parse(path.read_text(encoding="utf-8"), str(path))
+    tree.body = [node for node in tree.body if not isinstance(node, ast.Import | ast.ImportFrom)]
+    names = {"__name__": path.stem, **given}
+    exec(compile(tree, str(path), "exec"), names)  # noqa: S102 - it is the simulator's code, which is run in any case
+    return names
+
+
+VARIABLE = "CALVIN_SRC"
+_CURE = (
+    f"git clone --recurse-submodules https://github.com/mees/calvin, and name that folder in {VARIABLE} on every node, "
+    f"or as the env's option `source_dir`"
+)
+RendererName = Literal["egl", "tiny"]
+_PACKAGE, _CONF = Path("calvin_env"), Path("calvin_env/conf")
+_TASKS = Path("calvin_models/conf/callbacks/rollout/tasks/new_playtable_tasks.yaml")
+_WORDS = Path("calvin_models/conf/annotations/new_playtable_validation.yaml")
+SCENES = ("A", "B", "C", "D")
+TASKS, STEPS = 5, 360  # tasks of an episode, and the steps for each: evaluate_policy.py, EP_LEN
+PROTOCOL = BenchmarkProtocol(
+    name="CALVIN",
+    source="Mees et al. 2022, arXiv 2112.03227; calvin_agent/evaluation/evaluate_policy.py at fa03f01",
+    max_steps=TASKS * STEPS,
+    control_hz=30.0,
+    control="pose of the tool, relative: 0.02 m and 0.05 rad a unit, added to the last target",
+    success="the fifth task is solved, each within 360 steps and after the one before",
+    begins="one of 1000 chains of five tasks, with its initial state; the arm in one pose",
+    ends_on_success=True,
+    episodes=NUMBER,
+)
+_CAMERAS = {"static": CameraSpec(200, 200), "gripper": CameraSpec(84, 84)}
+_STATE = {  # parts of CALVIN's `robot_obs`, (15,), in order; its last number is the gripper's command
+    "tcp_pos": StateSpec(3, "m"),
+    "tcp_orn": StateSpec(3, "rad"),
+    "gripper_opening_width": StateSpec(1, "m"),
+    "robot_joints": StateSpec(7, "rad"),
+}
+CONTRACT = Contract(
+    cameras=_CAMERAS,
+    state=_STATE,
+    gripper=True,
+    instruction=True,
+    action=ActionSpec(dim=7, space="ee_pose", delta=True, rotation="euler_xyz", gripper_open=1.0, gripper_closed=-1.0),
+    control_hz=PROTOCOL.control_hz,
+)
+
+
+class Calvin(SimulatorEnv):
+    """One scene of CALVIN, "A" to "D", in which an episode is a chain of five tasks.
+
+    Observation: cameras `static`, 200x200, and `gripper`, 84x84; in `state`, in the world's frame, `tcp_pos` (3,) m and
+    `tcp_orn` (3,) rad of the tool, x-y-z angles about fixed axes, `gripper_opening_width` (1,) m, and `robot_joints`
+    (7,) rad; `gripper` is the last command, 1 = open.
+
+    Action: (7,): the tool's target moves by 0.02 m a unit along the world's axes, and its angles by 0.05 rad a unit;
+    the last is the gripper, 1 opens, -1 closes, and only its sign counts.
+
+    The reward is 1 in the step that solves a task. Its sum over an episode is the number of tasks solved in a row,
+    whose mean is CALVIN's average length. The episode ends with the fifth task, or with one that takes too long.
+    `info["tasks"]` are CALVIN's names of the chain, `info["solved"]` says how many are solved.
+    """
+
+    suite = "calvin"
+    _contract = CONTRACT
+    several_tasks = True
+    init_states = NUMBER
+    _open: ClassVar[str | None] = None  # upstream's code takes the process's only simulation for its own
+
+    def __init__(
+        self,
+        task: str = "D",
+        *,
+        task_steps: int = STEPS,
+        renderer: RendererName = "egl",
+        source_dir: str | None = None,
+    ) -> None:
+        """Make the environment; raises the errors of `make_env`, `ConfigError` also if this process has one open.
+
+        Args:
+            task: The scene.
+            task_steps: The steps that each task of a chain may take.
+            renderer: "egl" draws as upstream does; "tiny" is PyBullet's own in software, with other light and shadows.
+            source_dir: A checkout of CALVIN with its submodules; None is that of CALVIN_SRC.
+        """
+        self.require_task(task)
+        super().__init__(f"calvin/{task}", task_steps=task_steps)
+        if renderer not in ("egl", "tiny"):
+            raise ConfigError(f"{self._name}: renderer is {renderer!r}, want egl or tiny")
+        if Calvin._open is not None:
+            raise ConfigError(f"{self._name}: {Calvin._open} is open in this process, want one at a time; close it")
+        self._renderer, self._checkout = renderer, find_checkout(source_dir)
+        self._task_steps, self.max_steps = task_steps, TASKS * task_steps
+        with self._making():
+            self._env = make_simulator(self._checkout, task, renderer)
+            Calvin._open = self._name
+            self._resources.callback(self._free, self._env)
+            self._judge, self._words = read_tasks(self._checkout)
+            self._chains = Chains(self._checkout)
+        self._chain: Chain | None = None
+        self._done = 0  # tasks
+        self._task_step = 0  # steps of the present task
+        self._before: dict[str, Any] = {}  # CALVIN's information on the state in which the present task began
+
+    @classmethod
+    def known_contract(cls, arguments: Mapping[str, Any]) -> Contract:  # noqa: ARG003 - it is the same in each scene
+        return CONTRACT
+
+    @property
+    def instruction(self) -> str:
+        """The words of CALVIN's evaluation for the present task."""
+        return self._words[self._playing().tasks[min(self._done, TASKS - 1)]]
+
+    @classmethod
+    def tasks(cls) -> list[str]:
+        return list(SCENES)
+
+    @classmethod
+    def missing(cls) -> str | None:
+        cure = "run `vlagents-ray env make requirements/calvin.txt` and give the evaluation's workers that Python"
+        if lacks := without(("pybullet", "hydra", "gym", "git", "quaternion"), cure):
+            return lacks
+        try:
+            find_checkout(None)
+        except ConfigError as error:
+            return str(error)
+        return (
+            None
+            if graphics.devices()
+            else f"CALVIN finds no EGL device; {EGL_CURE}, or set the option renderer to tiny"
+        )
+
+    def renderer(self) -> Renderer | None:
+        return super().renderer() if self._renderer == "egl" else None
+
+    def describe(self) -> dict[str, Any]:
+        protocol = PROTOCOL.describe(max_steps=self.max_steps)
+        if self._renderer != "egl":
+            protocol["deviations"].append(f"renderer: {self._renderer}, upstream draws by OpenGL")
+        code = {name: code_in(self._checkout / name) for name in (".", "calvin_env")}
+        return {
+            "simulator": "calvin",
+            "task": self._name.partition("/")[2],
+            "pybullet": version("pybullet"),
+            "code": {name: state.to_json() for name, state in code.items() if state is not None},
+            "renderer": self._renderer,
+            "protocol": protocol,
+        }
+
+    def _begin(self, seed: int, state: int) -> tuple[Obs, dict[str, Any]]:
+        env = self._env
+        with quietly():
+            chain = self._chains[state]
+            env.load()  # or contacts of the last episode would shift the next one
+            env.robot.gripper_action = 1
+            env.reset(robot_obs=chain.robot, scene_obs=chain.scene)
+            self._before = env.get_info()
+        self._chain, self._done, self._task_step = chain, 0, 0
+        return self._observe(look=True), self._info()
+
+    def _advance(self, action: np.ndarray) -> tuple[Obs, float, bool, dict[str, Any]]:
+        """The reward is 1 in the step that solves a task; a task that takes too long ends the chain."""
+        env, chain = self._env, self._playing()
+        if self._ended():
+            raise NotReset(f"{self._name}: step after the end of the chain; call reset(seed=...) first")
+        command = action.astype(np.float64)
+        command[-1] = 1.0 if command[-1] > 0 else -1.0
+        env.robot.apply_action(command)  # as upstream's `step`, which also renders
+        for _ in range(env.action_repeat):
+            env.p.stepSimulation(physicsClientId=env.cid)
+        env.scene.step()
+        now = env.get_info()
+        solved = bool(self._judge.get_task_info_for_set(self._before, now, {chain.tasks[self._done]}))
+        self._task_step += 1
+        if solved:
+            self._done, self._task_step, self._before = self._done + 1, 0, now
+        return self._observe(look=self.looked_at or solved), float(solved), self._ended(), self._info()
+
+    def _ended(self) -> bool:
+        return self._done == TASKS or self._task_step >= self._task_steps
+
+    def _free(self, env: Any) -> None:
+        Calvin._open, self._chain = None, None
+        with quietly():
+            env.close()
+            env.ownsPhysicsClient = False  # it would be closed again by `__del__`
+
+    def _observe(self, *, look: bool) -> Obs:
+        env = self._alive()
+        robot, _ = env.robot.get_observation()
+        parts = np.split(robot[:14].astype(np.float32), np.cumsum([spec.dim for spec in _STATE.values()])[:-1])
+        cameras = {}
+        if look:
+            cameras = {one.name: np.ascontiguousarray(one.render()[0], np.uint8) for one in env.cameras}
+        return Obs(cameras, 1.0 if robot[14] > 0 else 0.0, dict(zip(_STATE, parts, strict=True)))
+
+    def _info(self) -> dict[str, Any]:
+        return {
+            "success": self._done == TASKS,
+            "solved": self._done,
+            "tasks": list(self._playing().tasks),
+        }
+
+    def _playing(self) -> Chain:
+        if self._chain is None:
+            raise NotReset(f"{self._name}: step before reset; call reset(seed=...) first")
+        return self._chain
+
+
+def find_checkout(chosen: str | None) -> Path:
+    """Return the checkout of CALVIN, `chosen` or that of CALVIN_SRC; raises `ConfigError` if it is none."""
+    named = chosen or os.environ.get(VARIABLE)
+    if not named:
+        raise ConfigError(f"calvin: {VARIABLE} is not set; {_CURE}")
+    checkout = Path(named).expanduser().resolve()
+    lacks = [str(part) for part in (_CONF, _TASKS, _WORDS) if not (checkout / part).exists()]
+    if lacks:
+        raise ConfigError(f"calvin: {checkout} lacks {lacks}, want a checkout of CALVIN with its submodules; {_CURE}")
+    return checkout
+
+
+def make_simulator(checkout: Path, scene: str, renderer: RendererName) -> Any:
+    """Make CALVIN's `PlayTableSimEnv` of a scene, with the cameras, arm and rates of its datasets."""
+    folder = str(checkout / _PACKAGE)
+    if folder not in sys.path:
+        sys.path.insert(0, folder)
+    if device := os.environ.get(EGL_DEVICE):
+        os.environ.setdefault("EGL_VISIBLE_DEVICES", device)
+    with quietly():
+        require("pybullet")
+        hydra, omegaconf = require("hydra"), require("omegaconf").OmegaConf
+        code: Any = importlib.import_module("calvin_env.envs.play_table_env")
+        code.get_git_commit_hash = lambda _: ""  # which wants a repository
+        parts = {
+            "env": "env/play_table_env",
+            "scene": f"scene/calvin_scene_{scene}",
+            "arm": "robot/panda",
+            "fingers": "robot/panda_longer_finger",
+            "static": "cameras/cameras/static",
+            "gripper": "cameras/cameras/gripper",
+        }
+        read = {name: omegaconf.load(checkout / _CONF / f"{path}.yaml") for name, path in parts.items()}
+        read["fingers"].pop("defaults")  # the arm, which hydra would merge
+        settings = omegaconf.create(
+            {
+                "data_path": "data",
+                "use_vr": False,
+                "env": read["env"],
+                "scene": read["scene"],
+                "robot": omegaconf.merge(read["arm"], read["fingers"]),
+                "cameras": {"static": read["static"], "gripper": read["gripper"]},
+            }
+        )
+        try:
+            return hydra.utils.instantiate(settings.env, use_scene_info=True, use_egl=renderer == "egl")
+        except SystemExit as error:  # PyBullet could not load its plug-in, which it has printed
+            raise EnvFailed(f"calvin: PyBullet cannot draw through EGL; {EGL_CURE}, or set renderer to tiny") from error
+
+
+def read_tasks(checkout: Path) -> tuple[Any, dict[str, str]]:
+    """Return CALVIN's judge of tasks, `Tasks`, and the words of each task in its evaluation."""
+    hydra, omegaconf = require("hydra"), require("omegaconf").OmegaConf
+    with quietly():
+        judge = hydra.utils.instantiate(omegaconf.load(checkout / _TASKS))
+    return judge, {task: texts[0] for task, texts in omegaconf.load(checkout / _WORDS).items()}
+
+
+@contextlib.contextmanager
+def quietly() -> Iterator[None]:
+    """Keep what upstream's code prints and warns of, such as gym's end, off the terminal; errors are raised."""
+    nowhere = io.StringIO()
+    with contextlib.redirect_stdout(nowhere), contextlib.redirect_stderr(nowhere), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield

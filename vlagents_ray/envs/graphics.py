@@ -1,0 +1,214 @@
+"""Which device renders an env's images: EGL's devices, their numbers in CUDA, and a check that the chosen one is used.
+
+Ray sets CUDA_VISIBLE_DEVICES to the GPU of a worker, but neither EGL nor Vulkan reads it: each would take its first
+device, which may be the GPU that a policy uses. So the device is chosen here. Nothing is chosen in a process without
+CUDA_VISIBLE_DEVICES.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from vlagents_ray.errors import ConfigError
+
+_MOST = 64  # devices
+_EXTENSIONS = 0x3055
+_DEVICE = 0x322C  # of a display
+_CUDA_DEVICE = 0x323A
+_GL_RENDERER = 0x1F01
+_SOFTWARE = "EGL_MESA_device_software"
+_CUDA = "EGL_NV_device_cuda"
+_Value = ctypes.c_ssize_t  # EGLAttrib
+
+
+@dataclass(frozen=True, slots=True)
+class EglDevice:
+    """A device of EGL."""
+
+    number: int  # in EGL's own order, which is that of MUJOCO_EGL_DEVICE_ID
+    software: bool
+    cuda: int | None  # its number among the CUDA devices that this process may use; None if CUDA does not know it
+
+
+@dataclass(frozen=True, slots=True)
+class Drawing:
+    """The device and driver of an OpenGL context."""
+
+    renderer: str  # the driver's name of it: "llvmpipe (LLVM 15.0.6, 256 bits)"
+    device: EglDevice
+
+
+def devices() -> list[EglDevice]:
+    """List all devices in EGL's order; empty if EGL is missing, or too old."""
+    functions = _functions()
+    return [] if functions is None else [device for _, device in functions.devices()]
+
+
+def drawing() -> Drawing | None:
+    """Return the device of the current OpenGL context of this thread; None if there is none, or it is not EGL's."""
+    functions = _functions()
+    display = None if functions is None else functions.library.eglGetCurrentDisplay()
+    if functions is None or not display:
+        return None
+    handle = functions.value(functions.display_attribute, display, _DEVICE)
+    device = next((device for pointer, device in functions.devices() if pointer == handle), None)
+    name = functions.gl_string(_GL_RENDERER)
+    return None if device is None or name is None else Drawing(name.decode(errors="replace"), device)
+
+
+class _Functions:
+    """The functions of EGL that are used here; raises `AttributeError` or `OSError` if one is missing."""
+
+    def __init__(self) -> None:
+        self.library = ctypes.CDLL("libEGL.so.1")
+        self.library.eglGetProcAddress.restype = ctypes.c_void_p
+        self.library.eglGetProcAddress.argtypes = [ctypes.c_char_p]
+        self.library.eglGetCurrentDisplay.restype = ctypes.c_void_p
+        pointers, whole = ctypes.POINTER(ctypes.c_void_p), ctypes.POINTER(ctypes.c_int)
+        self._query = self._extension("eglQueryDevicesEXT", ctypes.c_uint, ctypes.c_int, pointers, whole)
+        self._text = self._extension("eglQueryDeviceStringEXT", ctypes.c_char_p, ctypes.c_void_p, ctypes.c_int)
+        asking = (ctypes.c_uint, ctypes.c_void_p, ctypes.c_int, ctypes.POINTER(_Value))
+        self._attribute = self._extension("eglQueryDeviceAttribEXT", *asking)
+        self.display_attribute = self._extension("eglQueryDisplayAttribEXT", *asking)
+        self.gl_string = self._extension("glGetString", ctypes.c_char_p, ctypes.c_uint)
+
+    def devices(self) -> list[tuple[int | None, EglDevice]]:
+        handles, number = (ctypes.c_void_p * _MOST)(), ctypes.c_int()
+        if not self._query(_MOST, handles, ctypes.byref(number)):
+            return []
+        return [(handles[i], self._device(i, handles[i])) for i in range(number.value)]
+
+    def value(self, ask: Callable[..., int], of: int | None, what: int) -> int | None:
+        """Return the value of an attribute; None if it has none."""
+        found = _Value(-1)
+        return found.value if ask(of, what, ctypes.byref(found)) and found.value >= 0 else None
+
+    def _device(self, number: int, handle: int | None) -> EglDevice:
+        extensions = (self._text(handle, _EXTENSIONS) or b"").decode().split()
+        cuda = self.value(self._attribute, handle, _CUDA_DEVICE) if _CUDA in extensions else None
+        return EglDevice(number, _SOFTWARE in extensions, cuda)
+
+    def _extension(self, name: str, result: Any, *arguments: Any) -> Any:
+        address = self.library.eglGetProcAddress(name.encode())
+        if not address:
+            raise AttributeError(name)
+        return ctypes.CFUNCTYPE(result, *arguments)(address)
+
+
+def _functions() -> _Functions | None:
+    try:
+        return _Functions()
+    except (OSError, AttributeError):
+        return None
+
+
+GPUS = "CUDA_VISIBLE_DEVICES"
+EGL_DEVICE = "MUJOCO_EGL_DEVICE_ID"
+VULKAN_DRIVERS = ("VK_ICD_FILENAMES", "VK_DRIVER_FILES")  # the first is also read by the old loader that SAPIEN brings
+_ICD_FOLDERS = ("/usr/local/share/vulkan/icd.d", "/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d")
+_SAPIENS_OWN = "sapien/vulkan_library/"  # of NVIDIA's driver, which it names where it finds no other
+_SOFTWARE_VULKAN = "llvmpipe"  # how lavapipe names its device
+
+SHARE = "worker: {gpus: 0.25}, or --worker-gpus 0.25, gives each worker a part of a GPU"
+_CURE_HIDDEN = (
+    f"{SHARE}; to render in software install Mesa's drivers (libegl1 libgl1-mesa-dri mesa-vulkan-drivers) on that node"
+)
+_CURE_OWN = (
+    "install the NVIDIA driver's graphics part on that node (libnvidia-gl; in a container "
+    "NVIDIA_DRIVER_CAPABILITIES=all), or leave worker.gpus at 0 to render in software; if it is intended, set "
+    f"render_backend in env_options (ManiSkill) or {EGL_DEVICE} in worker.runtime_env.env_vars"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Renderer:
+    """The device that renders an env's images."""
+
+    name: str  # the driver's name of it: "llvmpipe (LLVM 15.0.6, 256 bits)", "NVIDIA H200/PCIe/SSE2"
+    software: bool
+    cuda: int | None  # its number among the CUDA devices that this process may use; None if CUDA does not know it
+    asked_for: bool = False  # the environment names this very device
+
+
+def has_gpu() -> bool | None:
+    """Whether this process was given a GPU; None if that is not stated."""
+    visible = os.environ.get(GPUS)
+    return None if visible is None else visible.strip() not in ("", "-1")
+
+
+def fitting(devices: Sequence[EglDevice], *, gpu: bool) -> EglDevice | None:
+    """Return the device to render on: CUDA's first one, or the software device without `gpu`; None if there is none."""
+    if gpu:
+        return min((one for one in devices if one.cuda is not None), key=lambda one: one.cuda or 0, default=None)
+    return next((one for one in devices if one.software), None)
+
+
+def prepare_rendering() -> None:
+    """Set what drivers and simulators read when they are loaded, for rendering without a display on shared cores.
+
+    Variables set by the user are kept. Call it before any simulator is imported: ManiSkill also imports MuJoCo, which
+    chooses its OpenGL then and for good.
+    """
+    os.environ.setdefault("LP_NUM_THREADS", "1")  # Mesa's software drivers take all cores otherwise
+    if not os.environ.get("MUJOCO_GL") and not os.environ.get("DISPLAY") and _has_egl():
+        os.environ["MUJOCO_GL"] = "egl"
+    choose_devices()
+
+
+def choose_devices() -> None:
+    """Set the variables that select the devices, before libraries are loaded; variables set by the user are kept."""
+    gpu = has_gpu()
+    if gpu is None:
+        return
+    if EGL_DEVICE not in os.environ and (device := fitting(devices(), gpu=gpu)) is not None:
+        os.environ[EGL_DEVICE] = str(device.number)
+    if not gpu and not any(os.environ.get(name) for name in VULKAN_DRIVERS) and (driver := _lavapipe()) is not None:
+        os.environ[VULKAN_DRIVERS[0]] = str(driver)
+
+
+def opengl_renderer() -> Renderer | None:
+    """Return the renderer of this thread's OpenGL context; None if there is none, or it is not EGL's."""
+    found = drawing()
+    if found is None:
+        return None
+    named = os.environ.get(EGL_DEVICE) == str(found.device.number)
+    return Renderer(found.renderer, found.device.software, found.device.cuda, named)
+
+
+def vulkan_renderer(name: str, cuda: int | None, *, asked_for: bool = False) -> Renderer:
+    """Return the renderer for the device that SAPIEN uses; `asked_for` says that the env's options named it."""
+    files = filter(None, map(os.environ.get, VULKAN_DRIVERS))
+    named = has_gpu() is False and any(_SAPIENS_OWN not in file for file in files)
+    return Renderer(name, name.startswith(_SOFTWARE_VULKAN), cuda, asked_for or named)
+
+
+def require_own(renderer: Renderer) -> None:
+    """Raise `ConfigError` if it is not the GPU that this process was given, or a GPU although it was given none."""
+    gpu = has_gpu()
+    if gpu is None or renderer.asked_for or (renderer.cuda is not None if gpu else renderer.software):
+        return
+    if gpu:
+        raise ConfigError(
+            f"the worker was given the GPU {os.environ[GPUS]}, but its env renders on {renderer.name!r}; {_CURE_OWN}"
+        )
+    raise ConfigError(
+        f"the worker was given no GPU (worker.gpus: 0), but its env renders on {renderer.name!r}, which a policy may "
+        f"be using; {_CURE_HIDDEN}"
+    )
+
+
+def _lavapipe() -> Path | None:
+    return next((path for folder in _ICD_FOLDERS for path in sorted(Path(folder).glob("lvp_icd*.json"))), None)
+
+
+def _has_egl() -> bool:
+    try:
+        ctypes.CDLL("libEGL.so.1")  # without it `MUJOCO_GL=egl` makes `import mujoco` fail
+    except OSError:
+        return False
+    return True

@@ -1,0 +1,449 @@
+"""RCS, the Robot Control Stack, in MuJoCo, and DuoBench, the benchmark for two arms that is built on it.
+
+Both need packages that contradict the simulators of this package's extras, and RCS is AGPL-3: they
+need a separate Python environment, requirements/rcs.txt. See docs/benchmarks/rcs.md.
+"""
+
+from __future__ import annotations
+
+import copy
+import importlib.util
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+
+from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, Rotation, StateSpec
+from vlagents_ray.envs.base import require_known
+from vlagents_ray.envs.gymnasium.view import plain
+from vlagents_ray.envs.simulator import BenchmarkProtocol, SimulatorEnv, Size, require_cameras
+from vlagents_ray.errors import ConfigError, MissingDependency, UnknownEnv
+from vlagents_ray.interface import HIGH_RES, Obs
+from vlagents_ray.registry import require
+
+ControlMode = Literal["joints", "xyzrpy", "tquat"]
+
+
+@dataclass(frozen=True, slots=True)
+class RcsTask:
+    """The settings that make a task of a scene which RCS has registered with Gymnasium."""
+
+    id: str  # Gymnasium's id of the scene
+    module: str | None  # module that registers it; None if the user names it
+    protocol: BenchmarkProtocol | None = None  # None: the user sets `max_steps`
+    control_mode: ControlMode = "joints"  # of an action, absolute by default
+    control_hz: float = 30.0
+    instruction: str = ""  # used if the simulator's info has none
+    prepare: Callable[[Any], None] = lambda _config: None  # puts the task into RCS's configuration of a scene without
+
+
+def _pick(config: Any) -> None:
+    config.task_cfg = require("rcs.envs.tasks").PickTaskConfig(robot_name=next(iter(config.robot_cfgs)))
+
+
+RCS_TASKS = {
+    "pick": RcsTask(
+        id="rcs/fr3",
+        module="rcs.envs.configs",
+        protocol=BenchmarkProtocol(
+            name="RCS pick",
+            source="rcs-core 0.7.3, rcs/envs/tasks.py, for the task; it states neither rate nor step limit: ours",
+            max_steps=300,
+            control_hz=30.0,
+            control="tquat",
+            success="the cuboid's middle is 7.8 cm or more above the robot's base, and the gripper is neither open "
+            "nor closed",
+            begins="the cuboid's place in a square of 20 cm, 50 cm in front of the robot, and its turn: the seed's",
+            ends_on_success=True,
+        ),
+        control_mode="tquat",
+        instruction="pick up the green cuboid",
+        prepare=_pick,
+    )
+}
+
+_DUOBENCH = BenchmarkProtocol(
+    name="DuoBench",
+    source="DuoBench 0.1.2, README, 'Evaluation Environment' (arXiv 2606.11901); it states no step limit: ours",
+    max_steps=900,
+    control_hz=30.0,
+    control="joints",
+    success="the task's last stage has been reached; stages are not lost again",
+    begins="where the objects are: the seed's",
+    ends_on_success=True,
+)
+_DUOBENCH_NAMES = (
+    "ball_maze",
+    "bin_sort",
+    "block_balance",
+    "carry_pot",
+    "hinge_chest",
+    "join_blocks",
+    "pour_marbles",
+    "spring_door",
+    "transfer_cube",
+    "transfer_gate",
+    "transfer_reorient",
+)
+DUOBENCH_TASKS = {
+    name: RcsTask(id=f"duobench/{name}", module=f"duobench.tasks.{name}", protocol=_DUOBENCH)
+    for name in _DUOBENCH_NAMES
+}
+
+
+RECORD = "record/"  # before a camera's name: its view for the record
+
+# Where this one is not, `import rcs` and `import duobench` download all assets (rcs-core 0.7.3, rcs/__init__.py).
+_REQUIRED = Path("assets/scenes/empty_world/scene.xml")
+
+
+@dataclass(frozen=True, slots=True)
+class _Assets:
+    """The location of a package's assets, and their download."""
+
+    variable: str  # variable that names their folder
+    folder: str  # in the home folder, if the variable is not set
+    cure: str = ""  # further steps beside `import`
+
+
+_ASSETS = {
+    "rcs": _Assets("RCS_PREFIX", ".rcs"),
+    "duobench": _Assets(
+        "DUOBENCH_PREFIX",
+        ".duobench",
+        f", then make {_REQUIRED} there, empty: DuoBench 0.1.2 has none, and each import would fetch all again",
+    ),
+}
+
+
+def missing_packages(*packages: str) -> str | None:
+    """Say why the packages, "rcs" or "duobench", cannot be imported here without a download; None if they can."""
+    for package in packages:
+        if importlib.util.find_spec(package) is None:
+            return (
+                f"{package} is not installed; make an environment, `vlagents-ray env make requirements/rcs.txt`, and "
+                f"have the workers run in it: runtime_env: {{py_executable: /path/to/.venv-rcs/bin/python}}"
+            )
+        assets = _ASSETS[package]
+        prefix = Path(os.environ.get(assets.variable) or Path.home() / assets.folder).expanduser()
+        if not (prefix / _REQUIRED).is_file():
+            return (
+                f"{package}'s assets are not in {prefix}: there is no {_REQUIRED}; set {assets.variable} to the folder "
+                f"that holds its `assets`, or fetch them once by `python -c 'import {package}'`{assets.cure}"
+            )
+    return None
+
+
+def creator(task: RcsTask, name: str) -> Any:
+    """Return RCS's maker of a scene; raises `MissingDependency` where RCS would download."""
+    reason = missing_packages("rcs", *({"duobench"} & {task.id.partition("/")[0]}))
+    if reason is not None:
+        raise MissingDependency(f"{name}: {reason}")
+    require(task.module or task.id.partition("/")[0])
+    rcs = require("rcs")
+    # DuoBench registers another scene under this name when it is imported; no episode may depend on that
+    rcs.SCENE_PATHS["empty_world"] = str(Path(rcs.RCS_PREFIX) / _REQUIRED)
+    gymnasium = require("gymnasium")
+    if task.id not in gymnasium.registry:
+        raise UnknownEnv(f"{name}: Gymnasium knows no {task.id!r}; set `module` to what registers it")
+    made = gymnasium.registry[task.id].entry_point
+    if not hasattr(made, "create_env"):
+        raise ConfigError(f"{name}: {task.id!r} is no scene of RCS: want one whose entry point is an RCSEnvCreator")
+    return made
+
+
+def configure(
+    config: Any,
+    *,
+    env: str,
+    control_mode: ControlMode,
+    delta: bool,
+    control_hz: float,
+    binary_gripper: bool,
+    size: Size,
+    cameras: Sequence[str] | None,
+    record_size: Size | None,
+) -> None:
+    """Set up a scene's configuration for an evaluation; sizes are (height, width) in pixels.
+
+    `env` is the env's name, for messages. The simulation runs without a window, as fast as it can, and for
+    1 / `control_hz` s a step, whether or not the arms have arrived.
+    """
+    base = require("rcs.envs.base")
+    config.headless = True
+    config.sim_cfg.realtime = False
+    config.sim_cfg.async_control = True
+    config.sim_cfg.frequency = control_hz
+    config.control_mode = {
+        "joints": base.ControlMode.JOINTS,
+        "xyzrpy": base.ControlMode.CARTESIAN_TRPY,
+        "tquat": base.ControlMode.CARTESIAN_TQuat,
+    }[control_mode]
+    config.relative_to = base.RelativeTo.LAST_STEP if delta else base.RelativeTo.NONE
+    config.max_relative_movement = None  # RCS's own: none for absolute commands; 0.5 m, 90 degrees, 5 degrees a joint
+    config.wrapper_cfg.binary_gripper = binary_gripper
+    have = config.camera_cfgs or {}
+    require_cameras(env, cameras or (), have)
+    chosen = {name: have[name] for name in (have if cameras is None else cameras)}
+    views = {name: _sized(camera, size) for name, camera in chosen.items()}
+    if record_size is not None:
+        views |= {RECORD + name: _sized(camera, record_size) for name, camera in chosen.items()}
+    config.camera_cfgs = views or None
+    if config.camera_adds is not None:
+        config.camera_adds = {name: added for name, added in config.camera_adds.items() if name in chosen}
+
+
+def _sized(camera: Any, size: Size) -> Any:
+    camera = copy.copy(camera)
+    camera.resolution_height, camera.resolution_width = size
+    return camera
+
+
+# RCS's angles are roll, pitch, yaw about fixed axes, R = Rz Ry Rx; its quaternions end with w.
+_UNITS = {"joints": "rad", "tquat": "m+quat_xyzw", "xyzrpy": "m+rad"}
+_COMMANDS: dict[ControlMode, tuple[str, Rotation]] = {
+    "joints": ("joint", "none"),
+    "tquat": ("ee_pose", "quat_xyzw"),
+    "xyzrpy": ("ee_pose", "euler_xyz"),
+}
+
+
+class Rcs(SimulatorEnv):
+    """One environment of one task: "pick", or the id of any scene with a task that RCS has registered.
+
+    Observation: the scene's cameras; of each arm `joints` rad, `tquat` and `xyzrpy`, the tool's pose
+    in the frame that all arms share; the gripper, 1 = open: see `Arms` for the names with several.
+    `info["objects"]` is {joint: (7,) float64}, the pose of each loose body in the world's frame, metres
+    and quaternion wxyz: for scripted experts only.
+
+    Action: for each arm its command in `control_mode`, then its gripper, which closes at 0.5 and below.
+
+    Success is the simulator's, and ends the episode. The seed places the objects.
+    """
+
+    suite = "rcs"
+    known: ClassVar[Mapping[str, RcsTask]] = RCS_TASKS
+    packages: ClassVar[tuple[str, ...]] = ("rcs",)
+    distributions: ClassVar[tuple[str, ...]] = ("rcs-core", "mujoco")
+
+    def __init__(
+        self,
+        task: str | None = None,
+        *,
+        module: str | None = None,
+        control_mode: ControlMode | None = None,
+        delta: bool = False,
+        control_hz: float | None = None,
+        binary_gripper: bool = True,
+        width: int = 224,
+        height: int = 224,
+        cameras: Sequence[str] | None = None,
+        record_size: Sequence[int] | None = None,
+        instruction: str | None = None,
+        max_steps: int | None = None,
+    ) -> None:
+        """Make the environment; raises the errors of `make_env`. Other options are those of most `SimulatorEnv`s.
+
+        Args:
+            task: One of `tasks()`, or Gymnasium's id of a scene, "lab/shelf"; None is the first of `tasks()`.
+            module: Imported first, because it registers the id; by default the id's namespace.
+            control_mode: "joints", "tquat" or "xyzrpy"; None is the protocol's.
+            delta: Commands are relative to where the arm is.
+            control_hz: Steps a second; None is the protocol's.
+            binary_gripper: It opens or closes; False: the command is its opening.
+            cameras: Which of the scene's to give; None is all.
+        """
+        task = self.tasks()[0] if task is None else task
+        self._task = self._find(task, module)
+        protocol = self._task.protocol
+        limit = protocol.max_steps if max_steps is None and protocol is not None else max_steps
+        if limit is None:
+            raise ConfigError(f"{self.suite}/{task} has no step limit of its own; set max_steps")
+        super().__init__(f"{self.suite}/{task}", record_size=record_size, width=width, height=height, max_steps=limit)
+        self.max_steps = limit
+        self._mode = control_mode or self._task.control_mode
+        self._given_instruction = instruction
+        hz = control_hz or self._task.control_hz
+        maker = creator(self._task, self._name)
+        config = maker.config()
+        self._task.prepare(config)
+        configure(
+            config,
+            env=self._name,
+            control_mode=self._mode,
+            delta=delta,
+            control_hz=hz,
+            binary_gripper=binary_gripper,
+            size=(height, width),
+            cameras=cameras,
+            record_size=self._record_size,
+        )
+        with self._making():
+            self._env = maker.create_env(config)
+            self._resources.callback(self._env.close)
+            self._sim = self._env.get_wrapper_attr("sim")
+            self._loose = _loose_joints(self._sim.model)
+            self._arms = Arms(self._env.action_space, self._env.observation_space, self._mode)
+        self._contract = Contract(
+            cameras={name: CameraSpec(height, width) for name in config.camera_cfgs or () if not _for_the_record(name)},
+            state=self._arms.state,
+            gripper=self._arms.has_gripper,
+            instruction=True,
+            action=self._arms.action_spec(delta=delta),
+            control_hz=hz,
+        )
+
+    @property
+    def instruction(self) -> str:
+        return self._given_instruction or self._instruction or self._task.instruction
+
+    @classmethod
+    def require_task(cls, task: str | None) -> None:
+        if "/" not in (task or ""):
+            require_known(cls.suite, task, cls.tasks(), ", or an id, as in 'lab/shelf'")
+
+    @classmethod
+    def tasks(cls) -> list[str]:
+        return sorted(cls.known)
+
+    @classmethod
+    def missing(cls) -> str | None:
+        return missing_packages(*cls.packages)
+
+    def describe(self) -> dict[str, Any]:
+        control = f"{self._mode}, delta" if self._contract.action.delta else self._mode
+        played = {"max_steps": self.max_steps, "control_hz": self._contract.control_hz, "control": control}
+        protocol = self._task.protocol
+        robots = self._alive().get_wrapper_attr("robot")
+        return super().describe() | {
+            "simulator": "rcs",
+            "task": self._task.id,
+            "robots": {name: robot.get_config().robot_type.id for name, robot in robots.items()},
+            "protocol": protocol.describe(**played) if protocol is not None else played,
+        }
+
+    def _begin(self, seed: int, state: int) -> tuple[Obs, dict[str, Any]]:
+        raw, info = self._env.reset(seed=seed)
+        self._instruction = str(info.get("instruction", ""))
+        if not self.instruction:
+            raise ConfigError(f"{self._name} states no instruction; set the option `instruction`")
+        return self._observe(raw), {"success": bool(info.get("success", False))}
+
+    def _advance(self, action: np.ndarray) -> tuple[Obs, float, bool, dict[str, Any]]:
+        raw, reward, terminated, _, info = self._env.step(self._arms.command(action))
+        if "success" not in info:
+            raise ConfigError(f"{self._name} does not say what success is: want a scene with a task")
+        task_info = {key: value for key, value in info.items() if key not in self._arms.names}  # without that of arms
+        outcome = {**plain(task_info), "success": bool(info["success"])}
+        return self._observe(raw), float(reward), bool(terminated), outcome
+
+    def _find(self, task: str, module: str | None) -> RcsTask:
+        if task in self.known:
+            found = self.known[task]
+            return replace(found, module=module) if module is not None else found
+        self.require_task(task)
+        return RcsTask(id=task, module=module)
+
+    def _observe(self, raw: Mapping[str, Any]) -> Obs:
+        state, gripper = self._arms.read(raw)
+        images = {name: frame["rgb"]["data"] for name, frame in raw.get("frames", {}).items()}
+        info: dict[str, Any] = {"objects": {name: np.array(self._sim.data.joint(name).qpos) for name in self._loose}}
+        if self._record_size is not None:
+            info[HIGH_RES] = {
+                name.removeprefix(RECORD): np.ascontiguousarray(image)
+                for name, image in images.items()
+                if _for_the_record(name)
+            }
+        return Obs(
+            cameras={name: np.ascontiguousarray(image) for name, image in images.items() if not _for_the_record(name)},
+            gripper=gripper,
+            state=state,
+            info=info,
+        )
+
+
+class DuoBench(Rcs):
+    """DuoBench's eleven tasks of two FR3 arms, "left" and "right", named without "duobench/".
+
+    An action has 16 numbers: the left arm's seven joints, rad, its gripper, then the right arm's. The
+    reward is the share of the task's stages reached; a step's info has `stage` and `max_stage`.
+    """
+
+    suite = "duobench"
+    known: ClassVar[Mapping[str, RcsTask]] = DUOBENCH_TASKS
+    packages, distributions = ("rcs", "duobench"), ("rcs-core", "duobench", "mujoco")
+
+
+def _loose_joints(model: Any) -> list[str]:
+    free = int(require("mujoco").mjtJoint.mjJNT_FREE)
+    return [model.joint(i).name for i in range(model.njnt) if model.jnt_type[i] == free]
+
+
+def _for_the_record(camera: str) -> bool:
+    return camera.startswith(RECORD)
+
+
+class Arms:
+    """Translates between RCS's dicts, keyed by robot, and what policies see.
+
+    The parts of a single arm's state have plain names, `joints`; those of several begin with the
+    arm's, `left/joints`, and so does the gripper, which then is a part of the state, (1,). In a row of
+    the action each arm has its command, then its gripper, 1 = open; the arms follow each other.
+    """
+
+    def __init__(self, actions: Mapping[str, Any], observations: Mapping[str, Any], mode: ControlMode) -> None:
+        """`actions` and `observations` are RCS's spaces: robot -> part -> Box (D,)."""
+        self.names = tuple(actions)
+        self.single = len(self.names) == 1
+        self._mode = mode
+        self._sizes = {name: int(actions[name][mode].shape[0]) for name in self.names}
+        self._grippers = {name for name in self.names if "gripper" in actions[name].spaces}
+        self.state = {
+            self._key(name, part): StateSpec(int(observations[name][part].shape[0]), unit)
+            for name in self.names
+            for part, unit in _UNITS.items()
+        }
+        if not self.single:
+            self.state |= {self._key(name, "gripper"): StateSpec(1) for name in self.names if name in self._grippers}
+        self.has_gripper = self.single and bool(self._grippers)  # that `Obs.gripper` can tell
+
+    def action_spec(self, *, delta: bool) -> ActionSpec:
+        space, rotation = _COMMANDS[self._mode]
+        return ActionSpec(
+            dim=sum(self._sizes.values()) + len(self._grippers),
+            space=space,
+            delta=delta,
+            rotation=rotation,
+            frame=None if self._mode == "joints" else "base",
+            gripper_open=1.0 if self._grippers else None,
+            gripper_closed=0.0 if self._grippers else None,
+            arms=None if self.single else self.names,
+        )
+
+    def command(self, row: np.ndarray) -> dict[str, dict[str, np.ndarray]]:
+        commands: dict[str, dict[str, np.ndarray]] = {}
+        rest = row.astype(np.float64)
+        for name in self.names:
+            pose, rest = np.split(rest, [self._sizes[name]])
+            commands[name] = {self._mode: pose}
+            if name in self._grippers:
+                commands[name]["gripper"], rest = np.split(rest, [1])
+        return commands
+
+    def read(self, observation: Mapping[str, Any]) -> tuple[dict[str, np.ndarray], float | None]:
+        """The state, each part (D,) float32, and a single arm's gripper in [0, 1], 1 = open."""
+        state = {
+            self._key(name, part): np.array(observation[name][part], dtype=np.float32)
+            for name in self.names
+            for part in _UNITS
+        }
+        openings = {name: np.clip(np.array(observation[name]["gripper"], np.float32), 0, 1) for name in self._grippers}
+        if self.single:
+            return state, float(openings[self.names[0]][0]) if openings else None
+        return state | {self._key(name, "gripper"): opening for name, opening in openings.items()}, None
+
+    def _key(self, name: str, part: str) -> str:
+        return part if self.single else f"{name}/{part}"

@@ -1,0 +1,240 @@
+"""A probe whether this machine can render, which renders one frame in a child process.
+
+A broken driver may hang or crash the process that loads it, so the attempt is made in a child with a
+time-out, and only once: the answers are cached for the life of the process.
+
+    probe = render_probe()                  # Vulkan, as SAPIEN (ManiSkill 3) uses it
+    probe.ok, probe.device, probe.cure      # True, "llvmpipe (LLVM 15.0.6, 256 bits)", None
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import importlib.util
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Literal
+
+import vlagents_ray
+from vlagents_ray.envs import graphics
+from vlagents_ray.envs.graphics import EglDevice
+from vlagents_ray.errors import EnvFailed, VLAgentsError
+
+TIMEOUT_S = 60.0  # a software driver compiles its shaders in 3 to 10 s
+
+VULKAN_CURE = (
+    "install a Vulkan driver: Mesa 25 renders in software (Debian 12: apt-get install -t bookworm-backports "
+    "mesa-vulkan-drivers, its own 22.3 is too old; elsewhere: mesa-vulkan-drivers); for an unpacked one set "
+    "VK_ICD_FILENAMES to its lvp_icd.json"
+)
+VULKAN_CURE_NVIDIA = (
+    "an NVIDIA driver is here but no Vulkan device: install the driver's graphics part (libnvidia-gl), or start the "
+    "container with NVIDIA_DRIVER_CAPABILITIES=all"
+)
+EGL_CURE = (
+    "install EGL: apt-get install libegl1 libgl1-mesa-dri renders in software; on NVIDIA the driver's graphics part "
+    "(libnvidia-gl), in a container NVIDIA_DRIVER_CAPABILITIES=all; MUJOCO_GL must be set before mujoco is imported"
+)
+
+_BOX_XML = """
+<mujoco>
+  <worldbody>
+    <light pos="0 0 3"/>
+    <camera name="front" pos="0 -3 0" xyaxes="1 0 0 0 0 1"/>
+    <geom type="box" size="0.5 0.5 0.5" rgba="1 0 0 1"/>
+  </worldbody>
+</mujoco>
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class RenderProbe:
+    """The outcome of rendering one frame."""
+
+    api: Literal["vulkan", "egl"]
+    ok: bool
+    seconds: float  # the child's run time, imports included
+    device: str | None = None  # the driver's name of it; "llvmpipe ..." is Mesa's software driver
+    error: str | None = None
+    cure: str | None = None
+    devices: tuple[EglDevice, ...] = ()  # all devices of EGL, if EGL was tried
+
+
+@functools.cache
+def render_probe(timeout_s: float = TIMEOUT_S) -> RenderProbe:
+    """Render one frame with SAPIEN, which needs a Vulkan device."""
+    if importlib.util.find_spec("sapien") is None:
+        return RenderProbe(
+            "vulkan",
+            ok=False,
+            seconds=0.0,
+            error="sapien is not installed",
+            cure="pip install 'vlagents-ray[maniskill]'",
+        )
+    return _run_child("vulkan", vulkan_cure(), timeout_s)
+
+
+@functools.cache
+def egl_probe(timeout_s: float = TIMEOUT_S) -> RenderProbe:
+    """Render one frame with MuJoCo through EGL, i.e. without a display."""
+    if importlib.util.find_spec("mujoco") is None:
+        return RenderProbe(
+            "egl", ok=False, seconds=0.0, error="mujoco is not installed", cure="pip install 'vlagents-ray[metaworld]'"
+        )
+    return _run_child("egl", EGL_CURE, timeout_s)
+
+
+def without(modules: Sequence[str], cure: str) -> str | None:
+    """Say which of these modules is not installed, with the cure; None if all are."""
+    missing = next((module for module in modules if importlib.util.find_spec(module) is None), None)
+    return None if missing is None else f"{missing} is not installed; {cure}"
+
+
+def without_egl(simulator: str) -> str | None:
+    """Say why a simulator cannot render here; the first call in a process renders one frame in a child."""
+    probe = egl_probe()
+    return None if probe.ok else f"{simulator} cannot render without a display ({probe.error}); {probe.cure}"
+
+
+@contextlib.contextmanager
+def failing(env: str, doing: str) -> Iterator[None]:
+    """Turn the errors of a simulator that renders through EGL into `EnvFailed`; this package's own errors pass."""
+    try:
+        yield
+    except VLAgentsError:
+        raise
+    except Exception as error:
+        about_egl = any(word in str(error) for word in ("EGL", "OpenGL", "GLContext", "mjr_makeContext"))
+        cure = f"; {EGL_CURE}" if about_egl else ""
+        raise EnvFailed(f"{env} failed to {doing}: {type(error).__name__}: {error}{cure}") from error
+
+
+def vulkan_cure() -> str:
+    """Return the cure on this machine if SAPIEN finds no rendering device."""
+    nvidia = Path("/dev/nvidiactl").exists() or shutil.which("nvidia-smi") is not None
+    return VULKAN_CURE_NVIDIA if nvidia else VULKAN_CURE
+
+
+@dataclass(frozen=True, slots=True)
+class VulkanDevice:
+    """A device on which SAPIEN can render."""
+
+    name: str  # "llvmpipe (LLVM 15.0.6, 256 bits)"
+    cuda: int | None  # its number among the CUDA devices of this process; None if CUDA does not know it
+
+
+def vulkan_device(*, on_gpu: bool) -> VulkanDevice | None:
+    """Return the device on which SAPIEN renders in this process."""
+    import sapien.render
+
+    usable = usable_devices(sapien.render.get_device_summary())
+    usable.sort(key=lambda device: (device.cuda is not None) != on_gpu)  # stable: otherwise SAPIEN's order
+    return usable[0] if usable else None
+
+
+def usable_devices(summary: str) -> list[VulkanDevice]:
+    """List the devices that SAPIEN's `summary` calls supported, in its order."""
+    found = []
+    for block in summary.split("GPU:")[1:]:
+        name, *lines = block.splitlines()
+        facts = {key.strip(): value.strip() for key, _, value in (line.partition(":") for line in lines)}
+        if facts.get("Supported") == "1":
+            cuda = int(facts.get("cudaId", "-1"))
+            found.append(VulkanDevice(name.strip(), cuda if cuda >= 0 else None))
+    return found
+
+
+def _run_child(api: Literal["vulkan", "egl"], cure: str, timeout_s: float) -> RenderProbe:
+    root = str(Path(vlagents_ray.__file__).parents[1])
+    path = os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")]))
+    variables = {**os.environ, "PYTHONPATH": path}
+    if api == "egl":
+        variables["MUJOCO_GL"] = "egl"
+    started = time.monotonic()
+    try:
+        child = subprocess.run(  # noqa: S603 - our own interpreter and module, no outside input
+            [sys.executable, "-m", __name__, api],
+            env=variables,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=timeout_s,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        error = f"no frame within {timeout_s:g} s"
+        return RenderProbe(api, ok=False, seconds=time.monotonic() - started, error=error, cure=cure)
+    seconds = time.monotonic() - started
+    if child.returncode == 0:
+        answer = json.loads(child.stdout.splitlines()[-1])
+        devices = tuple(EglDevice(**one) for one in answer["devices"])
+        return RenderProbe(api, ok=True, seconds=seconds, device=answer["device"], devices=devices)
+    errors = [line for line in child.stderr.splitlines() if line.strip()]
+    ended = f"the child ended with {child.returncode}"
+    return RenderProbe(api, ok=False, seconds=seconds, error=errors[-1].strip() if errors else ended, cure=cure)
+
+
+def _render_vulkan() -> str | None:
+    import numpy as np
+    import sapien
+
+    try:
+        device = sapien.Device("cuda")
+    except RuntimeError:
+        device = sapien.Device("cpu")  # any Vulkan device, software included
+    scene = sapien.Scene([sapien.physx.PhysxCpuSystem(), sapien.render.RenderSystem(device)])
+    scene.set_ambient_light([1.0, 1.0, 1.0])
+    box = scene.create_actor_builder()
+    box.add_box_visual(half_size=[0.5, 0.5, 0.5], material=[1.0, 0.0, 0.0])
+    box.build_kinematic(name="box")
+    camera = scene.add_camera("front", width=64, height=64, fovy=1.0, near=0.01, far=10.0)
+    camera.set_local_pose(sapien.Pose([-3.0, 0.0, 0.0]))
+    scene.update_render()
+    camera.take_picture()
+    _require_contrast(np.asarray(camera.get_picture("Color"))[..., :3])
+    found = vulkan_device(on_gpu=device.is_cuda())
+    return None if found is None else found.name
+
+
+def _render_egl() -> str | None:
+    import mujoco
+    import numpy as np
+    from OpenGL.GL import GL_RENDERER, glGetString
+
+    model = mujoco.MjModel.from_xml_string(_BOX_XML)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    renderer = mujoco.Renderer(model, 64, 64)
+    try:
+        renderer.update_scene(data, camera="front")
+        _require_contrast(np.asarray(renderer.render()))
+        name = glGetString(GL_RENDERER)
+    finally:
+        renderer.close()
+    return name.decode() if isinstance(name, bytes) else None
+
+
+def _require_contrast(image: object) -> None:
+    import numpy as np
+
+    if np.ptp(np.asarray(image)) == 0:
+        raise RuntimeError("the frame is of one colour: the driver runs but draws nothing")
+
+
+def _main(api: str) -> None:
+    device = _render_vulkan() if api == "vulkan" else _render_egl()
+    devices = [asdict(one) for one in graphics.devices()] if api == "egl" else []
+    sys.stdout.write("\n" + json.dumps({"device": device, "devices": devices}) + "\n")
+
+
+if __name__ == "__main__":
+    _main(sys.argv[1])

@@ -1,1 +1,0 @@
-"""Drawing on a machine: which GPU and which library draws, and what is missing."""

@@ -1,0 +1,355 @@
+"""robosuite's tasks of the robomimic study: Panda arms over a table in MuJoCo.
+
+with Robosuite("Lift") as env:
+    obs, _ = env.reset(seed=0)
+    obs, reward, terminated, truncated, info = env.step(Act(action=np.zeros(7, np.float32)))
+"""
+
+from __future__ import annotations
+
+import functools
+import logging
+import os
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
+from vlagents_ray.envs.graphics import EGL_DEVICE, GPUS
+from vlagents_ray.envs.render_probe import EGL_CURE
+from vlagents_ray.envs.simulator import BenchmarkProtocol, SimulatorEnv, Size
+from vlagents_ray.errors import ConfigError, EnvFailed
+from vlagents_ray.interface import HIGH_RES, Obs
+from vlagents_ray.registry import require
+
+_OPEN_M = 0.04  # a finger's travel from closed to open
+
+
+class RobosuiteEnv(SimulatorEnv):
+    """One environment of robosuite's; a subclass makes the simulator and hands it to `_use`.
+
+    `info["sim_state"]`, for scripted experts only, has the positions and quaternions xyzw of objects.
+    """
+
+    _raw: Mapping[str, str] = {}
+    """What robosuite calls parts of the contract's state, of those that it calls otherwise."""
+
+    def _use(self, simulator: Any) -> None:
+        self._env, self._renderer = simulator, CameraRenderer(simulator, self._record_size)
+        self._resources.callback(simulator.close)
+        self._resources.callback(self._renderer.make_current)
+
+    def _begin(self, seed: int, state: int) -> tuple[Obs, dict[str, Any]]:
+        with seeded(seed):
+            if hasattr(self._env, "rng"):  # robosuite 1.5 has a generator of its own, which its parts share
+                self._env.rng.bit_generator.state = np.random.default_rng(seed).bit_generator.state
+            self._renderer.make_current()  # the last episode's rendering resources are freed in their own context
+            self._renderer.open = True
+            raw = self._env.reset()
+        return self._observe(raw), {}
+
+    def _advance(self, action: np.ndarray) -> tuple[Obs, float, bool, dict[str, Any]]:
+        """The reward is 1 if the task is solved, else 0."""
+        self._renderer.open = self.looked_at
+        raw, *_ = self._env.step(self._command(action.astype(np.float64)))
+        success = bool(self._env._check_success())
+        return self._observe(raw, look=self.looked_at), float(success), *self._solved(success)
+
+    def describe(self) -> dict[str, Any]:
+        return super().describe() | {"control_mode": "OSC_POSE"}
+
+    def _command(self, action: np.ndarray) -> np.ndarray:
+        return action
+
+    def _sim_state(self, raw: Mapping[str, Any]) -> dict[str, np.ndarray]:
+        return {
+            name: np.asarray(value, np.float64)
+            for name, value in raw.items()
+            if name.endswith(("_pos", "_quat")) and not {"robot0", "robot1", "to"} & set(name.split("_"))
+        }
+
+    def _observe(self, raw: Mapping[str, Any], *, look: bool = True) -> Obs:
+        contract = self.contract
+        cameras = list(contract.cameras or {}) if look else []
+        info: dict[str, Any] = {"sim_state": self._sim_state(raw)}
+        if look and self._renderer.views:
+            info[HIGH_RES] = {name: _upright(self._renderer.views[name]) for name in cameras}
+        return Obs(
+            cameras={name: _upright(raw[f"{name}_image"]) for name in cameras},
+            gripper=gripper_opening(raw) if contract.gripper else None,
+            state={name: np.asarray(raw[self._raw.get(name, name)], np.float32) for name in contract.state or {}},
+            info=info,
+        )
+
+
+def gripper_opening(raw: Mapping[str, Any]) -> float:
+    """Return the opening of the Panda's gripper in robosuite's observation, 0 closed to 1 open."""
+    return min(max(float(raw["robot0_gripper_qpos"][0]) / _OPEN_M, 0.0), 1.0)
+
+
+def _upright(image: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(image[::-1])
+
+
+class CameraRenderer:
+    """Renders the cameras while it is `open`; otherwise they show black and cost nothing.
+
+    robosuite renders each camera for every observation, 14 times from the beginning of a reset to the policy's
+    first observation. It samples a step's observation, images included, after the first 2 ms of the step's 50;
+    the views for recordings are of the same moment.
+    """
+
+    def __init__(self, domain: Any, record_size: Size | None) -> None:
+        self.open = True
+        self.views: dict[str, np.ndarray] = {}
+        self._domain = domain
+        self._record_size = record_size
+        self._own = domain._create_camera_sensors
+        domain._create_camera_sensors = self._sensors  # called again in each reset
+
+    def make_current(self) -> None:
+        """Render in this simulator's OpenGL context: the process may have others."""
+        sim = self._domain.sim
+        if sim is not None and sim._render_context_offscreen is not None:  # after a failed reset there is none
+            sim._render_context_offscreen.gl_ctx.make_current()
+
+    def _sensors(self, cam_name: str, cam_w: int, cam_h: int, **rest: Any) -> tuple[list[Any], list[str]]:
+        [own], names = self._own(cam_name, cam_w=cam_w, cam_h=cam_h, **rest)
+        return [self._switched(own, cam_name, (cam_h, cam_w))], names
+
+    def _switched(self, own: Callable[[Any], np.ndarray], camera: str, size: tuple[int, int]) -> Callable[[Any], Any]:
+        @functools.wraps(own)  # keeps robosuite's attributes
+        def look(cache: Any) -> np.ndarray:
+            if not self.open:
+                return np.zeros((*size, 3), np.uint8)
+            self.make_current()
+            if self._record_size is not None:
+                height, width = self._record_size
+                view = self._domain.sim.render(camera_name=camera, height=height, width=width)
+                self.views = self.views | {camera: view}
+            return own(cache)
+
+        return look
+
+
+@contextmanager
+def seeded(seed: int) -> Iterator[None]:
+    """robosuite 1.4 and LIBERO draw from numpy's global generator, whose state is restored."""
+    before = np.random.get_state()  # noqa: NPY002
+    np.random.seed(seed)  # noqa: NPY002
+    try:
+        yield
+    finally:
+        np.random.set_state(before)  # noqa: NPY002
+
+
+@contextmanager
+def importing_robosuite(env: str) -> Iterator[None]:
+    """Surround the first import of robosuite; `env` is named in errors."""
+    with _no_log_file(), _egl_number(env):
+        yield
+
+
+@contextmanager
+def _no_log_file() -> Iterator[None]:
+    """Keep robosuite from its log file, one for the machine, which another user may own, and from its advice."""
+
+    def nowhere(_filename: object) -> logging.Handler:
+        return logging.NullHandler()
+
+    log = logging.getLogger("robosuite_logs")
+    real, level = logging.FileHandler, log.level
+    logging.FileHandler = nowhere  # type: ignore[assignment,misc]
+    log.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logging.FileHandler = real  # type: ignore[misc]
+        log.setLevel(level)
+
+
+@contextmanager
+def _egl_number(env: str) -> Iterator[None]:
+    """Correct robosuite, which takes EGL's numbers for CUDA's and refuses those not in CUDA_VISIBLE_DEVICES.
+
+    It reads them when it is imported. Where no EGL device was chosen it would draw on the one with CUDA's number, and
+    fail on "": the worker finds out on which.
+    """
+    chosen, visible = os.environ.get(EGL_DEVICE), os.environ.get(GPUS)
+    if visible == "" and chosen is None and os.environ.get("MUJOCO_GL") == "egl":
+        raise EnvFailed(f"{env} finds no EGL device that renders in software, and was given no GPU; {EGL_CURE}")
+    if chosen is None or not visible:
+        yield
+        return
+    os.environ[GPUS] = chosen
+    try:
+        yield
+    finally:
+        os.environ[GPUS] = visible
+
+
+CONTROL_HZ = 20.0
+_PROTOCOL = BenchmarkProtocol(
+    name="robomimic",
+    source="Mandlekar et al. 2021, arXiv 2108.03298; robomimic 0.3.0, dataset registry and base_config.py",
+    max_steps=400,
+    control_hz=CONTROL_HZ,
+    control="pose of the hand, delta, by OSC_POSE: 0.05 m and 0.5 rad a unit",
+    success="robosuite's own check of the task holds after a step",
+    begins="where the objects lie, and noise on the arm's joints: the seed's",
+    ends_on_success=True,
+    episodes=50,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class RobosuiteTask:
+    """A task of robosuite, and what robomimic observes and allows in it."""
+
+    instruction: str
+    max_steps: int = 400  # robomimic's horizon for demonstrations of proficient humans
+    cameras: tuple[str, ...] = ("agentview", "robot0_eye_in_hand")
+    size: int = 84  # of each image, pixels
+    arms: tuple[str, ...] = ("robot0",)
+
+    @property
+    def protocol(self) -> BenchmarkProtocol:
+        return replace(_PROTOCOL, max_steps=self.max_steps)
+
+
+TASKS: Mapping[str, RobosuiteTask] = {
+    "Lift": RobosuiteTask("lift the red cube"),
+    "PickPlaceCan": RobosuiteTask("pick up the can and place it in its bin"),
+    "NutAssemblySquare": RobosuiteTask("put the square nut onto the square peg"),
+    "ToolHang": RobosuiteTask(
+        "assemble the frame and hang the tool on it", 700, ("sideview", "robot0_eye_in_hand"), size=240
+    ),
+    "TwoArmTransport": RobosuiteTask(
+        "move the hammer from its bin into the other one, and the trash out of that",
+        700,
+        ("shouldercamera0", "shouldercamera1", "robot0_eye_in_hand", "robot1_eye_in_hand"),
+        arms=("robot0", "robot1"),
+    ),
+}
+
+
+class Robosuite(RobosuiteEnv):
+    """One environment of one of robosuite's tasks, e.g. "Lift".
+
+    Observation: cameras by robosuite's names, upright; in `state`, by robomimic's names, for each arm
+    `robot0_eef_pos` (3,) m and `robot0_eef_quat` (4,) xyzw of the hand in the world's frame, `robot0_gripper_qpos`
+    (2,) m of the fingers, and `robot0_joint_pos` (7,) rad. In `info["sim_state"]`, for scripted experts only: the
+    positions and quaternions xyzw of objects, and `target_pos`, where one of them belongs.
+
+    Action: (7,) in [-1, 1] for each arm: the hand's target moves by 0.05 m a unit along the base's axes, and turns by
+    0.5 rad a unit about them, axis-angle; the last is the gripper, -1 opens, 1 closes, and only its sign counts.
+    """
+
+    suite = title = "robosuite"
+    packages, distributions = ("robosuite", "mujoco"), ("robosuite", "mujoco")
+    cure = "run `vlagents-ray env make requirements/robosuite.txt` and give the evaluation's workers that Python"
+
+    def __init__(
+        self,
+        task: str = "Lift",
+        *,
+        width: int | None = None,
+        height: int | None = None,
+        cameras: Sequence[str] | None = None,
+        instruction: str | None = None,
+        max_steps: int | None = None,
+        ends_on_success: bool = True,
+        record_size: Sequence[int] | None = None,
+    ) -> None:
+        """Make the environment; raises the errors of `make_env`. Other options are those of most `SimulatorEnv`s.
+
+        Args:
+            task: robosuite's name, one of `tasks()`.
+            cameras: MuJoCo's names; None are robomimic's for the task.
+        """
+        self.require_task(task)
+        super().__init__(f"robosuite/{task}", record_size=record_size, width=width, height=height, max_steps=max_steps)
+        self._task = TASKS[task]
+        self._protocol, self._ends_on_success = self._task.protocol, ends_on_success
+        self.max_steps = max_steps or self._task.protocol.max_steps
+        self._contract = self.known_contract({"task": task, "width": width, "height": height, "cameras": cameras})
+        self._instruction = instruction or self._task.instruction
+        with importing_robosuite("robosuite"), warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # warnings of upstream code
+            simulator = require("robosuite")
+        if task not in simulator.ALL_ENVIRONMENTS:
+            raise ConfigError(f"{self._name}: robosuite {simulator.__version__} has no such task, 1.5 has; {self.cure}")
+        images = self._contract.cameras or {}
+        with self._making(), seeded(0):
+            made = simulator.make(
+                task,
+                robots=["Panda"] * len(self._task.arms),
+                controller_configs=_controllers(simulator),
+                control_freq=CONTROL_HZ,
+                ignore_done=True,
+                has_renderer=False,
+                has_offscreen_renderer=bool(images),
+                renderer="mujoco",  # with 1.5's own, a reset leaves the last episode's to a garbage collection
+                use_camera_obs=bool(images),
+                camera_names=list(images) or "agentview",
+                camera_heights=[spec.height for spec in images.values()] or 1,
+                camera_widths=[spec.width for spec in images.values()] or 1,
+            )
+            for arm in self._task.arms:  # which robosuite leaves out, and robomimic has
+                made.modify_observable(f"{arm}_joint_pos", "active", modifier=True)
+            self._use(made)
+
+    @classmethod
+    def known_contract(cls, arguments: Mapping[str, Any]) -> Contract:
+        """Return the contract; names and units of the state are those of robomimic's data."""
+        task = TASKS[arguments["task"]]
+        chosen = task.cameras if arguments["cameras"] is None else arguments["cameras"]
+        size = CameraSpec(arguments["height"] or task.size, arguments["width"] or task.size)
+        parts = {
+            "eef_pos": StateSpec(3, "m"),
+            "eef_quat": StateSpec(4, "quat_xyzw"),
+            "gripper_qpos": StateSpec(2, "m"),
+            "joint_pos": StateSpec(7, "rad"),
+        }
+        return Contract(
+            cameras=dict.fromkeys(chosen, size),
+            state={f"{arm}_{part}": spec for arm in task.arms for part, spec in parts.items()},
+            gripper=len(task.arms) == 1,
+            instruction=True,
+            action=ActionSpec(
+                dim=7 * len(task.arms),
+                space="ee_pose",
+                delta=True,
+                rotation="axis_angle",
+                frame="base",
+                gripper_open=-1.0,
+                gripper_closed=1.0,
+                low=-1.0,
+                high=1.0,
+                arms=task.arms if len(task.arms) > 1 else None,
+            ),
+            control_hz=CONTROL_HZ,
+        )
+
+    @classmethod
+    def tasks(cls) -> list[str]:
+        return list(TASKS)
+
+    def _sim_state(self, raw: Mapping[str, Any]) -> dict[str, np.ndarray]:
+        env, found = self._env, super()._sim_state(raw)
+        if hasattr(env, "target_bin_placements"):
+            found["target_pos"] = np.array(env.target_bin_placements[env.object_id], np.float64)
+        elif hasattr(env, "peg1_body_id"):
+            found["target_pos"] = np.array(env.sim.data.body_xpos[env.peg1_body_id], np.float64)
+        return found
+
+
+def _controllers(simulator: Any) -> Any:
+    """Return OSC_POSE with robosuite's own settings, which are robomimic's."""
+    if hasattr(simulator, "load_composite_controller_config"):  # 1.5
+        return simulator.load_composite_controller_config(robot="Panda")
+    return simulator.load_controller_config(default_controller="OSC_POSE")

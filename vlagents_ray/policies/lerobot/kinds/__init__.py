@@ -1,1 +1,0 @@
-"""How each type of LeRobot's policies computes the chunks of many sessions."""

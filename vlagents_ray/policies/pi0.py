@@ -1,0 +1,346 @@
+"""π0 in Hugging Face transformers: PaliGemma and an action expert with flow matching.
+
+A checkpoint is the folder of `PI0ForConditionalGeneration.save_pretrained` and `PI0Processor.save_pretrained`.
+Physical Intelligence's own code and checkpoints are `vlagents_ray.policies.openpi`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from vlagents_ray.contract import ActionSpec, Contract
+from vlagents_ray.errors import ConfigError, InvalidObservation
+from vlagents_ray.interface import Obs
+from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row, shared_frames
+from vlagents_ray.policies.base.accelerator import ensure_torchvision, torch_device, torch_dtype
+from vlagents_ray.policies.base.checkpoint import find_checkpoint, from_pretrained
+from vlagents_ray.policies.base.config import NoiseLevel
+from vlagents_ray.policies.base.model_inputs import (
+    camera_images,
+    camera_specs,
+    choose_cameras,
+    needs_gripper,
+    resize_with_pad,
+    state_specs,
+    state_vector,
+)
+from vlagents_ray.policies.flow import OFFERED, Change, Guide, RandomSteps, follow
+from vlagents_ray.registry import require
+
+CAMERAS = ("base_0_rgb", "left_wrist_0_rgb", "right_wrist_0_rgb")  # openpi's names, in the order of the image tokens
+USUAL_CAMERAS = {"base_0_rgb": "front", "left_wrist_0_rgb": "wrist"}
+USUAL_STATE = ("xyz_axis_angle", "gripper_qpos")  # LIBERO
+_EPSILON = 1e-8  # added to a standard deviation by PI0Processor
+_PROCESSOR = "processor_config.json"
+_STATISTICS = ("state_mean", "state_std", "actions_mean", "actions_std")
+
+
+class Pi0Config(ModelConfig):
+    """Settings of π0, beside those of all models."""
+
+    cameras: dict[str, str] | None = Field(
+        default=None,
+        description=f"those of {', '.join(CAMERAS)} that it was trained with -> ours; unset: {USUAL_CAMERAS}",
+    )
+    steps: int | None = Field(default=None, ge=1, description="steps of the flow; unset: the checkpoint's, usually 10")
+    max_tokens: int = Field(default=48, ge=1, description="tokens of an instruction, as in training; more are refused")
+    guidance: float = Field(default=5.0, gt=0, description="real-time chunking: largest weight of the old plan")
+    noise_level: NoiseLevel = 0.0
+
+
+@dataclass(frozen=True)
+class LoadedPi0:
+    """The model and its processor."""
+
+    network: Any
+    processor: Any
+    device: Any
+    dtype: Any
+    cores: FlowCores
+
+    def planned(self, row: Row) -> Row:
+        """Return the row with its leftover actions in the model's units."""
+        if row.leftover is None:
+            return row
+        mean, std = self._statistics()
+        return replace(row, leftover=(row.leftover - mean) / std)
+
+    def actions(self, flow: np.ndarray) -> np.ndarray:
+        """Convert the model's output, (..., max_action_dim), to actions (..., D) in the robot's units."""
+        mean, std = self._statistics()
+        return np.asarray(flow[..., : len(mean)] * std + mean)
+
+    def _statistics(self) -> tuple[np.ndarray, np.ndarray]:
+        mean, std = self.processor.actions_mean, self.processor.actions_std
+        return np.asarray(mean, np.float32), np.asarray(std, np.float32) + np.float32(_EPSILON)
+
+
+class Pi0(ModelPolicy):
+    """The policy π0: chunks by flow matching, with one forward pass for all sessions of a batch."""
+
+    Config: ClassVar[type] = Pi0Config
+    trainable = network = "model.network"
+    adaptable = True
+    config: Pi0Config
+    model: LoadedPi0 | None
+
+    def __init__(self, config: Pi0Config) -> None:
+        super().__init__(config)
+        self.cameras = _cameras(config.cameras)
+        self.state = tuple(config.state or USUAL_STATE)
+
+    @property
+    def contract(self) -> Contract:
+        loaded = self.model
+        return Contract(
+            cameras=camera_specs(self.cameras),
+            state=state_specs(self.state, self.state_dim),
+            gripper=needs_gripper(self.state),
+            instruction=True,
+            action=ActionSpec(dim=None if loaded is None else len(loaded.processor.actions_mean)),
+            chunk=None if loaded is None else self.chunk(loaded.network.config.chunk_size),
+            history=1,
+            behaviour=self.offered(OFFERED if self.config.noise_level else ()),
+        )
+
+    @property
+    def state_dim(self) -> int | None:
+        return None if self.model is None else len(self.model.processor.state_mean)
+
+    @property
+    def continues_plans(self) -> bool:
+        return self.config.actions == "chunk"
+
+    def load(self) -> LoadedPi0:
+        path = find_checkpoint(
+            self.config.checkpoint,
+            self.config.checkpoint_step,
+            needs=["config.json", _PROCESSOR, "*.safetensors"],
+        )
+        device = torch_device(self.config.device)
+        dtype = torch_dtype(self.config.dtype, device)
+        ensure_torchvision()
+        network = _network(path, device, dtype)
+        cores = FlowCores(
+            self.compilation.core("encode", partial(encode, network)),
+            self.compilation.core("velocity", partial(velocity_of, network)),
+        )
+        return LoadedPi0(network, _processor(path), device, dtype, cores)
+
+    def adapt(self, adapter: str, folder: Path) -> None:
+        """Refuse an adapter beside which other statistics lie than those of the base."""
+        file = folder / _PROCESSOR
+        try:
+            saved = dict(json.loads(file.read_text(encoding="utf-8"))) if file.is_file() else {}
+        except (TypeError, ValueError) as error:
+            raise ConfigError(f"{file}: is no processor's config ({error}); copy it again") from error
+        base = {name: list(getattr(self.loaded().processor, name)) for name in _STATISTICS}
+        other = [name for name in _STATISTICS if saved.get(name) not in (None, base[name])]
+        if other:
+            raise ConfigError(
+                f"{file}: got other {other} than the base has, want the same; merge the adapter into its base, and "
+                f"serve that as a checkpoint of its own"
+            )
+
+    def perceive(self, obs: Obs) -> dict[str, Any]:
+        """Return the model's inputs for one row, on the CPU: images, state, and the episode's tokens.
+
+        It is called on several threads, and so never uses the tokenizer: padding is a state of that.
+        """
+        processor = self.loaded().processor
+        torch, side = require("torch"), processor.image_processor.pad_size
+        found = camera_images(obs, self.cameras)
+        images = [resize_with_pad(found[name], side["height"], side["width"]) for name in self.cameras]
+        state = torch.zeros(1, processor.max_state_dim)
+        values = state_vector(obs, self.state, self.state_dim)
+        state[0, : len(values)] = processor.normalize(torch.from_numpy(values), "state")
+        return {
+            **self._begun().prompt,
+            "pixel_values": processor.image_processor(images, return_tensors="pt")["pixel_values"][None],
+            "pixel_attention_mask": torch.ones(1, len(images), dtype=torch.bool),
+            "state": state,
+        }
+
+    def _begin(self, instruction: str, seed: int, adapter: str = "") -> None:
+        """Begin an episode, with its tokens; an instruction longer than in training is refused, not truncated."""
+        super()._begin(instruction, seed, adapter)
+        if self.model is None:
+            return
+        processor, most = self.model.processor, self.config.max_tokens
+        patches = len(self.cameras) * processor.image_seq_length
+        tokens = processor.tokenizer(
+            [f"{processor.image_token * patches}{processor.tokenizer.bos_token}{instruction}\n"],
+            padding="max_length",
+            max_length=patches + most,
+            padding_side="right",
+            return_tensors="pt",
+        )
+        if (got := int(tokens["attention_mask"].sum()) - patches) > most:
+            raise InvalidObservation(
+                f"instruction: got {got} tokens, want at most {most}, as in training; shorten it, or set the policy's "
+                f"max_tokens"
+            )
+        if int((tokens["input_ids"] == processor.image_token_id).sum()) != patches:
+            raise InvalidObservation(
+                f"instruction: got {processor.image_token!r} in {instruction!r}, want words; it stands for an image"
+            )
+        self._begun().prompt = dict(tokens)
+
+    def predict(self, rows: Sequence[Row]) -> list[Prediction]:
+        model, torch = self.loaded(), require("torch")
+        shape = (model.network.config.chunk_size, model.network.config.max_action_dim)
+
+        def convert(array: np.ndarray) -> Any:
+            return torch.from_numpy(array).to(model.device, non_blocking=True)
+
+        noise = convert(np.stack([row.noise(*shape) for row in rows]))
+        guide = Guide.of([model.planned(row) for row in rows], *shape)
+        random = RandomSteps.of(rows, (self._steps, *shape), self.config.noise_level, convert)
+        with torch.inference_mode():
+            velocity = self._velocity(rows)
+            with self.adapters.rows([row.adapter for row in rows]):
+                flow = self._follow(velocity, noise, None if guide is None else guide.to(convert), random)
+            stated = {} if random is None else random.stated(self.config.execute, len(model.processor.actions_mean))
+        return [Prediction(model.actions(one), behaviour=stated.get(i, {})) for i, one in enumerate(flow.cpu().numpy())]
+
+    @property
+    def _steps(self) -> int:
+        return int(self.config.steps or self.loaded().network.config.num_inference_steps)
+
+    def _inputs(self, rows: Sequence[Row]) -> Mapping[str, Any]:
+        model, torch, frames = self.loaded(), require("torch"), [row.frames[-1] for row in rows]
+        batch = {key: torch.cat([frame[key] for frame in frames]) for key in frames[0]}
+        return {
+            key: value.to(model.device, model.dtype if value.is_floating_point() else None, non_blocking=True)
+            for key, value in batch.items()
+        }
+
+    def _velocity(self, rows: Sequence[Row]) -> Callable[[Any, float], Any]:
+        """Return the flow's velocity for the rows; what the samples of a session see is encoded once."""
+        model = self.loaded()
+        firsts, owners = shared_frames(rows)
+        inputs = self._inputs([rows[i] for i in firsts])
+        shared = owners if len(firsts) < len(rows) else None
+        with self.adapters.rows([rows[i].adapter for i in firsts]):
+            return flow_velocity(model.network, inputs, model.dtype, shared, model.cores)
+
+    def _follow(
+        self, velocity: Callable[[Any, float], Any], noise: Any, guide: Guide | None, random: RandomSteps | None
+    ) -> Any:
+        """Integrate noise (B, H, D) to actions, in the Euler steps of `PI0ForConditionalGeneration.sample_actions`.
+
+        The actions are kept in float32 between the steps, also if the model computes in another type, as in openpi.
+        """
+        steps, limit, changes = self._steps, self.config.guidance, list[Change]()
+        if guide is not None:
+            changes.append(guide.change(noise, steps=steps, limit=limit))
+        if random is not None:
+            changes.append(random.change)
+        return follow(velocity, noise, steps, *changes)
+
+
+def _cameras(chosen: Mapping[str, str] | None) -> dict[str, str]:
+    """Sort the cameras by the model's image tokens; a checkpoint may be trained without some of them."""
+    asked = USUAL_CAMERAS if chosen is None else chosen
+    known = [name for name in CAMERAS if name in asked] if asked and set(asked) <= set(CAMERAS) else CAMERAS
+    mapping = choose_cameras(chosen, USUAL_CAMERAS, known)
+    return {name: mapping[name] for name in known}
+
+
+def _network(path: Path, device: Any, dtype: Any) -> Any:
+    network = from_pretrained(require("transformers").PI0ForConditionalGeneration, path, dtype=dtype)
+    return network.eval().requires_grad_(False).to(device)
+
+
+def _processor(path: Path) -> Any:
+    processor = require("transformers").PI0Processor.from_pretrained(path, local_files_only=True)
+    absent = [name for name in _STATISTICS if getattr(processor, name) is None]
+    if absent:
+        raise ConfigError(
+            f"checkpoint {path}: {_PROCESSOR} has no {absent}; want those of the dataset it was trained on: "
+            f"PI0Processor(…, {absent[0]}=[…]).save_pretrained(folder) writes them"
+        )
+    return processor
+
+
+@dataclass(frozen=True)
+class FlowCores:
+    """The two passes of the network, which are functions of tensors: `encode` and `velocity_of`, or compiled forms."""
+
+    encode: Callable[..., Any]
+    velocity: Callable[..., Any]
+
+
+def flow_velocity(
+    network: Any,
+    inputs: Mapping[str, Any],
+    dtype: Any,
+    owners: Sequence[int] | None = None,
+    cores: FlowCores | None = None,
+) -> Callable[[Any, float], Any]:
+    """Return the flow's velocity as a function of noisy actions (B, H, D) and time; inputs are encoded once.
+
+    Args:
+        network: The `PI0ForConditionalGeneration`.
+        inputs: Tokens, images and states of P observations, as `PI0Processor` returns them, on the network's device.
+        dtype: The type in which the network computes.
+        owners: The observation of each of the B rows; None: row i is of observation i.
+        cores: The passes of the network, if they are compiled.
+
+    Returns:
+        The function, whose result is (B, H, D) float32.
+    """
+    torch = require("torch")
+    cores = cores or FlowCores(partial(encode, network), partial(velocity_of, network))
+    mask, state = inputs["attention_mask"], inputs["state"]
+    encoded = cores.encode(inputs["input_ids"], inputs["pixel_values"], inputs["pixel_attention_mask"], mask)
+    if owners is not None:
+        index = torch.tensor(owners, device=mask.device)
+        encoded, mask, state = encoded[index], mask[index], state[index]
+
+    def velocity(actions: Any, time: float) -> Any:
+        times = torch.full((len(actions),), time, dtype=torch.float32, device=actions.device)
+        return cores.velocity(encoded, mask, state, actions.to(dtype), times)
+
+    return velocity
+
+
+def encode(network: Any, tokens: Any, images: Any, cameras: Any, mask: Any) -> Any:
+    """Return the keys and values (P, layers, 2, heads, L, E) of tokens (P, L) and images, of which `mask` is not 0.
+
+    Args:
+        network: The `PI0ForConditionalGeneration`.
+        tokens: (P, L) int64.
+        images: (P, cameras, 3, S, S).
+        cameras: (P, cameras) bool, which of the images are there.
+        mask: (P, L), 0 for padding.
+    """
+    import torch  # the compiler follows a statement, and not `require`
+
+    layers = network.model.vlm(
+        inputs_embeds=network.model.embed_prefix(tokens, images, cameras),
+        attention_mask=mask,
+        position_ids=mask.cumsum(-1) - 1,
+        token_type_ids=torch.zeros_like(mask),
+        use_cache=True,
+    ).past_key_values.layers
+    return torch.stack([torch.stack([layer.keys, layer.values], 1) for layer in layers], 1)
+
+
+def velocity_of(network: Any, encoded: Any, mask: Any, state: Any, actions: Any, times: Any) -> Any:
+    """Return the velocity (B, H, D) float32 of noisy actions (B, H, D) at times (B,); see `encode` for the others."""
+    from transformers import DynamicCache
+
+    cache = DynamicCache()  # of this step alone: later ones must not attend to it
+    for number, layer in enumerate(encoded.unbind(1)):
+        cache.update(layer[:, 0], layer[:, 1], number)
+    output = network(state=state, noise=actions, timestep=times, attention_mask=mask, past_key_values=cache)
+    return output.logits.float()
