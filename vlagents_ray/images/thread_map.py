@@ -14,19 +14,10 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache
 from typing import TypeVar
 
-# The CPU cores on which a thread runs, and may run.
-
-
-def _getcpu() -> Callable[[], int]:
-    """Return the C library's `sched_getcpu`, or a function that returns -1 where there is none."""
-    if not hasattr(os, "sched_setaffinity"):
-        return lambda: -1
-    found: Callable[[], int] = getattr(ctypes.CDLL(None), "sched_getcpu", lambda: -1)
-    return found
-
-
-here: Callable[[], int] = _getcpu()
+here: Callable[[], int] = lambda: -1  # noqa: E731
 """Return the core on which the calling thread runs; -1 if it is not known."""
+if hasattr(os, "sched_setaffinity"):
+    here = getattr(ctypes.CDLL(None), "sched_getcpu", here)
 
 
 def allowed() -> int:
@@ -45,7 +36,7 @@ def thread_map(function: Callable[[Item], Result], items: Sequence[Item], work_s
     """Compute `[function(item) for item in items]`, in several threads if the work is worth it.
 
     Args:
-        function: A function that may be called from other threads, and does not wait for other calls of itself.
+        function: May be called from other threads, and does not wait for other calls of itself.
         items: Its arguments.
         work_s: The approximate time, s, that one core needs for all items.
 

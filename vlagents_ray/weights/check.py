@@ -26,11 +26,8 @@ def fitted(
     Args:
         held: The values that the policy has now, by name.
         pushed: The new values, by name: numpy or JAX arrays or torch tensors, on any device.
-        partial: Whether names may be missing, whose values stay, as in a push of adapters alone.
+        partial: Whether names may be missing, whose held values stay, as in a push of adapters alone.
         allow_same: Whether all values may equal those held.
-
-    Returns:
-        The values of all names; those of missing names are the objects held.
 
     Raises:
         InvalidWeights: A name is unknown or missing, or a value has another shape or kind of type, or is not finite.
@@ -50,10 +47,7 @@ def fitted(
 def require_fit(held: Mapping[str, Any], pushed: Mapping[str, Any], *, partial: bool = False) -> None:
     """Raise `InvalidWeights` if a name is unknown or missing, or a value has another shape or kind of type.
 
-    Args:
-        held: The values that the policy has now, by name.
-        pushed: The new values, or their `vlagents_ray.weights.safetensors.ValueSpec`.
-        partial: Whether names may be missing.
+    `pushed` are values, or their `vlagents_ray.weights.safetensors.ValueSpec`; with `partial`, names may be missing.
     """
     faults = [f"{name!r}: unknown, want one of the policy's {len(held)} names" for name in pushed if name not in held]
     if not partial:
@@ -65,12 +59,9 @@ def require_fit(held: Mapping[str, Any], pushed: Mapping[str, Any], *, partial: 
 
 
 def fingerprint(named: Mapping[str, Any]) -> str:
-    """Return a digest of 32 hexadecimal characters over names, shapes, types and all bytes of the values.
+    """Return a digest of 32 hexadecimal characters over names, shapes, types and all bytes of values on any device.
 
     A sample would be faster, and the same for weights that differ elsewhere.
-
-    Args:
-        named: Values by name, on any device.
     """
     found = hashlib.blake2b(digest_size=16)
     names = sorted(named)
@@ -103,7 +94,7 @@ def _kind(dtype: str) -> Any:
 
 
 def _is_finite(value: Any) -> bool:
-    if not dtype_name(value).startswith(("float", "bfloat", "complex")) or not _size(value):
+    if not dtype_name(value).startswith(("float", "bfloat", "complex")) or 0 in value.shape:
         return True
     if isinstance(value, np.ndarray):
         with np.errstate(over="ignore", invalid="ignore"):
@@ -115,13 +106,7 @@ def _is_finite(value: Any) -> bool:
 
 
 def _is_equal(new: Any, held: Any) -> bool:
-    if isinstance(new, np.ndarray):
-        return np.array_equal(new, held)
-    return bool((new == held).all())
-
-
-def _size(value: Any) -> int:
-    return int(np.prod(value.shape, dtype=np.int64))
+    return np.array_equal(new, held) if isinstance(new, np.ndarray) else bool((new == held).all())
 
 
 def _digest(value: Any) -> bytes:

@@ -20,14 +20,7 @@ _BFLOAT16 = np.dtype("V2")
 
 
 def named_values(trainable: Any) -> dict[str, Any]:
-    """Return references to the values of a trainable object, by name.
-
-    Args:
-        trainable: A torch module, or nested dicts and lists of arrays.
-
-    Raises:
-        NotTrainable: It is neither.
-    """
+    """Return references to the values of a torch module or nested dicts and lists, by name; raises `NotTrainable`."""
     if _is_module(trainable):
         # A module may add state of its own that is no tensor (`get_extra_state`), which a learner does not train.
         return {name: value for name, value in trainable.state_dict().items() if is_array(value)}
@@ -35,14 +28,10 @@ def named_values(trainable: Any) -> dict[str, Any]:
 
 
 def set_values(trainable: Any, named: Mapping[str, Any]) -> None:
-    """Replace values of a trainable object; names that are not in `named` keep theirs.
+    """Replace values of a trainable object by those of the same shapes, types and devices; other names keep theirs.
 
     Values on a GPU are copied to where the old ones are, since a CUDA graph may have recorded these addresses. All
     others are replaced by reference, which takes no time and no memory; so nobody may write into `named` afterwards.
-
-    Args:
-        trainable: A torch module, or nested dicts and lists of arrays.
-        named: The new values, of the shapes, types and devices of the old ones.
     """
     if _is_module(trainable):
         _set_tensors(trainable, named)
@@ -96,10 +85,6 @@ def converted(value: Any, held: Any) -> Any:
     """Return `value` as the type, precision and device of `held`, in memory that nobody else writes into.
 
     Read-only numpy arrays that own read-only memory, such as Ray's objects, are not copied where `held` is on the CPU.
-
-    Args:
-        value: A numpy or JAX array or a torch tensor of the same shape and kind as `held`.
-        held: The value in the place of which it will be.
     """
     if _is_tensor(held):
         torch = sys.modules["torch"]
