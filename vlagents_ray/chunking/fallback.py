@@ -173,10 +173,8 @@ Check = Callable[[np.ndarray, "np.ndarray | None"], np.ndarray]
 class Motion:
     """The motion of a robot in an episode: every action passes the check against the one before it.
 
-    Args:
-        check: Sees every action, such as a `vlagents_ray.robot.Guard`; None: only the contract is checked.
-        contract: The policy's contract.
-        safe: The action that keeps the robot still; None if an error is to be raised in its place.
+    Without a `check`, such as a `vlagents_ray.robot.Guard`, only the contract is checked. Without a `safe` action, an
+    error is raised in its place.
     """
 
     def __init__(self, check: Check | None, contract: Contract | None = None, safe: SafeAction | None = None) -> None:

@@ -129,43 +129,32 @@ class _Request(NamedTuple):
 class PlayerSettings:
     """The settings of a `ChunkPlayer`: when it asks the policy, and what it does with the answers.
 
-    Args:
-        mode: "open_loop" executes `execute` rows, then asks again and waits for the answer. "ensemble" asks at each
-            tick and averages what all chunks say of it, with the weights exp(-m * i), oldest first (ACT's temporal
-            ensembling). "async" asks in the background, one request at a time, with the newest observation.
-        execute: Rows between two requests: of a chunk (default: all), or in "async" ticks (default: 1).
-        merge: What becomes of a tick that several chunks have a row for, in "async": "newest", "average",
-            "weighted_average", "conservative", "ensemble", or a function (see `vlagents_ray.chunking.buffer`).
-        ensemble_m: The m of the weights.
-        real_time_chunking: Whether each request carries what is left of the plan and the measured delay (`LEFTOVER`,
-            `DELAY` in `vlagents_ray.interface`), for policies that use them; in "async" only.
-        deadline_s: The time within which `act` returns; 0 by default in "async", else none.
-        timeout_s: The time after which a request is given up; by default the agent's.
-        horizon: The number of rows of a chunk that may be executed at all.
-        max_age_s: How old the observation of an executed action may be. Its age counts from `info["captured_at"]`, that
-            of the sensor which was read first; without it, from the call of `act` (see `CaptureClock`).
-        safe: The action in place of a missing one (see `SafeAction`).
-        grippers: The dimensions of the action that are grippers (see `SafeAction`).
-        ask_for_help: The uncertainty above which the robot pauses (see `uncertainty`).
-        samples: The number of samples to ask for, from whose spread a policy's uncertainty is computed.
-
     Raises:
         ConfigError: A setting is out of range, or settings do not go together.
     """
 
     mode: Mode = "open_loop"
-    execute: int | None = None
+    """With "open_loop", execute `execute` rows, then ask again and wait for the answer. With "ensemble", ask each tick,
+    and average what all chunks say of it with the weights exp(-m * i), oldest first (ACT's temporal ensembling). With
+    "async", ask in the background, one request at a time, with the newest observation."""
+    execute: int | None = None  # rows between two requests: of a chunk (default: all), or in "async" ticks (default: 1)
     merge: str | Merge = "newest"
-    ensemble_m: float = ENSEMBLE_M
+    """What becomes of a tick that several chunks have a row for, in "async": "newest", "average", "weighted_average",
+    "conservative", "ensemble", or a function (see `vlagents_ray.chunking.buffer`)."""
+    ensemble_m: float = ENSEMBLE_M  # the m of the weights
     real_time_chunking: bool = False
-    deadline_s: float | None = None
-    timeout_s: float | None = None
-    horizon: int | None = None
+    """Whether each request carries what is left of the plan and the measured delay (`LEFTOVER`, `DELAY` in
+    `vlagents_ray.interface`), for policies that use them; in "async" only."""
+    deadline_s: float | None = None  # within which `act` returns; 0 by default in "async", else none
+    timeout_s: float | None = None  # after which a request is given up; by default the agent's
+    horizon: int | None = None  # rows of a chunk that may be executed at all
     max_age_s: float | None = None
-    safe: Safe = "auto"
-    grippers: Sequence[int] | None = None
-    ask_for_help: float | None = None
-    samples: int | None = None
+    """How old the observation of an executed action may be. Its age counts from `info["captured_at"]`, that of the
+    sensor which was read first; without it, from the call of `act` (see `CaptureClock`)."""
+    safe: Safe = "auto"  # the action in place of a missing one (see `SafeAction`)
+    grippers: Sequence[int] | None = None  # the columns of the action that are grippers (see `SafeAction`)
+    ask_for_help: float | None = None  # the uncertainty above which the robot pauses (see `uncertainty`)
+    samples: int | None = None  # to ask for, from whose spread a policy's uncertainty is computed
 
     def __post_init__(self) -> None:
         if self.mode not in get_args(Mode):

@@ -48,13 +48,7 @@ class Connection:
     ) -> None:
         """Set up the connection, without opening it.
 
-        Args:
-            url: The server's URL.
-            new_transport: Returns a new transport.
-            codec: The codec of the cameras.
-            timeout_s: How long a call may take.
-            connect_timeout_s: How long to wait for a server that is not ready.
-            leaves_silent: Whether to go to another replica when one no longer answers.
+        With `leaves_silent`, it goes to another replica when one no longer answers.
         """
         self.url = url
         self._new_transport = new_transport

@@ -33,15 +33,9 @@ _MOST_HELPERS = 3  # most threads beside the caller's; robots have few cameras
 
 
 def thread_map(function: Callable[[Item], Result], items: Sequence[Item], work_s: float) -> list[Result]:
-    """Compute `[function(item) for item in items]`, in several threads if the work is worth it.
+    """Compute `[function(item) for item in items]`, in several threads if the work is worth it: `work_s` on one core.
 
-    Args:
-        function: May be called from other threads, and does not wait for other calls of itself.
-        items: Its arguments.
-        work_s: The approximate time, s, that one core needs for all items.
-
-    Returns:
-        The results in the order of the items; an exception is that of the first item that raised one.
+    The function does not wait for other calls of itself. An exception is that of the first item that raised one.
     """
     threads = min(len(items), allowed(), 1 + _MOST_HELPERS)
     if threads < 2 or work_s < _LEAST_WORK_S:

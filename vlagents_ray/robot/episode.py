@@ -71,17 +71,7 @@ class RobotEpisode:
         lossless: bool = False,
         meaning: ActionSpec | None = None,
     ) -> None:
-        """Begin an episode in a folder, which gets its videos.
-
-        Args:
-            folder: The folder.
-            instruction: The task in words.
-            fps: The rate of the frames, Hz.
-            features: The dataset's features, which the frames must have; None in the first episode.
-            interventions: Whether the frames have the columns of interventions.
-            lossless: Whether its videos keep each pixel, see `Mp4`.
-            meaning: The meaning of its actions' numbers, if that is known.
-        """
+        """Begin an episode with its videos in a folder; `features` are those of the earlier ones, None in the first."""
         self.instruction = instruction
         self.features: dict[str, Any] = features or {}
         self.rows: dict[str, list[Any]] = {}
@@ -105,20 +95,10 @@ class RobotEpisode:
         wanted: np.ndarray | None = None,
         more: Mapping[str, Any] = MappingProxyType({}),
     ) -> None:
-        """Append a frame.
+        """Append a frame; raises `InvalidObservation` if cameras or shapes differ from those of the frames before.
 
-        Args:
-            obs: The observation.
-            action: The action, (D,).
-            captured_at: The time of the observation, s since 1970.
-            tick: The tick of the control loop.
-            safe: Whether the action is a safe one, not the policy's.
-            intervention: Whether a human moved the robot at this tick.
-            wanted: The policy's action, (D,), where another one was executed; None if it is not known.
-            more: Further columns by name, the same in each frame: a bool, int, float, text, or (D,) float32.
-
-        Raises:
-            InvalidObservation: Cameras or shapes differ from those of the frames before.
+        `wanted` is the policy's action, (D,), where another one was executed; None if it is not known. `more` are
+        further columns by name, the same in each frame: a bool, int, float, text, or (D,) float32.
         """
         values, names = state_vector(obs.state, None if obs.gripper is None else np.array(obs.gripper))
         if not self.rows:
@@ -252,15 +232,9 @@ def number_features(dtypes: Mapping[str, str]) -> dict[str, Any]:
 def state_vector(
     parts: Mapping[str, np.ndarray], gripper: np.ndarray | None, order: Iterable[str] | None = None
 ) -> tuple[np.ndarray, list[str]]:
-    """Concatenate the parts of the proprioception, (..., d) each, as LeRobot's policies expect them.
+    """Concatenate the parts of the proprioception, (..., d) each, as LeRobot's policies expect them, in `order`.
 
-    Args:
-        parts: The parts by name.
-        gripper: The gripper's opening, (...,); None if there is none.
-        order: The names of the parts to concatenate; all by default.
-
-    Returns:
-        The numbers, (..., D) float32, and a name for each of the D.
+    `gripper`, (...,), is the opening. Returns the numbers, (..., D) float32, and a name for each of the D.
     """
     chosen = parts_of(parts, gripper is not None) if order is None else order
     columns: list[np.ndarray] = []

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, get_args
 
@@ -201,16 +201,12 @@ def _reading(stated: Any, where: str, kind: str) -> InputTopic:
 
 def _made(kind: type[Any], stated: Any, where: str) -> Any:
     given = dict(_mapping(stated, where))
-    for one in fields(kind):
-        value = given.get(one.name)
-        if isinstance(value, list) and one.name in ("names", "fields"):
-            if not all(isinstance(name, str) for name in value):
-                raise ConfigError(f"{where}: {one.name}: got {value!r}, want a list of names")
-            given[one.name] = tuple(value)
+    for name in given.keys() & {"names", "fields"}:
+        value = given[name]
+        if not isinstance(value, list) or not all(isinstance(one, str) for one in value):
+            raise ConfigError(f"{where}: {name}: got {value!r}, want a list of names")
+        given[name] = tuple(value)
     require_arguments(where, kind, given)
-    for name in ("names", "fields"):
-        if not isinstance(given.get(name, ()), tuple):
-            raise ConfigError(f"{where}: {name}: got {given[name]!r}, want a list of names")
     return kind(**given)
 
 
