@@ -17,7 +17,7 @@ import numpy as np
 from pydantic import BaseModel, Field
 
 from vlagents_ray.bench.line_client import die_with_parent, own_stdout
-from vlagents_ray.chunking.player import ChunkPlayer
+from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.interface import DELAY, LEFTOVER, SAFE, Act, Agent, Obs
@@ -168,9 +168,8 @@ def drive(
         low, high = np.array([-1.1, 0, 0]), np.array([1.1, 1e6, 1e6])
         guard = Guard(agent.contract, low=low, high=high, max_step=np.array([MAX_STEP, 1e6, 1e6]))
         watchdog = Watchdog(lambda _: robot.stop(), {"server": SILENCE_S, "loop": 1.0})
-        player = NotingPlayer(
-            agent, deadline_s=0, safe=robot.here, max_age_s=MAX_AGE_S, check=guard, timeout_s=ACT_S, **MODES[mode]
-        )
+        settings = PlayerSettings(deadline_s=0, safe=robot.here, max_age_s=MAX_AGE_S, timeout_s=ACT_S, **MODES[mode])
+        player = NotingPlayer(agent, settings, check=guard)
         player.robot = robot
         ends = float("inf")
 

@@ -11,7 +11,7 @@ docs/tutorials/robot.md leads to your own arm, docs/control_loop.md explains chu
 
 import sys
 
-from vlagents_ray import ChunkPlayer, RemoteAgent
+from vlagents_ray import ChunkPlayer, PlayerSettings, RemoteAgent
 from vlagents_ray.robot import Guard, Watchdog, run_loop
 from vlagents_ray.robot.simulated import SimulatedRobot
 
@@ -30,7 +30,7 @@ def main(url):
     # Stops the arm when the server owes an answer for 1 s, or the loop does not come round for 0.2 s.
     watchdog = Watchdog(lambda _reason: arm.stop(), {"server": 1.0, "loop": 0.2})
     # In "async" the next chunk is asked for while the last one is executed, so that no tick waits for the network.
-    with ChunkPlayer(agent, mode="async", safe="hold", check=guard) as player:
+    with ChunkPlayer(agent, PlayerSettings(mode="async", safe="hold"), check=guard) as player:
         report = run_loop(arm, player, hz=50, seconds=2, instruction="stack the cups", watchdog=watchdog)
     refused = report.safe.get("max_step", 0)
     print(f"{refused} of {report.jitter['ticks']} actions refused, such as:", report.reasons.get("max_step"))

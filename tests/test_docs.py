@@ -21,7 +21,7 @@ from vlagents_ray.envs.simulator import BenchmarkProtocol
 from vlagents_ray.errors import BY_CODE, Overloaded, VLAgentsError
 from vlagents_ray.evaluate import EvalConfig
 from vlagents_ray.interface import Act
-from vlagents_ray.protocol import frame_layout, frames, json_messages, messages, observations
+from vlagents_ray.protocol import frame_layout, frames, json_messages, messages, values
 from vlagents_ray.protocol.messages import Limits, Reply
 from vlagents_ray.serve.config.deployment import EnvironmentArgs
 
@@ -142,7 +142,7 @@ PROTOCOL = (DOCS / "protocol.md").read_text()
 
 
 def test_the_protocol_has_every_key_header_limit_and_type() -> None:
-    keys = {*frames._REQUEST_KEYS, *json_messages._KEYS, *observations._OBS_KEYS}
+    keys = {*frames._REQUEST_KEYS, *json_messages._KEYS, *values._OBS_KEYS}
     reply = Reply("r", Act(np.zeros(1, np.float32)), step=1, draining=True, timing={"queue_ms": 1.0})
     failed = Reply("r", error=Overloaded("full"))
     for one in (reply, failed):

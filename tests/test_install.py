@@ -134,7 +134,7 @@ def test_a_robot_drives_a_server_in_80_mb(robot: Path, url: str, transport: str)
     code = f"""
 import re
 import numpy as np
-from vlagents_ray import ChunkPlayer, Obs, RemoteAgent
+from vlagents_ray import ChunkPlayer, Obs, PlayerSettings, RemoteAgent
 from vlagents_ray.robot import run_loop
 obs = Obs(cameras={{name: np.zeros((224, 224, 3), np.uint8) for name in ("front", "wrist")}}, gripper=1.0)
 
@@ -149,7 +149,7 @@ class Arm:
 with RemoteAgent({url!r}, transport={transport!r}) as agent:
     agent.reset(obs, "stack")
     assert agent.act(obs).action.shape == (7,)
-    with ChunkPlayer(agent, mode="async", safe="hold") as player:
+    with ChunkPlayer(agent, PlayerSettings(mode="async", safe="hold")) as player:
         report = run_loop(Arm(), player, hz=50, seconds=0.5)
     assert report.jitter["ticks"] > 0
     print(re.search("VmRSS:[^0-9]*([0-9]+) kB", open("/proc/self/status").read())[1])

@@ -7,7 +7,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from vlagents_ray.client import ChunkPlayer, RemoteAgent
+    from vlagents_ray.client import ChunkPlayer, PlayerSettings, RemoteAgent
     from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
     from vlagents_ray.errors import (
         ConfigError,
@@ -47,6 +47,7 @@ __all__ = [
     "LocalServer",
     "NotReset",
     "Obs",
+    "PlayerSettings",
     "PolicyFailed",
     "PolicyUnavailable",
     "RemoteAgent",

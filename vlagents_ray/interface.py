@@ -17,7 +17,7 @@ Each session has its own copy of the initialized agent, and all copies share the
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -122,6 +122,12 @@ class Agent:
     A server reports them, and an evaluation keeps results of different digests apart. If this is None, the digest is
     that of the files that `initialize` found by `vlagents_ray.policies.base.checkpoint.find_checkpoint`.
     """
+
+    check: Callable[[np.ndarray, np.ndarray | None], np.ndarray] | None = None
+    """Optional: a check that every action has passed when `act` returns, given it and the one before, (D,) each."""
+
+    control: Any = None
+    """Optional: the `vlagents_ray.chunking.control.Control` of the robot that `act` decides by at each tick."""
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Self:
@@ -277,6 +283,14 @@ class Agent:
             except Exception as error:  # noqa: BLE001 - returned to the session whose request failed
                 acts.append(error)
         return acts
+
+    @property
+    def reconnects(self) -> int:
+        """The number of times that the agent has connected again to its policy."""
+        return 0
+
+    def interrupt(self) -> None:
+        """Drop what is planned: the robot was stopped or moved, and did not execute the last action of `act`."""
 
     def check_health(self) -> None:
         """Raise an exception if this agent can never act again, e.g. after the loss of its GPU.

@@ -17,17 +17,9 @@ def plain(name: str) -> str:
 
 
 def distinct(names: Iterable[str], simplify: Callable[[str], str] = plain) -> dict[str, str]:
-    """Simplify names, and append numbers where two of them would become the same.
+    """Simplify names, and append numbers where two of them would become the same, whatever their order.
 
     "left/wrist" becomes "left_wrist"; beside a "left_wrist", which keeps its name, it becomes "left_wrist_2".
-    The result does not depend on the order of the names.
-
-    Args:
-        names: The names; duplicates count once.
-        simplify: A function of a name.
-
-    Returns:
-        The new name of each name; no two are the same.
     """
     wanted = sorted(set(names), key=lambda name: (simplify(name) != name, name))
     found: dict[str, str] = {}

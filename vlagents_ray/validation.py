@@ -8,13 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from vlagents_ray.contract import Contract, _differ
-from vlagents_ray.errors import (
-    InvalidAction,
-    InvalidObservation,
-    MissingCamera,
-    MissingState,
-    NotOffered,
-)
+from vlagents_ray.errors import InvalidAction, InvalidObservation, MissingCamera, MissingState, NotOffered
 from vlagents_ray.interface import WANT, Obs
 
 _FEW = 64  # numbers, up to which Python's own check is faster than numpy's

@@ -32,7 +32,7 @@ FLOWS: dict[str, tuple[str, list[tuple[str, str]], list[tuple[str, str]], tuple[
     ),
     "plasma": (
         "Plasma: same Ray node, where the Unix socket is out of reach",
-        [("RemoteAgent", "client/agent"), ("object store", "client/transports/plasma")],
+        [("RemoteAgent", "client/agent"), ("object store", "client/transports/serve_handle")],
         [("policy", "policies/"), ("batch queue", "serve/engine, serve/queue"),
          ("plasma endpoint", "serve/endpoints/plasma")],
         ("plasma object", "raw pixels, one copy"),

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from vlagents_ray import InvalidObservation, Obs
-from vlagents_ray.chunking.capture_clock import CaptureClock
+from vlagents_ray.chunking.buffer import CaptureClock
 
 
 class Clocks(SimpleNamespace):
@@ -32,7 +32,7 @@ class Clocks(SimpleNamespace):
 @pytest.fixture
 def clocks(monkeypatch: pytest.MonkeyPatch) -> Clocks:
     clocks = Clocks()
-    monkeypatch.setattr("vlagents_ray.chunking.capture_clock.time", clocks)
+    monkeypatch.setattr("vlagents_ray.chunking.buffer.time", clocks)
     return clocks
 
 

@@ -15,7 +15,7 @@ from scripted_leader import ScriptedLeader
 
 from vlagents_ray import Act, ActionSpec, Agent, ConfigError, Contract, Obs, PolicyFailed
 from vlagents_ray.chunking.control import Control
-from vlagents_ray.chunking.player import ChunkPlayer, uncertainty
+from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings, uncertainty
 from vlagents_ray.errors import InvalidAction, InvalidObservation
 from vlagents_ray.interface import DELAY, EXECUTED, INTERVENTION, LEFTOVER, SAFE, SAMPLES, WANTED
 from vlagents_ray.robot import Guard
@@ -66,7 +66,7 @@ class Arm:
 
     def settle(self) -> None:
         """Wait until the policy has answered what it was asked."""
-        wait_for(lambda: self.player._asker is None or self.player._asker._job is None)
+        wait_for(lambda: self.player._asker is None or not self.player._asker.busy)
 
 
 def row(value: float) -> np.ndarray:
@@ -91,7 +91,8 @@ def players() -> Iterator[list[ChunkPlayer]]:
 def make(players: list[ChunkPlayer]) -> Any:
     def made(agent: Agent, **options: Any) -> tuple[Arm, ScriptedLeader]:
         leader = options.pop("override", None) or ScriptedLeader(ahead)
-        player = ChunkPlayer(agent, override=leader, **options)
+        check = options.pop("check", None)
+        player = ChunkPlayer(agent, PlayerSettings(**options), check=check, override=leader)
         players.append(player)
         return Arm(player), leader
 
@@ -261,7 +262,7 @@ def test_a_served_policy_is_told_with_its_next_request(players: list[ChunkPlayer
 
     served = Replicas([Told()])
     leader = ScriptedLeader(ahead)
-    player = ChunkPlayer(served.agent(), override=leader, execute=2)
+    player = ChunkPlayer(served.agent(), PlayerSettings(execute=2), override=leader)
     arm = Arm(player)
     given = []
     for held in (False, True, True, True, False, False):
@@ -491,7 +492,7 @@ def test_help_cannot_be_asked_for_by_a_policy_that_states_no_uncertainty(make: A
     with pytest.raises(ConfigError, match="samples"):
         arm.tick()
     with pytest.raises(ConfigError, match="ask_for_help"):
-        ChunkPlayer(Near(), ask_for_help=float("nan"))
+        ChunkPlayer(Near(), PlayerSettings(ask_for_help=float("nan")))
 
 
 def lines_of(function: Any) -> list[int]:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from vlagents_ray.chunking.execution import PLAYED, WATCHED
-from vlagents_ray.chunking.player import ChunkPlayer
+from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.errors import DeadlineExceeded
 from vlagents_ray.interface import SAFE, Act, Agent, Obs
 
@@ -34,7 +34,7 @@ class Counting(Agent):
 
 def test_each_request_states_what_was_executed_since_the_one_before() -> None:
     policy = Counting()
-    player = ChunkPlayer(policy, execute=3)
+    player = ChunkPlayer(policy, PlayerSettings(execute=3))
     player.reset(OBS)
     acts = [player.act(OBS).action for _ in range(7)]
     second, third = policy.stated  # the first request was before the first answer, which says that somebody watches
@@ -47,7 +47,7 @@ def test_each_request_states_what_was_executed_since_the_one_before() -> None:
 
 def test_nothing_is_stated_while_nobody_watches() -> None:
     policy = Counting(watched=False)
-    player = ChunkPlayer(policy, execute=1)
+    player = ChunkPlayer(policy, PlayerSettings(execute=1))
     player.reset(OBS)
     acts = [player.act(OBS) for _ in range(5)]
     assert policy.stated == []
@@ -59,7 +59,7 @@ def test_nothing_is_stated_while_nobody_watches() -> None:
 
 def test_safe_actions_are_stated_with_their_reason_and_not_as_executed_rows() -> None:
     policy = Counting()
-    player = ChunkPlayer(policy, execute=4, deadline_s=5.0, safe="hold")
+    player = ChunkPlayer(policy, PlayerSettings(execute=4, deadline_s=5.0, safe="hold"))
     player.reset(OBS)
     for _ in range(4):
         player.act(OBS)
@@ -77,7 +77,7 @@ def test_safe_actions_are_stated_with_their_reason_and_not_as_executed_rows() ->
 
 def test_an_action_that_the_stopped_robot_did_not_execute_is_not_stated() -> None:
     policy = Counting()
-    player = ChunkPlayer(policy, execute=4)
+    player = ChunkPlayer(policy, PlayerSettings(execute=4))
     player.reset(OBS)
     player.act(OBS)
     player.act(OBS)
@@ -90,7 +90,7 @@ def test_an_action_that_the_stopped_robot_did_not_execute_is_not_stated() -> Non
 
 def test_nothing_of_the_episode_before_is_stated() -> None:
     policy = Counting()
-    player = ChunkPlayer(policy, execute=1)
+    player = ChunkPlayer(policy, PlayerSettings(execute=1))
     for _ in range(2):
         player.reset(OBS)
         for _ in range(3):

@@ -25,8 +25,7 @@ from vlagents_ray import (
     PolicyFailed,
     PolicyUnavailable,
 )
-from vlagents_ray.chunking.background import AsyncCaller
-from vlagents_ray.chunking.player import ChunkPlayer
+from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.errors import InvalidAction
 from vlagents_ray.interface import DELAY, LEFTOVER
 from vlagents_ray.robot import Guard
@@ -74,7 +73,8 @@ def playing() -> Iterator[Callable[..., tuple[Counting, ChunkPlayer]]]:
     made: list[tuple[Counting, ChunkPlayer]] = []
 
     def make(agent: Counting, **options: Any) -> tuple[Counting, ChunkPlayer]:
-        player = ChunkPlayer(agent, **options)
+        check = options.pop("check", None)
+        player = ChunkPlayer(agent, PlayerSettings(**options), check=check)
         player.reset(obs(0), "stack")
         made.append((agent, player))
         return agent, player
@@ -88,7 +88,7 @@ def playing() -> Iterator[Callable[..., tuple[Counting, ChunkPlayer]]]:
 def let(agent: Counting, player: ChunkPlayer) -> None:
     """One answer, and wait until the player could take it."""
     agent.gate.release()
-    wait_for(lambda: player._asker is not None and player._asker._job is None)
+    wait_for(lambda: player._asker is not None and not player._asker.busy)
 
 
 Playing = Callable[..., tuple[Counting, ChunkPlayer]]
@@ -261,7 +261,7 @@ def test_what_was_captured_too_long_ago_is_neither_executed_nor_asked_about(play
 
 def test_an_episode_does_not_begin_with_what_was_captured_too_long_ago() -> None:
     agent, frozen = Counting(), seen_at(0, time.time() - 3600)
-    with ChunkPlayer(agent, mode="async", max_age_s=60.0) as player:
+    with ChunkPlayer(agent, PlayerSettings(mode="async", max_age_s=60.0)) as player:
         player.reset(frozen)
         with pytest.raises(InvalidAction, match="a camera that hangs"):
             player.act(frozen)
@@ -274,7 +274,7 @@ def test_a_plan_grows_old_from_when_its_observation_was_captured(playing: Playin
     with pytest.MonkeyPatch.context() as patch:
         now = time.monotonic()
         patch.setattr("vlagents_ray.chunking.player.time.monotonic", lambda: now + 1.0)
-        patch.setattr("vlagents_ray.chunking.capture_clock.time.monotonic", lambda: now + 1.0)
+        patch.setattr("vlagents_ray.chunking.buffer.time.monotonic", lambda: now + 1.0)
         assert play(player, range(8, 9)) == [8]  # asked again, though five rows were left
 
 
@@ -418,7 +418,7 @@ def test_where_holding_would_go_on_moving_a_refused_safe_action_is_raised() -> N
         contract = Contract(action=ActionSpec(dim=2, delta=True))
 
     agent = Deltas(gated=True, rows=1)
-    with ChunkPlayer(agent, mode="async", check=Guard(low=0.5)) as player:
+    with ChunkPlayer(agent, PlayerSettings(mode="async"), check=Guard(low=0.5)) as player:
         player.reset(obs(1))
         assert player.act(obs(1)).action.tolist() == [1, 1]
         with pytest.raises(InvalidAction, match=r"waiting.*the safe action is refused, too.*below the limit 0\.5"):
@@ -436,7 +436,7 @@ def test_without_an_action_to_hold_a_refused_first_one_is_raised(playing: Playin
 def test_a_safe_action_that_does_not_fit_is_refused_before_the_robot_moves(delta: bool | None) -> None:
     agent = Counting()
     agent.contract = Contract(action=ActionSpec(dim=2, delta=delta))
-    with ChunkPlayer(agent, mode="async", safe="zero") as player:
+    with ChunkPlayer(agent, PlayerSettings(mode="async", safe="zero")) as player:
         with pytest.raises(ConfigError, match="safe"):
             player.initialize()
         with pytest.raises(ConfigError, match="safe"):
@@ -484,7 +484,7 @@ def test_act_before_reset_is_refused() -> None:
 )
 def test_options_that_mean_nothing_are_refused(options: dict[str, Any]) -> None:
     with pytest.raises(ConfigError):
-        ChunkPlayer(Counting(), **options)
+        ChunkPlayer(Counting(), PlayerSettings(**options))
 
 
 @pytest.mark.parametrize("mode", ["open_loop", "ensemble"])
@@ -493,19 +493,19 @@ def test_a_player_keeps_the_promises_of_an_agent(mode: Any) -> None:
         def act(self, obs: Obs) -> Act:
             return Act(np.tile(obs.state["joints"], (3, 1)).astype(np.float32))
 
-    check_agent(ChunkPlayer(Chunks(), mode=mode), steps=5)
+    check_agent(ChunkPlayer(Chunks(), PlayerSettings(mode=mode)), steps=5)
 
 
 def test_a_reply_that_was_lost_replays_nothing() -> None:
     served = Replicas([Counting(rows=4)])
-    player = ChunkPlayer(served.agent(), mode="async", execute=2)
+    player = ChunkPlayer(served.agent(), PlayerSettings(mode="async", execute=2))
     player.reset(obs(0))
     done, resumed = [], False
     for t in range(30):
         served.lose_reply |= t == 10
         act = player.act(obs(t))
         assert player._asker is not None
-        wait_for(lambda: player._asker._job is None)
+        wait_for(lambda: not player._asker.busy)
         resumed |= "resumed" in act.info
         done.append((t, round(float(act.action[0]), 4), act.info["age_ticks"]))
     player.close()
@@ -529,14 +529,14 @@ class Continuing(Agent):
 @pytest.mark.parametrize("real_time", [True, False])
 def test_real_time_chunking_over_the_wire_joins_chunks_without_a_jump(real_time: bool) -> None:
     served = Replicas([Continuing()])
-    player = ChunkPlayer(served.agent(), mode="async", real_time_chunking=real_time)
+    player = ChunkPlayer(served.agent(), PlayerSettings(mode="async", real_time_chunking=real_time))
     player.reset(Obs())
     actions, chunks = [], set()
     asker = player._asker
     assert asker is not None
     for tick in range(60):
         if tick % 10 == 9:  # no answer takes longer, however busy the machine is
-            wait_for(lambda: asker._job is None)
+            wait_for(lambda: not asker.busy)
         act = player.act(Obs())
         assert "safe" not in act.info
         actions.append(float(act.action[0]))
@@ -572,21 +572,3 @@ def test_a_player_is_driven_again_while_its_last_request_is_under_way(playing: P
     opener.join()
     assert isinstance(agent, Connected)
     assert not agent.overlapped
-
-
-def test_an_asker_is_not_idle_between_its_request_and_the_answer() -> None:
-    idle: list[bool] = []
-
-    class Watched(AsyncCaller):
-        def __setattr__(self, name: str, value: object) -> None:
-            super().__setattr__(name, value)
-            if threading.current_thread().name == "vlagents-ray-caller":
-                idle.append(self.idle)
-
-    agent = Counting()
-    asker = Watched(agent)
-    asker.ask(obs(0))
-    assert asker.take(30) is not None
-    asker.close()
-    assert idle
-    assert not any(idle)

@@ -12,11 +12,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-<<<<<<< HEAD
 from vlagents_ray.cli import listing, policies
-=======
-from vlagents_ray.cli.evaluation import policies
->>>>>>> policies
 from vlagents_ray.cli.main import app
 from vlagents_ray.client.transports import base
 from vlagents_ray.registry import POLICIES

@@ -8,9 +8,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from eval_fakes import wait_for
 from in_process_replicas import Replicas
 
-from vlagents_ray import Act, ActionSpec, Agent, ChunkPlayer, Contract, Obs, StateSpec
+from vlagents_ray import Act, ActionSpec, Agent, ChunkPlayer, Contract, Obs, PlayerSettings, StateSpec
 from vlagents_ray.evaluate.episode.latency import ChunkExecutor
 from vlagents_ray.evaluate.plan.config import ClockConfig
 from vlagents_ray.robot import Guard
@@ -78,7 +79,7 @@ def drive(
     moved: list[float] = []
     position, fresh = 0.0, 0
     due: int | None = None  # tick at which the request under way is answered
-    with ChunkPlayer(delayed, mode="async", check=check) as player:
+    with ChunkPlayer(delayed, PlayerSettings(mode="async"), check=check) as player:
         see = lambda: Obs(state={"joints": np.array([position], np.float32)})  # noqa: E731
         player.reset(see(), "go")
         asker = player._asker
@@ -86,8 +87,7 @@ def drive(
         for tick in range(60 + 2 * stall):
             if tick == due:
                 delayed.gate.release()
-                with asker._changed:
-                    assert asker._changed.wait_for(lambda: asker._job is None, 60)
+                wait_for(lambda: not asker.busy)
                 due, fresh = None, tick if delayed.asked == 6 else fresh
             act = player.act(see())
             if due is None and not asker.idle:

@@ -25,11 +25,10 @@ from tests.golden.scenarios import (
     server,
 )
 from tests.golden.traces import Step, Trace
-from vlagents_ray.client.transports.probe import bytes_probe
 from vlagents_ray.interface import Obs
 from vlagents_ray.protocol.frame_layout import pack
 from vlagents_ray.protocol.frames import CONTENT_TYPE, encode_requests
-from vlagents_ray.protocol.messages import LocalAddress, Request
+from vlagents_ray.protocol.messages import LocalAddress, Request, bytes_probe
 
 PIXELS = np.full((8, 8, 3), 7, np.uint8)
 SEEN = Obs({"front": PIXELS}, 0.5, {"joints": np.array([0.25, -0.5], np.float32)})

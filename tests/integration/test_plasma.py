@@ -27,8 +27,8 @@ from ray._private.worker import global_worker
 from readme_blocks import ENV, ROOT
 
 from vlagents_ray import ConnectionLost, Obs, PolicyUnavailable, RemoteAgent
-from vlagents_ray.client.transports import unix_messages
-from vlagents_ray.client.transports.plasma import PlasmaTransport
+from vlagents_ray.client.transports import shm
+from vlagents_ray.client.transports.serve_handle import PlasmaTransport
 from vlagents_ray.errors import DeadlineExceeded, MalformedMessage, MessageTooLarge
 from vlagents_ray.protocol.messages import PlasmaAddress, Request
 from vlagents_ray.ray_tools.reaper import MARK
@@ -272,7 +272,7 @@ def test_faults_are_answered_and_harm_nobody(agent: RemoteAgent, transport: Plas
         (free, "lease"),
     ):
         connection.send(message)
-        unix_messages._wait(connection, select.POLLIN, time.monotonic() + 60)
+        shm._wait(connection, select.POLLIN, time.monotonic() + 60)
         [reply] = transport._receive(connection)
         error = reply.error
         assert isinstance(error, MalformedMessage)
@@ -289,7 +289,7 @@ def test_what_is_too_large_is_refused_and_said(agent: RemoteAgent) -> None:
 
 
 def test_auto_takes_plasma_where_the_socket_of_shared_memory_does_not_reach(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vlagents_ray.client.transports.auto.reaches", lambda _: False)
+    monkeypatch.setattr("vlagents_ray.client.transports.select.reaches", lambda _: False)
     with RemoteAgent(f"serve://{APP}") as other:
         other.reset(frame(), "x")
         assert other.transport == "plasma"
@@ -300,7 +300,7 @@ def test_auto_takes_plasma_where_the_socket_of_shared_memory_does_not_reach(monk
 def test_auto_goes_on_by_the_handle_where_the_store_has_no_room_for_a_channel(
     monkeypatch: pytest.MonkeyPatch, first: int
 ) -> None:
-    monkeypatch.setattr("vlagents_ray.client.transports.auto.reaches", lambda _: False)
+    monkeypatch.setattr("vlagents_ray.client.transports.select.reaches", lambda _: False)
     with RemoteAgent(f"serve://{APP}") as other:
         other.reset(frame(first), "x")
         act = other.act(frame(3600, pixel=6))  # 39 MB, so a channel of 64 MB

@@ -17,7 +17,7 @@ import pytest
 from serve_command import free_address, serving
 
 from vlagents_ray import Act, Agent, Obs, RemoteAgent
-from vlagents_ray.chunking.player import ChunkPlayer
+from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.cli.robot import main
 from vlagents_ray.client.transports.select import TransportName
 from vlagents_ray.robot import Watchdog, run_loop
@@ -101,7 +101,7 @@ def server(address: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[c
 def witness(address: str, transport: TransportName) -> Iterator[Witness]:
     robot = Counter()
     agent = RemoteAgent(f"http://{address}", transport=transport)
-    with ChunkPlayer(agent, mode="async") as player:
+    with ChunkPlayer(agent, PlayerSettings(mode="async")) as player:
         yield Witness(player, robot)
 
 

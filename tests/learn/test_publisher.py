@@ -16,7 +16,7 @@ from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.learn import Publisher
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.weights.check import fingerprint
+from vlagents_ray.weights.trainable import fingerprint
 
 
 class Linear(Agent):

@@ -22,7 +22,7 @@ from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.config import PushedWeights
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.learn import Publisher, TrainingEvaluation, training_evaluation
-from vlagents_ray.weights.check import fingerprint
+from vlagents_ray.weights.trainable import fingerprint
 
 
 @pytest.fixture

@@ -25,8 +25,7 @@ from vlagents_ray.errors import (
 from vlagents_ray.images.codecs import JPEG, RAW, ImageCodec
 from vlagents_ray.images.jpeg_png import encode_jpeg
 from vlagents_ray.interface import Act, Obs
-from vlagents_ray.protocol.arrays import Buffer
-from vlagents_ray.protocol.frame_layout import pack
+from vlagents_ray.protocol.frame_layout import Buffer, pack
 from vlagents_ray.protocol.frames import (
     decode_replies,
     decode_reply,

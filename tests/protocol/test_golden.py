@@ -13,7 +13,6 @@ import pytest
 from in_flight import read_requests
 from starlette.testclient import TestClient
 
-from vlagents_ray.client.transports.probe import bytes_probe, is_probe
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import MalformedMessage
 from vlagents_ray.images.jpeg_png import decode
@@ -26,7 +25,15 @@ from vlagents_ray.protocol.frames import (
     encode_request,
     encode_requests,
 )
-from vlagents_ray.protocol.messages import DEFAULT_LIMITS, PROTOCOL_VERSION, Budget, Reply, Request
+from vlagents_ray.protocol.messages import (
+    DEFAULT_LIMITS,
+    PROTOCOL_VERSION,
+    Budget,
+    Reply,
+    Request,
+    bytes_probe,
+    is_probe,
+)
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.engine.engine import Engine

@@ -17,7 +17,7 @@ from in_process_replicas import Replicas
 from many import many
 
 from vlagents_ray import Act, ActionSpec, Agent, Contract, Obs
-from vlagents_ray.chunking.player import ChunkPlayer
+from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.client.commands import COMMAND, CommandInbox
 from vlagents_ray.errors import InvalidAction
 from vlagents_ray.interface import OF_THE_LOOP, SAFE
@@ -134,7 +134,9 @@ class Machine(RuleBasedStateMachine):
         self.guard = Passing(Policy.contract)
         self.agent: Agent = Policy()
         if played:
-            self.agent = ChunkPlayer(Policy(), override=Leader(), check=self.guard, safe="hold", **options)
+            self.agent = ChunkPlayer(
+                Policy(), PlayerSettings(safe="hold", **options), override=Leader(), check=self.guard
+            )
             self.watchdog.share(self.agent.control)
         self.control = self.watchdog.control
 

@@ -14,7 +14,7 @@ from eval_fakes import wait_for
 from scripted_leader import ScriptedLeader
 
 from vlagents_ray import Act, ActionSpec, Agent, ConfigError, Contract, Obs
-from vlagents_ray.chunking.player import ChunkPlayer
+from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.robot import Guard, Watchdog, run_loop
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.simulated import SimulatedRobot
@@ -93,10 +93,10 @@ def test_a_correction_of_a_second_is_recorded_from_its_first_tick_with_both_acti
 
     def answered() -> bool:
         """Let the policy answer within a tick, as no time passes between ticks."""
-        wait_for(lambda: player._asker is None or player._asker._job is None)
+        wait_for(lambda: player._asker is None or not player._asker.busy)
         return False
 
-    with recorder, ChunkPlayer(Going(), override=leader, check=guard, **options) as player:
+    with recorder, ChunkPlayer(Going(), PlayerSettings(**options), override=leader, check=guard) as player:
         report = run_loop(arm, player, hz=HZ, seconds=3.0, instruction="go", recorder=recorder, until=answered)
     seen = rows(tmp_path)
     led = [tick for tick, human in zip(seen["tick"], seen["intervention"], strict=True) if human]
@@ -146,7 +146,7 @@ def test_a_silent_server_stops_no_robot_that_a_human_moves() -> None:
     arm, leader = Arm(), ScriptedLeader(back)
     leader.held = True
     watchdog = Watchdog(lambda _: arm.stop(), {"server": 1.0})
-    with ChunkPlayer(Hanging(), override=leader, mode="async") as player:
+    with ChunkPlayer(Hanging(), PlayerSettings(mode="async"), override=leader) as player:
 
         def over() -> bool:
             if len(arm.commanded) == 75 and leader.held:

@@ -25,7 +25,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from vlagents_ray import Act, ActionSpec, Agent, CameraSpec, ConfigError, Contract, Obs, PolicyFailed, StateSpec
-from vlagents_ray.chunking.player import ChunkPlayer
+from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.cli.robot import _restarting as restarting
 from vlagents_ray.cli.robot import main
 from vlagents_ray.errors import InvalidAction
@@ -234,7 +234,7 @@ def test_an_action_out_of_bounds_never_reaches_the_robot_which_is_stopped() -> N
 
 def test_with_a_player_the_loop_goes_on_with_a_safe_action() -> None:
     robot = Watched(Going.contract)
-    player = ChunkPlayer(Going(wrong_at=3), deadline_s=30.0, check=Guard(Going.contract))
+    player = ChunkPlayer(Going(wrong_at=3), PlayerSettings(deadline_s=30.0), check=Guard(Going.contract))
     report = run_loop(robot, player, hz=HZ, until=lambda: len(robot.commanded) >= 6)
     player.close()
     assert robot.commanded == [0, 0.01, 0.02, 0.02, 0.04, 0.05]
@@ -246,7 +246,7 @@ def test_the_loop_has_no_other_guard_than_its_player() -> None:
         contract = Contract(action=ActionSpec(dim=2, delta=False))
 
     robot, guard = Watched(Bounded.contract), Guard(high=0.025)
-    player = ChunkPlayer(Bounded(), deadline_s=30.0, check=guard, safe=np.full(2, 9.0))
+    player = ChunkPlayer(Bounded(), PlayerSettings(deadline_s=30.0, safe=np.full(2, 9.0)), check=guard)
     report = run_loop(robot, player, hz=HZ, until=lambda: len(robot.commanded) >= 6)
     assert robot.commanded == [0, 0.01, 0.02, 0.02, 0.02, 0.02]  # neither what is planned nor the 9
     assert report.safe_ticks == 3
@@ -258,7 +258,7 @@ def test_the_loop_has_no_other_guard_than_its_player() -> None:
 
 def test_a_safe_action_without_any_guard_passes_the_contracts_bounds() -> None:
     robot = Watched(Going.contract)
-    player = ChunkPlayer(Going(wrong_at=3), deadline_s=30.0, safe=np.full(2, 9.0))
+    player = ChunkPlayer(Going(wrong_at=3), PlayerSettings(deadline_s=30.0, safe=np.full(2, 9.0)))
     with pytest.raises(InvalidAction, match="above the limit 1"):
         run_loop(robot, player, hz=HZ, seconds=1)
     player.close()
@@ -428,7 +428,7 @@ def test_a_report_counts_refused_actions_by_cause_whatever_their_numbers(
             return Act(np.full(2, value, np.float32))
 
     agent = Jumping()
-    with ChunkPlayer(agent, check=Guard(Going.contract, **limits), deadline_s=30.0) as player:
+    with ChunkPlayer(agent, PlayerSettings(deadline_s=30.0), check=Guard(Going.contract, **limits)) as player:
         report = run_loop(Watched(Going.contract), player, hz=200, until=lambda: agent.tick > 12)
     assert set(report.safe) == {cause}
     assert report.safe[cause] == report.safe_ticks >= 10
@@ -445,7 +445,7 @@ def test_waiting_for_the_next_chunk_is_counted_apart_from_safe_actions() -> None
             return super().act(obs)
 
     robot = Watched(Going.contract)
-    with ChunkPlayer(Late(), mode="async") as player:
+    with ChunkPlayer(Late(), PlayerSettings(mode="async")) as player:
         report = run_loop(robot, player, hz=200, seconds=0.2)
         gate.set()
     assert (report.safe, report.waiting) == ({}, report.safe_ticks)

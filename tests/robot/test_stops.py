@@ -9,7 +9,7 @@ import pyarrow.parquet as pq
 import pytest
 from scripted_leader import ScriptedLeader
 
-from vlagents_ray.chunking.player import ChunkPlayer
+from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.client.commands import COMMAND, CommandInbox
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.interface import Act, Agent, Obs
@@ -188,6 +188,6 @@ def test_a_pause_that_ends_between_the_players_decision_and_the_loops_moves_noth
             return act
 
     arm = Arm(simulated=False)
-    with Resumed(Doubting(), ask_for_help=0.5) as player:
+    with Resumed(Doubting(), PlayerSettings(ask_for_help=0.5)) as player:
         report = run_loop(arm, player, hz=200.0, until=lambda: arm.ticks > 6)
     assert (report.paused, applied(arm)) == (6, []), "it asks again at each tick, as no human has looked"

@@ -18,7 +18,7 @@ from vlagents_ray import ActionSpec, ConfigError, Contract, Obs
 from vlagents_ray.envs import make_env
 from vlagents_ray.errors import MissingDependency, MissingState
 from vlagents_ray.robot import run_loop
-from vlagents_ray.robot.environment import EnvRobot
+from vlagents_ray.robot.simulated import EnvRobot
 from vlagents_ray.robot.teleoperation import AxesLeader, Keyboard, SpaceMouse, TeleoperatedAgent
 
 DELTAS = Contract(

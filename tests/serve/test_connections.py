@@ -24,13 +24,12 @@ from websockets.sync.client import connect
 
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.credentials import Credentials
-from vlagents_ray.client.transports.direct_websocket import Stream
-from vlagents_ray.client.transports.probe import bytes_probe
 from vlagents_ray.client.transports.shm import ShmTransport
+from vlagents_ray.client.transports.websocket import Stream
 from vlagents_ray.errors import PolicyUnavailable, TooManyRequests, Unauthorized
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.frames import decode_reply, encode_request
-from vlagents_ray.protocol.messages import PROTOCOL_VERSION, Limits, Request
+from vlagents_ray.protocol.messages import PROTOCOL_VERSION, Limits, Request, bytes_probe
 from vlagents_ray.serve import periodic
 from vlagents_ray.serve.access import api_keys
 from vlagents_ray.serve.access.api_keys import NoKey

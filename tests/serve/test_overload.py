@@ -41,9 +41,8 @@ from in_flight import read_requests
 
 import vlagents_ray
 from vlagents_ray.client.credentials import Credentials
-from vlagents_ray.client.transports.direct_websocket import Stream
-from vlagents_ray.client.transports.probe import bytes_probe, is_answer
 from vlagents_ray.client.transports.shm import ShmTransport
+from vlagents_ray.client.transports.websocket import Stream
 from vlagents_ray.errors import DeadlineExceeded, MessageTooLarge, Overloaded, TooManyRequests, VLAgentsError
 from vlagents_ray.images import codecs, jpeg_png
 from vlagents_ray.images.codecs import decode_files
@@ -65,6 +64,8 @@ from vlagents_ray.protocol.messages import (
     PlasmaAddress,
     Reply,
     Request,
+    bytes_probe,
+    is_probe_answer,
 )
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints.shm import ShmServer
@@ -252,7 +253,7 @@ def test_every_way_in_is_tried() -> None:
 @pytest.mark.parametrize("path", ["/v1/stream", "own"])
 def test_a_probe_through_a_websocket_counts_for_the_rate(replica: KeyedReplica, path: str) -> None:
     def read(data: Any) -> str:
-        return "answered" if is_answer(data) else _read_reply(data)
+        return "answered" if is_probe_answer(data) else _read_reply(data)
 
     attempt = over_websocket(path, lambda _: bytes_probe(100), read)
     assert attempt(replica.visitor("right"), "after") == "answered"

@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
-from vlagents_ray.client.transports.probe import (
-    LEAST_BYTES,
-    bytes_probe,
-    is_answer,
-)
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.frames import decode_reply, encode_request
-from vlagents_ray.protocol.messages import Limits, Request
+from vlagents_ray.protocol.messages import (
+    LEAST_BYTES,
+    Limits,
+    Request,
+    bytes_probe,
+    is_probe_answer,
+)
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.engine.engine import Engine
@@ -57,7 +58,7 @@ def test_a_probe_is_answered_by_both_endpoints(client: TestClient, engine: Engin
         socket.send_bytes(message)
         streamed = socket.receive_bytes()
     assert posted.content == streamed
-    assert is_answer(streamed)
+    assert is_probe_answer(streamed)
     assert int.from_bytes(streamed[4:], "little") == len(message)
 
 

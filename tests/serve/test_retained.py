@@ -21,8 +21,8 @@ from websockets.exceptions import InvalidStatus
 
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.credentials import Credentials
-from vlagents_ray.client.transports.direct_websocket import Stream
 from vlagents_ray.client.transports.shm import ShmTransport
+from vlagents_ray.client.transports.websocket import Stream
 from vlagents_ray.errors import MessageTooLarge, Overloaded, PolicyUnavailable, TooManyRequests, VLAgentsError
 from vlagents_ray.interface import Obs
 from vlagents_ray.protocol.frames import decode_replies, encode_request

@@ -38,7 +38,6 @@ from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.connection import Connection
 from vlagents_ray.client.credentials import Credentials
 from vlagents_ray.client.transports.codec_selection import CodecChoice
-from vlagents_ray.client.transports.probe import bytes_probe
 from vlagents_ray.client.transports.shm import ShmTransport
 from vlagents_ray.errors import BY_CODE, VLAgentsError
 from vlagents_ray.interface import Act, Agent, Obs
@@ -50,6 +49,7 @@ from vlagents_ray.protocol.messages import (
     PlasmaAddress,
     RankName,
     Request,
+    bytes_probe,
 )
 from vlagents_ray.registry import dialect_class
 from vlagents_ray.serve import periodic

@@ -18,13 +18,12 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.client.transports.probe import answer
 from vlagents_ray.errors import NotReset, Overloaded, UnknownSession, VLAgentsError
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.protocol.frame_layout import pack
 from vlagents_ray.protocol.frames import describe_error, encode_replies, encode_requests
 from vlagents_ray.protocol.json_messages import problem, reply_to_json
-from vlagents_ray.protocol.messages import Reply, Request
+from vlagents_ray.protocol.messages import Reply, Request, probe_answer
 
 ROOT = Path(__file__).parents[2]
 GOLDEN = ROOT / "clients" / "golden"
@@ -302,7 +301,7 @@ def _probes() -> list[Golden]:
     data = b"VLA?\0\0\0\0" + b"\x55" * 92
     return [
         Golden("probe", "probe", "a probe of 100 bytes", data, {"bytes": 100}),
-        Golden("probe_answer", "probe", "its answer", answer(100), {"arrived": 100}),
+        Golden("probe_answer", "probe", "its answer", probe_answer(100), {"arrived": 100}),
     ]
 
 

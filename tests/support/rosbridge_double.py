@@ -22,8 +22,6 @@ import numpy as np
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import Server, ServerConnection, serve
 
-from vlagents_ray.images.jpeg_png import encode_png
-
 _TYPED = {np.dtype("<f8"): 86, np.dtype("<f4"): 85, np.dtype("<u2"): 69}
 
 
@@ -123,15 +121,7 @@ def rosbridge_double() -> Iterator[RosbridgeDouble]:
 
 def encoded(message: dict[str, Any], compression: str) -> str | bytes:
     """A message as a client asked for it."""
-    if compression == "cbor":
-        return cbor(message)
-    text = json.dumps(_plain(message))
-    if compression != "png":
-        return text
-    data = text.encode()
-    side = math.ceil(math.sqrt(len(data) / 3))
-    pixels = np.frombuffer(data.ljust(side * side * 3, b"\n"), np.uint8).reshape(side, side, 3)
-    return json.dumps({"op": "png", "data": base64.b64encode(encode_png(pixels)).decode()})
+    return cbor(message) if compression == "cbor" else json.dumps(_plain(message))
 
 
 def _plain(value: Any) -> Any:

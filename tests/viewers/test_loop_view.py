@@ -9,7 +9,7 @@ import pytest
 from viewer_files import read_mcap, read_rrd
 
 from vlagents_ray import Act, ActionSpec, Agent, Contract, Obs
-from vlagents_ray.chunking.player import ChunkPlayer
+from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.robot import run_loop
 from vlagents_ray.robot.simulated import SimulatedRobot
 from vlagents_ray.viewers import EpisodeViewer, ViewerFrame, open_viewers
@@ -51,7 +51,7 @@ class Kept:
 
 def run(viewers: list[EpisodeViewer]) -> None:
     agent = Counting()
-    player = ChunkPlayer(agent, mode="open_loop")
+    player = ChunkPlayer(agent, PlayerSettings(mode="open_loop"))
     robot = SimulatedRobot(agent.contract)
     run_loop(robot, player, hz=HZ, instruction="count", viewers=viewers, until=lambda: agent.asked > CHUNKS)
 

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vlagents_ray.errors import InvalidWeights, UnchangedWeights
-from vlagents_ray.weights.check import fingerprint, fitted
+from vlagents_ray.weights.trainable import fingerprint, fitted
 
 HELD = {"w": np.zeros((2, 3), np.float32), "b": np.zeros(3, np.float16), "n": np.zeros((), np.int64)}
 LARGE = np.zeros(10_000, np.float32)

@@ -1,4 +1,4 @@
-"""The buffer of action chunks, which decides which row of which chunk is executed next.
+"""The buffer of action chunks, which decides which row is executed next, and the capture times of observations.
 
 The chunk player, episodes of an evaluation (`vlagents_ray.evaluate.episode.latency`), policies that return the rows of
 their chunks one by one (`vlagents_ray.policies.base.policy`), and vla-eval's sessions all use this buffer.
@@ -11,13 +11,14 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from types import MappingProxyType
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from vlagents_ray.errors import ConfigError, PolicyFailed
-from vlagents_ray.interface import AGE, AGE_MS, CHUNK, DELAY, LEFTOVER, PLANNED, ROW, SILENT, Act
+from vlagents_ray.errors import ConfigError, InvalidObservation, PolicyFailed
+from vlagents_ray.interface import AGE, AGE_MS, CAPTURED, CHUNK, DELAY, LEFTOVER, PLANNED, ROW, SILENT, Act, Obs
 
 Mode = Literal["open_loop", "ensemble", "async"]
 Merge = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -88,15 +89,12 @@ class ChunkBuffer:
     """
 
     def __init__(self, merge: str | Merge = "newest", ensemble_m: float = ENSEMBLE_M) -> None:
-        """Begin a plan without chunks.
+        """Begin a plan without chunks; raises `ConfigError` if `merge` is an unknown name.
 
         Args:
             merge: How the rows that several chunks have for one step are combined: a name of `MERGES`, "ensemble", or a
                 function that is folded over them from the oldest to the newest.
             ensemble_m: The m of the ensemble's weights exp(-m * i), oldest first.
-
-        Raises:
-            ConfigError: `merge` is an unknown name.
         """
         if isinstance(merge, str) and merge not in MERGES and merge != ENSEMBLE:
             raise ConfigError(f"merge: got {merge!r}, want one of {sorted([*MERGES, ENSEMBLE])} or a function")
@@ -151,10 +149,7 @@ class ChunkBuffer:
         return np.stack(rows) if rows else None
 
     def continuation(self, delays: Iterable[int]) -> dict[str, Any]:
-        """Return the `Obs.info` of a request to a policy with real-time chunking; {} if no planned action is left.
-
-        `delays` are the ticks that recent answers took.
-        """
+        """Return the `Obs.info` of a request with real-time chunking; `delays` are the ticks of recent answers."""
         rest = self.leftover()
         return {} if rest is None else {LEFTOVER: rest, DELAY: min(max(delays, default=0), len(rest))}
 
@@ -186,21 +181,38 @@ class ChunkBuffer:
         return Step(action, newest, row)
 
 
-def require_settings(
-    mode: str,
-    execute: int | None,
-    horizon: int | None,
-    max_age_s: float | None,
-    merge: str | Merge,
-    real_time_chunking: bool,
-) -> None:
-    """Raise `ConfigError` if settings of a `ChunkPlayer` are out of range, or do not go together."""
-    if mode not in get_args(Mode):
-        raise ConfigError(f"mode: got {mode!r}, want one of {list(get_args(Mode))}")
-    for name, value in (("execute", execute), ("horizon", horizon)):
-        if value is not None and value < 1:
-            raise ConfigError(f"{name}: got {value}, want at least 1, or None")
-    if max_age_s is not None and not max_age_s > 0:
-        raise ConfigError(f"max_age_s: got {max_age_s}, want above 0, or None")
-    if mode != "async" and (merge != "newest" or real_time_chunking):
-        raise ConfigError(f"merge and real_time_chunking: got them with mode {mode!r}, want mode='async'")
+SKEW_S = 0.1
+"""How far ahead of this machine's clock the clock of a sensor's computer may be."""
+
+
+class CaptureClock:
+    """Computes when an observation was captured, in s of `time.monotonic`.
+
+    `captured_at` is `time.time`, since it travels to other machines, and that clock may be set at any moment. So it is
+    read once, when a new `captured_at` is first seen; from then on, `time.monotonic` measures the age. If the same
+    observation is passed again, for instance because a camera hangs, it ages whatever happens to the clock. A jump of
+    the clock affects only the observation during which it happens: after a jump forward the observation is too old;
+    after one backward it lies in the future (by more than `SKEW_S`), and counts as too old as well, since its age is
+    unknown.
+    """
+
+    def __init__(self) -> None:
+        self._stamp: float | None = None
+        self._at = 0.0
+
+    def __call__(self, obs: Obs) -> float:
+        """Return the capture time; now, if the observation has none; `-math.inf` for an impossible one."""
+        now, stamp = time.monotonic(), obs.info.get(CAPTURED)
+        if stamp is None:
+            return now
+        if not isinstance(stamp, (int, float)) or not math.isfinite(stamp):
+            raise InvalidObservation(f"info[{CAPTURED!r}]: got {stamp!r}, want seconds since 1970, as of time.time()")
+        if stamp != self._stamp:
+            age_s = time.time() - stamp
+            self._stamp, self._at = stamp, now - max(age_s, 0.0) if age_s >= -SKEW_S else -math.inf
+        return self._at
+
+
+def stamped(obs: Obs, extras: Mapping[str, Any]) -> Obs:
+    """Return a copy of the observation with its capture time and the `extras` of the request."""
+    return replace(obs, info={CAPTURED: time.time(), **obs.info, **extras})

@@ -25,13 +25,7 @@ class Leader(Protocol):
         ...
 
     def action(self, obs: Obs) -> np.ndarray:
-        """Return the human's action at once, for a tick at which `engaged` was true.
-
-        Args:
-            obs: The observation of the tick.
-
-        Returns:
-            The action, (D,) float32, in the units of the policy's contract.
+        """Return the human's action at once, (D,) float32 in the contract's units, for a tick with `engaged()`.
 
         Raises:
             InvalidAction: There is none at this tick; the robot holds still.
@@ -133,10 +127,10 @@ class Control:
             self._silent.discard(source)
 
     def restart(self) -> bool:
-        """Allow motion again after a stop; may also be called from a signal handler.
+        """Allow motion again after a stop, unless a source is `silent`; may also be called from a signal handler.
 
         Returns:
-            Whether motion is allowed. It is not while a source is silent (see `silent`); call this again afterwards.
+            Whether motion is allowed; if it is not, call this again after the silence.
         """
         with self._lock:
             if not self._silent:
@@ -160,11 +154,7 @@ class Control:
             self._pause = self._pause or other._pause
 
     def begin(self, *, auto: bool) -> None:
-        """Begin a run of the control loop.
-
-        Args:
-            auto: Whether the end of a silence restarts the robot; a stop that was commanded stays until `restart`.
-        """
+        """Begin a run of the loop; with `auto`, the end of a silence ends the stop that it caused."""
         with self._lock:
             self._auto, self._outcome, self.running = auto, None, True
 
@@ -175,11 +165,7 @@ class Control:
             return self._outcome or ""
 
     def update(self) -> bool:
-        """Decide at the beginning of a tick who moves the robot.
-
-        Returns:
-            Whether the plan of the policy is void, since a human moved the robot, or nothing does.
-        """
+        """Decide at the beginning of a tick who moves the robot; return whether that makes the policy's plan void."""
         pauses, engaged = self._pauses, False
         if self.leader is not None:
             try:
@@ -205,7 +191,9 @@ class Control:
         """Why the robot must not move, by the last `update` and what came since; None if it may move."""
         with self._lock:
             if self._state == "stopped" or self.stopped or self._unseen:
-                return Held("stopped", f"stopped: {self._stop or self._silence()}")
+                silent = " and the ".join(sorted(self._silent))
+                silence = f"no signal from the {silent}" if silent else "waiting for a restart (Watchdog.restart)"
+                return Held("stopped", f"stopped: {self._stop or silence}")
             if self._state == "paused" or (self._pause is not None and self._state != "human"):
                 return Held("paused", self._pause or PAUSED)
             return None
@@ -226,7 +214,3 @@ class Control:
     def over(self) -> bool:
         """Whether the episode ends, since it was marked."""
         return self._outcome is not None
-
-    def _silence(self) -> str:
-        silent = f"no signal from the {' and the '.join(sorted(self._silent))}"
-        return silent if self._silent else "waiting for a restart (Watchdog.restart)"

@@ -47,12 +47,7 @@ class Execution:
             self._watched_until = time.monotonic() + _WATCHED_S
 
     def note(self, act: Act, executed: int) -> Act:
-        """Note the action of a tick, and return it.
-
-        Args:
-            act: The action that the player returns, (D,).
-            executed: The number of the policy's actions that the plan counts as executed, this one included.
-        """
+        """Note the action of a tick, (D,), and return it; `executed` counts those of the policy, with this one."""
         reason = act.info.get(SAFE)
         if reason is None:
             self._rows.append((executed - 1, act.action.copy()))  # the caller may change its own
@@ -106,7 +101,7 @@ class Execution:
             "safe_ticks": self._safe_ticks,
             "safe_spells": self._spells,
             "late": self._late,
-            "reconnects": getattr(agent, "reconnects", 0),
+            "reconnects": agent.reconnects,
         }
         return {**stated, PLAYED: played}
 

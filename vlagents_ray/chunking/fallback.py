@@ -1,13 +1,14 @@
-"""The safe action, which a robot executes when the policy's action does not come in time."""
+"""The safe action of a robot, for when the policy's does not come in time, and the checks that each command passes."""
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
-from vlagents_ray.contract import ActionSpec
+from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import (
     ConfigError,
     ConnectionLost,
@@ -17,6 +18,7 @@ from vlagents_ray.errors import (
     VLAgentsError,
 )
 from vlagents_ray.interface import Obs
+from vlagents_ray.validation import check_action
 
 SafeName = Literal["auto", "hold", "zero"]
 Cause = Literal[
@@ -79,27 +81,22 @@ class SafeAction:
     chooses by the contract's `ActionSpec`. An array (D,), or a function of the observation that returns one (for
     instance of the measured joints), is used unchanged.
 
-    Raises `ConfigError` where the choice would be a guess or would move the robot: a repeated delta continues the
-    motion, and zeros as joint targets move the arm to its zero position. Only "hold" may be chosen where the contract
-    does not say what the actions are.
+    Args:
+        safe: The name, array or function of the safe action.
+        spec: The actions of the contract.
+        grippers: The columns of the grippers; by default the last one, if the contract says how the gripper is opened.
+
+    Raises:
+        ConfigError: The choice would be a guess or would move the robot: a repeated delta continues the motion, and
+            zeros as joint targets move the arm to its zero position. Only "hold" may be chosen where the contract does
+            not say what the actions are.
     """
 
     def __init__(self, safe: Safe, spec: ActionSpec, grippers: Sequence[int] | None = None) -> None:
-        """Choose the safe action.
-
-        Args:
-            safe: The name, array or function of the safe action.
-            spec: The actions of the contract.
-            grippers: The columns of the grippers; by default the last one, if the contract says how the gripper is
-                opened.
-
-        Raises:
-            ConfigError: The choice does not fit `spec`.
-        """
         if isinstance(safe, str):
             if safe not in get_args(SafeName):
                 raise ConfigError(f"safe: got {safe!r}, want one of {list(get_args(SafeName))}, an array or a function")
-            self._make: SafeName | np.ndarray | Callable[[Obs], np.ndarray] = _fitting(safe, spec)
+            self._make: Safe = _fitting(safe, spec)
         else:
             self._make = safe if callable(safe) else np.asarray(safe, np.float32)
         self._grippers = list(grippers) if grippers is not None else [-1] if spec.gripper_open is not None else []
@@ -108,11 +105,7 @@ class SafeAction:
         """Does the last action, commanded again, keep the robot where it is?"""
 
     def __call__(self, obs: Obs, last: np.ndarray | None) -> np.ndarray:
-        """Return the safe action, (D,) float32; `last` is the last commanded action, None if there was none.
-
-        Raises:
-            InvalidAction: There is no last action, and the safe one depends on it.
-        """
+        """Return the safe action, (D,) float32, given the last command; raises `InvalidAction` if it needs one."""
         if callable(self._make):
             return np.asarray(self._make(obs), np.float32)
         if isinstance(self._make, np.ndarray):
@@ -149,10 +142,7 @@ def stopping(spec: ActionSpec) -> SafeName:
 
 
 def neutral(spec: ActionSpec, dim: int | None = None) -> np.ndarray:
-    """Return no motion, (D,) float32, with the gripper open where `spec` says how one is opened.
-
-    For relative actions.
-    """
+    """Return no motion for relative actions, (D,) float32, with the gripper open where `spec` says how."""
     dim = spec.dim if dim is None else dim
     if dim is None:
         raise InvalidAction("neutral action: got a contract without action.dim; want one that states it")
@@ -174,3 +164,75 @@ def _fitting(safe: SafeName, spec: ActionSpec) -> SafeName:
         moves = "relative actions go on moving with" if fitting == "zero" else "absolute ones take for a pose to go to"
         raise ConfigError(f"safe: got {safe!r}, which {moves}; give safe={fitting!r}, or 'auto'")
     return fitting
+
+
+Check = Callable[[np.ndarray, "np.ndarray | None"], np.ndarray]
+"""The action and the one before it, (D,) each -> the action to be taken, or `InvalidAction`."""
+
+
+class Motion:
+    """The motion of a robot in an episode: every action passes the check against the one before it.
+
+    Without a `check`, such as a `vlagents_ray.robot.Guard`, only the contract is checked. Without a `safe` action, an
+    error is raised in its place.
+    """
+
+    def __init__(self, check: Check | None, contract: Contract | None = None, safe: SafeAction | None = None) -> None:
+        self._check, self._contract, self._safe = check, contract, safe
+        self._last: np.ndarray | None = None  # the last commanded action
+        self._before: np.ndarray | None = None  # the last one of the ticks before
+        self._state: Literal["stopped", "moving", "held"] = "stopped"
+
+    @property
+    def can_hold(self) -> bool:
+        """Whether an action is known that keeps the robot still."""
+        return self._safe is not None
+
+    def tick(self) -> None:
+        """Begin a tick, at which one action may be commanded."""
+        self._before = self._last
+
+    def stop(self) -> None:
+        """Note that the robot was stopped, and did not execute a command of this tick."""
+        self._last = self._before
+        self._state = "stopped"
+
+    def move(self, action: np.ndarray, obs: Obs) -> np.ndarray:
+        """Return an action of the policy or a human, (D,) float32, if it may reach the robot; else `InvalidAction`."""
+        if self._state == "held":  # by the last target; the robot may have been moved since, or never have arrived
+            with contextlib.suppress(InvalidAction):
+                self._last, self._state = self._checked(action, self._last), "moving"
+                return self._last
+        last = self._last if self._state == "moving" else self._standing(obs)
+        self._last, self._state = self._checked(action, last), "moving"
+        return self._last
+
+    def hold(self, obs: Obs, why: Held) -> tuple[np.ndarray, Held]:
+        """Return the action that keeps the robot still, (D,) float32, and why; raises `InvalidAction` without one."""
+        if self._safe is None:
+            raise InvalidAction(f"no action for this tick: {why.reason}")
+        last = self._standing(obs) if self._state == "stopped" else self._last
+        try:
+            action = self._checked(self._safe(obs, last), last)
+        except InvalidAction as refused:
+            why = why._replace(reason=f"{why.reason}; the safe action is refused, too: {refused}")
+            if last is None or not self._safe.holds:
+                raise InvalidAction(
+                    f"no action for this tick: {why.reason}; let the guard pass it, or give another one (safe=)"
+                ) from refused
+            action = self._checked(last, last)
+        self._state = "held" if self._state == "moving" else self._state
+        self._last = action
+        return action.copy(), why
+
+    def _standing(self, obs: Obs) -> np.ndarray | None:
+        """Return the robot's position, (D,), as far as it is known."""
+        reference = getattr(self._check, "reference", None)
+        return self._last if reference is None else reference(obs, self._last)
+
+    def _checked(self, action: np.ndarray, last: np.ndarray | None) -> np.ndarray:
+        """Return a row, (D,) float32, that may be sent to the robot; raises `InvalidAction` for any other."""
+        action = check_action(action, self._contract)
+        if action.ndim != 1:
+            raise InvalidAction(f"action: got {action.shape}, want (D,), a single row")
+        return action if self._check is None else self._check(action, last)

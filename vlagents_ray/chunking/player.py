@@ -2,27 +2,28 @@
 
 from __future__ import annotations
 
+import queue
+import threading
 import time
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 
-from vlagents_ray.chunking.background import AsyncCaller
 from vlagents_ray.chunking.buffer import (
     DELAYS,
     ENSEMBLE,
     ENSEMBLE_M,
+    CaptureClock,
     Chunk,
     ChunkBuffer,
     Merge,
     Mode,
     Step,
-    require_settings,
+    stamped,
 )
-from vlagents_ray.chunking.capture_clock import CaptureClock, stamped
 from vlagents_ray.chunking.control import Control, Leader
 from vlagents_ray.chunking.execution import Execution
 from vlagents_ray.chunking.fallback import (
@@ -32,12 +33,13 @@ from vlagents_ray.chunking.fallback import (
     STALE,
     STOPPED,
     WAITING,
+    Check,
     Held,
+    Motion,
     Safe,
     SafeAction,
     refused,
 )
-from vlagents_ray.chunking.motion import Check, Motion
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import ConfigError, InvalidAction, InvalidInput, NotReset, VLAgentsError
 from vlagents_ray.interface import (
@@ -58,6 +60,61 @@ from vlagents_ray.interface import (
 from vlagents_ray.validation import check_action
 
 UNCERTAINTY = "uncertainty"  # in the info of an Act, if the policy states it: a number, or one for each row
+_CLOSE_S = 2.0
+
+
+class AsyncCaller:
+    """A thread that calls `agent.act`, so that the caller's own thread never waits for it.
+
+    One thread uses it, and nothing else may use the agent during a request; `settle` waits for its end.
+    """
+
+    def __init__(self, agent: Agent) -> None:
+        self._agent = agent
+        self._jobs: queue.SimpleQueue[Obs | None] = queue.SimpleQueue()  # None ends the thread
+        self._answers: queue.SimpleQueue[Act | Exception] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._run, name="vlagents-ray-caller", daemon=True)
+        self._thread.start()
+        self.idle = True
+        """Whether there is neither a request in progress nor an answer to be taken."""
+
+    @property
+    def busy(self) -> bool:
+        """Whether a request is in progress."""
+        return not self.idle and self._answers.empty()
+
+    def ask(self, obs: Obs) -> None:
+        """Begin a request, only while `idle`. The caller must not change `obs` afterwards."""
+        self.idle = False
+        self._jobs.put(obs)
+
+    def take(self, wait_s: float = 0.0) -> Act | Exception | None:
+        """Return the policy's answer or its error, if it comes within `wait_s` seconds; else None."""
+        try:
+            answer = self._answers.get(timeout=wait_s) if wait_s else self._answers.get_nowait()
+        except queue.Empty:
+            return None
+        self.idle = True
+        return answer
+
+    def settle(self) -> None:
+        """Wait for the end of the request in progress, however long that takes, and drop its answer."""
+        if not self.idle:
+            self._answers.get()
+            self.idle = True
+
+    def close(self) -> None:
+        """Close the agent as soon as its request is over; wait for that for two seconds at most."""
+        self._jobs.put(None)
+        self._thread.join(_CLOSE_S)
+
+    def _run(self) -> None:
+        while (obs := self._jobs.get()) is not None:
+            try:
+                self._answers.put(self._agent.act(obs))
+            except Exception as error:  # noqa: BLE001 - raised or reported where the answer is taken
+                self._answers.put(error)
+        self._agent.close()
 
 
 class _Request(NamedTuple):
@@ -66,6 +123,53 @@ class _Request(NamedTuple):
     tick: int = -1
     step: int = 0  # `ChunkBuffer.executed` at its observation: the position of the answer's first row
     seen_at: float = 0.0  # s, of `time.monotonic`: when the observation was captured
+
+
+@dataclass(frozen=True)
+class PlayerSettings:
+    """The settings of a `ChunkPlayer`: when it asks the policy, and what it does with the answers.
+
+    Raises:
+        ConfigError: A setting is out of range, or settings do not go together.
+    """
+
+    mode: Mode = "open_loop"
+    """With "open_loop", execute `execute` rows, then ask again and wait for the answer. With "ensemble", ask each tick,
+    and average what all chunks say of it with the weights exp(-m * i), oldest first (ACT's temporal ensembling). With
+    "async", ask in the background, one request at a time, with the newest observation."""
+    execute: int | None = None  # rows between two requests: of a chunk (default: all), or in "async" ticks (default: 1)
+    merge: str | Merge = "newest"
+    """What becomes of a tick that several chunks have a row for, in "async": "newest", "average", "weighted_average",
+    "conservative", "ensemble", or a function (see `vlagents_ray.chunking.buffer`)."""
+    ensemble_m: float = ENSEMBLE_M  # the m of the weights
+    real_time_chunking: bool = False
+    """Whether each request carries what is left of the plan and the measured delay (`LEFTOVER`, `DELAY` in
+    `vlagents_ray.interface`), for policies that use them; in "async" only."""
+    deadline_s: float | None = None  # within which `act` returns; 0 by default in "async", else none
+    timeout_s: float | None = None  # after which a request is given up; by default the agent's
+    horizon: int | None = None  # rows of a chunk that may be executed at all
+    max_age_s: float | None = None
+    """How old the observation of an executed action may be. Its age counts from `info["captured_at"]`, that of the
+    sensor which was read first; without it, from the call of `act` (see `CaptureClock`)."""
+    safe: Safe = "auto"  # the action in place of a missing one (see `SafeAction`)
+    grippers: Sequence[int] | None = None  # the columns of the action that are grippers (see `SafeAction`)
+    ask_for_help: float | None = None  # the uncertainty above which the robot pauses (see `uncertainty`)
+    samples: int | None = None  # to ask for, from whose spread a policy's uncertainty is computed
+
+    def __post_init__(self) -> None:
+        if self.mode not in get_args(Mode):
+            raise ConfigError(f"mode: got {self.mode!r}, want one of {list(get_args(Mode))}")
+        for name, value in (("execute", self.execute), ("horizon", self.horizon)):
+            if value is not None and value < 1:
+                raise ConfigError(f"{name}: got {value}, want at least 1, or None")
+        if self.max_age_s is not None and not self.max_age_s > 0:
+            raise ConfigError(f"max_age_s: got {self.max_age_s}, want above 0, or None")
+        if self.ask_for_help is not None and not self.ask_for_help >= 0:
+            raise ConfigError(f"ask_for_help: got {self.ask_for_help}, want 0 or above, or None")
+        if self.mode != "async" and (self.merge != "newest" or self.real_time_chunking):
+            raise ConfigError(f"merge and real_time_chunking: got them with mode {self.mode!r}, want mode='async'")
+        if self.mode == "async" and self.deadline_s is None:
+            object.__setattr__(self, "deadline_s", 0.0)
 
 
 class ChunkPlayer(Agent):
@@ -84,73 +188,34 @@ class ChunkPlayer(Agent):
     errors are raised.
     """
 
+    control: Control
+    """The state of the robot, which decides at each `act` who moves it."""
+
     def __init__(
         self,
         agent: Agent,
+        settings: PlayerSettings | None = None,
         *,
-        mode: Mode = "open_loop",
-        execute: int | None = None,
-        merge: str | Merge = "newest",
-        ensemble_m: float = ENSEMBLE_M,
-        real_time_chunking: bool = False,
-        deadline_s: float | None = None,
-        timeout_s: float | None = None,
-        horizon: int | None = None,
-        max_age_s: float | None = None,
-        safe: Safe = "auto",
-        grippers: Sequence[int] | None = None,
         check: Check | None = None,
         override: Leader | None = None,
-        ask_for_help: float | None = None,
-        samples: int | None = None,
     ) -> None:
         """Play the chunks of a policy.
 
         Args:
             agent: The policy, in this process or a `RemoteAgent`.
-            mode: "open_loop" executes `execute` rows, then asks again and waits for the answer. "ensemble" asks at each
-                tick and averages what all chunks say of it, with the weights exp(-m * i), oldest first (ACT's temporal
-                ensembling). "async" asks in the background, one request at a time, with the newest observation.
-            execute: Rows between two requests: of a chunk (default: all), or in "async" ticks (default: 1).
-            merge: What becomes of a tick that several chunks have a row for, in "async": "newest", "average",
-                "weighted_average", "conservative", "ensemble", or a function (see `vlagents_ray.chunking.buffer`).
-            ensemble_m: The m of the weights.
-            real_time_chunking: Whether each request carries what is left of the plan and the measured delay
-                (`LEFTOVER`, `DELAY` in `vlagents_ray.interface`), for policies that use them; in "async" only.
-            deadline_s: The time within which `act` returns; 0 by default in "async", else none.
-            timeout_s: The time after which a request is given up; by default the agent's.
-            horizon: The number of rows of a chunk that may be executed at all.
-            max_age_s: How old the observation of an executed action may be. Its age counts from `info["captured_at"]`,
-                that of the sensor which was read first; without it, from the call of `act` (see `CaptureClock`).
-            safe: The action in place of a missing one (see `SafeAction`).
-            grippers: The dimensions of the action that are grippers (see `SafeAction`).
+            settings: When the policy is asked, and what is executed of its answers; default: `PlayerSettings()`.
             check: Sees every action before it is returned, such as a `vlagents_ray.robot.Guard`. In place of one of the
                 policy's that it refuses the safe one is taken, and the plan is dropped; in place of a safe one the last
                 action, if that keeps the robot still; else `act` raises `InvalidAction`. It gets the last action, too;
                 a `Guard` with `measure` takes the measured pose where there is none, and after safe actions.
             override: What a human moves the robot with. While it is engaged, `act` returns its actions with
                 `info["intervention"]` and, where known, `info["policy_action"]`. They pass `check`, too.
-            ask_for_help: The uncertainty above which the robot pauses (see `uncertainty`).
-            samples: The number of samples to ask for, from whose spread a policy's uncertainty is computed.
-
-        Raises:
-            ConfigError: Settings do not go together.
         """
-        if ask_for_help is not None and not ask_for_help >= 0:
-            raise ConfigError(f"ask_for_help: got {ask_for_help}, want 0 or above, or None")
-        require_settings(mode, execute, horizon, max_age_s, merge, real_time_chunking)
-        self._agent = agent
-        self._mode: Mode = mode
-        self._execute = execute
-        self._deadline_s = 0.0 if deadline_s is None and mode == "async" else deadline_s
-        self._timeout_s = timeout_s
-        self._horizon, self._max_age_s = horizon, max_age_s
-        self._safe_choice, self._grippers = safe, grippers
+        self.settings = settings = settings or PlayerSettings()
         self.check = check
         self.control = Control(override)
-        self._ask_for_help, self._samples = ask_for_help, samples
-        self._real_time = real_time_chunking
-        self._plan = ChunkBuffer(ENSEMBLE if mode == "ensemble" else merge, ensemble_m)
+        self._agent = agent
+        self._plan = ChunkBuffer(ENSEMBLE if settings.mode == "ensemble" else settings.merge, settings.ensemble_m)
         self._asker: AsyncCaller | None = None
         self._contract: Contract | None = None
         self._begin()
@@ -192,7 +257,7 @@ class ChunkPlayer(Agent):
         self._captured(obs)  # before the reset of the policy, which may take long
         info = self._agent.reset(obs, instruction, **kwargs)
         self._choose_safe()
-        if self._deadline_s is not None:
+        if self.settings.deadline_s is not None:
             self._note_asked(0, obs)
             self._take(self._agent.act(obs), 0)
             if self._asker is None:
@@ -265,31 +330,35 @@ class ChunkPlayer(Agent):
 
     def _ask(self, obs: Obs, tick: int, begun: float) -> None:
         """Take what the policy has answered, and ask it if that is due."""
-        if self._asker is None or self._deadline_s is None:
+        if self._asker is None or self.settings.deadline_s is None:
             if self._wants(tick, obs):
                 self._note_asked(tick, obs)
                 self._take(self._agent.act(stamped(obs, self._extras())), tick)
         else:  # no tick waits for an action that is not executed
-            wait_s = self._deadline_s if self.control.state == "autonomous" else 0.0
+            wait_s = self.settings.deadline_s if self.control.state == "autonomous" else 0.0
             self._ask_in_time(self._asker, obs, tick, begun + wait_s)
 
     def _choose_safe(self) -> None:
         """Choose the safe action; raises `ConfigError` if it does not fit the policy's actions."""
         self._contract = self._agent.contract
         spec = ActionSpec() if self._contract is None else self._contract.action
-        wanted = self._deadline_s is not None or self.control.leader is not None or self._ask_for_help is not None
-        safe = SafeAction(self._safe_choice, spec, self._grippers) if wanted else None
+        wanted = (
+            self.settings.deadline_s is not None
+            or self.control.leader is not None
+            or self.settings.ask_for_help is not None
+        )
+        safe = SafeAction(self.settings.safe, spec, self.settings.grippers) if wanted else None
         self._motion = Motion(self.check, self._contract, safe)
 
     def _note_asked(self, tick: int, obs: Obs) -> None:
         self._request, self._dropped = _Request(tick, self._plan.executed, self._captured(obs)), False
 
     def _is_old(self, seen_at: float) -> bool:
-        return self._max_age_s is not None and seen_at < time.monotonic() - self._max_age_s
+        return self.settings.max_age_s is not None and seen_at < time.monotonic() - self.settings.max_age_s
 
     def _next(self) -> Step | None:
         """Return the action for now from chunks that are young enough."""
-        if self._max_age_s is not None and self._plan.drop(time.monotonic() - self._max_age_s):
+        if self.settings.max_age_s is not None and self._plan.drop(time.monotonic() - self.settings.max_age_s):
             self._trouble = OLD
         return self._plan.next
 
@@ -300,10 +369,10 @@ class ChunkPlayer(Agent):
         step = self._next()
         if step is None or step.chunk.done:
             return step is None
-        if self._mode == "open_loop":
-            return self._execute is not None and step.row >= self._execute
+        if self.settings.mode == "open_loop":
+            return self.settings.execute is not None and step.row >= self.settings.execute
         last = step.chunk.end == self._plan.executed + 1  # also true for each answer of a single action
-        return last or tick - self._request.tick >= (self._execute or 1)
+        return last or tick - self._request.tick >= (self.settings.execute or 1)
 
     def _ask_in_time(self, asker: AsyncCaller, obs: Obs, tick: int, deadline: float) -> None:
         """Take an answer, send a request if one is due, and wait for its answer as long as allowed and needed."""
@@ -314,7 +383,7 @@ class ChunkPlayer(Agent):
                 self._waiting_since = time.monotonic()
             asker.ask(stamped(copied(obs), self._extras()))
         while not asker.idle and (left_s := deadline - time.monotonic()) > 0:
-            fresh = self._mode != "async" and self._request.tick == tick
+            fresh = self.settings.mode != "async" and self._request.tick == tick
             if not fresh and self._next() is not None:
                 break
             self._receive(asker.take(left_s), tick)
@@ -338,10 +407,10 @@ class ChunkPlayer(Agent):
         act = replace(act, info={key: value for key, value in act.info.items() if key not in OF_THE_LOOP})
         self._execution.heard(act)
         tick, step, seen_at = self._request
-        rows = Act(check_action(act.action, self._contract)).rows()[: self._horizon]
-        if self._mode == "open_loop" and act.done and self._execute is not None:
+        rows = Act(check_action(act.action, self._contract)).rows()[: self.settings.horizon]
+        if self.settings.mode == "open_loop" and act.done and self.settings.execute is not None:
             # A late answer keeps one row: the last row says that the task is done.
-            rows = rows[: max(self._execute, self._plan.executed + 1 - step)]
+            rows = rows[: max(self.settings.execute, self._plan.executed + 1 - step)]
         self._delays.append(now - tick)
         added = self._plan.add(Chunk(self._chunks, step, rows, act.done, act.info, tick, seen_at))
         self._chunks += 1
@@ -349,11 +418,13 @@ class ChunkPlayer(Agent):
 
     def _extras(self) -> dict[str, Any]:
         extras = self._execution.report(self._plan.executed, self._agent)
-        if self._samples is not None:
-            extras[SAMPLES] = self._samples
-        if self._timeout_s is not None:
-            extras[DEADLINE] = self._timeout_s * 1e3
-        if self._real_time and self.control.state != "human":  # who executes other actions than those of the plan
+        if self.settings.samples is not None:
+            extras[SAMPLES] = self.settings.samples
+        if self.settings.timeout_s is not None:
+            extras[DEADLINE] = self.settings.timeout_s * 1e3
+        if (
+            self.settings.real_time_chunking and self.control.state != "human"
+        ):  # who executes other actions than those of the plan
             extras |= self._plan.continuation(self._delays)
         return extras
 
@@ -404,7 +475,7 @@ class ChunkPlayer(Agent):
         After a pause the policy may continue once with an uncertain chunk: help is asked for again when there was a
         certain one in between.
         """
-        if self._ask_for_help is None or info is self._judged:
+        if self.settings.ask_for_help is None or info is self._judged:
             return False
         self._judged = info
         value = uncertainty(info)
@@ -413,10 +484,10 @@ class ChunkPlayer(Agent):
                 "ask_for_help: the policy states no uncertainty; ask it for samples (samples=8), or add "
                 f"act.info[{UNCERTAINTY!r}] to its answers"
             )
-        if value <= self._ask_for_help:
+        if value <= self.settings.ask_for_help:
             self._helped = False
         elif not self._helped:
-            self.control.pause(f"asks for help: its uncertainty is {value:.3g}, above {self._ask_for_help:.3g}")
+            self.control.pause(f"asks for help: its uncertainty is {value:.3g}, above {self.settings.ask_for_help:.3g}")
             return True
         return False
 
@@ -431,17 +502,10 @@ class ChunkPlayer(Agent):
 
 
 def uncertainty(info: Mapping[str, Any]) -> float | None:
-    """Return how uncertain a policy is of a chunk.
+    """Return how uncertain a policy is of a chunk, by the info of its `Act`; raises `InvalidAction` for another value.
 
-    Args:
-        info: The info of the policy's `Act`.
-
-    Returns:
-        `info["uncertainty"]` if the policy states it; else the mean standard deviation of its samples, in the units of
-        the action; None if there are none.
-
-    Raises:
-        InvalidAction: What it states is not a number.
+    It is `info["uncertainty"]` if the policy states it; else the mean standard deviation of its samples, in the units
+    of the action; None if there are none.
     """
     try:
         if UNCERTAINTY in info:

@@ -17,7 +17,7 @@ from typing import Any, get_args
 
 from vlagents_ray.chunking.buffer import ENSEMBLE, MERGES, Mode
 from vlagents_ray.chunking.control import Leader
-from vlagents_ray.chunking.player import ChunkPlayer
+from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.commands import CommandInbox
 from vlagents_ray.contract import Contract, require_match
@@ -28,8 +28,7 @@ from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.ros import RosRobot, read_settings
 from vlagents_ray.robot.safety import Guard, Watchdog, measured_state
 from vlagents_ray.robot.simulated import SimulatedRobot
-from vlagents_ray.robot.teleoperation import HELP, AxesLeader, Keyboard, SpaceMouse
-from vlagents_ray.robot.terminal import Terminal
+from vlagents_ray.robot.teleoperation import HELP, AxesLeader, Keyboard, SpaceMouse, Terminal
 from vlagents_ray.viewers.targets import open_viewers
 
 MOSTLY_SAFE = 3  # exit status
@@ -63,20 +62,19 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     parser, of_robot, of_env = command_parser()
     options = parser.parse_args(arguments)
     in_env = options.env is not None
-    given = [one.option_strings[0] for one in (of_robot if in_env else of_env) if _is_given(options, one)]
+    refused = of_robot if in_env else of_env
+    given = [one.option_strings[0] for one in refused if getattr(options, one.dest) != one.default]
     if given:
         parser.error(f"got {', '.join(given)} with{'' if in_env else 'out'} --env; leave them out")
     if not in_env and options.policy is None:
         parser.error("got neither a URL nor --env, want one of them")
+    if options.ros is not None and options.robot is not None:
+        parser.error("got --robot besides --ros, want one of them")
     if options.mode is None:
         options.mode = "open_loop" if in_env else "async"
     if options.mode != "async" and (options.merge != "newest" or options.rtc):
         parser.error(f"--merge and --rtc: got one of them with --mode {options.mode}, want --mode async")
     return options
-
-
-def _is_given(options: argparse.Namespace, action: argparse.Action) -> bool:
-    return bool(getattr(options, action.dest) != action.default)
 
 
 @contextlib.contextmanager
@@ -104,7 +102,7 @@ def _run(options: argparse.Namespace) -> LoopReport:
     make_robot = import_class("--robot", options.robot) if options.robot else None
     make_leader = import_class("--leader", options.leader) if ":" in (options.leader or "") else None
     with contextlib.ExitStack() as stack:
-        topics = _topics(options, stack)
+        topics = None if options.ros is None else stack.enter_context(RosRobot(read_settings(options.ros)))
         commands = CommandInbox() if options.operate else None
         agent = RemoteAgent(  # the player closes it
             options.policy, transport=options.transport, timeout_s=options.timeout_s, commands=commands
@@ -115,21 +113,18 @@ def _run(options: argparse.Namespace) -> LoopReport:
         stated = contract is not None and contract.action.relative is not None
         if options.safe == "auto" and not options.robot and topics is None and not stated:
             options.safe = "hold"  # the simulated robot uses such actions as absolute targets
-        player = stack.enter_context(
-            ChunkPlayer(
-                agent,
-                mode=options.mode,
-                execute=options.execute,
-                merge=options.merge,
-                real_time_chunking=options.rtc,
-                deadline_s=deadline_s,
-                horizon=options.horizon,
-                max_age_s=options.max_age_s,
-                safe=options.safe,
-                check=Guard(contract, max_step=options.max_step, measure=measured_state(options.measure)),
-                override=leader,
-            )
+        settings = PlayerSettings(
+            mode=options.mode,
+            execute=options.execute,
+            merge=options.merge,
+            real_time_chunking=options.rtc,
+            deadline_s=deadline_s,
+            horizon=options.horizon,
+            max_age_s=options.max_age_s,
+            safe=options.safe,
         )
+        guard = Guard(contract, max_step=options.max_step, measure=measured_state(options.measure))
+        player = stack.enter_context(ChunkPlayer(agent, settings, check=guard, override=leader))
         player.initialize()  # refuses settings that do not fit, before anything is timed or moves
         robot: Robot = topics or (SimulatedRobot(contract) if make_robot is None else make_robot())
         recorder = None
@@ -215,14 +210,6 @@ def _say_outcome(report: LoopReport, say: Callable[[str], None], *, led: bool) -
     say(f"against jitter: {', '.join(report.means)}")
 
 
-def _topics(options: argparse.Namespace, stack: contextlib.ExitStack) -> RosRobot | None:
-    if options.ros is None:
-        return None
-    if options.robot is not None:
-        raise ConfigError("--robot: got one besides --ros, want one of them")
-    return stack.enter_context(RosRobot(read_settings(options.ros)))
-
-
 @contextlib.contextmanager
 def _restarting(watchdog: Watchdog, say: Callable[[str], None]) -> Iterator[None]:
     """Let a person restart motion after a stop or a pause: by Enter or C at the terminal, or by SIGUSR1."""
@@ -277,6 +264,8 @@ def command_parser() -> tuple[argparse.ArgumentParser, list[argparse.Action], li
     of_robot: list[argparse.Action] = []
     of_env: list[argparse.Action] = []
     add = parser.add_argument
+    seconds = _number(above=True)
+    rows = _number(int, least=1)
 
     def real(*names: str, **settings: Any) -> None:
         of_robot.append(groups[0].add_argument(*names, **settings))
@@ -284,97 +273,48 @@ def command_parser() -> tuple[argparse.ArgumentParser, list[argparse.Action], li
     def simulated(*names: str, **settings: Any) -> None:
         of_env.append(groups[1].add_argument(*names, **settings))
 
-    add(
-        "policy",
-        nargs="?",
-        help="the URL of its server: http://gpu-box:8000; with --env also a registered policy, 'module:Class', or "
-        "nothing for a human alone",
-    )
-    add("--hz", type=_number(above=True), help=f"control rate (default: {_HZ:g}, or the environment's)")
-    real("--seconds", type=_number(above=True), default=60.0, help="how long (%(default)s)")
+    policy = "URL of its server: http://gpu-box:8000; with --env also a registered policy, 'module:Class', or nothing"
+    add("policy", nargs="?", help=policy)
+    add("--hz", type=seconds, help=f"control rate (default: {_HZ:g}, or the environment's)")
+    real("--seconds", type=seconds, default=60.0, help="how long (%(default)s)")
     real("--instruction", help="the task in words")
-    real(
-        "--robot",
-        metavar="MODULE:CLASS",
-        help="your class of the robot, created without arguments; default: a simulated one",
-    )
+    real("--robot", metavar="MODULE:CLASS", help="your robot's class, without arguments; default: a simulated one")
     real("--ros", metavar="FILE", help="a robot behind topics of ROS 2, from this file; see docs/ros.md")
-    add(
-        "--leader",
-        metavar="LEADER",
-        help="what a human takes over with: keyboard, spacemouse, or, without --env, MODULE:CLASS of yours, see Leader",
-    )
-    add("--step", type=_number(above=True), help="what a key or axis of these adds to a number of the action at a tick")
-    add("--mode", choices=get_args(Mode), help="see ChunkPlayer (default: async; with --env open_loop)")
-    add("--execute", type=_number(int, least=1), metavar="N", help="rows of a chunk to execute before asking again")
-    real("--horizon", type=_number(int, least=1), metavar="N", help="rows of a chunk that may be executed at all")
-    real(
-        "--max-age-s",
-        type=_number(above=True),
-        metavar="S",
-        help="largest age of the observation from which an action was computed",
-    )
-    real(
-        "--merge", choices=(*MERGES, ENSEMBLE), default="newest", help="how overlapping chunks are merged (%(default)s)"
-    )
+    leaders = "what a human takes over with: keyboard, spacemouse, or, without --env, MODULE:CLASS of yours, see Leader"
+    add("--leader", metavar="LEADER", help=leaders)
+    add("--step", type=seconds, help="what a key or axis of these adds to a number of the action at a tick")
+    add("--mode", choices=get_args(Mode), help="see PlayerSettings (default: async; with --env open_loop)")
+    add("--execute", type=rows, metavar="N", help="rows of a chunk to execute before asking again")
+    real("--horizon", type=rows, metavar="N", help="rows of a chunk that may be executed at all")
+    real("--max-age-s", type=seconds, metavar="S", help="largest age of the observation of an executed action")
+    merges = (*MERGES, ENSEMBLE)
+    real("--merge", choices=merges, default="newest", help="how overlapping chunks are merged (%(default)s)")
     real("--rtc", action="store_true", help="real-time chunking: send the rest of the plan, and the delay")
-    real(
-        "--deadline-ms",
-        type=_number(),
-        help=f"how long a tick may wait for an action (async: 0, else {WAIT_S * 1e3:.0f})",
-    )
-    real(
-        "--safe",
-        choices=("auto", "hold", "zero"),
-        default="auto",
-        help="the action of a tick without one of the policy (%(default)s: by contract)",
-    )
+    waits = f"how long a tick may wait for an action (async: 0, else {WAIT_S * 1e3:.0f})"
+    real("--deadline-ms", type=_number(), help=waits)
+    safe = "the action of a tick without one of the policy (%(default)s: by contract)"
+    real("--safe", choices=("auto", "hold", "zero"), default="auto", help=safe)
     add("--max-step", type=_number(), help="largest change of a number of the action from one tick to the next")
     real("--measure", metavar="PART", help="part of the state with the measured pose, for --max-step, e.g. joints")
-    real(
-        "--restart",
-        choices=get_args(Restart),
-        help="how motion restarts after a stop by the watchdog: by Enter, C or SIGUSR1, or by itself "
-        "(default: manual; auto for a simulated robot)",
-    )
-    real(
-        "--silent-s",
-        type=_number(above=True),
-        default=2.0,
-        help="stop the robot when the server is silent this long (%(default)s)",
-    )
-    real(
-        "--timeout-s",
-        type=_number(above=True),
-        default=10.0,
-        help="time after which a request is given up (%(default)s)",
-    )
+    restarts = "how motion restarts after a stop: by Enter, C or SIGUSR1, or by itself (manual; auto if simulated)"
+    real("--restart", choices=get_args(Restart), help=restarts)
+    silence = "stop the robot when the server is silent this long (%(default)s)"
+    real("--silent-s", type=seconds, default=2.0, help=silence)
+    real("--timeout-s", type=seconds, default=10.0, help="time after which a request is given up (%(default)s)")
     real("--transport", choices=("auto", "shm", "websocket", "http"), default="auto", help="(%(default)s)")
     add("--record", metavar="DIR", help="record a LeRobotDataset v3.0 there; needs the extra 'record'")
-    real(
-        "--rerun", metavar="DIR", help="write a .rrd file there for Rerun, or 'live': show the run in a running viewer"
-    )
-    real(
-        "--foxglove", metavar="DIR", help="write an .mcap file there for Foxglove, or 'live': let it connect to the run"
-    )
-    real(
-        "--operate",
-        action="store_true",
-        help="obey the buttons of the server's live page: pause, stop, success, failure",
-    )
+    real("--rerun", metavar="DIR", help="write a .rrd file there for Rerun, or 'live': show the run in its viewer")
+    real("--foxglove", metavar="DIR", help="write an .mcap file there for Foxglove, or 'live': let it connect")
+    buttons = "obey the buttons of the server's live page: pause, stop, success, failure"
+    real("--operate", action="store_true", help=buttons)
     real("--real-time", action="store_true", help="ask for SCHED_FIFO in place of a nice value")
-    real(
-        "--baseline",
-        type=_number(),
-        default=5.0,
-        metavar="S",
-        help="first measure an empty loop for this long (%(default)s)",
-    )
+    empty = "first measure an empty loop for this long (%(default)s)"
+    real("--baseline", type=_number(), default=5.0, metavar="S", help=empty)
     groups[1].add_argument("--env", metavar="NAME", help="the environment: tabletop, maniskill/PickCube-v1, …")
     settings: dict[str, Any] = {"action": "append", "metavar": "KEY=VALUE", "default": []}
     simulated("--env-set", **settings, help="an option of the environment: width=256")
     simulated("--set", **settings, help="a setting of the policy, repeatable")
-    simulated("--episodes", type=_number(int, least=1), default=10, metavar="N", help="how many (%(default)s)")
+    simulated("--episodes", type=rows, default=10, metavar="N", help="how many (%(default)s)")
     simulated("--seed", type=int, default=0, help="of the first episode; the others count on (%(default)s)")
     simulated("--ask-for-help", type=_number(), metavar="U", help="pause where the policy's uncertainty is above this")
     simulated("--samples", type=_number(int, least=2), metavar="N", help="to compute the uncertainty from")

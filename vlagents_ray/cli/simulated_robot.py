@@ -7,16 +7,13 @@ import contextlib
 import shutil
 import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import typer
 
-from vlagents_ray.chunking.buffer import Mode
 from vlagents_ray.chunking.control import Control, Leader
-from vlagents_ray.chunking.player import ChunkPlayer
+from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.cli.console import errors, out
 from vlagents_ray.cli.options import parse_settings
 from vlagents_ray.client.agent import RemoteAgent
@@ -26,9 +23,9 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Agent, Obs
 from vlagents_ray.policies.wrapper import Wrapper, build_agent
 from vlagents_ray.robot import Guard, run_loop
-from vlagents_ray.robot.environment import EnvRobot
 from vlagents_ray.robot.episode import Label
 from vlagents_ray.robot.record import Recorder
+from vlagents_ray.robot.simulated import EnvRobot
 from vlagents_ray.robot.teleoperation import HELP, AxesDevice, AxesLeader, Keyboard, SpaceMouse, TeleoperatedAgent
 
 _PERIOD_S = 0.2
@@ -45,11 +42,7 @@ _MOVES = {
 
 
 class TerminalView:
-    """A view of cameras side by side, redrawn in place five times a second at most.
-
-    Args:
-        write: Writes text to the terminal, and flushes it.
-    """
+    """Shows cameras side by side in a terminal, redrawn in place five times a second at most."""
 
     def __init__(self, write: Callable[[str], object]) -> None:
         self._write = write
@@ -75,14 +68,9 @@ class TerminalView:
 
 
 def blocks(images: list[np.ndarray], side: int) -> list[str]:
-    """Draw images side by side, two pixels a character.
+    """Draw images, (H, W, 3) uint8 RGB, side by side, two pixels a character, in 24-bit colours; return the lines.
 
-    Args:
-        images: The images, (H, W, 3) uint8 RGB each.
-        side: The larger side of each, in pixels; even.
-
-    Returns:
-        The lines, with escape sequences of 24-bit colours.
+    `side` is the larger side of each, in pixels, and even.
     """
     rows = [np.zeros((side, 0, 3), np.uint8)]
     for image in images:
@@ -132,86 +120,62 @@ def drive(options: argparse.Namespace) -> int:
         with errors():
             if options.ask_for_help is not None and options.leader != "keyboard":
                 raise ConfigError("--ask-for-help: got it without a way to answer, want --leader keyboard")
-            run = RobotRun(
-                env=options.env,
-                env_options=parse_settings(options.env_set, "--env-set"),
-                policy=options.policy,
-                settings=parse_settings(options.set, "--set"),
-                leader=options.leader,
-                record=None if options.record is None else Path(options.record),
-                hz=options.hz,
-                mode=options.mode,
-                execute=options.execute,
-                max_step=options.max_step,
-                step=options.step,
-                ask_for_help=options.ask_for_help,
-                samples=options.samples,
-            )
+            run = RobotRun(options)
             try:
                 run.play(range(options.seed, options.seed + options.episodes))
             except KeyboardInterrupt:
-                kept = "" if run.recorder is None else f"; {run.recorder.episodes} episodes are in {run.record}"
+                kept = "" if run.recorder is None else f"; {run.recorder.episodes} episodes are in {options.record}"
                 raise KeyboardInterrupt(f"interrupted{kept}") from None
     except typer.Exit as ended:
         return ended.exit_code
     return 0
 
 
-@dataclass
 class RobotRun:
-    """What `vlagents-ray robot --env` plays, and how; the fields are its options."""
+    """A run of `vlagents-ray robot --env` with its options."""
 
-    env: str
-    env_options: dict[str, Any]
-    policy: str | None
-    settings: dict[str, Any]
-    leader: str | None
-    record: Path | None
-    hz: float | None
-    mode: Mode
-    execute: int | None
-    max_step: float | None
-    step: float | None
-    ask_for_help: float | None
-    samples: int | None
-    verdict: Label | None = field(default=None, init=False)  # of the running episode, once a human has given it
-    over: bool = field(default=False, init=False)  # the human wants no further episode
-    recorder: Recorder | None = field(default=None, init=False)
-    _control: Control | None = field(default=None, init=False)
-    _view: TerminalView | None = field(default=None, init=False)
-    _said: str | None = field(default=None, init=False)  # what moves the robot, as printed
+    def __init__(self, options: argparse.Namespace) -> None:
+        self.options = options
+        self._env_options = parse_settings(options.env_set, "--env-set")
+        self._settings = parse_settings(options.set, "--set")
+        self.verdict: Label | None = None  # of the running episode, once a human has given it
+        self.over = False  # the human wants no further episode
+        self.recorder: Recorder | None = None
+        self._control: Control | None = None
+        self._view: TerminalView | None = None
+        self._said: str | None = None  # what moves the robot, as printed
 
     def play(self, seeds: Iterable[int]) -> None:
-        """Play an episode for each seed, and print what became of it.
+        """Play an episode for each seed, and print its outcome.
 
         Raises:
             ConfigError: The settings do not go together.
             ContractMismatch: The policy does not fit the environment.
         """
         with contextlib.ExitStack() as stack:
-            env = stack.enter_context(make_env(self.env, **self.env_options))
-            hz = self.hz or env.contract.control_hz or _HZ
+            env = stack.enter_context(make_env(self.options.env, **self._env_options))
+            hz = self.options.hz or env.contract.control_hz or _HZ
             leader = self._leader(env.contract, stack)
             agent = stack.enter_context(self._agent(env.contract, leader))
-            self._control = agent.control if isinstance(agent, ChunkPlayer) else None
-            recorder = None
-            if self.record is not None:
-                recorder = stack.enter_context(Recorder(self.record, hz, interventions=leader is not None))
-                self.recorder = recorder
-            if self.leader == "keyboard":
+            self._control = agent.control
+            if self.options.record is not None:
+                opened = Recorder(self.options.record, hz, interventions=leader is not None)
+                self.recorder = stack.enter_context(opened)
+            if self.options.leader == "keyboard":
                 out.print(f"{HELP}\n{KEYS}")
-            if self.leader is not None and out.is_terminal:
+            if self.options.leader is not None and out.is_terminal:
                 self._view = TerminalView(_write)
             for seed in seeds:
                 if self.over:
                     break
-                self._play(env, agent, seed, hz, recorder)
-        if recorder is not None:  # closed, so everything is written
-            out.print(f"recorded: {recorder.episodes} episodes in {self.record}, {recorder.dropped} frames dropped")
+                self._play(env, agent, seed, hz)
+        if (recorder := self.recorder) is not None:  # closed, so everything is written
+            kept = f"{recorder.episodes} episodes in {self.options.record}"
+            out.print(f"recorded: {kept}, {recorder.dropped} frames dropped")
 
-    def _play(self, env: EvalEnv, agent: Agent, seed: int, hz: float, recorder: Recorder | None) -> None:
-        self.verdict = None
-        robot = EnvRobot(env, seed, endless=self.leader is not None)
+    def _play(self, env: EvalEnv, agent: Agent, seed: int, hz: float) -> None:
+        self.verdict, recorder = None, self.recorder
+        robot = EnvRobot(env, seed, endless=self.options.leader is not None)
         self._say(f"seed {seed}: {env.instruction}")
 
         def label() -> Label:
@@ -225,8 +189,8 @@ class RobotRun:
                 self._view.draw(robot.observe().cameras)
             return robot.ended or self.verdict is not None
 
-        options = {} if self.policy is None else {"seed": seed, "env": self.env}
-        guard = Guard(env.contract, max_step=self.max_step) if self.policy is None else None
+        options = {} if self.options.policy is None else {"seed": seed, "env": self.options.env}
+        guard = Guard(env.contract, max_step=self.options.max_step) if self.options.policy is None else None
         report = run_loop(
             robot,
             agent,
@@ -242,40 +206,36 @@ class RobotRun:
         )
 
     def _leader(self, contract: Contract, stack: contextlib.ExitStack) -> Leader | None:
-        if self.leader is None:
+        if self.options.leader is None:
             return None
-        if self.leader not in DEVICES:
-            raise ConfigError(f"--leader: got {self.leader!r}, want one of {list(DEVICES)}")
+        if self.options.leader not in DEVICES:
+            raise ConfigError(f"--leader: got {self.options.leader!r}, want one of {list(DEVICES)}")
         device: AxesDevice
-        if self.leader == "keyboard":
+        if self.options.leader == "keyboard":
             verdicts = {"y": "success", "n": "failure", "x": "discard"}
             keys = {key: lambda label=label: setattr(self, "verdict", label) for key, label in verdicts.items()}
             device = stack.enter_context(Keyboard({**keys, "p": self._pause, "q": self._quit}))
         else:
             device = stack.enter_context(SpaceMouse())
-        return AxesLeader(contract, device, step=self.step)
+        return AxesLeader(contract, device, step=self.options.step)
 
     def _agent(self, contract: Contract, leader: Leader | None) -> Agent:
-        if self.policy is None:
+        if self.options.policy is None:
             if leader is None:
                 raise ConfigError("robot: got neither a policy nor --leader, want one of them, or both")
             return TeleoperatedAgent(leader, contract)
-        remote = "://" in self.policy
-        if remote and self.settings:
-            raise ConfigError(f"--set: got {sorted(self.settings)}, but {self.policy} has its settings already")
-        inner = RemoteAgent(self.policy) if remote else build_agent(self.policy, self.settings)
+        remote = "://" in self.options.policy
+        if remote and self._settings:
+            raise ConfigError(
+                f"--set: got {sorted(self._settings)}, but {self.options.policy} has its settings already"
+            )
+        inner = RemoteAgent(self.options.policy) if remote else build_agent(self.options.policy, self._settings)
         policy = EnvPolicy(inner, contract)
         policy.initialize()
         require_match(inner.contract, contract)
-        return ChunkPlayer(
-            policy,
-            mode=self.mode,
-            execute=self.execute,
-            check=Guard(contract, max_step=self.max_step),
-            override=leader,
-            ask_for_help=self.ask_for_help,
-            samples=self.samples,
-        )
+        given = self.options
+        settings = PlayerSettings(given.mode, given.execute, ask_for_help=given.ask_for_help, samples=given.samples)
+        return ChunkPlayer(policy, settings, check=Guard(contract, max_step=given.max_step), override=leader)
 
     def _pause(self) -> None:
         if self._control is None:

@@ -1,6 +1,6 @@
 """The client, which runs on the robot or beside the environment: a remote policy as an `Agent`."""
 
-from vlagents_ray.chunking.player import ChunkPlayer
+from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.client.agent import RemoteAgent
 
-__all__ = ["ChunkPlayer", "RemoteAgent"]
+__all__ = ["ChunkPlayer", "PlayerSettings", "RemoteAgent"]

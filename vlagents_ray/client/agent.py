@@ -6,7 +6,8 @@ import math
 import os
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,6 @@ from vlagents_ray.client.commands import CommandInbox
 from vlagents_ray.client.connection import Connection
 from vlagents_ray.client.credentials import Credentials
 from vlagents_ray.client.session import ClientSession, EpisodeState, call_with_recovery
-from vlagents_ray.client.tracing import traced
 from vlagents_ray.client.transports.codec_selection import CodecChoice, CodecName, LinkSpeed
 from vlagents_ray.client.transports.select import TransportName, select_transport
 from vlagents_ray.contract import Contract
@@ -29,7 +29,8 @@ from vlagents_ray.errors import (
 from vlagents_ray.images.codecs import RAW, ImageCodec
 from vlagents_ray.interface import DEADLINE, Act, Agent, Obs, copied
 from vlagents_ray.protocol.messages import RANKS, RankName, Reply, Request
-from vlagents_ray.tracing import tracer
+from vlagents_ray.registry import require
+from vlagents_ray.tracing import TRACEPARENT, tracer
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -72,13 +73,10 @@ class RemoteAgent(Agent):
                 less. 2 to 5 s suit a robot, since a call to a hung replica lasts until its end.
             connect_timeout_s: How long to wait for a server that cannot be reached or is still loading, by default
                 `timeout_s`; after 2 s, a warning is logged.
-            codec: How images are encoded for a network. "auto" measures the link when the first ones are sent (0.3 s,
-                more for images of 720p and above, or if ten round trips take longer) and takes raw pixels, JPEG or PNG,
-                whichever is computed to be the fastest to encode, send and decode; where ten round trips take a quarter
-                of the request's time, JPEG. "exact" leaves out JPEG, which changes the pixels a little; "raw",
-                "lossless" (PNG), "jpeg" or an `ImageCodec` force one. `agent.codec` says which is used, `agent.link`
-                what was measured. To a server on this machine "auto" and "exact" measure nothing, and pixels stay raw,
-                as in shared memory, plasma and the handle.
+            codec: How images are encoded for a network. "auto" measures the link when the first ones are sent (0.15 s,
+                or ten round trips), and takes raw pixels from 300 MB/s on, else JPEG. "exact" leaves out JPEG, which
+                changes the pixels a little: raw pixels from 25 MB/s on, else PNG. "raw", "lossless" (PNG), "jpeg" or
+                an `ImageCodec` force one. To a server on this machine pixels stay raw.
             rank: The class of the requests: a "robot" goes before a "simulation".
             resume: False raises the loss of a session as `ConnectionLost`; the episode then needs a new `reset`.
             api_key: The API key, for a server that requires one; by default the value of `VLAGENTS_RAY_API_KEY`.
@@ -105,8 +103,7 @@ class RemoteAgent(Agent):
         self._rank: RankName = rank
         self._resume = resume
         self._session = ClientSession(connection, rank)
-        if (trace := tracer()) is not None:
-            self._call = traced(trace, connection, self._call)  # type: ignore[method-assign,assignment]
+        self._tracer = tracer()
 
     def sessions(self, n: int) -> list[Self]:
         """Open `n` more sessions on this agent's connection, for `reset_batch` and `act_batch`; close each of them."""
@@ -281,9 +278,32 @@ class RemoteAgent(Agent):
         return found
 
     def _call(self, sessions: Sequence[ClientSession], requests: Sequence[Request], timeout_s: float) -> list[Reply]:
+        if self._tracer is not None:
+            return self._traced(requests, lambda: self._send(sessions, requests, timeout_s))
+        return self._send(sessions, requests, timeout_s)
+
+    def _send(self, sessions: Sequence[ClientSession], requests: Sequence[Request], timeout_s: float) -> list[Reply]:
         if self._resume:
             return call_with_recovery(self._connection, sessions, requests, timeout_s)
         return self._connection.call(requests, timeout_s)
+
+    def _traced(self, requests: Sequence[Request], send: Callable[[], list[Reply]]) -> list[Reply]:
+        """Send one message within a span, below the caller's own if there is one; the server's spans belong to it."""
+        trace: Any = require("opentelemetry.trace", extra="otel")
+        context: Any = require("opentelemetry.trace.propagation.tracecontext", extra="otel")
+        about = {"server.url": self.url, "transport": self.transport, "requests": len(requests)}
+        name = f"vlagents {requests[0].op}"
+        with self._tracer.start_as_current_span(name, kind=trace.SpanKind.CLIENT, attributes=about) as span:  # type: ignore[union-attr]
+            carrier: dict[str, str] = {}
+            context.TraceContextTextMapPropagator().inject(carrier)
+            for request in requests:
+                if request.obs is not None:
+                    info = {**request.obs.info, TRACEPARENT: carrier[TRACEPARENT]}
+                    request.obs = replace(request.obs, info=info)
+            replies = send()
+            if failed := [reply.error for reply in replies if reply.error is not None]:
+                span.set_status(trace.StatusCode.ERROR, f"{failed[0].code}: {failed[0]}")
+            return replies
 
     def _take(self, session: ClientSession, obs: Obs, reply: Reply, round_trip_ms: float) -> Act | Exception:
         episode = session.episode

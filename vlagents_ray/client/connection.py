@@ -11,18 +11,10 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-from vlagents_ray.client.credentials import is_loopback
 from vlagents_ray.contract import Contract
-from vlagents_ray.errors import (
-    ConfigError,
-    DeadlineExceeded,
-    NoReplica,
-    PolicyUnavailable,
-    UnknownApp,
-    VLAgentsError,
-)
+from vlagents_ray.errors import ConfigError, DeadlineExceeded, NoReplica, PolicyUnavailable, UnknownApp, VLAgentsError
 from vlagents_ray.interface import OF_THE_LOOP
-from vlagents_ray.protocol.messages import PROTOCOL_VERSION, Reply, Request, boot_id
+from vlagents_ray.protocol.messages import PROTOCOL_VERSION, Reply, Request, boot_id, is_loopback
 
 if TYPE_CHECKING:
     from vlagents_ray.client.transports.base import Transport
@@ -56,13 +48,7 @@ class Connection:
     ) -> None:
         """Set up the connection, without opening it.
 
-        Args:
-            url: The server's URL.
-            new_transport: Returns a new transport.
-            codec: The codec of the cameras.
-            timeout_s: How long a call may take.
-            connect_timeout_s: How long to wait for a server that is not ready.
-            leaves_silent: Whether to go to another replica when one no longer answers.
+        With `leaves_silent`, it goes to another replica when one no longer answers.
         """
         self.url = url
         self._new_transport = new_transport
@@ -118,7 +104,12 @@ class Connection:
             )
         contract = metadata.get("contract")
         self.contract = None if contract is None else Contract.from_json(contract)
-        self.codec.connected(near=_is_near(self.url, metadata))
+        # A tunnel to another machine also begins at a loopback address.
+        local = metadata.get("local")
+        near = (
+            local is not None and local["boot_id"] == boot_id() != "" and is_loopback(urlsplit(self.url).hostname or "")
+        )
+        self.codec.connected(near=near)
         self._silent, self._silent_since = False, None  # also where the transport is still the same
         self.metadata = metadata
 
@@ -168,8 +159,10 @@ class Connection:
                 self._must_reconnect = self._must_reconnect or (self._silent and self._leaves_silent)
             replies = [Reply(request.request_id, error=error) for request in requests]
         for reply in replies:
-            _without_names_of_the_loop(reply)
-        if len(replies) == len(requests) and not any(map(_changes_connection, replies)):
+            if reply.act is not None:  # a server has no say in who moves the robot, and why a tick has no action
+                for name in OF_THE_LOOP:
+                    reply.act.info.pop(name, None)
+        if len(replies) == len(requests) and not any(reply.error or reply.draining for reply in replies):
             return replies
         return self._noted(requests, replies)
 
@@ -212,13 +205,6 @@ class Connection:
             self._old_transport = None
 
 
-def _without_names_of_the_loop(reply: Reply) -> None:
-    """Remove what a server has no say in: why a tick has no action of the policy, and who moves the robot."""
-    if reply.act is not None:
-        for name in OF_THE_LOOP:
-            reply.act.info.pop(name, None)
-
-
 class _NextTransport:
     """A transport that connects in a thread of its own, once."""
 
@@ -251,14 +237,3 @@ class _NextTransport:
             self._dropped = True
         if self.ended:
             self.transport.close()
-
-
-def _changes_connection(reply: Reply) -> bool:
-    """Whether the reply changes the state of the connection."""
-    return reply.error is not None or reply.draining
-
-
-def _is_near(url: str, metadata: dict[str, Any]) -> bool:
-    """Whether the server is known to be on this machine: a tunnel to another one also begins at a loopback address."""
-    local = metadata.get("local")
-    return local is not None and local["boot_id"] == boot_id() != "" and is_loopback(urlsplit(url).hostname or "")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import ipaddress
 import logging
 import os
 import socket
@@ -14,6 +13,7 @@ from functools import cache
 from urllib.parse import SplitResult, urlsplit
 
 from vlagents_ray.errors import ConfigError, ConnectionLost, VLAgentsError
+from vlagents_ray.protocol.messages import is_loopback
 
 logger = logging.getLogger(__name__)
 
@@ -86,14 +86,6 @@ def withheld() -> Iterator[None]:
     finally:
         if key is not None:
             os.environ[KEY_VARIABLE] = key
-
-
-def is_loopback(host: str) -> bool:
-    """Whether `host` is an address of this machine that no other machine can reach."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:  # a host name
-        return host == "localhost"
 
 
 @cache

@@ -16,7 +16,8 @@ from vlagents_ray.protocol.messages import RankName, Reply, Request
 
 # no replica has the session; `NotReset` if it was to begin again and did not in time
 _LOST = (NotReset, UnknownSession)
-_GONE = (ConnectionLost, PolicyUnavailable, *_LOST)  # the session may continue on another replica
+# Errors after which another replica may answer; a living one refuses a reset for instance because it is full.
+_RETRYABLE = {"reset": (ConnectionLost, NoReplica), "act": (ConnectionLost, PolicyUnavailable, *_LOST)}
 _FIRST_PAUSE_S = 0.02
 _LONGEST_PAUSE_S = 0.5
 # No attempt begins with less time left: a request that takes long to arrive would be executed after its caller gave up.
@@ -33,12 +34,6 @@ class EpisodeState:
     contract: dict[str, Any] | None
     recent: deque[Obs] = field(default_factory=lambda: deque(maxlen=0))  # the last observations that were answered
     step: int | None = 0  # the server's count of acts; None when an answer may have been lost
-
-    def acted(self, obs: Obs, step: int | None) -> None:
-        """Note that `obs` was answered."""
-        self.step = step
-        if self.recent.maxlen:
-            self.recent.append(copied(obs))
 
 
 class ClientSession:
@@ -84,7 +79,9 @@ class ClientSession:
         """Note that `obs` was answered."""
         self.step = reply.step
         if self.episode is not None:
-            self.episode.acted(obs, reply.step)
+            self.episode.step = reply.step
+            if self.episode.recent.maxlen:
+                self.episode.recent.append(copied(obs))
 
     def is_lost(self, reply: Reply) -> bool:
         """Whether the session must begin again; if not, its replica checks that no answer was lost."""
@@ -93,8 +90,7 @@ class ClientSession:
     def begin_again(self, request: Request) -> Request:
         """Return the reset that begins the session again under a new id; `request` follows it, with that id.
 
-        With a new id, no remains of the old session can interfere. Any reply to `request` from now on comes from the
-        new session, even if the reply to the reset itself is lost or late.
+        With a new id, any reply to `request` from now on comes from the new session, even if that to the reset is late.
         """
         if self.episode is None:
             raise NotReset("act before reset; reset first")
@@ -116,7 +112,7 @@ def call_with_recovery(
     replies = connection.call(requests, timeout_s)
     lost: set[int] = set()  # sessions whose state no replica has
     pause_s = 0.0
-    while gone := [i for i, reply in enumerate(replies) if _is_retryable(requests[i], reply)]:
+    while gone := [i for i, reply in enumerate(replies) if isinstance(reply.error, _RETRYABLE[requests[i].op])]:
         if time.monotonic() + pause_s >= last_attempt:
             break
         time.sleep(pause_s)
@@ -147,12 +143,3 @@ def call_with_recovery(
         if session.resumed and reply.act is not None:
             reply.act.info["resumed"], session.resumed = True, False
     return replies
-
-
-def _is_retryable(request: Request, reply: Reply) -> bool:
-    """Whether another replica may answer.
-
-    False where a living replica refused a reset, for instance because it is full.
-    """
-    gone = (ConnectionLost, NoReplica) if request.op == "reset" else _GONE
-    return reply.error is not None and isinstance(reply.error, gone)

@@ -46,11 +46,7 @@ class ImageCodec:
             raise InvalidInput(f"subsampling: got {self.subsampling!r}, want one of {list(SUBSAMPLINGS)}")
 
     def file(self, image: np.ndarray) -> bytes:
-        """Encode an image as a JPEG or PNG file; a raw codec has no files.
-
-        Args:
-            image: The image, (H, W, 3) uint8 RGB.
-        """
+        """Encode an image, (H, W, 3) uint8 RGB, as a JPEG or PNG file; a raw codec has no files."""
         if self.name == "jpeg":
             return jpeg_png.encode_jpeg(image, self.quality, self.subsampling)
         return jpeg_png.encode_png(image)
@@ -90,17 +86,12 @@ def encode_files(cameras: Sequence[np.ndarray], codec: ImageCodec) -> list[bytes
 def decode_files(
     files: Sequence[bytes | memoryview], budget: PixelBudget, names: Sequence[str] = ()
 ) -> list[np.ndarray]:
-    """Decode JPEG or PNG files.
-
-    All images of a message are decoded here, so that the memory for all of them is reserved before the first one is.
+    """Decode JPEG or PNG files, after the memory for all of them is reserved; return (H, W, 3) uint8 RGB images.
 
     Args:
         files: The files.
         budget: The limits of the message.
         names: The cameras of the files, for error messages.
-
-    Returns:
-        The images, (H, W, 3) uint8 RGB, in the order of the files.
 
     Raises:
         MalformedMessage: A file cannot be decoded.

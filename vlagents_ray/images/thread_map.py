@@ -14,19 +14,10 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache
 from typing import TypeVar
 
-# The CPU cores on which a thread runs, and may run.
-
-
-def _getcpu() -> Callable[[], int]:
-    """Return the C library's `sched_getcpu`, or a function that returns -1 where there is none."""
-    if not hasattr(os, "sched_setaffinity"):
-        return lambda: -1
-    found: Callable[[], int] = getattr(ctypes.CDLL(None), "sched_getcpu", lambda: -1)
-    return found
-
-
-here: Callable[[], int] = _getcpu()
+here: Callable[[], int] = lambda: -1  # noqa: E731
 """Return the core on which the calling thread runs; -1 if it is not known."""
+if hasattr(os, "sched_setaffinity"):
+    here = getattr(ctypes.CDLL(None), "sched_getcpu", here)
 
 
 def allowed() -> int:
@@ -42,15 +33,9 @@ _MOST_HELPERS = 3  # most threads beside the caller's; robots have few cameras
 
 
 def thread_map(function: Callable[[Item], Result], items: Sequence[Item], work_s: float) -> list[Result]:
-    """Compute `[function(item) for item in items]`, in several threads if the work is worth it.
+    """Compute `[function(item) for item in items]`, in several threads if the work is worth it: `work_s` on one core.
 
-    Args:
-        function: A function that may be called from other threads, and does not wait for other calls of itself.
-        items: Its arguments.
-        work_s: The approximate time, s, that one core needs for all items.
-
-    Returns:
-        The results in the order of the items; an exception is that of the first item that raised one.
+    The function does not wait for other calls of itself. An exception is that of the first item that raised one.
     """
     threads = min(len(items), allowed(), 1 + _MOST_HELPERS)
     if threads < 2 or work_s < _LEAST_WORK_S:

@@ -19,8 +19,7 @@ from vlagents_ray.evaluate.results.summary import Summary
 from vlagents_ray.evaluate.run import evaluate
 from vlagents_ray.interface import POLICY, Act, Agent, Obs
 from vlagents_ray.serve.models.agent_copies import AgentCopies
-from vlagents_ray.weights.check import fingerprint
-from vlagents_ray.weights.trainable import evaluation_mode
+from vlagents_ray.weights.trainable import evaluation_mode, fingerprint
 
 
 class TrainingEvaluation:

@@ -9,20 +9,25 @@ offset 0   b"VLA" and the version byte 1
 from __future__ import annotations
 
 import json
+import math
+import re
 import struct
 from collections.abc import Callable
 from typing import Any
 
-from vlagents_ray.errors import MalformedMessage, MessageTooLarge
-from vlagents_ray.protocol.arrays import Buffer
+import numpy as np
+
+from vlagents_ray.errors import MalformedMessage, MessageTooLarge, shown
 from vlagents_ray.protocol.messages import PROTOCOL_VERSION, Budget, Limits
 
+Buffer = bytes | memoryview
 _PREFIX = struct.Struct("<3sBI")
 _ALIGN = 8
 HEADER_BYTES = 2**20  # most bytes of the JSON of a request; the limits of a body hold for that of a reply
 VALUES = 20_000  # most values in the JSON of a request, which parses in about 2 ms
 _INLINE_BYTES = 64 * 1024  # longer JSON is parsed within a budget, which may move it to a decoding thread
 _LONG_VALUES = 1_000_000
+_PLAIN = re.compile(r"[<|][biuf][1248]")
 dump = json.JSONEncoder(separators=(",", ":")).encode  # created once, as `json.dumps` creates an encoder for each call
 
 
@@ -45,12 +50,7 @@ def assemble(header: str, blobs: list[Buffer]) -> list[Buffer]:
 
 
 def unpack(data: Buffer, limits: Limits, budget: Budget | None = None) -> tuple[dict[str, Any], list[Buffer]]:
-    """Return the header of a frame and views of its blobs.
-
-    Args:
-        data: The frame.
-        limits: The limits of its size.
-        budget: Of a request, whose header has further limits; None for a reply.
+    """Return the header of a frame and views of its blobs; the header of a request has the limits of its `budget`.
 
     Raises:
         MalformedMessage: The data are not a frame.
@@ -113,7 +113,11 @@ def parse_json(
     if budget is not None and len(text) > _INLINE_BYTES:
         budget.parse(len(text))
     data = text if isinstance(text, str) else bytes(text)
-    _require_few_values(data, _LONG_VALUES if long else VALUES)
+    most = _LONG_VALUES if long else VALUES
+    if len(data) > 2 * most:  # each value takes two characters at least
+        marks: tuple[Any, ...] = (",", "[", "{") if isinstance(data, str) else (b",", b"[", b"{")
+        if sum(map(data.count, marks)) > most:  # it would need far more memory and time than its length suggests
+            raise MessageTooLarge(f"message: more than {most} values in its JSON; send arrays instead of lists")
     try:
         decoded = data if isinstance(data, str) else data.decode("utf-8-sig")
         value = json.loads(decoded, object_pairs_hook=pairs)
@@ -124,10 +128,35 @@ def parse_json(
     return value
 
 
-def _require_few_values(text: bytes | str, most: int) -> None:
-    """Raise `MessageTooLarge` for JSON that would need far more memory and time to read than its length suggests."""
-    if len(text) <= 2 * most:  # each value takes two characters at least
-        return
-    marks: tuple[Any, ...] = (",", "[", "{") if isinstance(text, str) else (b",", b"[", b"{")
-    if sum(map(text.count, marks)) > most:
-        raise MessageTooLarge(f"message: more than {most} values in its JSON; send arrays instead of lists")
+# Arrays from the bytes of any message: only bools, integers and floats, and only with all their bytes.
+
+
+def is_plain(dtype: Any) -> bool:
+    """Whether `dtype`, as numpy writes it, names bools, integers or floats."""
+    return isinstance(dtype, str) and _PLAIN.fullmatch(dtype) is not None
+
+
+def plain_dtype(dtype: Any) -> np.dtype[Any]:
+    """Return numpy's type of that name; raises `MalformedMessage` unless it is plain."""
+    if not is_plain(dtype):
+        raise MalformedMessage(f"array: got dtype {shown(dtype, 20)}, want one like '<f4' or '|u1'")
+    try:
+        found: np.dtype[Any] = np.dtype(dtype)
+    except TypeError as error:
+        raise MalformedMessage(f"array: got dtype {dtype!r}, which numpy does not know") from error
+    return found
+
+
+def read_array(data: Buffer, dtype: Any, shape: Any) -> np.ndarray:
+    """Return a read-only view of `data` as an array; raises `MalformedMessage` unless data, type and shape match."""
+    kind = plain_dtype(dtype)
+    if not isinstance(data, (bytes, memoryview)):
+        raise MalformedMessage(f"array: got {type(data).__name__} for its data, want bytes")
+    if not isinstance(shape, (list, tuple)) or len(shape) > 8 or not all(type(n) is int and n >= 0 for n in shape):
+        raise MalformedMessage(f"array: got shape {shown(shape)}, want up to 8 non-negative integers")
+    if math.prod(shape) * kind.itemsize != len(data):
+        raise MalformedMessage(f"array: got {len(data)} bytes, want {shown(shape)} of {dtype}")
+    try:
+        return np.frombuffer(data, kind).reshape(shape)
+    except (ValueError, OverflowError) as error:  # an axis too long for numpy beside an empty one
+        raise MalformedMessage(f"array: got shape {shown(shape)}, which numpy does not know") from error

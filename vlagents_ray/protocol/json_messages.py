@@ -17,8 +17,7 @@ from vlagents_ray.errors import MalformedMessage, VLAgentsError, shown
 from vlagents_ray.protocol.frame_layout import parse_json
 from vlagents_ray.protocol.frames import check_request, describe_error
 from vlagents_ray.protocol.messages import Budget, Op, Reply, Request
-from vlagents_ray.protocol.observations import read_obs
-from vlagents_ray.protocol.values import ValueReader
+from vlagents_ray.protocol.values import ValueReader, read_obs
 
 PROBLEM_TYPE = "application/problem+json"
 CAMERA_PREFIX = "cameras."

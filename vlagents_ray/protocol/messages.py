@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import ipaddress
+import os
+import socket
 import struct
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-from vlagents_ray.errors import MessageTooLarge, VLAgentsError
+from vlagents_ray.errors import MalformedMessage, MessageTooLarge, VLAgentsError
 from vlagents_ray.images.codecs import DecodedFiles
 from vlagents_ray.interface import Act, Obs
 
@@ -27,10 +30,7 @@ STREAM_BYTES = 16 * 2**20  # most bytes of one WebSocket message: uvicorn's limi
 
 
 def is_name(text: str) -> bool:
-    """Whether a text may be the id of a session or a request.
-
-    An id consists of visible ASCII characters, which cannot forge a line in a log.
-    """
+    """Whether a text may be the id of a session or a request: visible ASCII, which cannot forge a line in a log."""
     return text.isascii() and text.isprintable() and " " not in text and len(text) <= NAME_CHARACTERS
 
 
@@ -159,6 +159,21 @@ def boot_id() -> str:
         return ""
 
 
+def peer_uid(connection: socket.socket) -> int:
+    """Return the user id of the process at the other end of a Unix socket, as the kernel reports it."""
+    credentials = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
+    uid: int = struct.unpack("3i", credentials)[1]
+    return uid
+
+
+def is_loopback(host: str) -> bool:
+    """Whether `host` is an address of this machine that no other machine can reach."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:  # a host name
+        return host == "localhost"
+
+
 # The cost of a message, which is checked before any of it is decoded.
 
 
@@ -198,10 +213,7 @@ class Budget:
         self._left = self.limits.decoded_bytes
 
     def count(self, size: int) -> None:
-        """Count `size` bytes of the request that are in memory already.
-
-        Raises `MessageTooLarge` if they are too many.
-        """
+        """Count `size` bytes of the request that are in memory already; raises `MessageTooLarge` if too many."""
         self._left -= size
         if self._left < 0:
             raise MessageTooLarge(
@@ -212,3 +224,44 @@ class Budget:
     def hold(self, size: int) -> None:
         """Count `size` bytes that are about to be allocated for the request; raises an error if they may not be."""
         self.count(size)
+
+
+# A probe is answered at once, to measure the link; it reaches neither a session nor the policy. It is b"VLA?", a uint32
+# that is not read, and as many bytes as the link is to carry, in a WebSocket message or the body of `POST /v1/probe`,
+# under the limits of a request. The answer is b"VLA!" and the number of bytes that arrived, uint64 little-endian.
+
+_HEAD = struct.Struct("<4sI")
+_PROBE_TAG, _ANSWER_TAG = b"VLA?", b"VLA!"
+_ANSWER = struct.Struct("<4sQ")
+
+LEAST_BYTES = _HEAD.size
+
+
+def bytes_probe(size: int) -> bytes:
+    """Return a probe of `size` bytes, at least `LEAST_BYTES`; random, so that no tunnel compresses it."""
+    return _HEAD.pack(_PROBE_TAG, 0) + os.urandom(max(0, size - LEAST_BYTES))
+
+
+def is_probe(message: bytes | memoryview) -> bool:
+    """Whether a message is a probe, to be answered with `probe_answer`."""
+    return message[: len(_PROBE_TAG)] == _PROBE_TAG
+
+
+def read_probe(message: bytes, budget: Budget) -> None:
+    """Count a probe as one request of a simulation; raise `MalformedMessage` for any other message."""
+    budget.begin_message()
+    if not is_probe(message):
+        raise MalformedMessage(f"probe: got {message[:4]!r} at its start, want {_PROBE_TAG!r}")
+    if len(message) < LEAST_BYTES:
+        raise MalformedMessage(f"probe: got {len(message)} bytes, want at least {LEAST_BYTES}")
+    budget.begin("probe", "simulation")
+
+
+def probe_answer(size: int) -> bytes:
+    """Return the answer to a probe of `size` bytes."""
+    return _ANSWER.pack(_ANSWER_TAG, size)
+
+
+def is_probe_answer(message: bytes | memoryview) -> bool:
+    """Whether a message is the answer to a probe; no other message of a server begins like it."""
+    return len(message) == _ANSWER.size and message[: len(_ANSWER_TAG)] == _ANSWER_TAG

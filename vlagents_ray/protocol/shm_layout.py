@@ -21,7 +21,7 @@ import numpy as np
 
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge
 from vlagents_ray.interface import POLICY, Act, Obs
-from vlagents_ray.protocol.arrays import Buffer
+from vlagents_ray.protocol.frame_layout import Buffer
 from vlagents_ray.protocol.frames import check_request
 from vlagents_ray.protocol.messages import Limits, RankName, Reply, Request, is_name
 

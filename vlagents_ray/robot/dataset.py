@@ -22,8 +22,7 @@ from vlagents_ray.contract import ActionSpec
 from vlagents_ray.dataset_contract import INFO, STATISTICS
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.registry import require
-from vlagents_ray.robot.episode import ACTION, INTERVENTION_COLUMN, Finished, RobotEpisode
-from vlagents_ray.robot.statistics import Stats, joined, of_values
+from vlagents_ray.robot.episode import ACTION, INTERVENTION_COLUMN, Finished, RobotEpisode, Stats, joined, of_values
 
 VERSION = "v3.0"
 FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
@@ -44,14 +43,7 @@ class Dataset:
         interventions: bool = False,
         lossless: bool = False,
     ) -> None:
-        """Open or begin a dataset.
-
-        Args:
-            root: Its folder.
-            fps: The rate of its frames, Hz.
-            robot_type: The robot's name, if it has one.
-            interventions: Whether its frames have the columns of interventions.
-            lossless: Whether the videos of new episodes keep each pixel, see `Mp4`.
+        """Open or begin a dataset of frames at `fps` Hz; `lossless` videos keep each pixel.
 
         Raises:
             ConfigError: The folder has other files, or a dataset of another rate or version.
@@ -95,7 +87,7 @@ class Dataset:
     def begin(self, instruction: str, meaning: ActionSpec | None = None) -> RobotEpisode:
         """Begin an episode, to which frames are added; it is then passed to `save`, or abandoned.
 
-        Several episodes may run at once. `meaning` is that of the actions' numbers, if it is known.
+        Several may run at once. `meaning` is that of the actions' numbers, if it is known.
         """
         unfinished = self.root / UNFINISHED
         unfinished.mkdir(parents=True, exist_ok=True)
@@ -175,28 +167,23 @@ class Dataset:
         if int(self._stats[ACTION]["count"][0]) != info["total_frames"]:  # a crash left an episode that is not counted
             self._stats = {}
             for number in range(self.episodes):
-                self._stats = joined(self._stats, self._stats_of(number))
-
-    def _stats_of(self, number: int) -> dict[str, Stats]:
-        """Return the statistics of one episode."""
-        place = {"chunk_index": number // FILES_IN_CHUNK, "file_index": number % FILES_IN_CHUNK}
-        [about] = self._pq.read_table(self.root / EPISODES.format(**place)).to_pylist()
-        found: dict[str, Stats] = {}
-        for column, value in about.items():
-            if column.startswith("stats/"):
-                key, _, name = column.removeprefix("stats/").rpartition("/")
-                found.setdefault(key, {})[name] = np.array(value)
-        return found
+                place = {"chunk_index": number // FILES_IN_CHUNK, "file_index": number % FILES_IN_CHUNK}
+                [about] = self._pq.read_table(self.root / EPISODES.format(**place)).to_pylist()
+                found: dict[str, Stats] = {}
+                for column, value in about.items():
+                    if column.startswith("stats/"):
+                        key, _, name = column.removeprefix("stats/").rpartition("/")
+                        found.setdefault(key, {})[name] = np.array(value)
+                self._stats = joined(self._stats, found)
 
     def _sweep(self) -> None:
         """Remove the files that a crash left: those of the running episode, and of one not counted yet."""
         shutil.rmtree(self.root / UNFINISHED, ignore_errors=True)
         number = self.episodes
         stray = FILE.format(chunk_index=number // FILES_IN_CHUNK, file_index=number % FILES_IN_CHUNK)
-        for path in [*self.root.glob(f"data/{stray}.*"), *self.root.glob(f"videos/*/{stray}.*")]:
-            path.unlink()
-        for path in self.root.glob(f"meta/episodes/{stray}.*"):
-            path.unlink()
+        for folder in ("data", "videos/*", "meta/episodes"):
+            for path in self.root.glob(f"{folder}/{stray}.*"):
+                path.unlink()
 
     def _table(self, rows: Mapping[str, np.ndarray], features: Mapping[str, Any]) -> Any:
         pa = self._pa

@@ -1,4 +1,4 @@
-"""The running episode of a recording: its videos are on disk, its numbers in memory."""
+"""The running episode of a recording, with its videos on disk and its numbers in memory, and its statistics."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from vlagents_ray.errors import InvalidObservation
 from vlagents_ray.images.mp4 import Mp4
 from vlagents_ray.interface import Obs
 from vlagents_ray.naming import distinct
-from vlagents_ray.robot.statistics import ImageStatistics, Stats
 
 IMAGES, STATE, ACTION = "observation.images.", "observation.state", "action"
 ENVIRONMENT = "observation.environment_state"
@@ -31,6 +30,7 @@ INTERVENTIONS = {  # further columns of a recording with interventions, beside `
     INTERVENTION_COLUMN: "bool",  # whether the action is a human's
     "policy_known": "bool",  # whether it is known what the policy wanted; if not, `WANTED_ACTION` is zeros
 }
+Stats = dict[str, np.ndarray]  # "min", "max", "mean", "std", "count", "q01", ...
 Label = Literal["success", "failure", "discard"]
 INDEX = {  # columns that the dataset adds to each frame
     "timestamp": "float32",  # s, frame_index / fps
@@ -71,17 +71,7 @@ class RobotEpisode:
         lossless: bool = False,
         meaning: ActionSpec | None = None,
     ) -> None:
-        """Begin an episode in a folder.
-
-        Args:
-            folder: The folder for its videos.
-            instruction: The task in words.
-            fps: The rate of the frames, Hz.
-            features: The dataset's features, which the frames must have; None in the first episode.
-            interventions: Whether the frames have the columns of interventions.
-            lossless: Whether its videos keep each pixel, see `Mp4`.
-            meaning: The meaning of its actions' numbers, if that is known.
-        """
+        """Begin an episode with its videos in a folder; `features` are those of the earlier ones, None in the first."""
         self.instruction = instruction
         self.features: dict[str, Any] = features or {}
         self.rows: dict[str, list[Any]] = {}
@@ -105,20 +95,10 @@ class RobotEpisode:
         wanted: np.ndarray | None = None,
         more: Mapping[str, Any] = MappingProxyType({}),
     ) -> None:
-        """Append a frame.
+        """Append a frame; raises `InvalidObservation` if cameras or shapes differ from those of the frames before.
 
-        Args:
-            obs: The observation.
-            action: The action, (D,).
-            captured_at: The time of the observation, s since 1970.
-            tick: The tick of the control loop.
-            safe: Whether the action is a safe one, not the policy's.
-            intervention: Whether a human moved the robot at this tick.
-            wanted: The policy's action, (D,), where another one was executed; None if it is not known.
-            more: Further columns by name, the same in each frame: a bool, int, float, text, or (D,) float32.
-
-        Raises:
-            InvalidObservation: Cameras or shapes differ from those of the frames before.
+        `wanted` is the policy's action, (D,), where another one was executed; None if it is not known. `more` are
+        further columns by name, the same in each frame: a bool, int, float, text, or (D,) float32.
         """
         values, names = state_vector(obs.state, None if obs.gripper is None else np.array(obs.gripper))
         if not self.rows:
@@ -158,7 +138,10 @@ class RobotEpisode:
         return Finished(
             self.instruction,
             self.features,
-            {key: _column(values) for key, values in self.rows.items()},
+            {
+                key: np.array(values, object) if isinstance(values[0], str) else np.stack(values)
+                for key, values in self.rows.items()
+            },
             {key: images.result() for key, images in self.images.items()},
             {key: path for key, (path, _) in self.videos.items()},
             self._about,
@@ -188,7 +171,9 @@ class RobotEpisode:
         if self._interventions:
             features |= {WANTED_ACTION: features[ACTION]} | number_features(INTERVENTIONS)
         features |= number_features(MOMENTS | INDEX)
-        features |= {name: _feature(value) for name, value in more.items()}
+        for name, value in more.items():
+            dtype = "float32" if isinstance(value, np.ndarray) else _DTYPES[type(value)]
+            features[name] = {"dtype": dtype, "shape": [np.size(value)], "names": None}
         if self.features and self.features != features:
             odd = sorted(k for k in self.features.keys() | features.keys() if self.features.get(k) != features.get(k))
             raise InvalidObservation(f"recording: {odd} differ from the dataset's; record into a new folder")
@@ -234,17 +219,6 @@ def video_feature(height: int, width: int, fps: float, pixels: str = "yuv420p") 
     return {"dtype": "video", "shape": [height, width, 3], "names": names, "info": size | kind}
 
 
-def _feature(value: Any) -> dict[str, Any]:
-    """Describe the feature of which this is a frame's value."""
-    if isinstance(value, np.ndarray):
-        return {"dtype": "float32", "shape": [len(value)], "names": None}
-    return {"dtype": _DTYPES[type(value)], "shape": [1], "names": None}
-
-
-def _column(values: list[Any]) -> np.ndarray:
-    return np.array(values, object) if isinstance(values[0], str) else np.stack(values)
-
-
 def vector_feature(names: list[str]) -> dict[str, Any]:
     """Describe a feature of several numbers, one for each name."""
     return {"dtype": "float32", "shape": [len(names)], "names": names}
@@ -258,15 +232,9 @@ def number_features(dtypes: Mapping[str, str]) -> dict[str, Any]:
 def state_vector(
     parts: Mapping[str, np.ndarray], gripper: np.ndarray | None, order: Iterable[str] | None = None
 ) -> tuple[np.ndarray, list[str]]:
-    """Concatenate the parts of the proprioception, as LeRobot's policies expect them.
+    """Concatenate the parts of the proprioception, (..., d) each, as LeRobot's policies expect them, in `order`.
 
-    Args:
-        parts: The parts by name, (..., d) each.
-        gripper: The gripper's opening, (...,); None if there is none.
-        order: The names of the parts to concatenate; all by default.
-
-    Returns:
-        The numbers, (..., D) float32, and a name for each of the D.
+    `gripper`, (...,), is the opening. Returns the numbers, (..., D) float32, and a name for each of the D.
     """
     chosen = parts_of(parts, gripper is not None) if order is None else order
     columns: list[np.ndarray] = []
@@ -280,3 +248,75 @@ def state_vector(
             names += [f"{part}_{i}" for i in range(parts[part].shape[-1])]
     values = np.concatenate(columns, axis=-1) if columns else np.zeros(0)
     return values.astype(np.float32), names
+
+
+# The statistics of recorded features for LeRobot's normalisation (0.4.4, `lerobot/datasets/compute_stats.py`).
+
+_QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
+_PIXEL_STRIDE = 4  # in both directions; LeRobot samples pixels as well
+
+
+def of_values(values: np.ndarray) -> Stats:
+    """Compute the statistics of one episode's rows, (N, D) -> (D,) each; `count` is (1,)."""
+    values = values.astype(np.float64)
+    return {
+        "min": values.min(0),
+        "max": values.max(0),
+        "mean": values.mean(0),
+        "std": values.std(0),
+        "count": np.array([len(values)]),
+        **{name: np.quantile(values, q, axis=0) for name, q in _QUANTILES.items()},
+    }
+
+
+class ImageStatistics:
+    """The statistics of one camera in one episode, by channel, of pixels in [0, 1], (3, 1, 1) each."""
+
+    def __init__(self) -> None:
+        self._counts = np.zeros((3, 256), np.int64)
+        self._images = 0
+
+    def add(self, image: np.ndarray) -> None:
+        """Count a sample of the pixels of an image, (H, W, 3) uint8."""
+        seen = image[::_PIXEL_STRIDE, ::_PIXEL_STRIDE]
+        for channel in range(3):
+            self._counts[channel] += np.bincount(seen[..., channel].ravel(), minlength=256)
+        self._images += 1
+
+    def result(self) -> Stats:
+        """Return the statistics of all images, with the keys of `of_values`."""
+        levels = np.arange(256) / 255
+        share = self._counts / self._counts.sum(1, keepdims=True)
+        mean = share @ levels
+        below = np.cumsum(share, axis=1)
+
+        def quantile(q: float) -> np.ndarray:
+            return np.asarray(levels[np.argmax(below >= min(q, 1 - 1e-9), axis=1)])
+
+        stats = {
+            "min": quantile(1e-12),
+            "max": levels[255 - np.argmax(self._counts[:, ::-1] > 0, axis=1)],
+            "mean": mean,
+            "std": np.sqrt(np.maximum(share @ levels**2 - mean**2, 0)),
+            **{name: quantile(q) for name, q in _QUANTILES.items()},
+        }
+        return {name: value.reshape(3, 1, 1) for name, value in stats.items()} | {"count": np.array([self._images])}
+
+
+def joined(a: Mapping[str, Stats], b: Mapping[str, Stats]) -> dict[str, Stats]:
+    """Combine the statistics of two sets of frames; quantiles are averaged by count, as LeRobot does."""
+    return {key: _joined(a[key], b[key]) if key in a else b[key] for key in b}
+
+
+def _joined(a: Stats, b: Stats) -> Stats:
+    n, m = float(a["count"][0]), float(b["count"][0])
+    mean = (n * a["mean"] + m * b["mean"]) / (n + m)
+    variance = (n * (a["std"] ** 2 + (a["mean"] - mean) ** 2) + m * (b["std"] ** 2 + (b["mean"] - mean) ** 2)) / (n + m)
+    return {
+        "min": np.minimum(a["min"], b["min"]),
+        "max": np.maximum(a["max"], b["max"]),
+        "mean": mean,
+        "std": np.sqrt(variance),
+        "count": a["count"] + b["count"],
+        **{name: (n * a[name] + m * b[name]) / (n + m) for name in _QUANTILES},
+    }

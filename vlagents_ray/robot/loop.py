@@ -21,7 +21,7 @@ from vlagents_ray.chunking.fallback import Cause, Held
 from vlagents_ray.client.commands import CommandInbox
 from vlagents_ray.errors import ConfigError, InvalidAction
 from vlagents_ray.interface import CAPTURED, CAUSE, INTERVENTION, SAFE, SILENT, WANTED, Act, Agent, Obs
-from vlagents_ray.robot.pacing import KEPT_TICKS, SPIN_S, Pacer, jitter, undisturbed
+from vlagents_ray.robot.pacing import KEPT_TICKS, Pacer, jitter, undisturbed
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.safety import Guard, Watchdog
 from vlagents_ray.viewers.viewer import EpisodeViewer, LoopView
@@ -58,15 +58,7 @@ class Robot(Protocol):
 
 
 def import_class(option: str, name: str) -> Any:
-    """Import the class that an option of a command names.
-
-    Args:
-        option: The option, for the error message: "--robot".
-        name: "module:Class".
-
-    Raises:
-        ConfigError: The name has another form, or there is no such class.
-    """
+    """Import the class "module:Class" that an option such as "--robot" names; raises `ConfigError` without one."""
     module, colon, attribute = name.partition(":")
     if not colon:
         raise ConfigError(f"{option}: got {name!r}, want module:Class")
@@ -142,7 +134,6 @@ def run_loop(
     recorder: Recorder | None = None,
     viewers: Sequence[EpisodeViewer] = (),
     real_time: bool = False,
-    spin_s: float = SPIN_S,
     until: Callable[[], bool] = lambda: False,
     commands: CommandInbox | None = None,
 ) -> LoopReport:
@@ -175,7 +166,6 @@ def run_loop(
             with `interventions=True`.
         viewers: Show the run as one episode (see `vlagents_ray.viewers`).
         real_time: Run the thread with SCHED_FIFO (see `vlagents_ray.robot.pacing.undisturbed`).
-        spin_s: How long before each tick the thread spins instead of sleeping, s.
         until: Ends the loop when it returns True; called before each tick, and after the last one.
         commands: The commands of the live page, from `RemoteAgent(url, commands=...)`: pause, stop, mark.
 
@@ -199,112 +189,137 @@ def run_loop(
             "recorder: got one without interventions for a player with override=; want Recorder(…, interventions=True)"
         )
     report = LoopReport(hz)
-    barks = len(control.stops)
+    stops = len(control.stops)
     agent.initialize()
-    guard = _guard(agent, guard)
+    run = _Run(robot, agent, control, _guard(agent, guard), watchdog, recorder, commands, LoopView(viewers), report)
     with contextlib.ExitStack() as stack:
         control.begin(auto=restart == "auto")
         try:
             agent.reset(_observed(robot), instruction, **(reset_options or {}))
             if recorder is not None:
                 stack.enter_context(recorder.episode(instruction or ""))
-            shown = LoopView(viewers)
-            stack.enter_context(shown.episode(instruction or ""))
+            stack.enter_context(run.view.episode(instruction or ""))
             report.means = stack.enter_context(undisturbed(real_time=real_time))
             if watchdog is not None:
                 stack.enter_context(watchdog)
-            pacer = Pacer(hz, spin_s)
-            _drive(robot, agent, guard, watchdog, recorder, shown, report, pacer, seconds, until, control, commands)
+            run.drive(Pacer(hz), seconds, until)
             report.outcome = control.end()
             if report.outcome and recorder is not None and recorder.interventions:
                 recorder.label("success" if report.outcome == "success" else "failure")
         finally:
             control.running = False
             robot.stop()  # before the watchdog and the recorder end
-    report.barks = control.stops[barks:]
+    report.barks = control.stops[stops:]
     if report.mostly_safe is not None:
         logger.warning("%s", report.mostly_safe)
     return report
 
 
-def _drive(
-    robot: Robot,
-    agent: Agent,
-    guard: Guard,
-    watchdog: Watchdog | None,
-    recorder: Recorder | None,
-    shown: LoopView,
-    report: LoopReport,
-    pacer: Pacer,
-    seconds: float | None,
-    until: Callable[[], bool],
-    control: Control,
-    commands: CommandInbox | None,
-) -> None:
-    work_s: deque[float] = deque(maxlen=KEPT_TICKS)
-    collected = time.monotonic()
-    ticks = None if seconds is None else pacer.ticks_in(seconds)
-    last: np.ndarray | None = None
-    guarded = getattr(agent, "check", None) is guard  # the agent has checked the action before `act` returns
-    interrupt = getattr(agent, "interrupt", lambda: None)
-    decides = getattr(agent, "control", None) is control  # as a chunk player does, at each tick
-    standing = True  # before the first action, and after a stop until the next one
-    try:
-        while not (until() or report.done):
-            collected = _collect_after(collected)
-            tick = pacer.wait()
-            if ticks is not None and tick >= ticks:
-                pacer.forget(ticks)
-                break
-            obs = _observed(robot)
-            if not decides:
-                control.update()
-            act = agent.act(obs)
-            if act.action.ndim != 1:
-                raise InvalidAction(f"action: got {act.action.shape}, want one row; wrap the agent in a ChunkPlayer")
-            report.done = act.done
-            led = bool(act.info.get(INTERVENTION))
-            safe = _safe(act)
-            # Before this tick counts as a sign of life: it may be late.
-            stop = _held(robot, control, commands, safe)
-            if control.over:
-                break
-            if watchdog is not None:
-                watchdog.heard("loop")
-                watchdog.heard("server", _silent_s(act))
-            if stop is not None:
-                if not standing:
-                    robot.stop()  # again, as the watchdog may have stopped it just before the last action
-                standing = True
-                interrupt()
-                report.count(stop)
-                shown.add(obs, act, None, tick, pacer.since_tick_s(), stop.reason)
-                continue
-            if safe is not None:
-                report.count(safe)
-                if standing:  # a robot at rest gets no command
-                    continue
-            action = act.action
-            if not guarded:
-                action = guard(action, guard.reference(obs, last) if standing else last)
-            standing, last = False, action
-            robot.apply(action)
-            work_s.append(pacer.since_tick_s())
-            report.interventions += led
-            if recorder is not None:
-                wanted = act.info.get(WANTED)
-                recorder.add(obs, action, tick=tick, safe=safe is not None, intervention=led, wanted=wanted)
-            shown.add(obs, act, action, tick, work_s[-1])
-    finally:
-        report.jitter = jitter(pacer.late_s, pacer.missed, pacer.ticks)
-        if work_s:
-            report.work_p50_ms = float(np.median(work_s)) * 1e3
-            report.work_p99_ms = float(np.quantile(work_s, 0.99)) * 1e3
+@dataclass(slots=True)
+class _Run:
+    """One run of the control loop: what a tick needs."""
+
+    robot: Robot
+    agent: Agent
+    control: Control
+    guard: Guard
+    watchdog: Watchdog | None
+    recorder: Recorder | None
+    commands: CommandInbox | None
+    view: LoopView
+    report: LoopReport
+    standing: bool = True  # before the first action, and after a stop until the next one
+    last: np.ndarray | None = None  # the last action that was applied, (D,)
+
+    def drive(self, pacer: Pacer, seconds: float | None, until: Callable[[], bool]) -> None:
+        """Run ticks until the policy, `until`, a mark or the time ends it; the report gets the timing in any case."""
+        work_s: deque[float] = deque(maxlen=KEPT_TICKS)
+        collected = time.monotonic()
+        ticks = None if seconds is None else pacer.ticks_in(seconds)
+        try:
+            while not (until() or self.report.done):
+                # Cycles, which failed requests leave: automatic collection is off.
+                if time.monotonic() - collected > _COLLECT_S:
+                    gc.collect()
+                    collected = time.monotonic()
+                tick = pacer.wait()
+                if ticks is not None and tick >= ticks:
+                    pacer.forget(ticks)
+                    break
+                obs, act = self._asked()
+                # Before this tick counts as a sign of life: it may be late.
+                stop = self._held(act)
+                if self.control.over:
+                    break
+                if self.watchdog is not None:
+                    self.watchdog.heard("loop")
+                    self.watchdog.heard("server", _silent_s(act))
+                if stop is not None:
+                    self._stop(stop)
+                    self.view.add(obs, act, None, tick, pacer.since_tick_s(), stop.reason)
+                elif (action := self._applied(obs, act)) is not None:
+                    work_s.append(pacer.since_tick_s())
+                    self._record(obs, act, action, tick)
+                    self.view.add(obs, act, action, tick, work_s[-1])
+        finally:
+            self.report.jitter = jitter(pacer.late_s, pacer.missed, pacer.ticks)
+            if work_s:
+                self.report.work_p50_ms = float(np.median(work_s)) * 1e3
+                self.report.work_p99_ms = float(np.quantile(work_s, 0.99)) * 1e3
+
+    def _asked(self) -> tuple[Obs, Act]:
+        obs = _observed(self.robot)
+        if self.agent.control is not self.control:  # else `act` decides who moves the robot
+            self.control.update()
+        act = self.agent.act(obs)
+        if act.action.ndim != 1:
+            raise InvalidAction(f"action: got {act.action.shape}, want one row; wrap the agent in a ChunkPlayer")
+        self.report.done = act.done
+        return obs, act
+
+    def _held(self, act: Act) -> Held | None:
+        """Obey the commands that have come; return why nothing is commanded at this tick, None if something may be."""
+        if self.commands is not None:
+            self.commands.obey(self.control)
+        held, why, safe = self.control.hold(), getattr(self.robot, "holds", None), _safe(act)
+        if held is None and why is not None:
+            return Held("robot", str(why))
+        if held is None and safe is not None and safe.cause in ("stopped", "paused"):
+            return safe  # which is over since the player decided this tick
+        return held
+
+    def _stop(self, why: Held) -> None:
+        """Command nothing at this tick."""
+        if not self.standing:
+            self.robot.stop()  # again, as the watchdog may have stopped it just before the last action
+        self.standing = True
+        self.agent.interrupt()
+        self.report.count(why)
+
+    def _applied(self, obs: Obs, act: Act) -> np.ndarray | None:
+        """Apply the action, and return it; a robot at rest gets no safe action."""
+        safe, action = _safe(act), act.action
+        if safe is not None:
+            self.report.count(safe)
+            if self.standing:
+                return None
+        if self.agent.check is not self.guard:  # else it was checked before `act` returned
+            action = self.guard(action, self.guard.reference(obs, self.last) if self.standing else self.last)
+        self.standing, self.last = False, action
+        self.robot.apply(action)
+        return action
+
+    def _record(self, obs: Obs, act: Act, action: np.ndarray, tick: int) -> None:
+        led = bool(act.info.get(INTERVENTION))
+        self.report.interventions += led
+        if self.recorder is not None:
+            wanted = act.info.get(WANTED)
+            self.recorder.add(obs, action, tick=tick, safe=SAFE in act.info, intervention=led, wanted=wanted)
 
 
 def _shared_control(agent: Agent, watchdog: Watchdog | None, commands: CommandInbox | None) -> Control:
     """Return the one state of this robot: the player's, else the watchdog's, else that of the commands."""
-    control: Control | None = getattr(agent, "control", None)
+    control: Control | None = agent.control
     if control is None:
         control = watchdog.control if watchdog is not None else commands.control if commands is not None else Control()
     if watchdog is not None:
@@ -313,18 +328,6 @@ def _shared_control(agent: Agent, watchdog: Watchdog | None, commands: CommandIn
         control.adopt(commands.control)
         commands.control = control
     return control
-
-
-def _held(robot: Robot, control: Control, commands: CommandInbox | None, safe: Held | None) -> Held | None:
-    """Obey the commands that have come; return why nothing is commanded at this tick, None if something may be."""
-    if commands is not None:
-        commands.obey(control)
-    held, why = control.hold(), getattr(robot, "holds", None)
-    if held is None and why is not None:
-        return Held("robot", str(why))
-    if held is None and safe is not None and safe.cause in ("stopped", "paused"):
-        return safe  # which is over since the player decided this tick
-    return held
 
 
 def _safe(act: Act) -> Held | None:
@@ -338,18 +341,9 @@ def _silent_s(act: Act) -> float:
     return float(silent_s) if isinstance(silent_s, (int, float)) and 0 <= silent_s < math.inf else 0.0
 
 
-def _collect_after(collected: float) -> float:
-    """Free cycles, which failed requests leave, while automatic collection is off; return when that was done last."""
-    if time.monotonic() - collected <= _COLLECT_S:
-        return collected
-    gc.collect()
-    return time.monotonic()
-
-
 def _guard(agent: Agent, given: Guard | None) -> Guard:
     """Return the guard that actions have to pass; the agent is initialized, so it knows its contract."""
-    own = getattr(agent, "check", None)
-    own = own if isinstance(own, Guard) else None
+    own = agent.check if isinstance(agent.check, Guard) else None
     if given is not None and own is not None and own is not given:
         raise ConfigError("guard: got one besides the agent's own check=, want one of them; leave one out")
     return given or own or Guard(agent.contract)

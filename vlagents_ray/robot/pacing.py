@@ -76,12 +76,7 @@ class Pacer:
 
 
 def jitter(late_s: Sequence[float], missed: int, ticks: int | None = None) -> dict[str, float]:
-    """Compute the statistics of a loop's punctuality.
-
-    Args:
-        late_s: The lateness of ticks, s; of a long loop, that of the last ones.
-        missed: The number of ticks that were skipped.
-        ticks: The number of ticks that began; by default as many as in `late_s`.
+    """Compute the punctuality of a loop, of whose `ticks` the last ones have a lateness in `late_s`, s.
 
     Returns:
         `ticks`, `missed`, the share `on_time` that began within 2 ms, and the lateness `p50_ms`, `p99_ms` and `max_ms`.

@@ -36,11 +36,6 @@ class _Frame:
 
 
 @dataclass(frozen=True, slots=True)
-class _Begin:
-    instruction: str
-
-
-@dataclass(frozen=True, slots=True)
 class _End:
     label: Label | None
 
@@ -85,7 +80,8 @@ class Recorder:
         self._dataset = Dataset(Path(root), fps, robot_type, interventions=interventions)
         self._label: Label | None = None
         self._frames = frames
-        self._queue: queue.SimpleQueue[_Frame | _Begin | _End | None] = queue.SimpleQueue()
+        # A text begins an episode: its instruction.
+        self._queue: queue.SimpleQueue[_Frame | str | _End | None] = queue.SimpleQueue()
         self._put = 0  # frames added, counted by the loop's thread
         self._got = 0  # frames taken from the queue, counted by the writing thread
         self._thread = threading.Thread(target=self._run, name="vlagents-ray-recorder", daemon=True)
@@ -108,7 +104,7 @@ class Recorder:
         It is kept however the context ends, unless it has the label "discard".
         """
         self._label = None
-        self._queue.put(_Begin(instruction))
+        self._queue.put(instruction)
         try:
             yield
         finally:
@@ -190,9 +186,9 @@ class Recorder:
         if episode is not None:
             episode.abandon()
 
-    def _handle(self, item: _Frame | _Begin | _End, episode: RobotEpisode | None) -> RobotEpisode | None:
-        if isinstance(item, _Begin):
-            return self._dataset.begin(item.instruction)
+    def _handle(self, item: _Frame | str | _End, episode: RobotEpisode | None) -> RobotEpisode | None:
+        if isinstance(item, str):
+            return self._dataset.begin(item)
         if episode is None:  # abandoned after an error
             return None
         if isinstance(item, _Frame):

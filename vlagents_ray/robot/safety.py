@@ -125,11 +125,7 @@ class Guard:
 
 
 def measured_state(part: str | None) -> Callable[[Obs], np.ndarray] | None:
-    """Return a `measure` of a `Guard`: a part of the state.
-
-    Args:
-        part: The name of the part, such as "joints"; None measures nothing.
-    """
+    """Return a `measure` of a `Guard`: a part of the state, such as "joints"; None measures nothing."""
 
     def measured(obs: Obs) -> np.ndarray:
         if part not in obs.state:

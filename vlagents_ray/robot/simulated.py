@@ -1,11 +1,16 @@
-"""A simulated robot, to try the control loop, recording and a server without hardware."""
+"""Robots without hardware: a simulated arm to try the control loop with, and an environment that it drives."""
 
 from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
-from vlagents_ray.interface import Obs
+from vlagents_ray.interface import Act, Obs
+
+if TYPE_CHECKING:
+    from vlagents_ray.envs.base import EvalEnv
 
 _SIDE = 224  # px
 _DOT = 16
@@ -81,3 +86,35 @@ def _picture(height: int, width: int) -> np.ndarray:
     y, x = np.mgrid[:height, :width]
     noise = np.random.default_rng(0).integers(0, 8, (height, width))
     return np.stack([x * 200 // width + noise, y * 200 // height + noise, (x + y) % 160 + noise], -1).astype(np.uint8)
+
+
+class EnvRobot:
+    """One episode of an environment as a `Robot`: each command is a step, and without one, time stands still.
+
+    The caller closes `env`. With `endless` its step limit is ignored, as a human takes longer than a policy.
+    """
+
+    simulated = True
+
+    def __init__(self, env: EvalEnv, seed: int, *, endless: bool = False) -> None:
+        self._env, self._endless = env, endless
+        self._obs, _ = env.reset(seed=seed)
+        self.success = False  # the task was solved
+        self.ended = False  # by success, or as the environment says
+        self.steps = 0
+
+    def observe(self) -> Obs:
+        """Return the observation after the last step."""
+        return self._obs
+
+    def apply(self, action: np.ndarray) -> None:
+        """Make a step, if the episode has not ended."""
+        if self.ended:
+            return
+        self._obs, _, terminated, truncated, info = self._env.step(Act(action))
+        self.steps += 1
+        self.success = bool(info.get("success", False))
+        self.ended = self.success or terminated or (truncated and not self._endless)
+
+    def stop(self) -> None:
+        """Do nothing: the simulation makes a step only at a command."""

@@ -49,11 +49,7 @@ class ValueSpec:
 
 
 def header_of(named: Mapping[str, np.ndarray]) -> bytes:
-    """Return the beginning of a file with these values, before their bytes.
-
-    Raises:
-        InvalidWeights: A value has a type that the format does not have.
-    """
+    """Return the beginning of a file with these values; raises `InvalidWeights` for a type that it cannot have."""
     document, begin = {}, 0
     for name, value in named.items():
         if value.dtype not in _CODES:
@@ -83,10 +79,7 @@ def parts_of(named: Mapping[str, np.ndarray], length: int = PART_BYTES) -> Itera
 
 
 def read_header(data: bytes) -> dict[str, ValueSpec]:
-    """Return the values that a header announces, by name, in the order of their bytes.
-
-    Args:
-        data: A header and nothing after it, as `header_of` returns it.
+    """Return the values that a header of `header_of` announces, by name, in the order of their bytes.
 
     Raises:
         MalformedMessage: It is no header, or is too long, or its places leave gaps, overlap or do not fit the shapes.
@@ -176,7 +169,7 @@ class ValuesReader:
             self._room, data = self._room[length:], data[length:]
 
     def values(self) -> Mapping[str, np.ndarray]:
-        """Return the values, which nobody can write into, once all bytes have arrived.
+        """Return the values, read-only, once all bytes have arrived.
 
         Raises:
             MalformedMessage: A truth value is neither 0 nor 1.

@@ -61,10 +61,7 @@ def gpu_of(named: Mapping[str, Any]) -> str:
 
 @contextmanager
 def shared(named: Mapping[str, Any]) -> Iterator[SharedValues]:
-    """Yield the values for another process. Within this, nobody may write into them.
-
-    Args:
-        named: The values by name, of which those on a GPU are all on the same one (`gpu_of`).
+    """Yield values by name for another process, those on the GPU on one (`gpu_of`); nobody may write into them within.
 
     Raises:
         NotShared: The memory is of a kind that CUDA does not hand over.
@@ -88,11 +85,7 @@ def shared(named: Mapping[str, Any]) -> Iterator[SharedValues]:
 
 @contextmanager
 def opened(values: SharedValues) -> Iterator[Mapping[str, Any]]:
-    """Yield the values of another process by name, those on a GPU where they are: copy them, and keep none.
-
-    Raises:
-        NotShared: This process does not reach the memory.
-    """
+    """Yield another process's values by name, those on a GPU where they are; copy them. Raises `NotShared`."""
     torch = sys.modules["torch"]
     try:
         storages = {address: _MEMORY.opened(values.gpu, handle) for address, handle in values.storages.items()}

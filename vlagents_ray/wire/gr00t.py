@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.errors import InvalidObservation, MalformedMessage, MessageTooLarge, shown
-from vlagents_ray.protocol.arrays import read_array
+from vlagents_ray.protocol.frame_layout import read_array
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
 from vlagents_ray.registry import require
 from vlagents_ray.wire import msgpack

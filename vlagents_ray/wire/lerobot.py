@@ -24,9 +24,9 @@ from vlagents_ray.errors import (
     MissingCamera,
     MissingState,
 )
-from vlagents_ray.protocol.arrays import Buffer
+from vlagents_ray.protocol.frame_layout import Buffer
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Budget, Limits
-from vlagents_ray.protocol.observations import is_number
+from vlagents_ray.protocol.values import is_number
 from vlagents_ray.wire.mapping import KeyMapping
 from vlagents_ray.wire.pickles import NUMPY_CALLS, TORCH_CALLS, Name, fields_of, read_pickle, text, write_record
 

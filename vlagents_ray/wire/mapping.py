@@ -42,7 +42,7 @@ from vlagents_ray.errors import (
 )
 from vlagents_ray.interface import Obs
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
-from vlagents_ray.protocol.observations import as_camera, as_state, is_number
+from vlagents_ray.protocol.values import as_camera, as_state, is_number
 
 logger = logging.getLogger(__name__)
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.errors import InvalidInput, MalformedMessage, MessageTooLarge
-from vlagents_ray.protocol.arrays import read_array
+from vlagents_ray.protocol.frame_layout import read_array
 from vlagents_ray.protocol.messages import Limits
 from vlagents_ray.protocol.values import require_plain
 from vlagents_ray.registry import require

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge, shown
-from vlagents_ray.protocol.arrays import plain_dtype, read_array
+from vlagents_ray.protocol.frame_layout import plain_dtype, read_array
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
 from vlagents_ray.wire.mapping import ALOHA_ACTION, ALOHA_STATE, libero_state
 from vlagents_ray.wire.msgpack import pack, unpack

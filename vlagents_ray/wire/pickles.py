@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge, shown
-from vlagents_ray.protocol.arrays import Buffer, read_array
+from vlagents_ray.protocol.frame_layout import Buffer, read_array
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
 
 _PROTOCOLS = (4, 5)

@@ -14,7 +14,7 @@ import numpy as np
 
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge, shown
 from vlagents_ray.images.codecs import decode_files
-from vlagents_ray.protocol.arrays import read_array
+from vlagents_ray.protocol.frame_layout import read_array
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Budget, Limits
 from vlagents_ray.wire.msgpack import pack, unpack
 

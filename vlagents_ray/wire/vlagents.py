@@ -15,9 +15,9 @@ import numpy as np
 from vlagents_ray.errors import InvalidAction, InvalidObservation, MalformedMessage, MessageTooLarge, shown
 from vlagents_ray.images.codecs import decode_files
 from vlagents_ray.interface import GOAL_IMAGE, Act, Obs
-from vlagents_ray.protocol.arrays import read_array
+from vlagents_ray.protocol.frame_layout import read_array
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Budget, Limits
-from vlagents_ray.protocol.observations import is_number
+from vlagents_ray.protocol.values import is_number
 from vlagents_ray.wire import json_numpy, rpyc
 
 RAW, JPEG, SHARED = "raw", "jpeg_encoded", "shared_memory"

@@ -10,8 +10,7 @@ from typing import Any
 import pytest
 
 from vlagents_ray import RemoteAgent
-from vlagents_ray.client.transports.plasma import PlasmaTransport
-from vlagents_ray.client.transports.serve_handle import HandleTransport
+from vlagents_ray.client.transports.serve_handle import HandleTransport, PlasmaTransport
 from vlagents_ray.errors import ConfigError, PolicyUnavailable
 from vlagents_ray.interface import Obs
 
@@ -29,13 +28,13 @@ HERE, ELSEWHERE = "a" * 56, "b" * 56
 def test_who_is_not_on_the_replicas_node_is_told_what_to_use(
     monkeypatch: pytest.MonkeyPatch, node: str | None, address: dict[str, Any] | None, said: str
 ) -> None:
-    monkeypatch.setattr("vlagents_ray.client.transports.plasma.this_node", lambda: node)
+    monkeypatch.setattr("vlagents_ray.client.transports.serve_handle.this_node", lambda: node)
     with pytest.raises(ConfigError, match=said):
         PlasmaTransport("app").connect_to(HandleTransport("app"), {"plasma": address}, 1)
 
 
 def test_an_endpoint_that_is_gone_is_unavailable(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vlagents_ray.client.transports.plasma.this_node", lambda: HERE)
+    monkeypatch.setattr("vlagents_ray.client.transports.serve_handle.this_node", lambda: HERE)
     with pytest.raises(PolicyUnavailable, match="does not answer"):
         PlasmaTransport("app").connect_to(
             HandleTransport("app"), {"plasma": {"socket": "/no/endpoint", "node": HERE}}, 1
@@ -52,8 +51,8 @@ def test_outside_of_a_cluster_there_is_no_plasma() -> None:
 def test_a_replicas_socket_that_is_another_users_is_sent_nothing(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr("vlagents_ray.client.transports.plasma.this_node", lambda: HERE)
-    monkeypatch.setattr("vlagents_ray.client.transports.unix_messages.peer_uid", lambda _: os.getuid() + 1)
+    monkeypatch.setattr("vlagents_ray.client.transports.serve_handle.this_node", lambda: HERE)
+    monkeypatch.setattr("vlagents_ray.client.transports.shm.peer_uid", lambda _: os.getuid() + 1)
     path = str(tmp_path / "s")
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener:
         listener.bind(path)
@@ -70,8 +69,8 @@ def test_a_connection_that_fails_is_closed_at_once(
     def fail(_: socket.socket) -> None:
         raise broken
 
-    monkeypatch.setattr("vlagents_ray.client.transports.plasma.this_node", lambda: HERE)
-    monkeypatch.setattr("vlagents_ray.client.transports.unix_messages._require_same_user", fail)
+    monkeypatch.setattr("vlagents_ray.client.transports.serve_handle.this_node", lambda: HERE)
+    monkeypatch.setattr("vlagents_ray.client.transports.shm._require_same_user", fail)
     path = str(tmp_path / "s")
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener:
         listener.bind(path)

@@ -34,7 +34,7 @@ def test_requests_to_a_server_that_hangs_take_no_more_memory_than_it_would_accep
 def test_a_server_of_another_user_is_sent_nothing(monkeypatch: pytest.MonkeyPatch, *, keyed: bool) -> None:
     """Neither a key nor an observation: whoever takes the name of a server that has ended would command the robot."""
     name = f"vlagents-ray-test-{os.getpid()}"
-    monkeypatch.setattr("vlagents_ray.client.transports.unix_messages.peer_uid", lambda _: os.getuid() + 1)
+    monkeypatch.setattr("vlagents_ray.client.transports.shm.peer_uid", lambda _: os.getuid() + 1)
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener:
         listener.bind(f"\0{name}")
         listener.listen()

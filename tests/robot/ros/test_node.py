@@ -20,7 +20,7 @@ from ros_arm import BEAT, CAMERA, COMMANDS, JOINTS, NAMES, SIDE, TOLD, RosArm, h
 from rosbridge_double import RosbridgeDouble, rosbridge_double
 
 import vlagents_ray.cli.robot as command
-from vlagents_ray import Act, ActionSpec, Agent, CameraSpec, ChunkPlayer, Contract, Obs, StateSpec
+from vlagents_ray import Act, ActionSpec, Agent, CameraSpec, ChunkPlayer, Contract, Obs, PlayerSettings, StateSpec
 from vlagents_ray.errors import ConfigError, InvalidAction
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, PROTOCOL_VERSION
 from vlagents_ray.robot import Guard, Watchdog, run_loop
@@ -112,7 +112,9 @@ def driving(agent: Agent, **more: Any) -> Iterator[Drive]:
         robot = stack.enter_context(RosRobot(settings))
         watchdog = robot.watchdog = Watchdog(lambda _: robot.stop(), robot.silent_s)
         guard = SeeingGuard(agent.contract, max_step=MAX_STEP, measure=measured_state("joints"))
-        player = stack.enter_context(ChunkPlayer(agent, mode="open_loop", check=guard, deadline_s=1.0, safe="hold"))
+        player = stack.enter_context(
+            ChunkPlayer(agent, PlayerSettings(mode="open_loop", deadline_s=1.0, safe="hold"), check=guard)
+        )
         drive = Drive(double, arm, robot, watchdog)
 
         def run() -> None:

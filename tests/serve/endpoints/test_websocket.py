@@ -19,8 +19,7 @@ from eval_fakes import wait_for
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
-from vlagents_ray.client.transports.direct_websocket import Stream
-from vlagents_ray.client.transports.probe import bytes_probe, is_answer
+from vlagents_ray.client.transports.websocket import Stream
 from vlagents_ray.errors import (
     ConfigError,
     MalformedMessage,
@@ -35,6 +34,8 @@ from vlagents_ray.protocol.messages import (
     Limits,
     Reply,
     Request,
+    bytes_probe,
+    is_probe_answer,
 )
 from vlagents_ray.serve.access.api_keys import Keys, NoKey
 from vlagents_ray.serve.access.key_store import new_key
@@ -104,7 +105,7 @@ def test_an_ordinary_websocket_client_is_served_too(endpoint: WebSocketServer) -
         socket_.ping().wait(5)
         probe = bytes_probe(300_000)
         socket_.send(probe)
-        assert is_answer(socket_.recv(5))
+        assert is_probe_answer(socket_.recv(5))
         socket_.send(encode_request(Request("reset", Obs())))
         assert decode_reply(socket_.recv(5)).error is None
 

@@ -22,8 +22,8 @@ from eval_fakes import wait_for
 from in_flight import ask as ask_of
 from starlette.types import Receive, Scope, Send
 
-from vlagents_ray.client.transports.direct_websocket import Stream
 from vlagents_ray.client.transports.shm import ShmTransport
+from vlagents_ray.client.transports.websocket import Stream
 from vlagents_ray.errors import DeadlineExceeded
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.frames import decode_reply, encode_request

@@ -19,7 +19,7 @@ from live_server import LiveServer, ask, live_server
 from manual_clock import Clock
 
 from vlagents_ray import Obs, RemoteAgent
-from vlagents_ray.chunking.player import ChunkPlayer
+from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.cli.robot import main
 from vlagents_ray.client.commands import COMMAND, COMMANDED, CommandInbox
 from vlagents_ray.errors import InvalidInput, Overloaded, UnknownSession
@@ -161,7 +161,7 @@ def robot(server: LiveServer, *, obeys: bool = True) -> Iterator[tuple[Arm, str,
     arm, over, reports = Arm(), threading.Event(), []
     commands = CommandInbox() if obeys else None
     with RemoteAgent(server.url, commands=commands) as agent:
-        player = ChunkPlayer(agent, mode="async", deadline_s=0.01, safe="hold")
+        player = ChunkPlayer(agent, PlayerSettings(mode="async", deadline_s=0.01, safe="hold"))
         thread = threading.Thread(
             target=lambda: reports.append(
                 run_loop(arm, player, hz=100, instruction="hold", commands=commands, until=over.is_set)

@@ -17,7 +17,7 @@ from in_memory_keys import ChangingKeys
 from live_server import Address, LiveServer, ask, live_server
 
 from vlagents_ray import Obs, RemoteAgent
-from vlagents_ray.chunking.player import ChunkPlayer
+from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.client.commands import CommandInbox
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.policies.noop import Noop
@@ -118,7 +118,7 @@ def test_a_card_compares_what_was_planned_with_what_was_executed(page: Page, ser
 
     def play() -> None:
         with RemoteAgent(server.url) as agent:
-            player = ChunkPlayer(agent, mode="async", deadline_s=0.01, safe="hold")
+            player = ChunkPlayer(agent, PlayerSettings(mode="async", deadline_s=0.01, safe="hold"))
             obs = Obs(state={"joints": np.zeros(7, np.float32)})
             player.reset(obs, "play")
             while not over.wait(0.02):
@@ -167,7 +167,10 @@ def operated(server: LiveServer, key: str | None = None) -> Iterator[list[LoopRe
     """A simulated robot that obeys the page."""
     commands, over, reports = CommandInbox(), threading.Event(), []
     with RemoteAgent(server.url, api_key=key, commands=commands) as agent:
-        robot, player = SimulatedRobot(Contract(action=ActionSpec(7))), ChunkPlayer(agent, mode="async", safe="hold")
+        robot, player = (
+            SimulatedRobot(Contract(action=ActionSpec(7))),
+            ChunkPlayer(agent, PlayerSettings(mode="async", safe="hold")),
+        )
         thread = threading.Thread(
             target=lambda: reports.append(
                 run_loop(robot, player, hz=50, instruction="wipe the table", commands=commands, until=over.is_set)

@@ -26,7 +26,7 @@ from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.weights import versions
 from vlagents_ray.serve.weights.updates import PushOptions
-from vlagents_ray.weights.check import fingerprint
+from vlagents_ray.weights.trainable import fingerprint
 
 
 class Gain(Agent):

@@ -18,11 +18,10 @@ _SILENT_S = 2.0  # s after which an attempt to connect that goes on is reported
 class RequestChannel(Protocol):
     """Carries the requests of one frame at a time to one replica of a server.
 
-    A request names its session. A session ends with its `close` request, or with the connection.
-
-    Raises `PolicyUnavailable` when the server cannot be reached or is not ready, `ConnectionLost` when the connection
-    broke after the request was sent, and `DeadlineExceeded` when no answer came in time. An error that the server
-    replied with is in `Reply.error`.
+    A request names its session, which ends with its `close` request, or with the connection. Raises
+    `PolicyUnavailable` when the server cannot be reached or is not ready, `ConnectionLost` when the connection broke
+    after the request was sent, and `DeadlineExceeded` when no answer came in time. An error that the server replied
+    with is in `Reply.error`.
     """
 
     @property
@@ -71,10 +70,9 @@ class ConnectReport:
 
 
 def first_timeout_s(timeout_s: float) -> float:
-    """Return how long, s, the first replica may take to send anything, of `timeout_s` in all; the next gets twice that.
+    """Return how long, s, the first replica may take of `timeout_s` to send anything; the next gets twice that.
 
-    The first replica may hang while another one works. With this limit, every attempt to connect, however short, asks
-    at least two replicas.
+    So every attempt to connect, however short, asks at least two replicas, of which the first may hang.
     """
     return min(_ANSWER_S, timeout_s / 3)
 
@@ -85,8 +83,5 @@ def left_s(deadline: float) -> float:
 
 
 def is_answer(replies: Sequence[Reply], requests: Sequence[Request]) -> bool:
-    """Whether these replies belong to these requests, not to earlier ones that timed out.
-
-    An unreadable frame has no id.
-    """
+    """Whether these replies belong to these requests, not to earlier ones. An unreadable frame has no id."""
     return replies[0].request_id in ("", requests[0].request_id)

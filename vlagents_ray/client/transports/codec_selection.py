@@ -14,10 +14,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
-from vlagents_ray.client.transports.probe import LEAST_BYTES, bytes_probe
 from vlagents_ray.errors import MessageTooLarge, TooManyRequests
 from vlagents_ray.images.codecs import JPEG, LOSSLESS, RAW, ImageCodec
 from vlagents_ray.interface import Obs
+from vlagents_ray.protocol.messages import LEAST_BYTES, bytes_probe
 
 CodecName = Literal["auto", "exact", "raw", "lossless", "jpeg"]
 Send = Callable[[bytes], None]  # sends a probe and waits for the answer
@@ -46,13 +46,10 @@ class LinkSpeed:
 def measure(
     send: Send, clock: Callable[[], float] = time.perf_counter, within_s: float = float("inf")
 ) -> LinkSpeed | None:
-    """Measure the link over which `send` carries probes.
+    """Measure the link over which `send` carries probes; None if ten round trips take longer than `within_s`.
 
     Takes 0.15 s at most where a round trip is short, else ten round trips and one probe. Probes grow only while the
     last one was too short to measure, so a slow link carries few bytes.
-
-    Returns:
-        The speed; None, after two round trips, if ten of them take longer than `within_s`.
     """
 
     def seconds(size: int) -> float:
@@ -96,9 +93,8 @@ class CodecChoice:
     """The codec of one session's cameras: the one that the user asks for, or one chosen by the link.
 
     "auto" takes raw pixels within a machine and over links of at least 300 MB/s, else JPEG; "exact" raw pixels within a
-    machine and over links of at least 25 MB/s, else PNG. A link to a server so far away that measuring would take much
-    of a request's time counts as slow, without a measurement. Raw pixels are not taken where a message of so many bytes
-    is refused.
+    machine and over links of at least 25 MB/s, else PNG. A link so far away that measuring would take much of a
+    request's time counts as slow. Raw pixels are not taken where a message of so many bytes is refused.
     """
 
     def __init__(self, requested: CodecName | ImageCodec) -> None:
@@ -127,13 +123,9 @@ class CodecChoice:
     def codec_for(
         self, obs: Obs | None, send: Send, most_bytes: float = float("inf"), timeout_s: float = float("inf")
     ) -> ImageCodec:
-        """Return the codec for an observation; probes are sent only if it has yet to be chosen.
+        """Return the codec for an observation; probes are sent, by `send`, only if it has yet to be chosen.
 
-        Args:
-            obs: The observation of the request.
-            send: Sends a probe and waits for the answer.
-            most_bytes: The largest message.
-            timeout_s: How long the request may take, probes included.
+        `most_bytes` is the largest message, and `timeout_s` how long the request may take, probes included.
         """
         if obs is None or self._compressed is None or self.codec is self._compressed:
             return self.codec or RAW

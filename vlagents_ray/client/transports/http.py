@@ -28,12 +28,7 @@ from vlagents_ray.errors import (
     UnknownApp,
     VLAgentsError,
 )
-from vlagents_ray.protocol.frames import (
-    CONTENT_TYPE,
-    decode_replies,
-    encode_requests,
-    read_error,
-)
+from vlagents_ray.protocol.frames import CONTENT_TYPE, decode_replies, encode_requests, read_error
 from vlagents_ray.protocol.messages import (
     DEFAULT_LIMITS,
     MACHINE_HEADER,

@@ -1,50 +1,141 @@
-"""Selects the transport for a URL."""
+"""Selects the transport for a URL; "auto" is the fastest that the server allows when it connects."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal, get_args
+import time
+from collections.abc import Sequence
+from typing import Any, Literal, get_args
 from urllib.parse import urlsplit
 
 from vlagents_ray.client.credentials import ANONYMOUS, Credentials
+from vlagents_ray.client.transports.base import RequestChannel, Transport
 from vlagents_ray.client.transports.codec_selection import CodecChoice
-from vlagents_ray.client.transports.http import http_url
-from vlagents_ray.errors import ConfigError
-
-if TYPE_CHECKING:
-    from vlagents_ray.client.transports.base import Transport
+from vlagents_ray.client.transports.http import HttpTransport, http_url
+from vlagents_ray.client.transports.serve_handle import HandleTransport, PlasmaTransport
+from vlagents_ray.client.transports.shm import ShmTransport, reaches
+from vlagents_ray.client.transports.websocket import WebSocketTransport
+from vlagents_ray.errors import ConfigError, MessageTooLarge, NotReset, PolicyUnavailable
+from vlagents_ray.protocol.messages import Reply, Request, boot_id
 
 TransportName = Literal["auto", "shm", "plasma", "websocket", "http", "handle"]
 
 
+class AutoTransport:
+    """Shared memory if the policy runs on this machine for this user; else a WebSocket.
+
+    Inside the cluster: shared memory, else a plasma channel on the replica's node, else the Serve handle. Shared memory
+    comes first because it is faster, without Ray's locks and framing; plasma reaches a replica on this node whose
+    socket is in another network namespace. Where the object store has no room for a channel, the handle is used
+    instead: its frames lie in the store for a moment, or on disk if the store has no room for them.
+    """
+
+    def __init__(
+        self, url: str, codec: CodecChoice, credentials: Credentials = ANONYMOUS, *, only_shm: bool = False
+    ) -> None:
+        self._credentials = credentials
+        self._url = url
+        self._codec = codec
+        self._only_shm = only_shm
+        self._chosen: RequestChannel | None = None
+        self._handle: HandleTransport | None = None  # in addition to a channel to the same replica
+
+    @property
+    def name(self) -> str:
+        """The name of the chosen transport; "auto" before one is chosen."""
+        return "auto" if self._chosen is None else self._chosen.name
+
+    @property
+    def holds_sessions(self) -> bool:
+        """Whether sessions end with the connection of the chosen transport."""
+        return self._chosen is not None and self._chosen.holds_sessions
+
+    def connect(self, timeout_s: float) -> dict[str, Any]:
+        """Return the server's metadata, once it answers and the chosen transport is connected."""
+        deadline = time.monotonic() + timeout_s
+        parts = urlsplit(self._url)
+        handle = HandleTransport(parts.netloc, must_be_near=self._only_shm) if parts.scheme == "serve" else None
+        metadata_source = handle or HttpTransport(self._url, self._codec, self._credentials, boot_id())
+        try:
+            metadata = metadata_source.connect(timeout_s)
+        except BaseException:
+            metadata_source.close()
+            raise
+        left_s = max(1.0, deadline - time.monotonic())
+        local = metadata.get("local")
+        if handle is not None and not self._only_shm and local and local["keyed"] and not self._credentials.api_key:
+            local = None  # a client in the cluster needs a key for this endpoint only
+        shm = self._shm(local, left_s)
+        if shm is not None or handle is None:
+            metadata_source.close()
+        if shm is not None:
+            self._chosen = shm
+        elif handle is not None:
+            channel = self._channel(handle, metadata, left_s)
+            self._chosen, self._handle = channel or handle, None if channel is None else handle
+        else:
+            stream = WebSocketTransport(self._url, self._codec, self._credentials)
+            stream.connect_to(metadata, left_s)
+            self._chosen = stream
+        return metadata
+
+    def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
+        """Send the requests by the chosen transport."""
+        if self._chosen is None:
+            raise NotReset("not connected; reset first")
+        try:
+            return self._chosen.call(requests, timeout_s)
+        except MessageTooLarge:  # too large for the channel; nothing was sent
+            if self._handle is None:
+                raise
+        self._chosen.close()
+        self._chosen, self._handle = self._handle, None
+        return self._chosen.call(requests, timeout_s)
+
+    def close(self) -> None:
+        """End the connection; the next one chooses again, since the server may have moved."""
+        if self._chosen is not None:
+            self._chosen.close()
+            self._chosen = self._handle = None
+
+    def _channel(self, handle: HandleTransport, metadata: dict[str, Any], timeout_s: float) -> PlasmaTransport | None:
+        transport = PlasmaTransport(urlsplit(self._url).netloc)
+        try:
+            transport.connect_to(handle, metadata, timeout_s)
+        except (ConfigError, PolicyUnavailable):  # the replica is on another node
+            return None
+        return transport
+
+    def _shm(self, local: dict[str, Any] | None, timeout_s: float) -> ShmTransport | None:
+        if not local or not reaches(local):
+            if self._only_shm:
+                raise ConfigError(f"{self._url}: transport 'shm' needs the policy on this machine; it is on another")
+            return None
+        transport = ShmTransport(local, self._credentials)
+        try:
+            transport.connect(timeout_s)
+        except PolicyUnavailable:  # the server is another user's, or in a container with its own network
+            if self._only_shm:
+                raise
+            return None
+        return transport
+
+
 def select_transport(url: str, transport: str, codec: CodecChoice, credentials: Credentials = ANONYMOUS) -> Transport:
     """Return the transport for a URL; raises `ConfigError` if the two do not go together."""
-    scheme = urlsplit(url).scheme
+    inside = urlsplit(url).scheme == "serve"
     if transport not in get_args(TransportName):
         raise ConfigError(f"transport: got {transport!r}, want one of {list(get_args(TransportName))}")
-    inside = scheme == "serve"
     if transport in (("http", "websocket") if inside else ("handle", "plasma")):
         raise ConfigError(
             f"transport {transport!r} does not reach {url!r}; 'handle' and 'plasma' go together with serve://APP"
         )
     credentials.use_at(url)
-    if transport == "handle":
-        from vlagents_ray.client.transports.serve_handle import HandleTransport
-
-        return HandleTransport(urlsplit(url).netloc)
-    if transport == "plasma":
-        from vlagents_ray.client.transports.plasma import PlasmaTransport
-
-        return PlasmaTransport(urlsplit(url).netloc)
-    if transport == "http":
-        from vlagents_ray.client.transports.http import HttpTransport
-
-        return HttpTransport(url, codec, credentials)
-    if transport == "websocket":
-        from vlagents_ray.client.transports.websocket import WebSocketTransport
-
-        return WebSocketTransport(url, codec, credentials)
+    if transport in ("handle", "plasma"):
+        app = urlsplit(url).netloc
+        return HandleTransport(app) if transport == "handle" else PlasmaTransport(app)
+    if transport in ("http", "websocket"):
+        kind = HttpTransport if transport == "http" else WebSocketTransport
+        return kind(url, codec, credentials)
     if not inside:
         http_url(url)  # raises for an invalid URL before anything is tried
-    from vlagents_ray.client.transports.auto import AutoTransport
-
     return AutoTransport(url, codec, credentials, only_shm=transport == "shm")

@@ -1,7 +1,7 @@
-"""The Serve handle transport, `serve://APP`: from inside the Ray cluster, with the observation in plasma.
+"""`serve://APP`, from inside the Ray cluster: a Serve handle, or a plasma channel to a replica on this node.
 
 The Serve handle picks a replica once; from then on the session's requests go to that replica, since a handle may send
-each request to another one.
+each request to another one. `vlagents_ray.serve.endpoints.plasma` is the server's side of the channel.
 """
 
 from __future__ import annotations
@@ -10,18 +10,28 @@ import pickle
 import time
 import uuid
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 from vlagents_ray.client.transports.base import ConnectReport, first_timeout_s
+from vlagents_ray.client.transports.shm import UnixTransport
 from vlagents_ray.errors import ConfigError, ConnectionLost, DeadlineExceeded, PolicyUnavailable, VLAgentsError
 from vlagents_ray.images.codecs import RAW
-from vlagents_ray.protocol.frames import decode_replies, encode_requests
-from vlagents_ray.protocol.messages import Reply, Request, boot_id
-from vlagents_ray.ray_tools.private import is_connected, replica_request
+from vlagents_ray.protocol.frame_layout import Buffer
+from vlagents_ray.protocol.frames import decode_replies, encode_requests, request_parts
+from vlagents_ray.protocol.messages import LocalAddress, PlasmaAddress, Reply, Request, boot_id
+from vlagents_ray.ray_tools.private import (
+    channel_content,
+    is_connected,
+    register_writer,
+    replica_request,
+    write_channel,
+)
 
 _PAUSE_S = 0.2  # s before another replica is requested in place of one that is gone
 _QUERY_S = 10.0  # s between two queries for the replicas' nodes, which change over time
 _FIRST_QUERY_S = 3.0  # s to wait for the first query; an application without a replica does not answer
+_CHUNK = 2**20  # bytes; Ray copies longer buffers in other threads
+_WRITE_MS = 1000  # the channel is free when a frame is written; if not, something is wrong with it
 
 
 class ClientApi(Protocol):
@@ -95,8 +105,7 @@ class HandleTransport:
 
         try:
             handle = serve.get_app_handle(self._app)
-            here = ray.get_runtime_context().get_node_id() if is_connected() else ""
-            attaching = handle.attach.remote(here, boot_id(), self._must_be_near)
+            attaching = handle.attach.remote(this_node() or "", boot_id(), self._must_be_near)
             metadata, self._replica = attaching.result(timeout_s=timeout_s)
         except ray.exceptions.RayTaskError as error:
             raise PolicyUnavailable(f"serve://{self._app}: {error.cause}") from error
@@ -194,3 +203,109 @@ def call_replica(replica: Any, method: Callable[..., Any], *args: Any, request_i
     """
     header = replica_request(request_id or uuid.uuid4().hex, method.__name__)
     return replica.handle_request.remote(header, *args)
+
+
+# Plasma: frames in mutable objects of the node, for a client on the node of its replica.
+
+
+class PlasmaTransport(UnixTransport):
+    """Writes raw frames into a channel that the replica leases to this connection, which is a session.
+
+    Any process of the cluster on the replica's node can use it: actors, tasks, drivers. A frame that outgrows the
+    channel gets a larger one.
+    """
+
+    name: ClassVar[str] = "plasma"
+
+    def __init__(self, app: str) -> None:
+        super().__init__()
+        self._app = app
+        self._handle = HandleTransport(app, must_be_near=True)
+        self._channel: Any = None  # the ObjectRef of the channel
+        self._capacity = 0
+        self._unread = False  # the replica may still have to read the last frame
+
+    def connect(self, timeout_s: float) -> dict[str, Any]:
+        """Let the Serve handle choose a replica, connect to its socket, and return its metadata.
+
+        Raises:
+            ConfigError: The replica runs on another node, or this process is not on a node itself.
+        """
+        deadline = time.monotonic() + timeout_s
+        metadata = self._handle.connect(timeout_s)
+        self.connect_to(self._handle, metadata, max(1.0, deadline - time.monotonic()))
+        return metadata
+
+    def connect_to(self, handle: HandleTransport, metadata: dict[str, Any], timeout_s: float) -> None:
+        """Connect like `connect`, to the replica that `handle` chose and whose metadata this is."""
+        node = this_node()
+        if node is None:
+            raise ConfigError(
+                f"serve://{self._app}: transport 'plasma' needs a process on a node of the cluster; "
+                f"a Ray client (ray://) is none: use http://"
+            )
+        address = metadata.get("plasma")
+        if address is None:
+            raise ConfigError(f"serve://{self._app}: its replica offers no plasma endpoint; use transport 'handle'")
+        if address["node"] != node:
+            raise ConfigError(
+                f"serve://{self._app}: transport 'plasma' needs the replica on this node ({node[:8]}), the chosen one "
+                f"is on {address['node'][:8]}; use transport 'handle', or 'auto'"
+            )
+        self._handle = handle
+        self._server = PlasmaAddress(**address).socket
+        self._open(timeout_s)
+
+    def _is_free(self) -> bool:
+        return not self._unread
+
+    def _write(self, requests: Sequence[Request], deadline: float) -> tuple[bytes, int | None]:
+        written = self._writer.write(requests)
+        frame = _gather(request_parts(requests, RAW) if written is None else written.parts())
+        if frame.total_bytes > self._capacity:
+            self._lease(frame.total_bytes, deadline)
+        if (reason := write_channel(self._channel, frame, _WRITE_MS)) is not None:
+            raise OSError(f"the channel cannot be written ({reason})")
+        self._unread = True
+        flags = 0 if written is None else LocalAddress.COMPACT
+        message: bytes = PlasmaAddress.REQUEST.pack(self._channel.binary(), flags)
+        return (message if written is None else message + written.message), None
+
+    def _unsent(self) -> None:
+        self._unread = False  # the channel refuses a later frame if this one was not read
+
+    def _answered(self, freed: int) -> None:
+        self._unread = False
+
+    def close(self) -> None:
+        """End the session; the replica takes the channel back."""
+        super().close()
+        self._channel, self._capacity, self._unread = None, 0, False
+
+    def _lease(self, length: int, deadline: float) -> None:
+        import ray
+
+        key, self._capacity = self._handle.lease(length, max(1e-3, deadline - time.monotonic()))
+        # The id is enough: the replica owns the object, and keeps it as long as the replica lives.
+        self._channel = ray.ObjectRef(key)
+        register_writer(self._channel)
+
+
+def _gather(parts: list[Buffer]) -> Any:
+    """Return the pieces of a frame in a form that Ray copies straight into the channel, one after the other.
+
+    Ray copies longer buffers with six threads, which it starts for each copy and which takes longer than the copy:
+    hence the chunks.
+    """
+    pieces = (memoryview(part)[at : at + _CHUNK] for part in parts for at in range(0, len(part), _CHUNK))
+    return channel_content(PlasmaAddress.TAG, pieces)
+
+
+def this_node() -> str | None:
+    """Return the id of the Ray node that this process runs on; None for a Ray client, and without Ray."""
+    import ray
+
+    if not is_connected():
+        return None
+    node: str = ray.get_runtime_context().get_node_id()
+    return node

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.envs.batch import make_batch
+from vlagents_ray.envs.base import make_batch
 from vlagents_ray.errors import ConfigError, VLAgentsError
 from vlagents_ray.evaluate.artifacts.storage import storing
 from vlagents_ray.evaluate.artifacts.trajectory import Trajectory

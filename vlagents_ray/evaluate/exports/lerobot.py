@@ -34,6 +34,8 @@ from vlagents_ray.robot.episode import (
     INDEX,
     STATE,
     Finished,
+    ImageStatistics,
+    Stats,
     camera_keys,
     number_features,
     parts_of,
@@ -42,7 +44,6 @@ from vlagents_ray.robot.episode import (
     video_feature,
     without_slash,
 )
-from vlagents_ray.robot.statistics import ImageStatistics, Stats
 
 GRIPPER_FEATURE = "observation.gripper"
 VERSION = "policy_version"

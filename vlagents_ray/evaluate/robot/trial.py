@@ -12,8 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.chunking.player import ChunkPlayer
-from vlagents_ray.errors import CheckpointFailed, EnvFailed, InvalidAction, PolicyFailed, PolicyUnavailable
+from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
+from vlagents_ray.errors import (
+    CheckpointFailed,
+    EnvFailed,
+    InvalidAction,
+    PolicyFailed,
+    PolicyUnavailable,
+)
 from vlagents_ray.evaluate.episode.episode import transport_of
 from vlagents_ray.evaluate.episode.failures import env_side, policy_side
 from vlagents_ray.evaluate.episode.records import EpisodeResult
@@ -141,8 +147,10 @@ class WatchedRobot(Robot):
 class _CountingPlayer(ChunkPlayer):
     """A chunk player that records what the policy's answers say of themselves."""
 
-    def __init__(self, agent: Agent, stats: EpisodeStats, operator: Operator, **settings: Any) -> None:
-        super().__init__(agent, **settings)
+    def __init__(
+        self, agent: Agent, stats: EpisodeStats, operator: Operator, settings: PlayerSettings, check: Guard
+    ) -> None:
+        super().__init__(agent, settings, check=check)
         self._stats = stats
         self._operator = operator
         self._chunk = -1
@@ -247,11 +255,13 @@ def _player(
             agent,
             stats,
             operator,
-            mode=settings.mode,
-            execute=cell.policy.execute,
-            deadline_s=_deadline_s(settings),
-            max_age_s=settings.max_age_s,
-            safe=settings.safe,
+            PlayerSettings(
+                mode=settings.mode,
+                execute=cell.policy.execute,
+                deadline_s=_deadline_s(settings),
+                max_age_s=settings.max_age_s,
+                safe=settings.safe,
+            ),
             check=Guard(agent.contract, max_step=settings.max_step, measure=measured_state(settings.measure)),
         )
         unplayed.pop_all()  # the player closes it

@@ -21,7 +21,7 @@ from typing import Any
 
 from vlagents_ray.client import RemoteAgent
 from vlagents_ray.client.credentials import Credentials
-from vlagents_ray.client.transports.plasma import this_node
+from vlagents_ray.client.transports.serve_handle import this_node
 from vlagents_ray.contract import require_match
 from vlagents_ray.envs import make_env
 from vlagents_ray.envs.base import BatchEnv, SequentialBatch, make_batch

@@ -18,7 +18,7 @@ import numpy as np
 from vlagents_ray.errors import MalformedMessage, PolicyUnavailable, VLAgentsError, shown
 from vlagents_ray.policies.upstream.client import Answer, ClientOptions, WebSocketClient
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
-from vlagents_ray.protocol.observations import is_number
+from vlagents_ray.protocol.values import is_number
 from vlagents_ray.wire import msgpack
 
 REPLIES = {"hello": "hello_ack", "reset": "reset_result", "infer": "infer_result"}

@@ -27,11 +27,7 @@ TWIST = ("linear.x", "linear.y", "linear.z", "angular.x", "angular.y", "angular.
 
 
 def field(message: Any, path: str) -> Any:
-    """Return a field of a message, "header.stamp.sec".
-
-    Raises:
-        MalformedMessage: The message has no such field.
-    """
+    """Return a field of a message, "header.stamp.sec"; raises `MalformedMessage` if there is none."""
     for name in path.split("."):
         try:
             message = message[name] if isinstance(message, Mapping) else getattr(message, name)
@@ -43,7 +39,7 @@ def field(message: Any, path: str) -> Any:
 
 
 def stamp(message: Any) -> float | None:
-    """Return the time in a message's header, s since 1970; None if it has no header, or one that nobody filled in."""
+    """Return the time in a message's header, s since 1970; None without a header, or with an empty one."""
     try:
         sec, nanosec = field(message, "header.stamp.sec"), field(message, "header.stamp.nanosec")
     except MalformedMessage:
@@ -52,13 +48,9 @@ def stamp(message: Any) -> float | None:
 
 
 def image(message: Any) -> np.ndarray:
-    """Return the pixels of a `sensor_msgs/msg/Image`.
+    """Return the pixels of a `sensor_msgs/msg/Image`, (H, W, 3) uint8 RGB, in memory of its own.
 
-    Args:
-        message: The message. Its rows may be longer than the pixels need (`step`). Of "mono16" the upper 8 bits count.
-
-    Returns:
-        The image, (H, W, 3) uint8 RGB, in memory of its own.
+    Rows may be longer than the pixels need (`step`). Of "mono16" the upper 8 bits count.
 
     Raises:
         InvalidObservation: The encoding is not one of colours or greys.
@@ -93,29 +85,17 @@ def image(message: Any) -> np.ndarray:
 
 
 def compressed_image(message: Any) -> np.ndarray:
-    """Return the pixels of a `sensor_msgs/msg/CompressedImage` that holds a JPEG or PNG file.
-
-    Returns:
-        The image, (H, W, 3) uint8 RGB.
-
-    Raises:
-        MalformedMessage: The data are not a complete JPEG or PNG file.
-        MessageTooLarge: It has more pixels than 4096 x 4096.
-        MissingDependency: A PNG file came, and Pillow is not installed.
-    """
+    """Return the pixels of a `sensor_msgs/msg/CompressedImage` that holds a JPEG or PNG file, as `decode` does."""
     return decode(_bytes("image", field(message, "data")))
 
 
 def joints(message: Any, names: Sequence[str] = (), values: Values = "position") -> np.ndarray:
-    """Return numbers of joints of a `sensor_msgs/msg/JointState`, by name, in whatever order they came.
+    """Return numbers of a `sensor_msgs/msg/JointState` by the names of joints, (len(names),) float32.
 
     Args:
-        message: The message.
+        message: The message, whose order does not matter.
         names: The joints in the order wanted; all of them in the message's order, if empty.
         values: The field to read: positions (rad or m), velocities or efforts.
-
-    Returns:
-        The numbers, (len(names),) float32.
 
     Raises:
         MissingState: The message lacks one of the joints.
@@ -137,20 +117,14 @@ def joints(message: Any, names: Sequence[str] = (), values: Values = "position")
 
 
 def pose(message: Any, rotation: PoseRotation = "quat_xyzw") -> np.ndarray:
-    """Return the numbers of a `geometry_msgs/msg/Pose` or `PoseStamped`.
+    """Return position (m) and rotation of a `geometry_msgs/msg/Pose` or `PoseStamped`, (7,), (6,) or (3,) float32.
 
-    Args:
-        message: The message.
-        rotation: How the rotation is written after the position: "quat_xyzw" or "quat_wxyz" (of unit length),
-            "euler_xyz" (roll, pitch and yaw about fixed axes, rad), or "none".
-
-    Returns:
-        Position (m) and rotation, (7,), (6,) or (3,) float32.
-
-    Raises:
-        MalformedMessage: A number is not finite, or the quaternion has no length.
+    `rotation` says how it is written after the position: "quat_xyzw" or "quat_wxyz" (of unit length), "euler_xyz"
+    (roll, pitch and yaw about fixed axes, rad), or "none". Raises `MalformedMessage` if a number is not finite, or the
+    quaternion has no length.
     """
-    at = field(message, "pose") if _has(message, "pose") else message
+    stamped = "pose" in message if isinstance(message, Mapping) else hasattr(message, "pose")
+    at = field(message, "pose") if stamped else message
     position = _numbers("pose", [field(at, f"position.{axis}") for axis in "xyz"])
     if rotation == "none":
         return _finite("pose", position)
@@ -168,14 +142,7 @@ def pose(message: Any, rotation: PoseRotation = "quat_xyzw") -> np.ndarray:
 
 
 def numbers(message: Any) -> np.ndarray:
-    """Return the numbers of a `std_msgs/msg/Float64MultiArray`, `Float32MultiArray`, `Float64` or `Float32`.
-
-    Returns:
-        The numbers, flat, (D,) float32.
-
-    Raises:
-        MalformedMessage: A number is not finite.
-    """
+    """Return the numbers of a `Float64MultiArray`, `Float32MultiArray`, `Float64` or `Float32`, flat, (D,) float32."""
     data = field(message, "data")
     return _finite("data", _numbers("data", [data] if isinstance(data, (int, float)) else data))
 
@@ -208,12 +175,9 @@ def twist(row: np.ndarray, fields: Sequence[str] = TWIST) -> dict[str, Any]:
 
 
 def joint_trajectory(row: np.ndarray, names: Sequence[str], reach_s: float) -> dict[str, Any]:
-    """Return a `trajectory_msgs/msg/JointTrajectory` of one point.
+    """Return a `trajectory_msgs/msg/JointTrajectory` of one point: positions, (D,) in the order of `names`.
 
-    Args:
-        row: The positions, (D,) in the order of `names`.
-        names: The joints.
-        reach_s: The time in which the arm is to reach them, from when the controller gets the message, s.
+    The arm is to reach it `reach_s` seconds after the controller gets the message.
     """
     nanoseconds = round(reach_s * 1e9)
     point = {
@@ -227,10 +191,6 @@ def joint_trajectory(row: np.ndarray, names: Sequence[str], reach_s: float) -> d
 def _header() -> dict[str, Any]:
     now = time.time_ns()
     return {"stamp": {"sec": now // 10**9, "nanosec": now % 10**9}, "frame_id": ""}
-
-
-def _has(message: Any, name: str) -> bool:
-    return name in message if isinstance(message, Mapping) else hasattr(message, name)
 
 
 def _whole(name: str, value: Any) -> int:

@@ -13,14 +13,7 @@ from vlagents_ray.registry import require
 
 
 class Ros2:
-    """A node of ROS 2. A thread spins it.
-
-    Args:
-        node: Its name.
-
-    Raises:
-        MissingDependency: rclpy is not installed, or its setup file has not been sourced.
-    """
+    """A node of ROS 2, which a thread spins; raises `MissingDependency` without rclpy, or if ROS was not sourced."""
 
     name = "ros2"
     up = True  # there is no connection to be lost; a peer that is gone is silent
@@ -38,12 +31,8 @@ class Ros2:
     def subscribe(self, topic: str, kind: str, take: Callable[[Any], None], *, sensor: bool) -> None:
         """Have messages of a topic given to `take`, on the link's thread; before `open`.
 
-        Args:
-            topic: The topic.
-            kind: Its type, "sensor_msgs/msg/Image".
-            take: Gets each message.
-            sensor: Whether it is a sensor's, of which the newest message is wanted and a lost one is not sent again;
-                such a subscription also matches a reliable publisher.
+        Of a sensor the newest message is wanted and a lost one is not sent again; such a subscription also matches a
+        reliable publisher.
         """
         qos = require("rclpy.qos")
         reliability = qos.ReliabilityPolicy.BEST_EFFORT if sensor else qos.ReliabilityPolicy.RELIABLE
@@ -82,11 +71,7 @@ class Ros2:
 
 
 def message_class(kind: str) -> type[Any]:
-    """Return the class of a message type, "sensor_msgs/msg/Image".
-
-    Raises:
-        ConfigError: Its package is not installed, or has no such message.
-    """
+    """Return the class of a message type, "sensor_msgs/msg/Image"; raises `ConfigError` if it is not installed."""
     package, _, name = kind.split("/")
     try:
         found: type[Any] = getattr(import_module(f"{package}.msg"), name)
@@ -98,28 +83,19 @@ def message_class(kind: str) -> type[Any]:
 
 
 def filled(instance: Any, message: Mapping[str, Any]) -> Any:
-    """Fill in the fields of a message.
+    """Fill in fields of a message, of which the others keep their values, and return it.
 
-    Args:
-        instance: The message; fields that are not stated keep their values.
-        message: The fields. Lists of mappings are lists of the messages that the field's type names.
-
-    Returns:
-        The instance.
+    Lists of mappings are lists of the messages that the type of the field names.
     """
     for name, value in message.items():
         if isinstance(value, Mapping):
             filled(getattr(instance, name), value)
         elif isinstance(value, list) and value and isinstance(value[0], Mapping):
-            package, part = _element(instance.get_fields_and_field_types()[name])
+            # "sequence<trajectory_msgs/JointTrajectoryPoint>"
+            kind = instance.get_fields_and_field_types()[name].partition("<")[2].removesuffix(">")
+            package, part = kind.partition(",")[0].split("/")
             made = message_class(f"{package}/msg/{part}")
             setattr(instance, name, [filled(made(), one) for one in value])
         else:
             setattr(instance, name, value)
     return instance
-
-
-def _element(kind: str) -> tuple[str, str]:
-    """Return package and name of the elements of "sequence<trajectory_msgs/JointTrajectoryPoint>"."""
-    package, _, part = kind.partition("<")[2].removesuffix(">").partition(",")[0].partition("/")
-    return package, part

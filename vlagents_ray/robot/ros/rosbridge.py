@@ -5,7 +5,6 @@ The protocol is specified in ROSBRIDGE_PROTOCOL.md of https://github.com/RobotWe
 
 from __future__ import annotations
 
-import base64
 import contextlib
 import json
 import logging
@@ -16,12 +15,11 @@ from collections.abc import Callable
 from socket import SHUT_RDWR, SO_SNDTIMEO, SOL_SOCKET
 from typing import Any
 
+import numpy as np
 from websockets.exceptions import ConnectionClosed, WebSocketException
 from websockets.sync.client import ClientConnection, connect
 
-from vlagents_ray.errors import ConnectionLost, MalformedMessage, VLAgentsError
-from vlagents_ray.images.jpeg_png import decode as decode_image
-from vlagents_ray.robot.ros import cbor
+from vlagents_ray.errors import ConnectionLost, MalformedMessage, VLAgentsError, shown
 
 logger = logging.getLogger(__name__)
 _OPEN_S = 5.0
@@ -37,7 +35,7 @@ class Rosbridge:
 
     Args:
         url: The server, "ws://arm-pc:9090".
-        compression: What messages are asked for in: "cbor", whose images need no base64; "png" or "none" (JSON).
+        compression: What messages are asked for in: "cbor", whose images need no base64, or "none" (JSON).
     """
 
     name = "rosbridge"
@@ -58,13 +56,8 @@ class Rosbridge:
     def subscribe(self, topic: str, kind: str, take: Callable[[Any], None], *, sensor: bool) -> None:
         """Have messages of a topic given to `take`, on the link's thread; before `open`.
 
-        Args:
-            topic: The topic.
-            kind: Its type, "sensor_msgs/msg/Image".
-            take: Gets each message.
-            sensor: Whether the topic is a sensor's: then it is subscribed to again while it is silent. The server
-                chooses the quality of service by the publishers that it knows at that moment, and gets nothing from one
-                with best effort that it found later.
+        A sensor's topic is subscribed to again while it is silent: the server chooses the quality of service by the
+        publishers that it knows at that moment, and gets nothing from one with best effort that it found later.
         """
         self._take[topic], self._types[topic] = take, kind
         if sensor:
@@ -75,11 +68,7 @@ class Rosbridge:
         self._outlets[topic] = kind
 
     def open(self) -> None:
-        """Connect.
-
-        Raises:
-            ConnectionLost: The server cannot be reached.
-        """
+        """Connect; raises `ConnectionLost` if the server cannot be reached."""
         self._connect()
         self._thread = threading.Thread(target=self._run, name="vlagents-ray-rosbridge", daemon=True)
         self._thread.start()
@@ -90,11 +79,7 @@ class Rosbridge:
         return self._socket is not None
 
     def publish(self, topic: str, message: dict[str, Any]) -> bool:
-        """Publish a message.
-
-        Returns:
-            Whether it was sent; not if the connection is lost.
-        """
+        """Publish a message; return False, without sending it, if the connection is lost."""
         socket = self._socket
         if socket is None:
             return False
@@ -207,39 +192,109 @@ class Rosbridge:
 
 
 def decoded(frame: str | bytes) -> dict[str, Any]:
-    """Decode a message of the protocol.
-
-    Args:
-        frame: What came over the WebSocket: JSON as text, CBOR as bytes; JSON may hold a PNG with JSON inside.
-
-    Returns:
-        The message, with its operation as "op".
-
-    Raises:
-        MalformedMessage: The frame cannot be decoded.
-        MissingDependency: It is PNG, and Pillow is not installed.
-    """
-    message = cbor.decode(frame) if isinstance(frame, bytes) else _json(frame)
-    if isinstance(message, dict) and message.get("op") == "png":
-        message = _json(_inside(message.get("data")))
-    if not isinstance(message, dict):
-        raise MalformedMessage(f"rosbridge: got {type(message).__name__}, want an object with `op`")
+    """Decode a message of the protocol: JSON if it is a text, CBOR if it is bytes; raises `MalformedMessage`."""
+    if isinstance(frame, bytes):
+        message = decode_cbor(frame)
+    else:
+        try:
+            message = json.loads(frame)
+        except (ValueError, RecursionError) as error:
+            raise MalformedMessage(f"rosbridge: got {frame[:40]!r}, want JSON ({error})") from error
+    if not isinstance(message, dict) or not isinstance(message.get("op"), str):
+        raise MalformedMessage(f"rosbridge: got {shown(message)}, want an object with `op`")
     return message
 
 
-def _json(text: str) -> Any:
-    try:
-        return json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise MalformedMessage(f"rosbridge: got {text[:40]!r}, want JSON ({error})") from error
+# CBOR (RFC 8949) with typed arrays (RFC 8746), as far as rosbridge uses it: no indefinite lengths. The robot's install
+# has no package for it. Nothing that the bytes declare is allocated before they have shown to be as long.
+
+_DEPTH = 16
+_SIMPLE: dict[int, Any] = {20: False, 21: True, 22: None, 23: None}
+_FLOATS = {25: struct.Struct(">e"), 26: struct.Struct(">f"), 27: struct.Struct(">d")}
+# Typed arrays: the tag's bits say kind, byte order and size.
+_TYPED = {
+    64: "u1", 65: ">u2", 66: ">u4", 67: ">u8", 68: "u1", 69: "<u2", 70: "<u4", 71: "<u8",
+    72: "i1", 73: ">i2", 74: ">i4", 75: ">i8", 77: "<i2", 78: "<i4", 79: "<i8",
+    80: ">f2", 81: ">f4", 82: ">f8", 84: "<f2", 85: "<f4", 86: "<f8",
+}  # fmt: skip
 
 
-def _inside(data: Any) -> str:
-    """Return the JSON whose bytes are the pixels of a PNG file."""
-    try:
-        file = base64.b64decode(data, validate=True)
-        return decode_image(file).tobytes().decode()  # JSON allows the line feeds at its end
-    except (TypeError, ValueError) as error:
-        if isinstance(error, MalformedMessage):
-            raise
-        raise MalformedMessage(f"rosbridge: got a PNG message that does not hold JSON ({error})") from error
+def decode_cbor(data: bytes | memoryview) -> Any:
+    """Decode one CBOR item: byte strings become views of `data`, typed arrays numpy arrays, (D,).
+
+    Raises:
+        MalformedMessage: The data are truncated, continue after the item, nest too deep, or use what is not supported.
+    """
+    reader = _CborReader(memoryview(data))
+    found = reader.item(_DEPTH)
+    if reader.left:
+        raise MalformedMessage(f"CBOR: got {reader.left} bytes after the item, want none")
+    return found
+
+
+class _CborReader:
+    def __init__(self, view: memoryview) -> None:
+        self._view, self._at = view, 0
+
+    @property
+    def left(self) -> int:
+        return len(self._view) - self._at
+
+    def item(self, depth: int) -> Any:
+        if depth == 0:
+            raise MalformedMessage(f"CBOR: got more than {_DEPTH} levels, want a message of ROS")
+        head = self._take(1)[0]
+        kind, low = head >> 5, head & 31
+        if kind == 7:
+            return self._simple(low)
+        count = self._count(low)
+        if kind <= 1:
+            return count if kind == 0 else -1 - count
+        if kind <= 3:
+            return self._take(count) if kind == 2 else self._text(count)
+        if kind == 6:
+            return self._tagged(count, self.item(depth - 1))
+        if count * (kind - 3) > self.left:  # each item takes a byte or more, and a mapping has two an entry
+            raise MalformedMessage(f"CBOR: got {self.left} bytes for {count * (kind - 3)} items")
+        if kind == 4:
+            return [self.item(depth - 1) for _ in range(count)]
+        return {self._name(self.item(depth - 1)): self.item(depth - 1) for _ in range(count)}
+
+    def _take(self, count: int) -> memoryview:
+        if count > self.left:
+            raise MalformedMessage(f"CBOR: got {self.left} bytes, want {count} or more; the message is truncated")
+        self._at += count
+        return self._view[self._at - count : self._at]
+
+    def _count(self, low: int) -> int:
+        if low < 24:
+            return low
+        if low > 27:
+            raise MalformedMessage(f"CBOR: got the additional information {low}, want 0 to 27: no indefinite lengths")
+        return int.from_bytes(self._take(1 << (low - 24)), "big")
+
+    def _text(self, count: int) -> str:
+        try:
+            return str(self._take(count), "utf-8")
+        except UnicodeDecodeError as error:
+            raise MalformedMessage(f"CBOR: got a text that is not UTF-8 ({error})") from error
+
+    def _name(self, key: Any) -> str:
+        if not isinstance(key, str):
+            raise MalformedMessage(f"CBOR: got the key {shown(key)}, want a field's name")
+        return key
+
+    def _tagged(self, tag: int, value: Any) -> Any:
+        if tag not in _TYPED:
+            return value
+        kind = np.dtype(_TYPED[tag])
+        if not isinstance(value, memoryview) or len(value) % kind.itemsize:
+            raise MalformedMessage(f"CBOR: got a typed array of {kind} that is not as many bytes")
+        return np.frombuffer(value, kind)
+
+    def _simple(self, low: int) -> Any:
+        if low in _FLOATS:
+            return _FLOATS[low].unpack(self._take(_FLOATS[low].size))[0]
+        if low not in _SIMPLE:
+            raise MalformedMessage(f"CBOR: got the simple value {low}, want false, true, null or a float")
+        return _SIMPLE[low]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, get_args
 
@@ -80,7 +80,7 @@ class RosSettings:
     silent_s: float = 1.0
     clock: str = "stamp"  # whether a message's age counts from its header's time stamp, or from its arrival ("arrival")
     ready_s: float = 10.0  # how long the first message of each topic is waited for
-    compression: str = "cbor"  # of a rosbridge: "cbor", "png" or "none"
+    compression: str = "cbor"  # of a rosbridge: "cbor" or "none"
 
     @property
     def sensors(self) -> list[InputTopic]:
@@ -102,10 +102,7 @@ class RosSettings:
 
 
 def read_settings(file: Path | str) -> RosSettings:
-    """Read a file of topics.
-
-    Args:
-        file: A YAML file, as docs/ros.md explains it.
+    """Read a YAML file of topics, as docs/ros.md explains it.
 
     Raises:
         ConfigError: It cannot be read, or a setting is unknown, missing or has a wrong value.
@@ -120,15 +117,7 @@ def read_settings(file: Path | str) -> RosSettings:
 
 
 def settings_from(stated: Any, where: str) -> RosSettings:
-    """Check what a file states, and return it.
-
-    Args:
-        stated: The decoded document.
-        where: The file's name, for the messages.
-
-    Raises:
-        ConfigError: A setting is unknown, missing or has a wrong value.
-    """
+    """Check the decoded document of a file with the name `where`, and return it; raises `ConfigError`."""
     top = dict(_mapping(stated, where))
     for part, kind in (("cameras", IMAGE), ("state", JOINT_STATE)):
         named = _mapping(top.get(part) or {}, f"{where}: {part}")
@@ -180,7 +169,7 @@ def _check(settings: RosSettings, where: str) -> None:
         if limit is not None and not limit > 0:
             raise ConfigError(f"{where}: {name}: got {limit}, want above 0")
     _one_of(f"{where}: clock", settings.clock, ("stamp", "arrival"))
-    _one_of(f"{where}: compression", settings.compression, ("cbor", "png", "none"))
+    _one_of(f"{where}: compression", settings.compression, ("cbor", "none"))
     if settings.link != ROS2 and not settings.link.startswith(("ws://", "wss://")):
         raise ConfigError(f"{where}: link: got {settings.link!r}, want 'ros2', or a rosbridge as 'ws://arm-pc:9090'")
 
@@ -212,16 +201,12 @@ def _reading(stated: Any, where: str, kind: str) -> InputTopic:
 
 def _made(kind: type[Any], stated: Any, where: str) -> Any:
     given = dict(_mapping(stated, where))
-    for one in fields(kind):
-        value = given.get(one.name)
-        if isinstance(value, list) and one.name in ("names", "fields"):
-            if not all(isinstance(name, str) for name in value):
-                raise ConfigError(f"{where}: {one.name}: got {value!r}, want a list of names")
-            given[one.name] = tuple(value)
+    for name in given.keys() & {"names", "fields"}:
+        value = given[name]
+        if not isinstance(value, list) or not all(isinstance(one, str) for one in value):
+            raise ConfigError(f"{where}: {name}: got {value!r}, want a list of names")
+        given[name] = tuple(value)
     require_arguments(where, kind, given)
-    for name in ("names", "fields"):
-        if not isinstance(given.get(name, ()), tuple):
-            raise ConfigError(f"{where}: {name}: got {given[name]!r}, want a list of names")
     return kind(**given)
 
 

@@ -23,9 +23,9 @@ from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
 
-from vlagents_ray.client.credentials import KEY_VARIABLE, is_loopback
+from vlagents_ray.client.credentials import KEY_VARIABLE
 from vlagents_ray.errors import ConfigError, Forbidden, TooManyRequests, Unauthorized, VLAgentsError
-from vlagents_ray.protocol.messages import RankName
+from vlagents_ray.protocol.messages import RankName, is_loopback
 from vlagents_ray.serve.access.audit import Audit
 from vlagents_ray.serve.access.key_store import Key, parse_keys, read_text
 

@@ -29,7 +29,6 @@ from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from vlagents_ray.client.transports.probe import answer, is_probe, read_probe
 from vlagents_ray.errors import MalformedMessage, PolicyUnavailable, UnknownApp, VLAgentsError
 from vlagents_ray.protocol.frames import CONTENT_TYPE, encode_replies
 from vlagents_ray.protocol.json_messages import plain_values
@@ -41,6 +40,9 @@ from vlagents_ray.protocol.messages import (
     Limits,
     Op,
     Reply,
+    is_probe,
+    probe_answer,
+    read_probe,
 )
 from vlagents_ray.serve.access.api_keys import current_caller
 from vlagents_ray.serve.endpoints.docs_page import STYLE, docs_page
@@ -147,7 +149,7 @@ class _HttpEndpoint:
         try:
             message = await self._requests.body(http, admission)
             read_probe(message, admission)
-            return Response(answer(len(message)), media_type="application/octet-stream")
+            return Response(probe_answer(len(message)), media_type="application/octet-stream")
         except ClientDisconnect:
             return Response(status_code=499)
         except VLAgentsError as error:
@@ -225,7 +227,7 @@ class _HttpEndpoint:
     def _probed(self, sender: Sender, message: bytes) -> bytes:
         try:
             read_probe(message, sender.admission(self._limits, len(message), "simulation"))
-            return answer(len(message))
+            return probe_answer(len(message))
         except VLAgentsError as error:
             return encode_replies([Reply(error=error)])
 

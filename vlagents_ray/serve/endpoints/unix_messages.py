@@ -24,11 +24,10 @@ from typing import ClassVar, Protocol
 
 import numpy as np
 
-from vlagents_ray.client.transports.unix_messages import peer_uid
 from vlagents_ray.errors import PolicyUnavailable, VLAgentsError
 from vlagents_ray.protocol import shm_layout
 from vlagents_ray.protocol.frames import Decoded, decode_requests, encode_replies
-from vlagents_ray.protocol.messages import OPS, Limits, LocalAddress, Op, Reply
+from vlagents_ray.protocol.messages import OPS, Limits, LocalAddress, Op, Reply, peer_uid
 from vlagents_ray.serve.access.api_keys import Caller, Identity, NoKey
 from vlagents_ray.serve.endpoints.acceptor import Acceptor
 from vlagents_ray.serve.engine import arrival

@@ -18,10 +18,9 @@ from websockets.http11 import Response
 from websockets.protocol import State
 from websockets.server import ServerProtocol
 
-from vlagents_ray.client.transports.probe import answer, is_probe, read_probe
 from vlagents_ray.errors import MalformedMessage, Overloaded, PolicyUnavailable, TooManyRequests, VLAgentsError
 from vlagents_ray.protocol.frames import Decoded, decode_requests
-from vlagents_ray.protocol.messages import STREAM_BYTES, Limits
+from vlagents_ray.protocol.messages import STREAM_BYTES, Limits, is_probe, probe_answer, read_probe
 from vlagents_ray.serve.access.api_keys import Caller, Identity
 from vlagents_ray.serve.endpoints.buffers import READ_BYTES, ReceiveBuffer, SendBuffer, receive
 from vlagents_ray.serve.engine import arrival
@@ -325,7 +324,7 @@ class WebSocketConnection:
             data = bytes(frame.data)
             if is_probe(data):
                 read_probe(data, admission)
-                self._send(answer(len(data)))
+                self._send(probe_answer(len(data)))
             else:
                 self._decode(_Received(sender, admission, message, len(data), arrived), data)
         except VLAgentsError as error:

@@ -41,9 +41,9 @@ from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from vlagents_ray.client.credentials import is_loopback
 from vlagents_ray.errors import ConfigError, MalformedMessage, MessageTooLarge, Overloaded, VLAgentsError
 from vlagents_ray.protocol.json_messages import problem
+from vlagents_ray.protocol.messages import is_loopback
 from vlagents_ray.serve.access.api_keys import Caller, Keys, ScopeCheck, caller_name, current_caller
 from vlagents_ray.serve.access.audit import log_pressed
 from vlagents_ray.serve.access.origin_check import require_same_origin

@@ -18,10 +18,9 @@ from weakref import WeakValueDictionary
 from vlagents_ray.errors import MessageTooLarge, NotTrainable, Overloaded, UnknownSession, WeightsNotStaged
 from vlagents_ray.interface import POLICY, Agent
 from vlagents_ray.policies.compilation import CAPTURES
-from vlagents_ray.weights.check import fingerprint, fitted, require_fit
 from vlagents_ray.weights.safetensors import ValueSpec, read_header
 from vlagents_ray.weights.shared_values import gpu_of
-from vlagents_ray.weights.trainable import is_copied, own_copy, portable
+from vlagents_ray.weights.trainable import fingerprint, fitted, is_copied, own_copy, portable, require_fit
 
 DIGITS = 16  # of a checkpoint's digest in place of a fingerprint, hexadecimal
 WAIT_S = 600.0  # time for which a commit with the mode "wait" holds up resets, s: a session may never end its episode

@@ -19,7 +19,6 @@ from process_resources import descriptors
 from shm_client import LIMITS, call, client, request
 
 from vlagents_ray.client.transports.shm import ShmTransport, reaches
-from vlagents_ray.client.transports.unix_messages import peer_uid
 from vlagents_ray.errors import (
     ConnectionLost,
     DeadlineExceeded,
@@ -28,7 +27,7 @@ from vlagents_ray.errors import (
 )
 from vlagents_ray.protocol import shm_layout
 from vlagents_ray.protocol.frames import encode_request
-from vlagents_ray.protocol.messages import LocalAddress
+from vlagents_ray.protocol.messages import LocalAddress, peer_uid
 from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.engine.engine import Engine
 
