@@ -3,7 +3,8 @@
 #   make setup [PYTHON=...] [TORCH_INDEX_URL=...] [TORCH_CUDA=1]     the environment, in .venv
 #   make demo                                                       serve a policy, evaluate it, show the table
 #   make check                                                      lint, types, layers, quick tests: no Ray, torch, simulator
-#   make test [TEST_PROCESSES=3]                                    lint, types, layers, families, all tests
+#   make test [TEST_PROCESSES=3]                                    lint, types, layers, all tests but integrations
+#   make integrations [TEST_PROCESSES=3]                            families, and tests of other systems and of endurance
 #   make families [FAMILIES="lerobot lerobot06 hf rcs libero openvla …"]       tests of model families, in .venv-NAME each
 #   make verified [FAMILIES="lerobot hf"]                           what they verify, into the tables of docs/policies
 #   make docs                                                       the site of docs/, in build/docs, for a browser
@@ -20,7 +21,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := setup
-.PHONY: setup demo bench check test families docs verified extras locks dist sbom fmt lint type clean
+.PHONY: setup demo bench check test integrations families docs verified extras locks dist sbom fmt lint type clean
 
 VENV ?= .venv
 TORCH ?= torch==2.13.0
@@ -43,7 +44,7 @@ TOOLS := $(if $(wildcard $(STAMP)),$(VENV),$(VENV)-check)
 TEST_PROCESSES ?= 3
 CHECK_PROCESSES ?= 3
 # Marked so: what wants more than Python, takes long, or wants the machine for itself (pyproject.toml, tests/support/needs.py).
-NOT_QUICK := ray or server or hosts or sim or vulkan or torch or gpu or browser or node or compiler or alone or slow
+NOT_QUICK := ray or server or hosts or sim or vulkan or torch or gpu or browser or node or compiler or alone or slow or integration
 # Environments of model families: requirements/NAME.txt, in $(VENV)-NAME. What is tested in each is in tests/families,
 # in folders of the family's name. Those whose code is on no package index want its source, too: OPENPI_SRC, OPENVLA_SRC,
 # OPENVLA_OFT_SRC, OCTO_SRC, DIFFUSION_POLICY_SRC, VJEPA2_SRC, GR00T_SRC.
@@ -77,10 +78,18 @@ check: lint type
 
 # Lint and types in another make: this one chose their environment before there was a whole one.
 test: setup
-	@$(MAKE) --no-print-directory lint type docs families
+	@$(MAKE) --no-print-directory lint type
 	@echo '== tests'
-	VLAGENTS_RAY_ENVIRONMENTS=$(abspath $(VENV)) $(BIN)/python tests/support/play_again.py \
-	  -n $(TEST_PROCESSES) --dist loadfile --no-loadscope-reorder
+	$(call PLAY,not (integration))
+
+integrations: setup
+	@$(MAKE) --no-print-directory docs families
+	@echo '== integrations'
+	$(call PLAY,integration)
+
+# The tests of one tier, of the whole environment.
+PLAY = VLAGENTS_RAY_ENVIRONMENTS=$(abspath $(VENV)) $(BIN)/python tests/support/play_again.py \
+  -n $(TEST_PROCESSES) --dist loadfile --no-loadscope-reorder -m "$(1)"
 
 # Environments one after the other, as each installs this folder; then the tests of two at once.
 families:

@@ -12,9 +12,10 @@ from pathlib import Path
 
 import many  # noqa: F401 - registers profiles
 import pytest
+import shared_ray as shared
 from assets import assets
 from fail_on_skip import pytest_make_collect_report, pytest_runtest_makereport
-from needs import left_out, nothing_else, skip_what_is_missing
+from needs import left_out, mark_tier, nothing_else, skip_what_is_missing
 from process_resources import pytest_pyfunc_call
 from xdist_workers import own_ray_folder, turn
 
@@ -26,7 +27,7 @@ __all__ = ["pytest_make_collect_report", "pytest_pyfunc_call", "pytest_runtest_m
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 os.environ.setdefault("WANDB_MODE", "offline")
-# Ray starts a worker for each CPU before it knows what for: a second of CPU for each of the hundred Rays of a test run.
+# Ray starts a worker for each CPU before it knows what for: a second of CPU for each of the Rays of a test run.
 os.environ.setdefault("RAY_prestart_worker_first_driver", "0")
 os.environ.setdefault("RAY_enable_worker_prestart", "0")
 # A shell that starts a job in the background has it, and all that it starts, ignore Ctrl-C; tests send it to servers.
@@ -37,14 +38,23 @@ if (simpler := assets("simpler")) is not None:
     os.environ.setdefault("MS_ASSET_DIR", str(simpler))  # ManiSkill reads it once a process
 _RAY_FOLDER = own_ray_folder()
 
-# What takes longest goes first, so that the processes that share the tests end at about the same time; what wants the
-# machine for itself goes last, when there is nothing left to wait for.
-_ORDER = ("hosts", "server", "ray", "vulkan", "sim", "torch")
+# What takes longest goes first, so that the processes that share the tests end at about the same time; files that share
+# a Ray follow those that start their own, so that each process starts the shared one once.
+_ORDER = ("hosts", "server", "ray", shared.FIXTURE, "vulkan", "sim", "torch")
+_shared_files: set[Path] = set()
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
     """Leave out the file if `-m` leaves out all of it."""
     return left_out(collection_path, config.option.markexpr) or None
+
+
+def pytest_itemcollected(item: pytest.Item) -> None:
+    """Mark what uses the shared Ray, and the tier."""
+    if shared.FIXTURE in getattr(item, "fixturenames", ()):
+        item.add_marker("ray")
+        _shared_files.add(item.path)
+    mark_tier(item)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -55,7 +65,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             raise pytest.UsageError(f"{item.nodeid}: got an address in a test's name; name its parameters with ids=")
         marked = {marker.name for marker in item.iter_markers()}
         place = next((number for number, name in enumerate(_ORDER) if name in marked), len(_ORDER))
-        if "alone" in marked:
+        if item.path in _shared_files:
+            place = _ORDER.index(shared.FIXTURE)
+        if "alone" in marked:  # when there is nothing left to wait for
             place = len(_ORDER) + 1
         files[item.path] = min(files.get(item.path, place), place)
     items.sort(key=lambda item: files[item.path])
@@ -67,8 +79,16 @@ def pytest_collection_finish() -> None:
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Skip what this machine cannot run."""
+    """Skip what this machine cannot run; end the shared Ray before a file that does not share it."""
     skip_what_is_missing(item)
+    if item.path not in _shared_files:
+        shared.stop()
+
+
+@pytest.fixture(scope="module")
+def shared_ray() -> None:
+    """Ray in this process, as other files use it too; `shared_ray.shared_server` serves policies on it."""
+    shared.start()
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -86,6 +106,10 @@ def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object
     """Wait for the test's turn before its time is taken."""
     with turn(item), nothing_else(item):
         return (yield)
+
+
+def pytest_sessionfinish() -> None:
+    shared.stop()
 
 
 def pytest_unconfigure() -> None:

@@ -61,7 +61,8 @@ def reader(earlier: Path, tmp_path: Path) -> Path:
 
 def named(page: Path, block: Block) -> object:
     """Each command of a shell block starts an interpreter; what quick tests say of them is in test_docs.py."""
-    marks = [pytest.mark.server] * block.ray + [pytest.mark.slow] * (block.ray or block.language in SHELL)
+    marks = [pytest.mark.integration] * (block.ray and page != README)
+    marks += [pytest.mark.server] * block.ray + [pytest.mark.slow] * (block.ray or block.language in SHELL)
     return pytest.param(page, block, id=f"{page.stem}-{block}", marks=marks)
 
 

@@ -23,6 +23,7 @@ def steps(workflow: Path) -> list[dict[str, Any]]:
     return [step for job in yaml.safe_load(workflow.read_text())["jobs"].values() for step in job["steps"]]
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(
     "words",
     [["zizmor", "--offline", "--strict-collection", "--no-progress"], ["jactionlint", "--shellcheck="]],

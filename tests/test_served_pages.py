@@ -17,6 +17,7 @@ from serve_command import serving
 
 pytestmark = [pytest.mark.server, pytest.mark.slow]
 
+README = next(page for page in PAGES if page.name == "README.md")
 _SERVED = [
     (page, block) for page in PAGES if page not in TUTORIALS for block in blocks(page.read_text()) if block.server
 ]
@@ -28,6 +29,12 @@ _SERVED += [
 ]
 # One server after the other, and first the one that is still there from the tutorials.
 SERVED = sorted(_SERVED, key=lambda one: (one[1].server != "noop", str(one[1].server)))
+
+
+def named(page: Path, block: Block) -> object:
+    """`make test` runs those of the README, `make integrations` all others."""
+    marks = [] if page == README else [pytest.mark.integration]
+    return pytest.param(page, block, id=f"{page.stem}-{block}", marks=marks)
 
 
 @pytest.fixture(scope="module")
@@ -77,6 +84,7 @@ def test_modules_of_ones_own_are_served_evaluated_and_trained_from_their_folder(
     Path(kept).unlink()
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("page", TUTORIALS, ids=lambda page: page.stem)
 def test_a_tutorial_works_from_top_to_bottom(page: Path, host_of: Callable[[str | None], str], tmp_path: Path) -> None:
     for block in blocks(page.read_text()):
@@ -84,7 +92,7 @@ def test_a_tutorial_works_from_top_to_bottom(page: Path, host_of: Callable[[str 
             run(block, tmp_path, host_of(block.server), page=f"page_{page.stem}")
 
 
-@pytest.mark.parametrize(("page", "block"), [pytest.param(*one, id=f"{one[0].stem}-{one[1]}") for one in SERVED])
+@pytest.mark.parametrize(("page", "block"), [named(*one) for one in SERVED])
 def test_a_block_works(page: Path, block: Block, host_of: Callable[[str | None], str], tmp_path: Path) -> None:
     checkout(tmp_path)
     run(block, tmp_path, host_of(block.server), page=page.stem)

@@ -22,7 +22,10 @@ PAGES = [
     "measured.html",
     "ARCHITECTURE.html",
 ]
-pytestmark = pytest.mark.skipif(not (SITE / "index.html").is_file(), reason="the site is not built: make docs")
+pytestmark = [
+    pytest.mark.integration,
+    pytest.mark.skipif(not (SITE / "index.html").is_file(), reason="the site is not built: make docs"),
+]
 
 
 class PageLinks(HTMLParser):

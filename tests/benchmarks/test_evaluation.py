@@ -117,6 +117,7 @@ def test_the_peers_see_these_packages_and_nothing_else_of_ours(tmp_path: Path) -
 
 
 @pytest.mark.slow
+@pytest.mark.integration
 @pytest.mark.parametrize("name", ["vla-eval", SPLIT])
 @pytest.mark.server
 def test_a_peer_plays_the_plan_by_its_own_command(tmp_path: Path, name: str) -> None:

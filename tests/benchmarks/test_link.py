@@ -54,6 +54,7 @@ def test_both_namespaces_end_with_a_bench_that_was_killed() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.integration
 @pytest.mark.server
 @pytest.mark.alone
 def test_round_trips_over_a_link_or_the_reason_why_not(tmp_path: Path) -> None:

@@ -28,6 +28,7 @@ def test_workers_that_never_play_together_are_an_error() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.integration
 @pytest.mark.ray
 @pytest.mark.alone
 def test_it_measures_the_tabletop() -> None:

@@ -8,6 +8,7 @@ from benchmarks.push import measure_push
 
 
 @pytest.mark.slow
+@pytest.mark.integration
 @pytest.mark.server
 def test_the_sessions_act_on_with_the_weights_of_each_push() -> None:
     rounds = measure_push(2_500_000, "float16", sessions=3, base_ms=1, rounds=2, seconds=1)

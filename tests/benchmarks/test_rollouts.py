@@ -6,6 +6,7 @@ from benchmarks.rollouts import main
 
 
 @pytest.mark.slow
+@pytest.mark.integration
 @pytest.mark.server
 def test_it_measures_both(capsys: pytest.CaptureFixture[str]) -> None:
     main("tiny", workers=2, num_envs=2, episodes=8, rounds=1, size=32)

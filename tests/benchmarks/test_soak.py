@@ -65,6 +65,7 @@ def test_the_verdict_names_what_is_missed(changes: dict[str, object], missed: li
 
 
 @pytest.mark.slow
+@pytest.mark.integration
 @pytest.mark.ray
 def test_killed_workers_lose_no_episode_and_repeat_none() -> None:
     for _ in range(4):  # on a busy machine one worker may play all of them while the other one starts

@@ -116,6 +116,7 @@ EVAL = ("--out", "runs/x", "--policy")
         (("eval", "tabletop", *EVAL, "scripted", "--video", "alll"), "video: got str, want 'none', "),
         (("eval", "tabletop", "--policy", "scripted"), "error got no --out, want --out; or a file of runs (.yaml)"),
         (("eval", "tabletop", "--out", "runs/x"), "error got no --policy, want --policy; or a file of runs (.yaml)"),
+        (("eval", "absent.yaml"), "'absent.yaml' does not exist"),
         (("eval", "typo.yaml"), "worker: got 2, want a mapping with some of ['cpus', "),
         (("eval", "typo.yaml"), "did you mean 'workers'?"),
         (("eval", "low.yaml"), "workers: got 0, want greater than 0"),

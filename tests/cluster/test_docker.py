@@ -17,6 +17,8 @@ from typer.testing import CliRunner
 
 from vlagents_ray.cli.main import app
 
+pytestmark = pytest.mark.integration
+
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "cluster" / "docker"
 DOCKERFILE = FOLDER / "Dockerfile"

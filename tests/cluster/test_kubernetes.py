@@ -31,6 +31,8 @@ from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.launch.deployment_file import listens_at, read_deployment
 from vlagents_ray.serve.launch.haproxy import ROBOTS
 
+pytestmark = pytest.mark.integration
+
 ROOT = Path(__file__).parents[2]
 DOCKERFILE = (ROOT / "cluster/docker/Dockerfile").read_text()
 SERVICE = RayService.model_validate(manifest("RayService", "policy"))

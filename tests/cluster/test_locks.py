@@ -9,6 +9,8 @@ import resolved
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+pytestmark = pytest.mark.integration
+
 ENTRY = re.compile(r"([a-z0-9-]+)==(\S+)((?: \\\n    --hash=sha256:[0-9a-f]{64})+)\n")
 TORCH = {Requirement(line).name: Requirement(line) for line in resolved.lines(resolved.TORCH)}
 

@@ -15,7 +15,7 @@ from vlagents_ray.policies.experts import expert_for
 from vlagents_ray.testing import check_env
 
 gym_aloha = pytest.importorskip("gym_aloha.env")
-pytestmark = pytest.mark.sim
+pytestmark = [pytest.mark.sim, pytest.mark.integration]
 
 FIRST = (0.0, -0.96, 1.16, 0.0, -0.3, 0.0, 0.1)  # the pose in which both arms begin
 STILL = Act(np.array(FIRST * 2, np.float32))

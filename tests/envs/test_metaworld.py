@@ -19,7 +19,7 @@ from vlagents_ray.testing import check_env
 from vlagents_ray.validation import check_observation
 
 metaworld = pytest.importorskip("metaworld")
-pytestmark = pytest.mark.sim
+pytestmark = [pytest.mark.sim, pytest.mark.integration]
 
 STILL = Act(np.zeros(4, np.float32))
 

@@ -14,7 +14,7 @@ from vlagents_ray.interface import Obs
 from vlagents_ray.policies.experts import expert_for
 from vlagents_ray.testing import check_env
 
-pytestmark = pytest.mark.sim
+pytestmark = [pytest.mark.sim, pytest.mark.integration]
 
 NAME = "gymnasium/FetchReach-v4"
 

@@ -22,6 +22,7 @@ def test_the_tabletop() -> None:
 
 
 @pytest.mark.sim
+@pytest.mark.integration
 def test_metaworld() -> None:
     played("metaworld/drawer-open-v3", **SMALL, record_size=(40, 40))
 

@@ -60,7 +60,7 @@ class SlowAfterTwo(Progress):
             self._monkeypatch.setattr(Deadline, "leaves_room", False)
 
 
-@pytest.mark.usefixtures("cluster")
+@pytest.mark.usefixtures("shared_ray")
 def test_out_of_time_keeps_what_is_finished_and_resume_plays_the_rest(
     config: Callable[..., EvalConfig], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -73,7 +73,7 @@ def test_out_of_time_keeps_what_is_finished_and_resume_plays_the_rest(
     assert (summary.state, summary.total.episodes) == ("complete", 6)
 
 
-@pytest.mark.usefixtures("cluster")
+@pytest.mark.usefixtures("shared_ray")
 def test_an_end_that_is_past_plays_nothing(config: Callable[..., EvalConfig]) -> None:
     with pytest.raises(OutOfTime) as stopped:
         evaluate(config(), agent_factory=ToZero, end_at=time.time() - 1)

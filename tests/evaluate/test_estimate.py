@@ -27,7 +27,7 @@ def test_why_an_env_cannot_be_timed_is_told() -> None:
     assert "the simulator is gone" in str(longest_episode(LINE, {"broken": "the simulator is gone"}, {}))
 
 
-@pytest.mark.usefixtures("cluster")
+@pytest.mark.usefixtures("shared_ray")
 class TestOnACluster:
     def test_an_env_is_timed_where_nothing_was_played(self, config: Config) -> None:
         settings = config(envs=[LINE, OTHER_LINE], episodes=4, seeds=[0, 10])

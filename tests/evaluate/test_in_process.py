@@ -22,7 +22,7 @@ def outcomes(summary: Summary) -> list[dict[str, Any]]:
     return [one.result.outcome for cell in summary.results.cells for one in cell.episodes]
 
 
-def test_its_episodes_are_those_of_workers(config: Config, tmp_path: Path, cluster: None) -> None:
+def test_its_episodes_are_those_of_workers(config: Config, tmp_path: Path, shared_ray: None) -> None:
     envs = {"envs": [LINE, OTHER_LINE]}
     usual = evaluate(config(**envs, out=tmp_path / "usual"), agent_factory=ToZero)
     here = evaluate(config(**envs), agent_factory=ToZero, in_process=True)

@@ -38,7 +38,7 @@ class Noisy(ToZero):
         return act if self._acts < 4 else Act(act.action + np.float32(np.random.default_rng().uniform(0.01, 0.02)))
 
 
-@pytest.mark.usefixtures("cluster")
+@pytest.mark.usefixtures("shared_ray")
 class TestOnACluster:
     def test_a_deterministic_policy_does_the_same_byte_for_byte(self, config: Config, tmp_path: Path) -> None:
         results = play(config(episodes=4, seed=20))

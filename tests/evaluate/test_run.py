@@ -53,7 +53,7 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(worker, "GRACE_S", 0.2)
 
 
-@pytest.mark.usefixtures("cluster")
+@pytest.mark.usefixtures("shared_ray")
 class TestOnACluster:
     def test_results_do_not_depend_on_the_number_of_workers(self, config: Config, tmp_path: Path) -> None:
         one = config(envs=[LINE, OTHER_LINE], episodes=8, workers=1, out=tmp_path / "one")

@@ -14,7 +14,7 @@ from vlagents_ray.evaluate.plan.jobs import plan
 from vlagents_ray.evaluate.workers.pool import WorkerPool
 
 
-@pytest.mark.usefixtures("cluster")
+@pytest.mark.usefixtures("shared_ray")
 def test_reports_that_have_come_are_taken_in_one_turn(config: Callable[..., EvalConfig]) -> None:
     settings = config(workers=2)
     jobs = plan(cells(settings))

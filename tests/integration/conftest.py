@@ -1,4 +1,4 @@
-"""Real servers on real Ray, one for each test file that needs one."""
+"""Real servers on real Ray."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from shared_ray import shared_server
 
 from vlagents_ray.serve.launch.deployment_file import deployment
-from vlagents_ray.serve.launch.server import Server, running_server
+from vlagents_ray.serve.launch.server import Server
 
 SUPPORT = Path(__file__).parent.parent / "support"
 
@@ -37,6 +38,6 @@ def importable_agents() -> Iterator[None]:
 
 @contextmanager
 def serving(policy: str, **args: Any) -> Iterator[Server]:
-    """A server of one policy on a cluster of its own."""
-    with running_server(deployment(policy, **args), num_cpus=4) as server:
+    """A server of one policy on the Ray that test files share: for files that take the fixture `shared_ray`."""
+    with shared_server(deployment(policy, **args)) as server:
         yield server

@@ -359,29 +359,3 @@ def test_statistics_and_metrics_are_on_loopback_alone(served: Served) -> None:
         socket.create_connection(("127.0.0.1", port), timeout=5).close()
         with pytest.raises(OSError, match="refused"):
             socket.create_connection(("127.0.0.2", port), timeout=5).close()
-
-
-def test_off_loopback_nothing_starts_until_somebody_decides_who_is_let_in(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="--insecure"), running_server(deployment("noop"), host=EVERYWHERE):
-        pytest.fail("started")
-    with (
-        pytest.raises(ConfigError, match="keys new"),
-        running_server(deployment("noop"), host=EVERYWHERE, keys_file=tmp_path / "none.json"),
-    ):
-        pytest.fail("started")
-
-
-def test_ipv6_is_not_supported_and_says_so() -> None:
-    with (
-        pytest.raises(ConfigError, match="IPv6 is not supported"),
-        running_server(deployment("noop"), host="::1", insecure=True),
-    ):
-        pass
-
-
-def test_files_that_are_no_certificate_are_refused_before_anything_starts(tmp_path: Path) -> None:
-    certificate, key = authority(tmp_path, "a").sign("server")
-    other = authority(tmp_path, "b").sign("server")[1]
-    for tls in (Tls(certificate, other), Tls(tmp_path / "none", key), Tls(certificate, key, client_ca=key)):
-        with pytest.raises(ConfigError, match="TLS"), running_server(deployment("noop"), tls=tls):
-            pytest.fail("started")

@@ -46,7 +46,7 @@ def values(folder: Path) -> dict[str, dict[str, np.ndarray]]:
 
 
 @pytest.fixture(scope="module")
-def server(folder: Path, values: dict[str, dict[str, np.ndarray]]) -> Iterator[Server]:
+def server(shared_ray: None, folder: Path, values: dict[str, dict[str, np.ndarray]]) -> Iterator[Server]:
     choices = {name: {"adapter": str(folder.parent / name)} for name in values}
     config = {"checkpoint": str(folder)}
     with serving("adapted_network:Small", config=config, checkpoints={"choices": choices}) as server:

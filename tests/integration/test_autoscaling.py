@@ -25,7 +25,7 @@ def gone() -> bool:
 
 
 @pytest.mark.slow
-def test_replicas_come_from_none_and_go_to_none_and_no_step_fails() -> None:
+def test_replicas_come_from_none_and_go_to_none_and_no_step_fails(shared_ray: None) -> None:
     with serving("noop", config={"base_ms": 40}, batch={"max_size": 1}, autoscaling=FROM_NONE) as server:
         wait_for(gone)
         stop = threading.Event()

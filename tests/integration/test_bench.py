@@ -32,6 +32,7 @@ def bench(ray_home: Path, *words: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.slow
+@pytest.mark.integration
 @pytest.mark.alone
 def test_every_way_is_measured_and_shared_memory_is_the_fastest_to_a_local_process(
     ray_home: Path, tmp_path: Path
@@ -52,6 +53,7 @@ def test_every_way_is_measured_and_shared_memory_is_the_fastest_to_a_local_proce
 
 
 @pytest.mark.slow
+@pytest.mark.integration
 @pytest.mark.alone
 def test_throughput_comes_near_the_bare_policy_and_never_above_it(ray_home: Path, tmp_path: Path) -> None:
     """Written out as a class, `noop` is a policy of unknown speed, which is measured bare; it sleeps, so that the

@@ -5,7 +5,7 @@ from __future__ import annotations
 import http.client
 import json
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -14,15 +14,16 @@ import pytest
 from eval_fakes import wait_for
 from flat_config import flat_config
 from ray.serve.schema import ServeDeploySchema
+from shared_ray import shared_server
 
 from tests.integration.test_sessions import TRANSPORTS, url
-from vlagents_ray import ConfigError, Obs, RemoteAgent
+from vlagents_ray import Obs, RemoteAgent
 from vlagents_ray.errors import CheckpointFailed, UnknownCheckpoint
 from vlagents_ray.evaluate import evaluate
 from vlagents_ray.evaluate.results.summary import checkpoint_of, weights_of
 from vlagents_ray.policies.base.checkpoint_files import digest
 from vlagents_ray.serve.launch.deployment_file import deployment
-from vlagents_ray.serve.launch.server import Server, running_server
+from vlagents_ray.serve.launch.server import Server
 
 POLICY = "served_agents:Stored"
 
@@ -47,9 +48,9 @@ def deployed(folder: Path, **beside: Any) -> ServeDeploySchema:
 
 
 @pytest.fixture(scope="module")
-def server(folder: Path) -> Iterator[Server]:
+def server(shared_ray: None, folder: Path) -> Iterator[Server]:
     """Deployed by Serve, as its file has `deployments`: only so can it change without new replicas."""
-    with running_server(deployed(folder, num_replicas=1), num_cpus=4) as server:
+    with shared_server(deployed(folder, num_replicas=1)) as server:
         yield server
 
 
@@ -271,15 +272,3 @@ def test_a_sweep_evaluates_each_checkpoint_on_one_server(fresh: Server, folder: 
     summary = evaluate(flat_config(**settings, steps=[3, 4], out=tmp_path / "results"))
     assert [(group.contender, group.episodes) for group in summary.totals] == [("policy@3", 3), ("policy@4", 3)]
     assert [checkpoint_of(cell) for cell in summary.results.cells] == [str(folder / "3"), str(folder / "4")]
-
-
-def test_a_file_that_cannot_be_is_refused_before_anything_starts(folder: Path) -> None:
-    config = {"checkpoint": "x"}
-    wrong: list[Callable[[], Any]] = [
-        lambda: deployment(POLICY, config=config, checkpoints={"choices": {"a": {"scales": 1}}}),
-        lambda: deployment("noop", checkpoints={"steps": True}),
-        lambda: deployment(POLICY, config=config, checkpoints={"loaded": 0}),
-    ]
-    for read in wrong:
-        with pytest.raises(ConfigError):
-            read()

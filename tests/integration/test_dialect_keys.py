@@ -17,7 +17,7 @@ from vlagents_ray.serve.access.key_store import new_key
 from vlagents_ray.serve.launch.server import free_port
 
 
-def test_with_keys_on_only_who_has_one_is_served_and_a_revoked_one_is_not(tmp_path: Path) -> None:
+def test_with_keys_on_only_who_has_one_is_served_and_a_revoked_one_is_not(shared_ray: None, tmp_path: Path) -> None:
     """GR00T's protocol carries a key, vlagents' does not: it is served on purpose, or not at all."""
     file = tmp_path / "keys.json"
     key = new_key(file, "arm")

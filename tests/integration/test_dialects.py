@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 import yaml
 from peer_environment import drive, peers_python
+from shared_ray import shared_server
 from websockets.sync.client import connect
 
 from vlagents_ray.serve.launch.deployment_file import IMPORT_PATH, read_deployment
-from vlagents_ray.serve.launch.server import Server, running_server
+from vlagents_ray.serve.launch.server import Server
 from vlagents_ray.wire import openpi as openpi_codec
 
 CALLS = 12
@@ -34,7 +35,7 @@ def python() -> Path:
 
 
 @pytest.fixture(scope="module")
-def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+def server(shared_ray: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     """Two applications of one deployment file: at the root, and under /pi."""
     args = {"policy": "served_agents:Mirror", "config": {"slow_s": 0.002}, "batch": {"max_size": 8}}
     names = {"root": ("/", DIALECTS), "pi": ("/pi", {"openpi": DIALECTS["openpi"]})}
@@ -44,7 +45,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     ]
     file = tmp_path_factory.mktemp("deployment") / "two.yaml"
     file.write_text(yaml.safe_dump({"applications": apps}))
-    with running_server(read_deployment(str(file)), num_cpus=4) as server:
+    with shared_server(read_deployment(str(file))) as server:
         yield server
 
 

@@ -16,14 +16,17 @@ import ray
 import yaml
 from eval_fakes import LINE, wait_for
 from flat_config import flat_config
+from shared_ray import shared_server
 from virtual_environments import ended, layered
 
 from vlagents_ray import Obs, RemoteAgent
 from vlagents_ray.client.transports.select import TransportName
 from vlagents_ray.evaluate import evaluate
 from vlagents_ray.serve.launch.deployment_file import read_deployment
-from vlagents_ray.serve.launch.server import Server, running_server
+from vlagents_ray.serve.launch.server import Server
 from vlagents_ray.serve.python_env.create import make_environment
+
+pytestmark = pytest.mark.integration
 
 AGENT = "python_env_agents:Telling"
 VERSIONS = {"old": ("1.26.4", "1.15.0"), "new": (np.__version__, "1.16.0")}  # of numpy and six
@@ -44,7 +47,7 @@ class Served:
 
 
 @pytest.fixture(scope="module")
-def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+def served(shared_ray: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     home = tmp_path_factory.mktemp("environments")
     requirements = home / "apart.txt"
     requirements.write_text("six==1.15.0\nnumpy==1.26.4\n")
@@ -73,7 +76,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
         for name, environment in environments.items()
     ]
     file.write_text(yaml.safe_dump({"applications": applications}))
-    with running_server(read_deployment(str(file)), num_cpus=4) as server:
+    with shared_server(read_deployment(str(file))) as server:
         yield Served(server, notes)
 
 

@@ -27,6 +27,8 @@ from vlagents_ray.evaluate import evaluate
 from vlagents_ray.serve.launch.deployment_file import read_deployment
 from vlagents_ray.serve.launch.server import Server, running_server
 
+pytestmark = pytest.mark.integration
+
 ROOT = Path(__file__).parents[2]
 ENVIRONMENTS = os.environ.get("VLAGENTS_RAY_ENVIRONMENTS") or sys.prefix  # with -NAME after it
 

@@ -53,7 +53,7 @@ FENCE = vla_eval_codec.encode(vla_eval_codec.Message("hello", {"protocol_version
 
 
 @pytest.fixture(scope="module")
-def server() -> Iterator[Server]:
+def server(shared_ray: None) -> Iterator[Server]:
     dialects = {
         "openpi": {"mapping": "openpi-libero"},
         "roboarena": {"mapping": "openpi-libero"},

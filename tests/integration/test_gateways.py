@@ -38,7 +38,7 @@ class Ports:
 
 
 @pytest.fixture(scope="module")
-def ports() -> Iterator[Ports]:
+def ports(shared_ray: None) -> Iterator[Ports]:
     """One replica, and a gateway with all three dialects."""
     ports = Ports(free_port(), free_port(), free_port())
     dialects = {name: {"port": getattr(ports, name)} for name in ("vlagents", "gr00t", "lerobot")}

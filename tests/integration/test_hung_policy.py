@@ -27,11 +27,9 @@ OUTSIDE: list[TransportName] = ["shm", "websocket", "http"]
 
 
 @pytest.fixture(scope="module")
-def server() -> Iterator[Server]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("RAY_metrics_report_interval_ms", "500")  # instead of 10 s
-        with serving("served_agents:Hanging", replicas=2, limits={"act_s": ACT_S, "warm_up_s": ACT_S}) as server:
-            yield server
+def server(shared_ray: None) -> Iterator[Server]:
+    with serving("served_agents:Hanging", replicas=2, limits={"act_s": ACT_S, "warm_up_s": ACT_S}) as server:
+        yield server
 
 
 def hung_calls() -> list[str]:

@@ -69,7 +69,7 @@ class Disaster(Progress):
 
 
 @pytest.fixture(scope="module")
-def alone(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, int], tuple[Any, ...]]:
+def alone(shared_ray: None, tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, int], tuple[Any, ...]]:
     """By one worker, from one replica that batches nothing."""
     out = tmp_path_factory.mktemp("alone")
     with serving("served_agents:Hesitant", batch={"max_size": 1}) as server:
@@ -80,7 +80,7 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, int], tup
 
 
 @pytest.fixture(scope="module")
-def server(alone: dict[Any, Any], request: pytest.FixtureRequest) -> Iterator[Server]:
+def server(shared_ray: None, alone: dict[Any, Any], request: pytest.FixtureRequest) -> Iterator[Server]:
     """With so many replicas, for all tests that want as many."""
     with serving("served_agents:Hesitant", batch={"max_size": 8}, replicas=request.param) as server:
         yield server

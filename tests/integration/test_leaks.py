@@ -20,6 +20,8 @@ from vlagents_ray.client.transports.codec_selection import CodecName
 from vlagents_ray.client.transports.select import TransportName
 from vlagents_ray.serve.launch.server import Server
 
+pytestmark = pytest.mark.integration
+
 # So many that a kilobyte or two of each shows; VLAGENTS_SESSIONS=N opens N by each transport
 SESSIONS: dict[TransportName, int] = {"shm": 2400, "websocket": 600, "http": 600, "handle": 300, "plasma": 300}
 MIB = 2**20
@@ -28,7 +30,7 @@ MOST = {"descriptors": 2, "threads": 2, "maps": 1, "own descriptors": 2, "own th
 
 
 @pytest.fixture(scope="module")
-def server() -> Iterator[Server]:
+def server(shared_ray: None) -> Iterator[Server]:
     with serving("served_agents:Accountant") as server:
         yield server
 

@@ -23,7 +23,7 @@ TRANSPORTS = ("shm", "plasma", "websocket", "http", "handle")
 
 
 @pytest.fixture(scope="module")
-def server() -> Iterator[Server]:
+def server(shared_ray: None) -> Iterator[Server]:
     with serving("noop", replicas=2) as server:
         yield server
 

@@ -26,7 +26,7 @@ def play(url: str, transport: TransportName, client: int) -> list[int]:
 
 
 @pytest.mark.slow
-def test_what_waits_while_a_batch_runs_is_the_next_batch() -> None:
+def test_what_waits_while_a_batch_runs_is_the_next_batch(shared_ray: None) -> None:
     """100 ms + 1 ms an observation, 24 clients. Serve's default of 5 requests at a time must not cap the batch."""
     with serving("noop", config={"base_ms": 100, "per_item_ms": 1}, batch={"max_size": 16}) as server:
         for transport in ("shm", "websocket", "http"):
@@ -38,7 +38,7 @@ def test_what_waits_while_a_batch_runs_is_the_next_batch() -> None:
 
 
 @pytest.mark.slow
-def test_replicas_come_with_the_load_and_go_with_it() -> None:
+def test_replicas_come_with_the_load_and_go_with_it(shared_ray: None) -> None:
     """Neither shared memory nor a WebSocket is a request to Serve that says how much is going on."""
     autoscaling = {"max_replicas": 2, "look_back_s": 2, "upscale_delay_s": 1, "downscale_delay_s": 1}
     with serving("noop", config={"base_ms": 30}, autoscaling=autoscaling) as server:

@@ -12,12 +12,14 @@ from pathlib import Path
 import pytest
 from eval_fakes import wait_for
 from prometheus_series import scrape
+from shared_ray import shared_server
 
-from tests.integration.conftest import serving
 from vlagents_ray import Obs, RemoteAgent
+from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.serve.launch.server import Server
 
 ACTS = 30
+APP = "measured"
 DASHBOARD = Path(__file__).parents[2] / "cluster/grafana/policy_server.json"
 NOT_YET = {  # no call hung, no memory ran out, no weights were pushed, nothing is recorded, there is no shadow
     "vlagents_hung_calls_total",
@@ -34,18 +36,20 @@ STAGES = ("decode", "queue", "inference", "encode")
 
 
 @pytest.fixture(scope="module")
-def server() -> Iterator[Server]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("RAY_metrics_report_interval_ms", "500")  # instead of 10 s
-        with serving("noop", batch={"sizes": [2, 4]}) as server:
-            yield server
+def server(shared_ray: None) -> Iterator[Server]:
+    config = deployment("noop", batch={"sizes": [2, 4]})
+    config.applications[0].name = APP
+    with shared_server(config) as server:
+        yield server
 
 
 def scraped() -> dict[str, float]:
-    """Our series of the node: name and tags, sorted, to value."""
+    """Our series of the server: name and tags, sorted, to value."""
     found = {}
     for one in scrape():
-        assert one.tags["application"] == one.tags["policy"] == "noop"
+        if one.tags["application"] != APP:  # which others served on this Ray before
+            continue
+        assert one.tags["policy"] == "noop"
         assert one.tags["deployment"] == "Policy"
         assert one.tags["replica"]
         found[one.key("op", "transport", "class", "code", "stage", "le")] = one.value
@@ -55,7 +59,7 @@ def scraped() -> dict[str, float]:
 def test_prometheus_reads_requests_batches_and_load(server: Server) -> None:
     with (
         RemoteAgent(server.url, transport="shm") as near,
-        RemoteAgent("serve://noop", transport="handle", rank="simulation") as inside,
+        RemoteAgent(f"serve://{APP}", transport="handle", rank="simulation") as inside,
     ):
         for agent in (near, inside):
             agent.reset(Obs())

@@ -14,12 +14,13 @@ import numpy as np
 import pytest
 from eval_fakes import wait_for
 from ray.serve.schema import ServeDeploySchema
+from shared_ray import shared_server
 
 from tests.integration.test_sessions import TRANSPORTS, obs, url
 from vlagents_ray import RemoteAgent
 from vlagents_ray.images.jpeg_png import encode_jpeg
 from vlagents_ray.serve.launch.deployment_file import deployment
-from vlagents_ray.serve.launch.server import Server, running_server
+from vlagents_ray.serve.launch.server import Server
 
 
 def deployed(replicas: int) -> ServeDeploySchema:
@@ -32,8 +33,8 @@ def deployed(replicas: int) -> ServeDeploySchema:
 
 
 @pytest.fixture(scope="module")
-def server() -> Iterator[Server]:
-    with running_server(deployed(3), num_cpus=4) as server:
+def server(shared_ray: None) -> Iterator[Server]:
+    with shared_server(deployed(3)) as server:
         yield server
 
 

@@ -34,11 +34,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def server(folder: Path) -> Iterator[Server]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("RAY_metrics_report_interval_ms", "500")
-        with serving(POLICY, record={"folder": str(folder)}) as server:
-            yield server
+def server(shared_ray: None, folder: Path) -> Iterator[Server]:
+    with serving(POLICY, record={"folder": str(folder)}) as server:
+        yield server
 
 
 def saved(folder: Path) -> int:
@@ -46,7 +44,8 @@ def saved(folder: Path) -> int:
 
 
 def series(key: str) -> list[float]:
-    return [one.value for one in scrape() if one.key("outcome") == key]
+    found = [one for one in scrape() if one.tags["application"] == "Brightness"]
+    return [one.value for one in found if one.key("outcome") == key]
 
 
 def play(agent: RemoteAgent, seed: int) -> tuple[int, list[np.ndarray]]:

@@ -107,7 +107,7 @@ def ledger(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def server(ledger: Path) -> Iterator[Server]:
+def server(shared_ray: None, ledger: Path) -> Iterator[Server]:
     with serving("served_agents:Ledger", config={"folder": str(ledger)}, replicas=REPLICAS) as server:
         yield server
 
@@ -119,6 +119,7 @@ def running() -> int:
 
 
 @pytest.mark.alone
+@pytest.mark.integration
 def test_killed_and_frozen_replicas_lose_double_cross_and_delay_no_act(server: Server, ledger: Path) -> None:
     drawn = random.Random(SEED)
     players = []

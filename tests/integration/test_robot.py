@@ -28,7 +28,7 @@ ROWS = 50
 PATIENCE_S = 300.0
 ATTEMPTS = 5  # of what a machine that stands still for a second spoils
 
-pytestmark = [pytest.mark.alone, pytest.mark.slow]
+pytestmark = [pytest.mark.alone, pytest.mark.slow, pytest.mark.integration]
 
 
 class Counter:

@@ -31,7 +31,7 @@ def version(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def served(version: Path) -> Iterator[Server]:
+def served(shared_ray: None, version: Path) -> Iterator[Server]:
     with serving("served_agents:Stochastic", config={"version": str(version)}) as server:
         yield server
 

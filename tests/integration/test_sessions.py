@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from tests.integration.conftest import serving
-from vlagents_ray import NotReset, Obs, PolicyUnavailable, RemoteAgent
+from vlagents_ray import NotReset, Obs, RemoteAgent
 from vlagents_ray.client.transports.select import TransportName
 from vlagents_ray.errors import MessageTooLarge
 from vlagents_ray.images.codecs import JPEG, RAW
@@ -23,7 +23,7 @@ TRANSPORTS: list[TransportName] = ["shm", "plasma", "websocket", "http", "handle
 
 
 @pytest.fixture(scope="module")
-def server() -> Iterator[Server]:
+def server(shared_ray: None) -> Iterator[Server]:
     """One replica of a policy written as in the paper."""
     with serving("served_agents:Reacher", config={"scale": 2.0}, batch={"max_size": 8}) as server:
         yield server
@@ -134,11 +134,6 @@ def test_metadata_says_what_is_served(server: Server) -> None:
         assert agent.metadata["policy"] == "served_agents:Reacher"
         assert agent.metadata["config"] == {"scale": 2.0}
         assert agent.contract is None
-
-
-def test_nobody_there_is_unavailable() -> None:
-    with pytest.raises(PolicyUnavailable, match="not ready within"):
-        RemoteAgent("http://127.0.0.1:9", connect_timeout_s=0.3).reset(obs(0))
 
 
 def test_a_robot_without_our_client_needs_only_http(server: Server) -> None:

@@ -16,10 +16,11 @@ import ray
 import yaml
 from eval_fakes import wait_for
 from prometheus_series import scrape
+from shared_ray import shared_server
 
 from vlagents_ray import Obs, RemoteAgent
 from vlagents_ray.serve.launch.deployment_file import IMPORT_PATH, read_deployment
-from vlagents_ray.serve.launch.server import Server, running_server
+from vlagents_ray.serve.launch.server import Server
 
 ACTS = 40
 ALONE, SHADOWED = "alone", "shadowed"
@@ -57,7 +58,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def server(tmp_path_factory: pytest.TempPathFactory, folder: Path) -> Iterator[Server]:
+def server(shared_ray: None, tmp_path_factory: pytest.TempPathFactory, folder: Path) -> Iterator[Server]:
     """The same live policy twice: alone, and with a candidate that takes ten times as long, for all sessions."""
     shadow = {"policy": TENFOLD, "share": 1.0, "record": str(folder)}
     apps = [
@@ -66,10 +67,8 @@ def server(tmp_path_factory: pytest.TempPathFactory, folder: Path) -> Iterator[S
     ]
     file = tmp_path_factory.mktemp("deployment") / "two.yaml"
     file.write_text(yaml.safe_dump({"applications": apps}))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("RAY_metrics_report_interval_ms", "500")  # instead of 10 s
-        with running_server(read_deployment(str(file)), num_cpus=4) as server:
-            yield server
+    with shared_server(read_deployment(str(file))) as server:
+        yield server
 
 
 @pytest.fixture(scope="module")
@@ -122,7 +121,8 @@ def test_each_comparison_is_recorded(server: Server, folder: Path) -> None:
 
 
 def series() -> dict[str, float]:
-    return {one.key("outcome", "rows", "joint"): one.value for one in scrape() if "_bucket" not in one.name}
+    found = [one for one in scrape() if one.tags["application"] == SHADOWED and "_bucket" not in one.name]
+    return {one.key("outcome", "rows", "joint"): one.value for one in found}
 
 
 def test_prometheus_reads_the_comparisons(server: Server) -> None:

@@ -9,12 +9,12 @@ import psutil
 import pytest
 from eval_fakes import wait_for
 from ray.serve.schema import ServeDeploySchema
+from shared_ray import shared_server
 
 from tests.integration.conftest import serving
 from tests.integration.test_shadow import AGENT, frames, played, recorded
 from vlagents_ray import ConfigError, Obs, RemoteAgent
 from vlagents_ray.serve.launch.deployment_file import deployment
-from vlagents_ray.serve.launch.server import running_server
 
 
 def candidates() -> set[int]:
@@ -32,7 +32,7 @@ def redeploy(config: ServeDeploySchema) -> None:
     client.deploy_apps(config)
 
 
-def test_a_candidate_that_turns_out_not_to_fit_fails_the_start_with_the_reason() -> None:
+def test_a_candidate_that_turns_out_not_to_fit_fails_the_start_with_the_reason(shared_ray: None) -> None:
     with (
         pytest.raises(ConfigError, match="the policy gives 8, the env takes 7"),
         serving(AGENT, shadow={"policy": "shadowed_agents:Unstated"}),
@@ -40,7 +40,9 @@ def test_a_candidate_that_turns_out_not_to_fit_fails_the_start_with_the_reason()
         pass
 
 
-def test_the_candidate_changes_its_settings_and_the_live_policy_does_not_restart(tmp_path: Path) -> None:
+def test_the_candidate_changes_its_settings_and_the_live_policy_does_not_restart(
+    shared_ray: None, tmp_path: Path
+) -> None:
     """As a deployment file states them, beside `args`."""
 
     def config(offset: float) -> ServeDeploySchema:
@@ -55,7 +57,7 @@ def test_the_candidate_changes_its_settings_and_the_live_policy_does_not_restart
         return acts[-1]["difference"]["mean"] if acts else 0.0
 
     before = candidates()
-    with running_server(config(0.5), num_cpus=4) as server, RemoteAgent(server.url) as agent:
+    with shared_server(config(0.5)) as server, RemoteAgent(server.url) as agent:
         agent.reset(Obs({"front": np.zeros((2, 2, 3), np.uint8)}, 1.0, {"joints": np.ones(7, np.float32)}), "", seed=1)
         wait_for(lambda: difference() == pytest.approx(0.5, abs=1e-4))
         redeploy(config(2.0))

@@ -20,7 +20,7 @@ from vlagents_ray.serve.launch.server import Server
 
 
 @pytest.fixture(scope="module")
-def server() -> Iterator[Server]:
+def server(shared_ray: None) -> Iterator[Server]:
     with serving("served_agents:Proportional", replicas=2) as server:
         yield server
 

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from eval_fakes import wait_for
 from ray.serve.schema import ServeDeploySchema
+from shared_ray import shared_server
 
 from vlagents_ray import Obs, RemoteAgent
 from vlagents_ray.errors import InvalidWeights, UnchangedWeights
 from vlagents_ray.learn import Publisher
 from vlagents_ray.serve.launch.deployment_file import deployment
-from vlagents_ray.serve.launch.server import Server, running_server
+from vlagents_ray.serve.launch.server import Server
 
 TRANSPORTS = ("shm", "plasma", "websocket", "http", "handle")
 
@@ -26,8 +27,8 @@ def deployed(replicas: int) -> ServeDeploySchema:
 
 
 @pytest.fixture(scope="module")
-def server() -> Iterator[Server]:
-    with running_server(deployed(2), num_cpus=3) as server:
+def server(shared_ray: None) -> Iterator[Server]:
+    with shared_server(deployed(2)) as server:
         yield server
 
 

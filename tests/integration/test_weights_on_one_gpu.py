@@ -7,13 +7,13 @@ from typing import Any
 
 import pytest
 from shared_cpu_memory import SharedCpuMemory
+from shared_ray import shared_server
 
 from tests.integration.test_weights import acts_of
 from vlagents_ray.errors import InvalidWeights
 from vlagents_ray.learn import Publisher
 from vlagents_ray.learn.publisher import AppTarget
 from vlagents_ray.serve.launch.deployment_file import deployment
-from vlagents_ray.serve.launch.server import running_server
 from vlagents_ray.weights import shared_values
 from vlagents_ray.weights.shared_values import SharedValues
 
@@ -22,7 +22,7 @@ pytestmark = pytest.mark.torch
 
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
 def test_both_replicas_act_with_what_the_learner_hands_over(
-    device: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    shared_ray: None, device: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     import torch
 
@@ -40,7 +40,7 @@ def test_both_replicas_act_with_what_the_learner_hands_over(
     resources = {"num_gpus": 0.2} if device == "cuda" else {}
     document = deployment("served_agents:OnOneGpu", config={"device": device}, replicas=2, resources=resources)
     learner = torch.nn.Linear(500, 400, device=device).requires_grad_(False)
-    with running_server(document, num_cpus=3) as server, Publisher("serve://OnOneGpu") as weights:
+    with shared_server(document) as server, Publisher("serve://OnOneGpu") as weights:
 
         def acted() -> set[tuple[int, float]]:
             return {acts_of(server, "OnOneGpu", "http") for _ in range(4)}

@@ -7,30 +7,19 @@ import os
 import re
 import signal
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import ray
 from eval_fakes import LINE, PYTHONPATH, ToZero, wait_for
 
 from vlagents_ray.learn import RolloutPlan, Rollouts, arrays
-from vlagents_ray.ray_tools.session import start_ray
 
-pytestmark = pytest.mark.ray
+pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("shared_ray")]
 
 SETTINGS: dict[str, Any] = {"worker": {"runtime_env": {"env_vars": {"PYTHONPATH": PYTHONPATH}}}}
 IMAGES = {"camera": [64, 64]}  # an episode has more bytes than Ray sends inside of a message
-
-
-@pytest.fixture(scope="module", autouse=True)
-def cluster() -> Iterator[None]:
-    """A local Ray cluster for the tests of this file."""
-    start_ray(num_cpus=4, include_dashboard=False, log_to_driver=False, logging_level="ERROR")
-    yield
-    ray.shutdown()
 
 
 def in_plasma(values: np.ndarray) -> bool:

@@ -264,6 +264,7 @@ def test_a_killed_run_goes_on_to_the_same_table(folder: Path, undisturbed: dict[
 
 @pytest.mark.server
 @pytest.mark.slow
+@pytest.mark.integration
 def test_killed_replicas_and_workers_change_nothing(folder: Path, undisturbed: dict[str, Any], tmp_path: Path) -> None:
     out, pushed, killed = tmp_path / "run", tmp_path / "pushed", tmp_path / "killed"
     with start_run(folder, out, before=HELD.format(pushed=str(pushed), killed=str(killed))) as run:

@@ -172,6 +172,7 @@ def test_without_a_group_of_both_outcomes_the_weights_stay() -> None:
 
 @pytest.mark.server
 @pytest.mark.slow
+@pytest.mark.integration
 def test_the_example_killed_after_an_iteration_goes_on_to_the_table_of_a_whole_run(tmp_path: Path) -> None:
     example = yaml.safe_load((Path(__file__).parents[2] / "examples/learn/grpo.yaml").read_text())
     small = {"iterations": 2, "episodes": 32, "evaluate_every": 1, "held_out": 8}  # with the example's clone

@@ -10,7 +10,7 @@ from vlagents_ray.errors import ContractMismatch, InvalidObservation
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.experts import expert_for
 
-pytestmark = pytest.mark.sim
+pytestmark = [pytest.mark.sim, pytest.mark.integration]
 
 
 @pytest.mark.slow

@@ -11,12 +11,12 @@ import pytest
 
 from vlagents_ray.client.transports.shm import ShmTransport
 
-pytestmark = [pytest.mark.alone, pytest.mark.slow]
+pytestmark = [pytest.mark.alone, pytest.mark.slow, pytest.mark.integration]
 
 SECONDS = 3.0
 ATTEMPTS = 3  # a machine that does something else meanwhile misleads
 NOISE_MS = 5.0  # of p90 on a machine with two cores, of which the flooding process takes one while it begins
-CASES = [  # `tests/support/flood.py table` has all ways, parts and numbers of connections
+CASES = [
     *((way, "images", 1) for way in flood.WAYS),
     *((way, "header", connections) for way in flood.FRAMES for connections in (8, 32)),
     *(("own port", part, 8) for part in flood.PARTS if part != "header"),
@@ -42,7 +42,7 @@ def test_a_robots_act_takes_less_than_twice_as_long(
 ) -> None:
     """The median, and p90 against that of the same robot alone in the same attempt.
 
-    p99 of a robot alone is anything from 4 to 90 ms on two cores: `table` shows it.
+    p99 of a robot alone is anything from 4 to 90 ms on two cores.
     """
     found = []
     for _ in range(ATTEMPTS):

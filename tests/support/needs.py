@@ -1,6 +1,7 @@
 """What a test needs, by its markers: what this machine cannot give is skipped, what no marker names is refused.
 
-So `make check`, which leaves out whatever is marked, is sure to start no Ray and to load no simulator.
+So `make check`, which leaves out whatever is marked, is sure to start no Ray and to load no simulator. The marker
+`integration` is the tier that `make test` leaves out.
 """
 
 from __future__ import annotations
@@ -25,7 +26,10 @@ from typescript_client import node_version
 
 # Ray makes a session's folder in this one: in no process of the test does one start that finds a file in its place.
 _NO_RAY = "/dev/null/not-marked-ray"  # short: a longer name would be replaced, as sockets in it could not be named
+INTEGRATION = "integration"
 _RAY = ("ray", "server", "hosts")
+# Few machines have what tests of these need, or they take minutes: they are of the tier `integration`.
+_INTEGRATION = ("browser", "compiler", "hosts", "node", "vulkan")
 _SIMULATORS = {
     "gym_pusht", "gymnasium_robotics", "libero", "mani_skill", "metaworld", "mujoco", "rcs", "robocasa", "robosuite",
     "sapien",
@@ -33,12 +37,24 @@ _SIMULATORS = {
 
 
 def left_out(file: Path, markexpr: str) -> bool:
-    """Does `-m 'not (a or b)'` leave out all of a file? Then it is not imported: torch and simulators take seconds."""
+    """Whether `-m 'not (a or b)'` or `-m integration` leaves out all of a file, which then need not be imported."""
     names = re.fullmatch(r"not \((\w+(?: or \w+)*)\)", markexpr)
-    if names is None or file.suffix != ".py":
+    if file.suffix != ".py" or (names is None and markexpr != INTEGRATION):
         return False
-    marked = " ".join(re.findall(r"^pytestmark = .*", file.read_text(), re.MULTILINE))
-    return not set(re.findall(r"pytest\.mark\.(\w+)", marked)).isdisjoint(names[1].split(" or "))
+    text = file.read_text()
+    if names is None:
+        return not re.search(rf"\bmark\.({'|'.join((INTEGRATION, *_INTEGRATION))})\b", text)
+    unwanted = set(names[1].split(" or "))
+    if INTEGRATION in unwanted:
+        unwanted.update(_INTEGRATION)
+    marked = " ".join(re.findall(r"^pytestmark = .*", text, re.MULTILINE))
+    return not unwanted.isdisjoint(re.findall(r"pytest\.mark\.(\w+)", marked))
+
+
+def mark_tier(item: pytest.Item) -> None:
+    """Mark a test of `integration` that one of its other markers makes one."""
+    if any(item.get_closest_marker(name) for name in _INTEGRATION):
+        item.add_marker(INTEGRATION)
 
 
 def skip_what_is_missing(item: pytest.Item) -> None:

@@ -125,7 +125,7 @@ def test_a_rule_has_an_end() -> None:
         StopConfig()
 
 
-@pytest.mark.usefixtures("cluster")
+@pytest.mark.usefixtures("shared_ray")
 class TestOnACluster:
     STOP = {"target": 0.3, "at_least": 3}  # noqa: RUF012 - never changed
 

@@ -11,7 +11,7 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig, WorkerConfig
 from vlagents_ray.evaluate.workers.cluster import CapacityMonitor
 
-pytestmark = pytest.mark.usefixtures("cluster")
+pytestmark = pytest.mark.usefixtures("shared_ray")
 
 WANTED = WorkerConfig(cpus=64)
 

@@ -32,7 +32,7 @@ def test_a_process_knows_the_files_that_it_writes_to(tmp_path: Path) -> None:
     assert (tmp_path / "log").read_text().strip() == str([str(tmp_path / "log")])
 
 
-@pytest.mark.usefixtures("cluster")
+@pytest.mark.usefixtures("shared_ray")
 def test_another_node_reads_its_own_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "log").write_text("from there")
     monkeypatch.setattr(socket, "gethostname", lambda: "here")
@@ -49,7 +49,7 @@ def test_a_host_that_is_gone_has_no_log(monkeypatch: pytest.MonkeyPatch) -> None
     assert tail_at("gone", ["/log"]) == ""
 
 
-@pytest.mark.usefixtures("cluster")
+@pytest.mark.usefixtures("shared_ray")
 def test_a_host_that_does_not_answer_is_no_host_without_a_log(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(socket, "gethostname", lambda: "here")
     monkeypatch.setattr(cluster, "TIMEOUT_S", 0.1)

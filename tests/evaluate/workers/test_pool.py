@@ -21,7 +21,7 @@ from vlagents_ray.evaluate.workers.pool import WorkerPool
 from vlagents_ray.evaluate.workers.rollout import Report
 from vlagents_ray.evaluate.workers.worker import WorkerHandle
 
-pytestmark = pytest.mark.usefixtures("cluster")
+pytestmark = pytest.mark.usefixtures("shared_ray")
 
 Config = Callable[..., EvalConfig]
 

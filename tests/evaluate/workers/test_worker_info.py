@@ -17,6 +17,7 @@ from vlagents_ray.ray_tools.session import start_ray
 Config = Callable[..., EvalConfig]
 
 DRAWN = "rendered_env:Drawn"
+pytestmark = pytest.mark.ray
 
 
 @pytest.fixture(scope="module", autouse=True)

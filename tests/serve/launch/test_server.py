@@ -12,7 +12,7 @@ from vlagents_ray.errors import PolicyUnavailable
 from vlagents_ray.serve.access.key_store import new_key
 from vlagents_ray.serve.launch import server
 from vlagents_ray.serve.launch.deployment_file import deployment, together, with_settings
-from vlagents_ray.serve.launch.server import _deploy, wait_for_proxies
+from vlagents_ray.serve.launch.server import deploy, wait_for_proxies
 
 
 class FakeClient:
@@ -41,7 +41,7 @@ def test_a_server_on_its_own_ray_builds_its_applications_itself(ends_at_once: bo
     """For a file Serve starts a process that imports everything once more, which takes a second."""
     client = FakeClient()
     two = together({"a": deployment("noop", replicas=2), "b": with_settings(deployment("noop"), {"action_dim": 3})})
-    _deploy(client, two, own=True, ingress=not ends_at_once)
+    deploy(client, two, own=True, ingress=not ends_at_once)
     assert client.by_serve == []
     assert [(app.name, app.route_prefix) for app in client.built_here] == [("a", "/a"), ("b", "/b")]
     parts = [part for app in client.built_here for part in app.deployments]
@@ -63,14 +63,14 @@ def test_a_server_on_its_own_ray_builds_its_applications_itself(ends_at_once: bo
 def test_what_serve_must_apply_is_deployed_by_serve(config: ServeDeploySchema) -> None:
     """So that another deployment of the file changes it without new replicas."""
     client = FakeClient()
-    _deploy(client, config, own=True, ingress=True)
+    deploy(client, config, own=True, ingress=True)
     assert (client.by_serve, client.built_here) == ([config], [])
 
 
 def test_a_cluster_of_others_keeps_the_file() -> None:
     """There others may deploy it again."""
     client, config = FakeClient(), deployment("noop")
-    _deploy(client, config, own=False, ingress=True)
+    deploy(client, config, own=False, ingress=True)
     assert (client.by_serve, client.built_here) == ([config], [])
 
 

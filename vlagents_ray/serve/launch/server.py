@@ -99,7 +99,7 @@ def shut_down(client: Any) -> None:
     forget_serve(client)
 
 
-__all__ = ["Server", "free_port", "running_server", "spread_over_gpus"]
+__all__ = ["Server", "deploy", "free_port", "running_server", "spread_over_gpus"]
 
 _START_S, _GROW_S = 600.0, 3600.0  # time for a policy to get ready: here; on a cluster that may add a machine first
 _END_S = 0.1  # period at which a replica that ends checks for remaining requests; Serve's own is 2 s
@@ -174,7 +174,7 @@ def running_server(
         stack.push(unless_lost(lambda: shut_down(client)))
         _require_gpus(config)
         remind = functools.partial(_missing_gpus, config)
-        _deploy(client, config, own=own, ingress=ingress)
+        deploy(client, config, own=own, ingress=ingress)
         url = f"{'http' if tls is None else 'https'}://{LOOPBACK if host == EVERYWHERE else host}:{public}"
         paths = {app.name: (app.route_prefix or "").rstrip("/") for app in config.applications}
         if timeout_s is None:
@@ -208,7 +208,7 @@ def _access(config: ServeDeploySchema, keys_file: Path | None, insecure: bool, p
     return changed
 
 
-def _deploy(client: Any, config: ServeDeploySchema, *, own: bool, ingress: bool) -> None:
+def deploy(client: Any, config: ServeDeploySchema, *, own: bool, ingress: bool) -> None:
     """Deploy the applications, without waiting for them.
 
     Serve starts a process for a deployment file, which imports the server once more. On our `own` Ray, applications of

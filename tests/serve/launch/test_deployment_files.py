@@ -1,0 +1,108 @@
+"""Deployment files, and servers whose settings cannot hold: all is refused before anything starts."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from certificates import authority
+
+from vlagents_ray import ConfigError
+from vlagents_ray.serve.access.tls import Tls
+from vlagents_ray.serve.launch.deployment_file import deployment, listens_at, read_deployment
+from vlagents_ray.serve.launch.server import running_server
+from vlagents_ray.serve.ports import EVERYWHERE
+
+ROOT = Path(__file__).parents[3]
+STORED = "served_agents:Stored"
+
+
+def application(args: str) -> str:
+    return f"applications: [{{name: a, import_path: vlagents_ray.serve.app:build, args: {args}}}]"
+
+
+@pytest.mark.parametrize(
+    ("text", "word"),
+    [
+        (application("{policy: noop, polic: 1}"), "polic"),
+        (application("{policy: nope}"), "nope"),
+        (application("{}"), "policy"),
+        (application("{policy: noop, config: {xy: 1}}"), "xy"),
+        (application("{policy: noop, batch: {max_size: 0}}"), "max_size"),
+        (application("{policy: noop, dialects: {vlagents: {}, gr00t: {port: 8080}}}"), "share port 8080"),
+        (application("{policy: noop, dialects: {gr00t: {mapping: gr01t}}}"), "gr01t"),
+        (application("{policy: noop, replicas: 1, autoscaling: {}}"), "exclude each other"),
+        ("applications: 3", "applications"),
+        ("a: [", "YAML"),
+    ],
+)
+def test_a_wrong_deployment_file_is_refused(tmp_path: Path, text: str, word: str) -> None:
+    file = tmp_path / "d.yaml"
+    file.write_text(text)
+    with pytest.raises(ConfigError, match=word):
+        read_deployment(str(file))
+
+
+def test_a_file_says_where_to_listen_and_nobody_is_let_in_by_default(tmp_path: Path) -> None:
+    file = tmp_path / "d.yaml"
+    file.write_text(application("{policy: noop}"))
+    assert listens_at(read_deployment(str(file))) == ("127.0.0.1", 8000)
+    file.write_text(application("{policy: noop}") + f"\nhttp_options: {{host: {EVERYWHERE}, port: 8123}}")
+    assert listens_at(read_deployment(str(file))) == (EVERYWHERE, 8123)
+
+
+@pytest.mark.parametrize("file", sorted((ROOT / "deployments").glob("*.yaml")), ids=lambda file: file.stem)
+def test_every_shipped_deployment_file_is_valid(file: Path, tmp_path: Path) -> None:
+    """In this environment in the place of the policy's own: what is heavy comes with loading."""
+    text = file.read_text()
+    [app] = yaml.safe_load(text)["applications"]
+    if (own := app["args"].get("environment", {}).get("python")) is not None:
+        assert (ROOT / "requirements" / f"{Path(own).parents[1].name.removeprefix('.venv-')}.txt").is_file()
+        text = text.replace(own, sys.executable)
+    here = tmp_path / file.name
+    here.write_text(text)
+    assert read_deployment(str(here)).applications
+
+
+@pytest.mark.parametrize(
+    "read",
+    [
+        lambda config: deployment(STORED, config=config, checkpoints={"choices": {"a": {"scales": 1}}}),
+        lambda _: deployment("noop", checkpoints={"steps": True}),
+        lambda config: deployment(STORED, config=config, checkpoints={"loaded": 0}),
+    ],
+    ids=["setting", "steps", "loaded"],
+)
+def test_checkpoints_that_cannot_be_chosen_are_refused(read: Callable[[dict[str, Any]], Any]) -> None:
+    with pytest.raises(ConfigError):
+        read({"checkpoint": "x"})
+
+
+def test_off_loopback_nothing_starts_until_somebody_decides_who_is_let_in(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="--insecure"), running_server(deployment("noop"), host=EVERYWHERE):
+        pytest.fail("started")
+    with (
+        pytest.raises(ConfigError, match="keys new"),
+        running_server(deployment("noop"), host=EVERYWHERE, keys_file=tmp_path / "none.json"),
+    ):
+        pytest.fail("started")
+
+
+def test_ipv6_is_not_supported_and_says_so() -> None:
+    with (
+        pytest.raises(ConfigError, match="IPv6 is not supported"),
+        running_server(deployment("noop"), host="::1", insecure=True),
+    ):
+        pytest.fail("started")
+
+
+def test_files_that_are_no_certificate_are_refused(tmp_path: Path) -> None:
+    certificate, key = authority(tmp_path, "a").sign("server")
+    other = authority(tmp_path, "b").sign("server")[1]
+    for tls in (Tls(certificate, other), Tls(tmp_path / "none", key), Tls(certificate, key, client_ca=key)):
+        with pytest.raises(ConfigError, match="TLS"), running_server(deployment("noop"), tls=tls):
+            pytest.fail("started")

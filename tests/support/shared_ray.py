@@ -1,0 +1,101 @@
+"""The one Ray of this test process, and one Serve on it, where test files deploy their policies one after the other.
+
+A file that needs a Ray, but not its own, takes the fixture `shared_ray`. Ray starts when the first such file needs
+it, and ends before the first test of a file without the fixture, which may start a Ray of its own. The order of the
+files in tests/conftest.py makes that happen once. Only tests of launching, of crashes and of settings of Ray itself
+start their own.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from vlagents_ray.serve.ports import LOOPBACK, free_port, keep
+
+FIXTURE = "shared_ray"
+_CPUS = 4  # only an account: replicas, and workers of evaluations
+_READY_S = 180.0  # for a policy to be ready; the machine may be busy
+_SUPPORT = Path(__file__).parent
+
+_running: contextlib.ExitStack | None = None
+_port = 0  # of Serve's HTTP
+
+
+def start() -> None:
+    """Start Ray, unless it runs."""
+    global _running, _port  # noqa: PLW0603 - one for each process
+    if _running is not None:
+        return
+    from vlagents_ray.serve.launch.private_cluster import own_ray
+
+    _port = free_port()
+    with contextlib.ExitStack() as stack:
+        patch = stack.enter_context(pytest.MonkeyPatch.context())
+        patch.setenv("RAY_metrics_report_interval_ms", "500")  # instead of 10 s, for which tests would wait
+        patch.setenv("PYTHONPATH", str(_SUPPORT), prepend=os.pathsep)
+        stack.enter_context(own_ray(LOOPBACK, _port, num_cpus=_CPUS))
+        _running = stack.pop_all()
+
+
+def stop() -> None:
+    """End Ray and Serve, if they run."""
+    global _running
+    if _running is None:
+        return
+    from ray.serve.context import _get_global_client
+
+    from vlagents_ray.serve.launch.server import shut_down
+
+    running, _running = _running, None
+    with running:
+        if (client := _get_global_client(raise_if_no_controller_running=False)) is not None:
+            shut_down(client)
+
+
+@contextlib.contextmanager
+def shared_server(config: Any) -> Iterator[Any]:
+    """Serve a deployment on the shared Ray for the length of the context, as `running_server` does on one of its own.
+
+    Args:
+        config: A `ServeDeploySchema`.
+
+    Yields:
+        A `Server`.
+
+    Raises:
+        ConfigError: An application failed to deploy.
+    """
+    from ray import serve
+
+    from vlagents_ray.ray_tools.private import proxies_now, start_serve
+    from vlagents_ray.serve.config.deployment import ServerArgs
+    from vlagents_ray.serve.launch.deployment_file import with_gateways_at
+    from vlagents_ray.serve.launch.haproxy import wait_for_haproxy
+    from vlagents_ray.serve.launch.readiness import wait_until_ready
+    from vlagents_ray.serve.launch.server import Server, deploy, wait_for_proxies
+
+    assert _running is not None, f"the file has to take the fixture {FIXTURE}"
+    config = with_gateways_at(config, LOOPBACK)
+    for app in config.applications:
+        keep(*(one.port for one in ServerArgs(**app.args).dialects.gateways().values()))
+    client, proxies = start_serve({"host": LOOPBACK, "port": _port}, "HeadOnly")
+    url = f"http://{LOOPBACK}:{_port}"
+    paths = {app.name: (app.route_prefix or "").rstrip("/") for app in config.applications}
+    urls = {name: url + path for name, path in paths.items()}
+    deadline = time.monotonic() + _READY_S
+    try:
+        deploy(client, config, own=True, ingress=True)
+        wait_for_proxies(proxies, lambda: proxies_now(client))
+        wait_until_ready(serve, urls, set(paths), deadline)
+        if (stats_port := os.environ.get("RAY_SERVE_HAPROXY_STATS_PORT")) is not None:
+            wait_for_haproxy(serve, paths, int(stats_port), deadline)
+        yield Server(url, urls)
+    finally:
+        client.delete_apps(list(serve.status().applications))
