@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from vlagents_ray.cli import listing, policies
+from vlagents_ray.cli import policies
 from vlagents_ray.cli.main import app
 from vlagents_ray.client.transports import base
 from vlagents_ray.registry import POLICIES
