@@ -283,6 +283,8 @@ class Engine:
         self.require_ready()
         request, origin = pending.request, pending.origin
         if request.op == "act":
+            if origin.owner and not request.session and pending.session_id not in origin.sessions:
+                raise NotReset("act before reset: this connection has no session yet; reset first")
             pending.session = session = self.sessions.get(pending.session_id)
             if session.agent is None:
                 raise NotReset(f"session {pending.session_id!r}: act before a successful reset; reset first")

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING
 
-from vlagents_ray.errors import DeadlineExceeded, NotReset, OutcomeUnknown, TooManyRequests, VLAgentsError
+from vlagents_ray.errors import DeadlineExceeded, OutcomeUnknown, TooManyRequests, VLAgentsError
 from vlagents_ray.protocol.frames import Decoded
 from vlagents_ray.protocol.messages import Limits, Reply
 from vlagents_ray.serve.access.api_keys import Caller, Identity, NoKey
@@ -169,23 +169,14 @@ class Sender:
         return sent
 
     def _admitted(self, requests: list[PendingRequest], counted: bool) -> list[PendingRequest]:
-        """Return the requests that the key and the connection allow; the others are finished with their error."""
-        owner, known = self._origin.owner, self._origin.sessions
-        if self._caller is None and not owner:
+        """Return the requests that the caller's key allows; the others are finished with their error."""
+        if self._caller is None:
             return requests
         allowed = []
         for pending in requests:
             try:
-                if self._caller is not None:
-                    self._admit(self._caller, pending, counted=counted or self._paid)
-                    self._paid = False
-                if (
-                    pending.request.op == "act"
-                    and not pending.request.session
-                    and owner
-                    and pending.session_id not in known
-                ):
-                    raise NotReset("act before reset: this connection has no session yet; reset first")
+                self._admit(self._caller, pending, counted=counted or self._paid)
+                self._paid = False
                 allowed.append(pending)
             except VLAgentsError as error:
                 pending.fail(error)
