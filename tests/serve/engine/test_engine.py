@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from in_flight import send, submit
+from in_flight import submit
 
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.errors import (
@@ -24,9 +24,7 @@ from vlagents_ray.errors import (
 )
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.messages import Reply, Request
-from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.engine.sender import Sender
 
 
 class Echo(Agent):
@@ -108,15 +106,6 @@ def test_act_before_reset_and_unknown_sessions_are_refused(serving: Callable[...
     assert isinstance(ask(engine, "a", "reset", kwargs={"fail": True}).error, PolicyFailed)
     with pytest.raises(NotReset):
         ask(engine, "a", "act")
-
-
-def test_the_requests_of_a_message_are_taken_in_order(serving: Callable[..., Engine]) -> None:
-    sender = Sender(serving(Echo()), "test", caller=NoKey.OPEN)
-    answers: queue.SimpleQueue[list[Reply]] = queue.SimpleQueue()
-    for ops in (("act", "reset"), ("close",), ("reset", "act", "act")):
-        send(sender, [Request(op, Obs()) for op in ops], answers.put)  # type: ignore[arg-type]
-        replies = answers.get(timeout=10)
-        assert [type(reply.error) for reply in replies if reply.error] == [NotReset] * (ops[0] == "act")
 
 
 def test_a_closed_session_is_unknown(serving: Callable[..., Engine]) -> None:
