@@ -64,7 +64,7 @@ CHUNK, ROW = "chunk", "row"  # int: its number in the episode, and the row of th
 AGE_MS = "age_ms"  # float: the same in ms, from its capture until the player returned the action
 SILENT = "silent_s"  # float: seconds since the oldest unanswered request, retries included; 0.0 if there is none
 OF_THE_LOOP = (SAFE, CAUSE, INTERVENTION, WANTED, AGE, PLANNED, CHUNK, ROW, AGE_MS, SILENT)
-"""The names of `Act.info` by which a control loop goes. An answer that comes from a server has none of them."""
+"""The names of `Act.info` that only a chunk player on the robot writes, and that a control loop reads."""
 
 
 @dataclass(slots=True)
@@ -314,5 +314,14 @@ def copied(obs: Obs) -> Obs:
         {name: np.array(image) for name, image in obs.cameras.items()},
         obs.gripper,
         {name: np.array(part) for name, part in obs.state.items()},
-        {key: np.array(value) if isinstance(value, np.ndarray) else value for key, value in obs.info.items()},
+        _copied(obs.info),
     )
+
+
+def _copied(value: Any) -> Any:
+    """Copy arrays wherever they are nested: `DEPTH` has one for each camera."""
+    if isinstance(value, np.ndarray):
+        return np.array(value)
+    if isinstance(value, dict):
+        return {key: _copied(one) for key, one in value.items()}
+    return [_copied(one) for one in value] if isinstance(value, list) else value

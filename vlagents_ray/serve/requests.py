@@ -71,7 +71,7 @@ class Origin:
 
     transport: str = ""  # for the metrics
     owner: str = ""  # connection with which its sessions end; empty if it has none
-    connection: str = ""  # that carries several sessions, as the source of the queue's turns; empty: the session itself
+    connection: str = ""  # the sender, whose requests share one turn in the queue; empty: each session has a turn
     caller: Caller | None = None  # None if no key is asked for
     prefix: str = ""  # of the session ids of the caller's key
     sessions: set[str] = field(default_factory=set)  # those of the owner, as the engine names them
@@ -92,39 +92,50 @@ class Opening:
 
 @dataclass(slots=True, eq=False)
 class PendingRequest:
-    """One request in flight, from its message to its answer. `done` receives that, once, on any thread."""
+    """One request in flight, from its message to its answer.
+
+    `done` receives the answer, on any thread: the policy's, one that gives up on a hanging policy, the one that reads
+    the connection, or an event loop. Where two of these answer at once, `done` ignores the second answer.
+    """
 
     session_id: str  # as the engine names it
     request: Request
     done: Callable[[Reply], None]
     rank: Rank = Rank.ROBOT
-    arrived: float = field(default_factory=time.perf_counter)  # s of the engine's clock
+    arrived: float = field(default_factory=time.perf_counter)  # s of the engine's clock; by default that is this one
     deadline: float = math.inf  # after which no answer is of use, s of the engine's clock
     origin: Origin = NOWHERE
     over: bool = False  # whether it was answered, or its caller no longer waits
-    begun: bool = False  # whether it is in a batch, so that the policy acts on it; guarded by the queue's lock
+    begun: bool = False  # whether a batch has taken it, so that the policy acts on it; set under the queue's lock
     sought: bool = False  # whether its session was looked for at other replicas
     session: Any = None  # the `Session` of an act, as it was when the request came
     opening: Opening | None = None  # of a reset
-    loaded: float | None = None  # time at which the checkpoint was loaded, s, if a reset had to wait for it
+    # Time at which the checkpoint was loaded, s, if a reset had to wait for it. Such a reset is run even if it is over,
+    # to give the checkpoint back.
+    loaded: float | None = None
     preparation: Preparation | None = None  # of its observation, on another thread
     return_s: float | None = None  # recent time from an answer to the session's next request, s, if known
     place: int = 0  # among the requests of its message
-    files: DecodedFiles = None  # type: ignore[assignment]  # those of its message's images, where somebody observes
-    kept: dict[Any, Any] = None  # type: ignore[assignment]  # what observers keep for the answer, by observer
+    # Set where somebody observes: the files of its message's images, and what observers keep for the answer.
+    files: DecodedFiles = None  # type: ignore[assignment]
+    kept: dict[Any, Any] = None  # type: ignore[assignment]
 
     def finish(self, reply: Reply) -> None:
         """Deliver the answer, unless the request is over."""
         if self.over:
             return
         self.over = True
-        if self.preparation is not None:
-            self.preparation.cancel()
-            self.preparation = None
+        self.drop_preparation()
         try:
             self.done(reply)
         except Exception:
             logger.exception("request %s: its caller could not take the reply", self.request.request_id)
+
+    def drop_preparation(self) -> None:
+        """Let no thread prepare the observation, unless one has begun to."""
+        preparation, self.preparation = self.preparation, None
+        if preparation is not None:
+            preparation.cancel()
 
     def fail(self, error: VLAgentsError) -> None:
         """Deliver an error, unless the request is over."""
@@ -267,7 +278,8 @@ class Message:
                 timing = reply.timing
                 decode_ms, queue_ms = timing.get("decode_ms", 0.0), timing.get("queue_ms", 0.0)
                 inference_ms, encode_ms = timing.get("inference_ms", 0.0), timing.get("encode_ms", 0.0)
-                times = (timing["total_ms"], decode_ms, queue_ms, inference_ms, encode_ms)  # in the order of `STAGES`
+                total_ms = timing.get("total_ms", 0.0)  # too many replies at once are sent as errors, without times
+                times = (total_ms, decode_ms, queue_ms, inference_ms, encode_ms)  # in the order of `STAGES`
                 self._stats.handled((op, self.transport, rank, "ok"), times)
             else:
                 total_ms = (time.perf_counter() - self.arrived) * 1e3

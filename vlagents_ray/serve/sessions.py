@@ -258,7 +258,7 @@ class SessionTable(Generic[M]):
             for session_id in session_ids:
                 session = self._sessions.get(session_id)
                 if session is not None and session.origin.owner == connection:
-                    self._forget(session_id)
+                    self._forget(session_id, (max(session.steps, session.expected), _ANY))  # a reset that waits is void
 
     def close_those_of(self, model: M) -> None:
         """Close all sessions of that model."""

@@ -107,6 +107,7 @@ def run_episodes(
     Raises:
         ConfigError: The numbers of episodes and sessions differ, or there are fewer environments.
         EnvFailed: The simulator broke, which ends all episodes.
+        InvalidAction: An action does not fit one of several environments.
     """
     if not len(keys) == len(sessions) <= env.num_envs or not keys:
         raise ConfigError(

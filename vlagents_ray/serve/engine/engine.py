@@ -17,6 +17,7 @@ from vlagents_ray.contract import Contract
 from vlagents_ray.errors import (
     DeadlineExceeded,
     NotReset,
+    OutcomeUnknown,
     PolicyFailed,
     PolicyUnavailable,
     UnknownSession,
@@ -209,20 +210,23 @@ class Engine:
         if call is None:
             if self._hung is not None:
                 logger.warning("the policy has returned from %r after all", self._hung.op)
-                self._hung = self._unready = None
+                self._hung = None
+                if self._failure is None:
+                    self._unready = None
             return
-        if self._hung is not None:
-            return
-        self._hung, said = call, call.describe()
-        logger.error("%s. This replica is not healthy until it does. Its thread:\n%s", said, call.stack())
-        self.stats.hung(call.op)
-        self._unready = PolicyUnavailable(f"{said}; the session begins again at another replica")
+        said = call.describe()
+        refusal = PolicyUnavailable(f"{said}; the session begins again at another replica")
+        if self._hung is None:
+            self._hung, self._unready = call, refusal
+            logger.error("%s. This replica is not healthy until it does. Its thread:\n%s", said, call.stack())
+            self.stats.hung(call.op)
         # The policy may still act on the running batch, so its requests must not be sent again; waiting ones may be.
+        # Each time, as a request that was checked just before is queued just after.
         running, waiting = self.queue.clear()
         for pending in running:
-            pending.fail(DeadlineExceeded(said))
+            pending.fail(OutcomeUnknown(said))
         for pending in waiting:
-            self._fail(pending, self._unready)
+            self._fail(pending, refusal)
 
     def drain(self) -> None:
         """Ask all clients, with their next replies, to reconnect to other replicas, since this one will stop."""
@@ -303,16 +307,14 @@ class Engine:
             session = self.sessions.open(pending.session_id, origin)
             opening.first = self.sessions.begin(session, request.step)
             pending.opening = opening
-        if origin.owner:
-            if request.op == "close":
-                origin.sessions.discard(pending.session_id)
-            else:
-                origin.sessions.add(pending.session_id)
+        if origin.owner and request.op != "close":
+            origin.sessions.add(pending.session_id)
 
     def withdraw(self, *requests: PendingRequest) -> None:
         """End requests without an answer as `BatchQueue.withdraw` does, and undo resets that have not begun."""
         self.queue.withdraw(*requests)
         for pending in requests:
+            pending.drop_preparation()
             self._undo(pending)
 
     def _undo(self, pending: PendingRequest) -> None:
@@ -411,6 +413,7 @@ class Engine:
             self._observe(pending)
         else:
             self.sessions.close(session_id)
+            pending.origin.sessions.discard(session_id)
         return {}
 
     def _ready(self, pending: PendingRequest) -> tuple[Session[LoadedModel], LoadedModel, WeightsVersion]:

@@ -7,10 +7,15 @@ could not be decoded reach no observer. `vlagents_ray.serve.observers` has the o
 
 from __future__ import annotations
 
+import logging
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 from vlagents_ray.protocol.messages import Reply
 from vlagents_ray.serve.requests import PendingRequest
+
+logger = logging.getLogger(__name__)
 
 
 class Observer:
@@ -50,16 +55,27 @@ class Observers(Observer):
             self.any = bool(self._all)
 
     def on_request(self, pending: PendingRequest) -> None:
-        """See `Observer`."""
+        """See `Observer`; as below, an error of an observer costs no answer."""
         for observer in self._all:
-            observer.on_request(pending)
+            with _logged(observer):
+                observer.on_request(pending)
 
     def before_answer(self, pending: PendingRequest, reply: Reply) -> None:
         """See `Observer`."""
         for observer in self._all:
-            observer.before_answer(pending, reply)
+            with _logged(observer):
+                observer.before_answer(pending, reply)
 
     def on_answer(self, pending: PendingRequest, reply: Reply) -> None:
         """See `Observer`."""
         for observer in self._all:
-            observer.on_answer(pending, reply)
+            with _logged(observer):
+                observer.on_answer(pending, reply)
+
+
+@contextmanager
+def _logged(observer: Observer) -> Iterator[None]:
+    try:
+        yield
+    except Exception:
+        logger.exception("%s: a request is left out", type(observer).__name__)

@@ -63,8 +63,10 @@ class Resets:
             session.first, session.moves = opening.first, 0
             session.expected = max(session.expected, opening.first)
             is_abandoned = partial(self._is_abandoned, pending, session)
+            pending.begun = False  # while its checkpoint is loaded, the policy is not at work on it
             if self._models.hold(session, opening.choice, partial(self._requeue, pending), is_abandoned) is None:
                 return  # `_requeue` queues it again
+            pending.begun = True
         else:
             session = self._sessions.get(session_id)
             if session.resetting is not pending:

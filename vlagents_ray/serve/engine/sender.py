@@ -49,8 +49,8 @@ class Sender:
             caller: The authenticated caller, or the reason why none is needed. It has no default, so that an endpoint
                 without authentication fails.
             connected: Whether the sender has a connection, with which its sessions end.
-            counted: Whether the first request of each message was counted for the key on arrival, and the others, of
-                a message that is sent without an admission, by `count`; by default for senders without a connection.
+            counted: Whether the first request of each message was charged to the key on arrival, as it is by default
+                for senders without a connection. Messages sent without an admission charge further ones by `count`.
 
         Raises:
             TypeError: `caller` is neither a `Caller` nor a `NoKey`.
@@ -74,7 +74,7 @@ class Sender:
         return Message(self._engine.stats, self._origin.transport, op, rank)
 
     def admission(self, limits: Limits, size: int = 0, rank: str = "robot") -> MessageAdmission:
-        """Return the admission of a message of `size` bytes; its first request counts unless the sender's `counted`."""
+        """Return the admission of a message of `size` bytes, which charges its requests to the key; see `counted`."""
         robot, caller, counted = rank != "simulation", self._caller, self._counted
         keep = self._engine.observers.any
         if caller is None:
@@ -218,8 +218,7 @@ class Sender:
         """Submit the requests of a message, and wait for the replies until the requests' deadlines.
 
         The time that a request may have waited during a pause of the process counts towards its deadline.
-        When the caller stops waiting (deadline, disconnect), its requests are cancelled, unless their batch is
-        running.
+        When the caller stops waiting (deadline, disconnect), its requests that no batch has taken are withdrawn.
         """
         loop = asyncio.get_running_loop()
         future: asyncio.Future[list[Reply]] = loop.create_future()
@@ -233,8 +232,8 @@ class Sender:
         try:
             return await future
         finally:
-            for pending in sent:
-                pending.over = True
+            if left := [pending for pending in sent if not pending.over]:
+                self._engine.withdraw(*left)
             if timer is not None:
                 timer.cancel()
 

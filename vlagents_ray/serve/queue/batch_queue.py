@@ -81,7 +81,7 @@ class BatchQueue:
         self._begun = 0.0  # start of the running batch, s
 
     def bind(self, *, driven: bool = False) -> None:
-        """Make the calling thread the one that takes batches; `driven` if it calls `take`, when the poller wakes it."""
+        """Make the calling thread the policy's; if it is `driven`, the poller's `wake` tells it when to call `take`."""
         self._thread = 0 if driven else threading.get_ident()
         self._driven = self._asleep = driven
         self._load_timer.mark_busy()
@@ -101,7 +101,7 @@ class BatchQueue:
             self._wake()
 
     def withdraw(self, *requests: PendingRequest) -> None:
-        """End requests without an answer. Their `begun` no longer changes: the policy only acts on those that have."""
+        """End requests without an answer. No batch takes them any more, but a reset whose checkpoint was loaded."""
         with self._lock:
             for pending in requests:
                 pending.over = True

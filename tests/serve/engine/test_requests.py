@@ -1,0 +1,151 @@
+"""Requests in flight: what is left of one that its sender gives up, and of a message that cannot be answered."""
+
+from __future__ import annotations
+
+import asyncio
+import queue
+import threading
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from eval_fakes import wait_for
+from in_flight import ask, send
+
+from vlagents_ray.errors import DeadlineExceeded, MessageTooLarge
+from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.protocol import frames
+from vlagents_ray.protocol.frames import decode_replies
+from vlagents_ray.protocol.messages import Limits, Reply, Request
+from vlagents_ray.serve.access.api_keys import NoKey
+from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.metrics_buffer import MetricsBuffer
+from vlagents_ray.serve.engine.observer import Observer
+from vlagents_ray.serve.engine.sender import Sender
+from vlagents_ray.serve.requests import Message, PendingRequest
+
+
+class Gated(Agent):
+    """Acts when the gate is open."""
+
+    gate = threading.Event()
+    busy = threading.Semaphore(0)
+
+    def act(self, obs: Obs) -> Act:
+        Gated.busy.release()
+        assert Gated.gate.wait(10)
+        return Act(np.zeros(1))
+
+
+class Served:
+    def __init__(self) -> None:
+        Gated.gate.set()
+        Gated.busy = threading.Semaphore(0)
+        self.engine = Engine(Gated())
+        self.engine.start()
+        self.first = self.sender("first")
+        self.ask(self.first, "reset")
+
+    def sender(self, name: str, *, connected: bool = True) -> Sender:
+        return Sender(self.engine, "test", name, caller=NoKey.OPEN, connected=connected)
+
+    def put(self, sender: Sender, op: str, **fields: float) -> queue.SimpleQueue[list[Reply]]:
+        replies: queue.SimpleQueue[list[Reply]] = queue.SimpleQueue()
+        send(sender, [Request(op, Obs(), **fields)], replies.put)  # type: ignore[arg-type]
+        return replies
+
+    def ask(self, sender: Sender, op: str) -> Reply:
+        [reply] = self.put(sender, op).get(timeout=10)
+        assert reply.error is None
+        return reply
+
+    def occupy(self) -> None:
+        """Make the policy busy until `go_on`."""
+        Gated.gate.clear()
+        self.put(self.first, "act")
+        assert Gated.busy.acquire(timeout=10)
+
+    def go_on(self) -> None:
+        Gated.gate.set()
+        self.ask(self.first, "act")
+
+
+@pytest.fixture
+def served() -> Iterator[Served]:
+    one = Served()
+    yield one
+    Gated.gate.set()
+    one.engine.close()
+
+
+def test_a_reset_that_waits_when_its_connection_ends_leaves_no_session(served: Served) -> None:
+    served.occupy()
+    other = served.sender("other")
+    reset = served.put(other, "reset")
+    other.release()
+    served.go_on()
+    assert reset.get(timeout=10)[0].error is not None
+    assert served.engine.sessions.ids() == ["first"]
+
+
+def test_a_close_that_comes_too_late_leaves_the_session_to_the_end_of_its_connection(served: Served) -> None:
+    other = served.sender("other")
+    served.ask(other, "reset")
+    served.occupy()
+    close = served.put(other, "close", deadline_ms=1.0)
+    threading.Event().wait(0.01)
+    served.go_on()
+    assert isinstance(close.get(timeout=10)[0].error, DeadlineExceeded)
+    assert "other" in served.engine.sessions
+    other.release()
+    assert "other" not in served.engine.sessions
+
+
+@pytest.mark.parametrize("began", [True, False])
+def test_a_reset_whose_caller_is_gone_is_as_if_it_had_never_been(served: Served, began: bool) -> None:
+    other = served.sender("other", connected=False)
+    if began:
+        served.ask(other, "reset")
+    before = served.engine.sessions.versions()
+    served.occupy()
+
+    async def give_up() -> None:
+        asked = asyncio.create_task(ask(other, [Request("reset", Obs())]))
+        while served.engine.queue.depth() == 0:
+            await asyncio.sleep(0.001)
+        asked.cancel()
+        await asyncio.wait([asked])
+
+    asyncio.run(give_up())
+    served.go_on()
+    wait_for(lambda: served.engine.queue.depth() == 0)
+    after = served.engine.sessions.versions()
+    assert after.keys() == before.keys()
+    assert after.get("other") == before.get("other")
+
+
+def test_too_many_replies_for_one_frame_are_errors_and_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(frames, "DEFAULT_LIMITS", Limits(body_bytes=2000))
+    stats = MetricsBuffer()
+    stats.enable()
+    message = Message(stats, "test")
+    message.decoded_alike(2)
+    message.replies = [Reply(act=Act(np.zeros(300, np.float32)), timing={"queue_ms": 1.0}) for _ in range(2)]
+    assert all(isinstance(reply.error, MessageTooLarge) for reply in decode_replies(message.frame()))
+    assert sum(sample.seen for sample in stats.collect().requests.values()) == 2
+
+
+def test_an_observer_that_fails_costs_no_answer(served: Served, caplog: pytest.LogCaptureFixture) -> None:
+    class Broken(Observer):
+        def on_request(self, pending: PendingRequest) -> None:
+            raise RuntimeError("request")
+
+        def before_answer(self, pending: PendingRequest, reply: Reply) -> None:
+            raise RuntimeError("before")
+
+        def on_answer(self, pending: PendingRequest, reply: Reply) -> None:
+            raise RuntimeError("after")
+
+    served.engine.observers.add(Broken())
+    assert served.ask(served.first, "act").act is not None
+    assert "Broken: a request is left out" in caplog.text
