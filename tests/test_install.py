@@ -67,7 +67,8 @@ def test_the_wheel_holds_every_module_and_the_licence_and_no_tests(wheel: Path) 
     assert "vlagents_ray/py.typed" in names
     page = ROOT / "vlagents_ray/evaluate/report"
     resources = {str(path.relative_to(ROOT)) for pattern in ("report.*", "templates/*") for path in page.glob(pattern)}
-    assert len(resources) >= 4
+    resources |= {str(path.relative_to(ROOT)) for path in (ROOT / "vlagents_ray/cli/skeletons").glob("*/*")}
+    assert len(resources) >= 13
     assert resources - names == set()
     assert [name for name in names if name.endswith(".dist-info/licenses/LICENSE")]
     assert [name for name in names if name.startswith(("benchmarks/", "tests/", "deployments/"))] == []

@@ -73,7 +73,7 @@ def test_a_driver_gets_the_observation_and_makes_the_calls_it_is_told_to(fake: P
 def test_server_and_driver_end_with_the_context(fake: PeerClient, obs: Path) -> None:
     with peer_connected(fake, PYTHON, obs) as driver:
         driver.ready()
-        driver_pid = driver.child.pid  # type: ignore[attr-defined]
+        driver_pid = driver.pid  # type: ignore[attr-defined]
         running = subprocess.run(["pgrep", "-f", fake.script], capture_output=True, text=True, check=True)
         pids = [int(pid) for pid in running.stdout.split()]
         assert driver_pid in pids

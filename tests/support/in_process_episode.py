@@ -10,8 +10,8 @@ import numpy as np
 from vlagents_ray.envs import EvalEnv
 from vlagents_ray.envs.base import SequentialBatch
 from vlagents_ray.errors import VLAgentsError
-from vlagents_ray.evaluate.episode.episode import EpisodeObserver, EpisodeSettings, Watch, run_episodes
-from vlagents_ray.evaluate.episode.records import EpisodeResult
+from vlagents_ray.evaluate.episode.episode import EpisodeSettings, Watch, run_episodes
+from vlagents_ray.evaluate.episode.records import EpisodeObserver, EpisodeResult
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.policies.scripted import Scripted

@@ -6,6 +6,7 @@ import contextlib
 import socket
 import threading
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 from urllib.parse import urlsplit
@@ -14,7 +15,7 @@ import typer
 
 from vlagents_ray.cli.console import errors, out
 from vlagents_ray.cli.listing import require_packages
-from vlagents_ray.cli.options import Address, Set, parse_settings
+from vlagents_ray.cli.options import Address, Set, command_of, parse_settings
 from vlagents_ray.cli.ray_session import RESTART, exit_if_ray_is_lost, quiet_ray
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.ports import EVERYWHERE, LOOPBACK
@@ -27,48 +28,81 @@ if TYPE_CHECKING:
     from vlagents_ray.serve.config.deployment import ServerArgs
 
 
-def serve_command(
-    source: Annotated[str, typer.Argument(help="A registered policy, 'module:Class', or a deployment file (.yaml).")],
+@dataclass(frozen=True)
+class ServeOptions:
+    """The options of `vlagents-ray serve`."""
+
+    source: Annotated[str, typer.Argument(help="A registered policy, 'module:Class', or a deployment file (.yaml).")]
     host: Annotated[
         str | None, typer.Option(help="0.0.0.0, or an address of this machine; default: the file's, or 127.0.0.1.")
-    ] = None,
-    port: Annotated[int | None, typer.Option(min=1, max=65535, help="Default: the file's, or 8000.")] = None,
-    settings: Set = [],  # noqa: B006 - typer reads it
+    ] = None
+    port: Annotated[int | None, typer.Option(min=1, max=65535, help="Default: the file's, or 8000.")] = None
+    settings: Set = field(default_factory=list)
     serve_set: Annotated[
         list[str], typer.Option("--serve-set", metavar="KEY=VALUE", help="A setting of the server: batch.max_size=8.")
-    ] = [],  # noqa: B006
+    ] = field(default_factory=list)
     vlagents_port: Annotated[
         int | None, typer.Option(min=1, max=65535, help="Also accept clients of the package vlagents, at this port.")
-    ] = None,
-    rerun: Annotated[str | None, typer.Option(metavar="DIR", help="Write .rrd files for Rerun.")] = None,
-    foxglove: Annotated[str | None, typer.Option(metavar="DIR", help="Write .mcap files for Foxglove.")] = None,
-    address: Address = None,
+    ] = None
+    rerun: Annotated[str | None, typer.Option(metavar="DIR", help="Write .rrd files for Rerun.")] = None
+    foxglove: Annotated[str | None, typer.Option(metavar="DIR", help="Write .mcap files for Foxglove.")] = None
+    address: Address = None
     keys: Annotated[
         Path | None, typer.Option(help="File of the API keys; default: VLAGENTS_RAY_KEYS_FILE or VLAGENTS_RAY_KEYS.")
-    ] = None,
-    insecure: Annotated[bool, typer.Option("--insecure", help="Accept every client, without keys.")] = False,
-    plain_http: Annotated[bool, typer.Option("--plain-http", help="No warning of unencrypted keys.")] = False,
-    tls_cert: Annotated[Path | None, typer.Option(help="Certificate in PEM: serve https:// and wss://.")] = None,
-    tls_key: Annotated[Path | None, typer.Option(help="Its key, in PEM.")] = None,
-    tls_client_ca: Annotated[Path | None, typer.Option(help="CA of the certificates of clients, in PEM.")] = None,
-) -> None:
+    ] = None
+    insecure: Annotated[bool, typer.Option("--insecure", help="Accept every client, without keys.")] = False
+    plain_http: Annotated[bool, typer.Option("--plain-http", help="No warning of unencrypted keys.")] = False
+    tls_cert: Annotated[Path | None, typer.Option(help="Certificate in PEM: serve https:// and wss://.")] = None
+    tls_key: Annotated[Path | None, typer.Option(help="Its key, in PEM.")] = None
+    tls_client_ca: Annotated[Path | None, typer.Option(help="CA of the certificates of clients, in PEM.")] = None
+
+    def server_args(self) -> dict[str, Any]:
+        """Return the settings below `args` of the deployment that the options state.
+
+        Raises:
+            ConfigError: An option cannot be parsed, or --serve-set has settings of the policy.
+        """
+        args = parse_settings(self.serve_set, "--serve-set")
+        for name, target in (("rerun", self.rerun), ("foxglove", self.foxglove)):
+            if target is not None:
+                where = target if is_live(name, target) else str(Path(target).resolve())
+                args["viewers"] = {**args.get("viewers", {}), name: where}
+        if "config" in args:
+            raise ConfigError("--serve-set config: the policy's own settings go into --set")
+        config = parse_settings(self.settings, "--set")
+        return {**args, **({"config": config} if config else {})}
+
+    def tls(self) -> Tls | None:
+        """Return the certificates that the options name; raises `ConfigError` if one of the two is missing."""
+        from vlagents_ray.serve.access.tls import Tls
+
+        if self.tls_cert is None and self.tls_key is None and self.tls_client_ca is None:
+            return None
+        if self.tls_cert is None or self.tls_key is None:
+            raise ConfigError("TLS: give both --tls-cert and --tls-key")
+        return Tls(self.tls_cert, self.tls_key, self.tls_client_ca)
+
+
+@command_of(ServeOptions)
+def serve_command(options: ServeOptions) -> None:
     """Serve a policy until Ctrl-C."""
     from vlagents_ray.serve.launch.deployment_file import listens_at, read_deployment, with_dialect, with_gateways_at
     from vlagents_ray.serve.launch.server import running_server
 
     with errors():
-        config = read_deployment(source, _server_args(settings, serve_set, rerun=rerun, foxglove=foxglove))
-        if vlagents_port is not None:
-            config = with_dialect(config, "vlagents", {"port": vlagents_port})
+        address, keys, insecure = options.address, options.keys, options.insecure
+        config = read_deployment(options.source, options.server_args())
+        if options.vlagents_port is not None:
+            config = with_dialect(config, "vlagents", {"port": options.vlagents_port})
         if address is None:
             require_packages(config)
         stated_host, stated_port = listens_at(config)
-        host, port = host or stated_host, port or stated_port
+        host, port = options.host or stated_host, options.port or stated_port
         access: dict[str, Any] = {
             "keys_file": keys,
             "insecure": insecure,
-            "plain_http": plain_http,
-            "tls": _tls(tls_cert, tls_key, tls_client_ca),
+            "plain_http": options.plain_http,
+            "tls": options.tls(),
         }
         with (
             quiet_ray(f"vlagents-ray-serve-{port}", started := threading.Event()) as log,
@@ -128,25 +162,3 @@ def _address(url: str, path: str) -> str:
         return f"{method} {url}{place}"
     parts = urlsplit(url)
     return f"{'wss' if parts.scheme == 'https' else 'ws'}://{parts.netloc}{parts.path}{place}"
-
-
-def _tls(certificate: Path | None, key: Path | None, client_ca: Path | None) -> Tls | None:
-    from vlagents_ray.serve.access.tls import Tls
-
-    if certificate is None and key is None and client_ca is None:
-        return None
-    if certificate is None or key is None:
-        raise ConfigError("TLS: give both --tls-cert and --tls-key")
-    return Tls(certificate, key, client_ca)
-
-
-def _server_args(settings: list[str], serve_set: list[str], **viewers: str | None) -> dict[str, Any]:
-    args = parse_settings(serve_set, "--serve-set")
-    for name, target in viewers.items():
-        if target is not None:
-            where = target if is_live(name, target) else str(Path(target).resolve())
-            args["viewers"] = {**args.get("viewers", {}), name: where}
-    if "config" in args:
-        raise ConfigError("--serve-set config: the policy's own settings go into --set")
-    config = parse_settings(settings, "--set")
-    return {**args, **({"config": config} if config else {})}

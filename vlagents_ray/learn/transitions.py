@@ -9,9 +9,8 @@ import numpy as np
 
 from vlagents_ray.errors import ConfigError, EnvFailed
 from vlagents_ray.evaluate.artifacts.recorder import Artifacts, EpisodeRecorder
-from vlagents_ray.evaluate.episode.records import EpisodeResult
+from vlagents_ray.evaluate.episode.records import EpisodeResult, version_of
 from vlagents_ray.evaluate.episode.second_pass import SecondPass
-from vlagents_ray.evaluate.episode.stats import version_of
 from vlagents_ray.evaluate.plan.config import EpisodeChoice, EvalConfig
 from vlagents_ray.interface import BEHAVIOUR, WANT, Act, Obs
 from vlagents_ray.learn.columns import EXTRA, FINAL, REPLAY, RowMemory, at_rows, constant, tensors, words

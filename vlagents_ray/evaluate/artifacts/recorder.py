@@ -17,10 +17,8 @@ from typing_extensions import Self
 from vlagents_ray.evaluate.artifacts.storage import episode_folder, outcome, stem, whole
 from vlagents_ray.evaluate.artifacts.trajectory import TrajectoryRecorder, save_trajectory
 from vlagents_ray.evaluate.artifacts.video import DEFAULT_FPS, Footage, VideoRecorder, save_videos
-from vlagents_ray.evaluate.episode.episode import EpisodeObserver
-from vlagents_ray.evaluate.episode.records import EpisodeResult
+from vlagents_ray.evaluate.episode.records import EpisodeObserver, EpisodeResult
 from vlagents_ray.evaluate.episode.second_pass import PlayedEpisode, SecondPass
-from vlagents_ray.evaluate.episode.stats import version_of
 from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.evaluate.plan.config import EpisodeChoice, EvalConfig
 from vlagents_ray.evaluate.plan.jobs import Job
@@ -73,10 +71,12 @@ class Recording(EpisodeRecorder):
     def __init__(self, config: EvalConfig, fps: float | None) -> None:
         self._wants_video, self._wants_trajectory = config.video, config.record
         self._video = VideoRecorder(fps, seen=config.record != "none")
-        self._trajectory = TrajectoryRecorder()
-        self._played = PlayedEpisode()
+        self._trajectory, self._played = TrajectoryRecorder(), PlayedEpisode()
         self._views = EpisodeViews(config, fps)
         self._is_viewed = bool(config.rerun or config.foxglove)
+        self._observers: list[EpisodeObserver] = [self._views]
+        self._observers += [self._played] if self.wants_images == "failures" else []
+        self._observers += [self._trajectory] if self._wants_trajectory != "none" else []
 
     @property
     def wants_images(self) -> EpisodeChoice:
@@ -88,23 +88,16 @@ class Recording(EpisodeRecorder):
 
     def add_observation(self, obs: Obs) -> None:
         self._show(obs)
-        self._views.add_observation(obs)
-        if self.wants_images == "failures":
-            self._played.add_observation(obs)
-        if self._wants_trajectory != "none":
-            self._trajectory.add_observation(obs)
+        for observer in self._observers:
+            observer.add_observation(obs)
 
     def add_act(self, act: Act, ticks_waited: int = 0) -> None:
-        self._views.add_act(act)
-        if self._wants_trajectory != "none":
-            self._trajectory.add_version(version_of(act), ticks_waited)
+        for observer in self._observers:
+            observer.add_act(act, ticks_waited)
 
     def add_action(self, action: np.ndarray, reward: float, success: bool) -> None:
-        self._views.add_action(action, reward, success)
-        if self.wants_images == "failures":
-            self._played.add_action(action, reward, success)
-        if self._wants_trajectory != "none":
-            self._trajectory.add_action(action, reward, success)
+        for observer in self._observers:
+            observer.add_action(action, reward, success)
 
     def finish(self, result: EpisodeResult, second_pass: SecondPass) -> Artifacts:
         video, trajectory = _wanted(self._wants_video, result), _wanted(self._wants_trajectory, result)
@@ -143,7 +136,7 @@ def _wanted(which: EpisodeChoice, result: EpisodeResult) -> bool:
     return which == "all" or (which == "failures" and not result.success_once)
 
 
-class EpisodeViews:
+class EpisodeViews(EpisodeObserver):
     """Shows one episode in the viewers that the settings name. Use as a context manager, which closes them."""
 
     def __init__(self, config: EvalConfig, hz: float | None) -> None:
@@ -179,13 +172,11 @@ class EpisodeViews:
             self._seen.append(ViewerFrame.of(obs, self._ticks, time=self._begun + self._ticks * self._period_s))
             self._ticks += 1
 
-    def add_act(self, act: Act) -> None:
-        """Add an answer of the policy to the last observation; row k of its chunk is for k actions later."""
+    def add_act(self, act: Act, ticks_waited: int = 0) -> None:
         if self._viewers:
             self._rows, self._row, self._numbers = np.array(act.rows()), 0, numbers_of(act.info)
 
     def add_action(self, action: np.ndarray, reward: float, success: bool) -> None:
-        """Show the step of an executed action, (D,)."""
         if not self._viewers:
             return
         rows, row = self._rows, self._row

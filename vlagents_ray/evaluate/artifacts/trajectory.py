@@ -22,9 +22,9 @@ from vlagents_ray.evaluate.artifacts.storage import (
     whole,
 )
 from vlagents_ray.evaluate.artifacts.video import Footage
-from vlagents_ray.evaluate.episode.records import EpisodeResult
+from vlagents_ray.evaluate.episode.records import EpisodeObserver, EpisodeResult, version_of
 from vlagents_ray.evaluate.plan.cases import EvalCase
-from vlagents_ray.interface import Obs
+from vlagents_ray.interface import Act, Obs
 from vlagents_ray.naming import distinct
 
 NO_VERSION = -1  # of a policy that names none, and of steps before its first answer in real-time mode
@@ -77,7 +77,7 @@ class Trajectory:
             raise ConfigError(f"{path}: cannot be read as a trajectory ({error})") from error
 
 
-class TrajectoryRecorder:
+class TrajectoryRecorder(EpisodeObserver):
     """Collects the numbers of one episode."""
 
     def __init__(self) -> None:
@@ -102,12 +102,11 @@ class TrajectoryRecorder:
         self._seen.append(state)
         self._grippers.append(obs.gripper)
 
-    def add_version(self, version: int | None, after: int) -> None:
-        """Add the version of the weights that chose the actions which follow `after` further ones; None if unknown."""
-        self._next = after, NO_VERSION if version is None else version
+    def add_act(self, act: Act, ticks_waited: int = 0) -> None:
+        version = version_of(act)
+        self._next = ticks_waited, NO_VERSION if version is None else version
 
     def add_action(self, action: np.ndarray, reward: float, success: bool) -> None:
-        """Add the action, (D,), that was executed after the last observation, with its reward and success."""
         after, version = self._next
         if after == 0:
             self._version = version

@@ -14,8 +14,6 @@ from functools import partial
 from time import perf_counter
 from typing import Any, Literal
 
-import numpy as np
-
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.contract import Contract
 from vlagents_ray.envs.base import BatchEnv, Environment
@@ -29,7 +27,7 @@ from vlagents_ray.evaluate.episode.failures import (
     policy_side,
 )
 from vlagents_ray.evaluate.episode.latency import ChunkExecutor, Tick
-from vlagents_ray.evaluate.episode.records import EpisodeResult
+from vlagents_ray.evaluate.episode.records import EpisodeObserver, EpisodeResult
 from vlagents_ray.evaluate.episode.stats import EpisodeStats
 from vlagents_ray.evaluate.plan.config import ClockConfig
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
@@ -53,22 +51,6 @@ class EpisodeSettings:
     clock: ClockConfig | None = None
     reset_options: Mapping[str, Any] = field(default_factory=dict)  # of each reset of an environment
     policy_options: Mapping[str, Any] = field(default_factory=dict)  # of each reset of the policy
-
-
-class EpisodeObserver:
-    """Is called with what happens in one episode. This one ignores it: override some methods."""
-
-    request_info: Mapping[str, Any] = {}
-    """Added to the `Obs.info` of every request to the policy."""
-
-    def add_observation(self, obs: Obs) -> None:
-        """Add an observation, beginning with that of the reset."""
-
-    def add_act(self, act: Act, ticks_waited: int = 0) -> None:
-        """Add an answer of the policy; some or all rows of its action are executed after `ticks_waited` other ones."""
-
-    def add_action(self, action: np.ndarray, reward: float, success: bool) -> None:
-        """Add an executed action, (D,), with its reward and success; its next observation was added before."""
 
 
 def run_episodes(

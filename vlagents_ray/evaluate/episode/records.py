@@ -1,11 +1,15 @@
-"""The records of an episode and of its worker in the results."""
+"""The records of an episode and of its worker in the results, and what observes an episode."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
+import numpy as np
+
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
+from vlagents_ray.interface import POLICY, Act, Obs
 from vlagents_ray.ray_tools.git_state import GitState
 
 Status = Literal["done", "policy_error", "infra_failed"]
@@ -97,3 +101,26 @@ class WorkerInfo:
     policy: str  # name of the policy in the evaluation
     transport: str
     renderer: str | None  # name by its driver; None if no device draws
+
+
+class EpisodeObserver:
+    """Is called with what happens in one episode. This one ignores it: override some methods."""
+
+    request_info: Mapping[str, Any] = {}
+    """Added to the `Obs.info` of every request to the policy."""
+
+    def add_observation(self, obs: Obs) -> None:
+        """Add an observation, beginning with that of the reset."""
+
+    def add_act(self, act: Act, ticks_waited: int = 0) -> None:
+        """Add an answer of the policy; some or all rows of its action are executed after `ticks_waited` other ones."""
+
+    def add_action(self, action: np.ndarray, reward: float, success: bool) -> None:
+        """Add an executed action, (D,), with its reward and success; its next observation was added before."""
+
+
+def version_of(act: Act) -> int | None:
+    """Return the version of the weights that chose an action; None if the policy names none."""
+    said = act.info.get(POLICY)
+    version = said.get("version") if isinstance(said, Mapping) else None
+    return int(version) if isinstance(version, int | np.integer) else None

@@ -10,8 +10,9 @@ import numpy as np
 
 from vlagents_ray.envs.base import BatchEnv, Options
 from vlagents_ray.errors import VLAgentsError
-from vlagents_ray.evaluate.episode.episode import EpisodeObserver, Watch
+from vlagents_ray.evaluate.episode.episode import Watch
 from vlagents_ray.evaluate.episode.failures import EnvStep, checked_obs, checked_step, env_side
+from vlagents_ray.evaluate.episode.records import EpisodeObserver
 from vlagents_ray.interface import Act, Obs
 
 

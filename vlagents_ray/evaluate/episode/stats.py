@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from time import perf_counter
 from typing import Any
@@ -13,7 +12,7 @@ import numpy as np
 from vlagents_ray.errors import PolicyFailed
 from vlagents_ray.evaluate.episode.failures import EnvStep
 from vlagents_ray.evaluate.episode.latency import Tick
-from vlagents_ray.evaluate.episode.records import Ending, EpisodeResult
+from vlagents_ray.evaluate.episode.records import Ending, EpisodeResult, version_of
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
 from vlagents_ray.interface import POLICY, Act
 
@@ -125,13 +124,6 @@ class EpisodeStats:
             first_policy_version=self.first_policy_version,
             actions_sha256=self.actions.hexdigest(),
         )
-
-
-def version_of(act: Act) -> int | None:
-    """Return the version of the weights that chose an action; None if the policy names none."""
-    said = act.info.get(POLICY)
-    version = said.get("version") if isinstance(said, Mapping) else None
-    return int(version) if isinstance(version, int | np.integer) else None
 
 
 def _quantile(milliseconds: list[float], q: float) -> float | None:

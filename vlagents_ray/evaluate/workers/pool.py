@@ -41,12 +41,10 @@ class WorkerPool(Workers):
     While the head of the cluster does not answer, the existing workers play on, and no others are started.
     """
 
-    def __init__(
-        self, config: EvalConfig, agent_factory: AgentFactory, recorder_factory: RecorderFactory = Recording
-    ) -> None:
+    def __init__(self, config: EvalConfig, agent_factory: AgentFactory, recorders: RecorderFactory = Recording) -> None:
         super().__init__()
         self._config = config
-        self._recorder_factory = recorder_factory
+        self._recorders = recorders
         self._actor_class = ray.remote(concurrency_groups={"watch": 1})(Rollout)
         self._agent_factory = agent_factory
         # from this process's environment, which workers on other nodes do not inherit
@@ -95,7 +93,7 @@ class WorkerPool(Workers):
             "scheduling_strategy": strategy(node),
             "runtime_env": runtime_env(cell),
         }
-        actor = self._actor_class.options(**options).remote(self._config, self._agent_factory, self._recorder_factory)
+        actor = self._actor_class.options(**options).remote(self._config, self._agent_factory, self._recorders)
         starting, now = actor.ready.remote(self._credentials), monotonic()
         self._workers.append(WorkerHandle(cell.worker, cell.kind, actor, starting=starting, started_at=now, node=node))
 

@@ -93,12 +93,10 @@ class Heartbeat:
 class Rollout:
     """Plays jobs. Keeps its agent and its environment until a job needs another."""
 
-    def __init__(
-        self, config: EvalConfig, agent_factory: AgentFactory, recorder_factory: RecorderFactory = Recording
-    ) -> None:
+    def __init__(self, config: EvalConfig, agent_factory: AgentFactory, recorders: RecorderFactory = Recording) -> None:
         self._config = config
         self._agent_factory = agent_factory
-        self._recorder_factory = recorder_factory
+        self._recorders = recorders
         self._agent: Agent | None = None
         self._policy: str | None = None  # the policy of the agent
         self._described: dict[str, Any] = {}  # of an agent without a server: its weights
@@ -167,9 +165,7 @@ class Rollout:
             require_match(agent.contract, env.contract)
             setup.worker = _worker_info(cell.policy.name, agent, env)
         with contextlib.ExitStack() as stack:
-            recordings = [
-                stack.enter_context(self._recorder_factory(self._config, env.contract.control_hz)) for _ in jobs
-            ]
+            recordings = [stack.enter_context(self._recorders(self._config, env.contract.control_hz)) for _ in jobs]
             for job, recording in zip(jobs, recordings, strict=True):
                 recording.begin(job)
             outcomes = self._play(agent, env, jobs, recordings)

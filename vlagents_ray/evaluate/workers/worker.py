@@ -183,11 +183,9 @@ class FailedAttempts:
 class InProcessWorkers(Workers):
     """One worker without Ray, which plays while it is waited for. No time limit can end a simulator that hangs."""
 
-    def __init__(
-        self, config: EvalConfig, agent_factory: AgentFactory, recorder_factory: RecorderFactory = Recording
-    ) -> None:
+    def __init__(self, config: EvalConfig, agent_factory: AgentFactory, recorders: RecorderFactory = Recording) -> None:
         super().__init__()
-        self._make = functools.partial(Rollout, config, agent_factory, recorder_factory)
+        self._make = functools.partial(Rollout, config, agent_factory, recorders)
         self._rollout = self._make()
 
     def __exit__(self, *_: object) -> None:
