@@ -13,8 +13,7 @@ import yaml
 from page_commands import PAGES, commands, read_as_typed
 
 from vlagents_ray.cli.evaluation.command import read_run
-from vlagents_ray.envs import aloha, metaworld, robocasa
-from vlagents_ray.envs import calvin
+from vlagents_ray.envs import aloha, calvin, metaworld, robocasa
 from vlagents_ray.envs.gymnasium.env import known
 from vlagents_ray.envs.robosuite import TASKS
 from vlagents_ray.envs.simulator import BenchmarkProtocol

@@ -16,8 +16,7 @@ from tests.families.lerobot.conftest import FILTERS, Load, Made, begun, view
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import BEHAVIOUR, DISTRIBUTION, SAMPLES, WANT, Act
 from vlagents_ray.policies.base import Row
-from vlagents_ray.policies.lerobot import LeRobot
-from vlagents_ray.policies.lerobot import kinds
+from vlagents_ray.policies.lerobot import LeRobot, kinds
 
 pytestmark = FILTERS
 
