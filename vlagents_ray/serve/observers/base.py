@@ -29,7 +29,7 @@ class Pending(Protocol):
 
     session_id: str  # as the engine names it
     request: Request  # its observation is there in `on_request` only: the engine drops it once the policy has acted
-    files: DecodedFiles  # the files of its images, for `on_request` as well
+    files: DecodedFiles | None  # the files of its images, for `on_request` as well
     kept: dict[Any, Any]  # what observers keep for the answer, by observer; gone with a request that is given up
 
 
@@ -113,7 +113,7 @@ class Observers(Observer):
 class _Pending:
     session_id: str
     request: Request
-    files: DecodedFiles
+    files: DecodedFiles | None
     kept: dict[Any, Any] = field(default_factory=dict)
 
 
