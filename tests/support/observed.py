@@ -12,7 +12,7 @@ from vlagents_ray.serve.engine.observer import Observer
 def observe(
     observer: Observer, session: str, request: Request, reply: Reply, files: DecodedFiles | None = None
 ) -> None:
-    pending = SimpleNamespace(session_id=session, request=request, files=files or {}, kept={})
+    pending = SimpleNamespace(session_id=session, request=request, files=files, kept={})
     observer.on_request(pending)
     request.obs = None  # as the engine does once the policy has acted
     observer.before_answer(pending, reply)

@@ -228,7 +228,7 @@ class LiveObserver(Observer):
         state = {name: np.array(part) for name, part in obs.state.items()}
         if obs.gripper is not None:
             state["gripper"] = np.array([obs.gripper], np.float32)
-        files = pending.files
+        files = pending.files or {}
         sent = {name: bytes(files[id(image)][1]) for name, image in obs.cameras.items() if id(image) in files}
         cameras = {name: image for name, image in obs.cameras.items() if name not in sent}
         kept = KeptObservation(next(self._numbers), now, state, cameras, sent)

@@ -72,11 +72,9 @@ VideoFiles = Callable[[int], Path | None]
 def live_routes(fleet: Fleet, *, open_to_network: bool, videos: VideoFiles | None = None) -> list[BaseRoute]:
     """Return the routes of the live page.
 
-    Args:
-        fleet: Gathers what the page shows.
-        open_to_network: Whether other machines reach this server without a key; watching is then refused, as the
-            pictures of all robots would be public.
-        videos: Finds the videos to which the document of an evaluation refers; None on a policy's server.
+    If the server is `open_to_network`, as other machines reach it without a key, watching is refused: the pictures of
+    all robots would be public. `videos` finds those to which the document of an evaluation refers; None on a policy's
+    server.
     """
     endpoint = _LiveEndpoint(fleet, open_to_network, videos)
     routes: list[BaseRoute] = [
@@ -243,17 +241,10 @@ def require_watch_keys(host: str, keys: Keys | None) -> None:
 def page_server(
     fleet: Fleet, address: tuple[str, int], keys: Keys | None, *, name: str, videos: VideoFiles
 ) -> Iterator[str]:
-    """Serve the live page of an evaluation on a thread for the length of the context.
+    """Serve the live page of an evaluation on a thread for the length of the context, and yield its address.
 
-    Args:
-        fleet: Gathers what the page shows.
-        address: (host, port) to listen on; port 0 is any that is free.
-        keys: The keys of viewers; None admits all, which only loopback allows.
-        name: What the keys call this server, where they are for some applications alone.
-        videos: As for `live_routes`.
-
-    Yields:
-        The address of the page.
+    `address` is (host, port) to listen on; port 0 is any that is free. Without `keys`, which only loopback allows, all
+    are admitted; keys for some applications alone call this one `name`. See `live_routes` for `videos`.
 
     Raises:
         ConfigError: Other machines would reach the page without a key, or the address is not free.

@@ -353,7 +353,7 @@ class Fleet:
         shown = frozenset[str]().union(*(viewer.shown for viewer in self._viewers))
         readers: dict[str, SnapshotReader] = {} if self._others is None else dict(await self._others.views())
         if self._own is not None:
-            readers[""] = partial(asyncio.to_thread, self._own.read)
+            readers[""] = partial(_read_own, self._own)
         results = await asyncio.gather(
             *(read(self._read.get(name, 0), shown) for name, read in readers.items()), return_exceptions=True
         )
@@ -362,6 +362,10 @@ class Fleet:
         if self._own is not None and isinstance(error := results[-1], BaseException):
             raise error
         return list(found.values())
+
+
+async def _read_own(own: ReplicaView, since: int, shown: Collection[str]) -> Snapshot:
+    return await asyncio.to_thread(own.read, since, shown)
 
 
 def _with_files(snapshot: Snapshot, files: list[bytes], shown: Collection[str]) -> dict[str, Any]:
