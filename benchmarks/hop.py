@@ -17,9 +17,8 @@ from vlagents_ray.cli.console import errors, progress, save
 from vlagents_ray.interface import Agent
 from vlagents_ray.policies.noop import Noop
 from vlagents_ray.serve.models.agent_copies import AgentCopies
-from vlagents_ray.serve.python_env.child_agent import ChildAgent
+from vlagents_ray.serve.python_env.child_agent import Child, ChildAgent
 from vlagents_ray.serve.python_env.child_main import Settings
-from vlagents_ray.serve.python_env.child_process import Child
 from vlagents_ray.serve.python_env.probe import probe
 
 IN_PROCESS, CHILD = "in the replica", "child process"

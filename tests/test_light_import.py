@@ -18,7 +18,7 @@ FILES = (
     "errors",
     "interface",
     "naming",
-    "ray_tools/local_servers",
+    "ray_tools/session",
     "ray_tools/private",
     "ray_tools/reaper",
     "registry",

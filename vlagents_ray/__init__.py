@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     )
     from vlagents_ray.images.codecs import ImageCodec
     from vlagents_ray.interface import Act, Agent, Obs
-    from vlagents_ray.ray_tools.local_servers import LocalServer, join
+    from vlagents_ray.ray_tools.session import LocalServer, join
 
 __all__ = [
     "Act",
@@ -59,7 +59,7 @@ __all__ = [
     "join",
 ]
 
-_HOMES = ("errors", "contract", "interface", "images.codecs", "client", "ray_tools.local_servers")
+_HOMES = ("errors", "contract", "interface", "images.codecs", "client", "ray_tools.session")
 
 
 def __getattr__(name: str) -> Any:

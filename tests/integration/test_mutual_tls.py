@@ -13,7 +13,7 @@ from vlagents_ray import ConfigError, Obs, RemoteAgent, Unauthorized
 from vlagents_ray.client.transports.select import TransportName
 from vlagents_ray.serve.access.key_store import new_key
 from vlagents_ray.serve.access.tls import Tls
-from vlagents_ray.serve.launch import private_cluster
+from vlagents_ray.serve.launch import server
 from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.serve.launch.server import running_server
 
@@ -28,14 +28,14 @@ def test_a_client_without_a_certificate_is_refused_where_one_is_wanted(tmp_path:
     config = deployment("noop")
     with running_server(
         config, host="127.0.0.2", num_cpus=2, keys_file=tmp_path / "keys.json", tls=tls, timeout_s=120
-    ) as server:
+    ) as served:
         for way in WAYS:
-            with RemoteAgent(server.url, transport=way, api_key=token, ca=ours.file, certificate=mine) as agent:
+            with RemoteAgent(served.url, transport=way, api_key=token, ca=ours.file, certificate=mine) as agent:
                 agent.reset(Obs(), "x")
                 agent.act(Obs())
             for certificate in (None, foreign):
                 agent = RemoteAgent(
-                    server.url, transport=way, api_key=token, ca=ours.file, certificate=certificate, connect_timeout_s=5
+                    served.url, transport=way, api_key=token, ca=ours.file, certificate=certificate, connect_timeout_s=5
                 )
                 with pytest.raises(ConfigError, match="certificate="), agent:
                     agent.reset(Obs(), "x")
@@ -49,7 +49,7 @@ def test_a_replica_that_others_would_reach_does_not_start_without_keys() -> None
 
     from vlagents_ray.serve.ports import EVERYWHERE, free_port
 
-    with private_cluster.own_ray("127.0.0.1", free_port(), num_cpus=2):
+    with server.own_ray("127.0.0.1", free_port(), num_cpus=2):
         client = serve_start(http_options={"host": EVERYWHERE, "port": free_port(EVERYWHERE)})
         try:
             client.deploy_apps(deployment("noop"))
@@ -64,7 +64,7 @@ def test_a_replica_that_others_would_reach_does_not_start_without_keys() -> None
 def test_without_haproxy_serve_asks_for_keys_and_encrypts_by_itself(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(private_cluster, "haproxy_binary", lambda: None)
+    monkeypatch.setattr(server, "haproxy_binary", lambda: None)
     ca = authority(tmp_path, "ca")
     token = new_key(tmp_path / "keys.json", "arm")
     tls, config = Tls(*ca.sign("server", "IP:127.0.0.2")), deployment("noop")
@@ -74,13 +74,13 @@ def test_without_haproxy_serve_asks_for_keys_and_encrypts_by_itself(
         running_server(config, tls=replace(tls, client_ca=ca.file), **access),  # type: ignore[arg-type]
     ):
         pytest.fail("started")
-    with running_server(config, tls=tls, **access) as server:  # type: ignore[arg-type]
+    with running_server(config, tls=tls, **access) as served:  # type: ignore[arg-type]
         for way in WAYS:
-            with RemoteAgent(server.url, transport=way, api_key=token, ca=ca.file) as agent:
+            with RemoteAgent(served.url, transport=way, api_key=token, ca=ca.file) as agent:
                 agent.reset(Obs(), "x")
                 agent.act(Obs())
             with (
                 pytest.raises(Unauthorized),
-                RemoteAgent(server.url, transport=way, api_key="wrong", ca=ca.file) as agent,
+                RemoteAgent(served.url, transport=way, api_key="wrong", ca=ca.file) as agent,
             ):
                 agent.reset(Obs(), "x")

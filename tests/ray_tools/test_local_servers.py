@@ -11,10 +11,10 @@ import pytest
 from fake_raylet import raylet
 
 from vlagents_ray import ConfigError, join
-from vlagents_ray.ray_tools import local_servers as found_here
-from vlagents_ray.ray_tools.local_servers import LocalServer, announce, local_servers
+from vlagents_ray.ray_tools import session as found_here
 from vlagents_ray.ray_tools.private import use_loopback
 from vlagents_ray.ray_tools.reaper import MARK
+from vlagents_ray.ray_tools.session import LocalServer, announce, local_servers
 
 
 @pytest.fixture(autouse=True)

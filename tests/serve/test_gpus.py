@@ -13,7 +13,7 @@ from ray._private import accelerators
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.ray_tools.private import gpus_here
-from vlagents_ray.serve.launch import readiness, server
+from vlagents_ray.serve.launch import server
 from vlagents_ray.serve.launch.deployment_file import deployment, with_replicas_on
 from vlagents_ray.serve.replica import engine_replica
 
@@ -107,12 +107,12 @@ def test_gpus_are_counted_as_ray_counts_them_less_those_that_are_hidden(monkeypa
 def test_what_a_cluster_is_missing_is_repeated_until_it_is_there(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(readiness, "_REMIND_S", 0.0)
+    monkeypatch.setattr(server, "_REMIND_S", 0.0)
     missing = iter(["a GPU", "a GPU", None])
     states = iter(["DEPLOYING", "DEPLOYING", "DEPLOYING", "RUNNING"])
     serve = SimpleNamespace(status=lambda: SimpleNamespace(applications={"a": SimpleNamespace(status=next(states))}))
-    monkeypatch.setattr(readiness, "_http_reason", lambda _: None)
-    readiness.wait_until_ready(serve, {"a": "url"}, ["a"], float("inf"), lambda: next(missing))
+    monkeypatch.setattr(server, "_http_reason", lambda _: None)
+    server.wait_until_ready(serve, {"a": "url"}, ["a"], float("inf"), lambda: next(missing))
     assert [record.getMessage() for record in caplog.records] == ["waiting: a GPU"] * 2
 
 

@@ -19,7 +19,7 @@ from tests.simulation.clients import Robot, Violation, play
 from tests.simulation.world import Replica, World
 from vlagents_ray.errors import UnknownSession, VLAgentsError
 from vlagents_ray.serve.requests import PendingRequest
-from vlagents_ray.serve.scaling import held_sessions, session_migration
+from vlagents_ray.serve.scaling import session_migration
 from vlagents_ray.serve.sessions import Session
 
 SEEDS = int(os.environ.get("VLAGENTS_SIMULATION_SEEDS", "10000"))
@@ -143,7 +143,7 @@ def test_the_simulation_finds_what_was_wrong_before(
     world: dict[str, Callable[..., Any]], sign: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(session_migration, "EXPORT_S", 3.0)
-    monkeypatch.setattr(held_sessions, "EXPORT_S", 3.0)
+    monkeypatch.setattr(session_migration, "EXPORT_S", 3.0)
     with pytest.raises(Violation, match=sign) as found:
         run_all(2000, **world)
     print(found.value)

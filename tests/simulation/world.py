@@ -25,8 +25,7 @@ from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import Sender
 from vlagents_ray.serve.queue.batch_queue import Taken
-from vlagents_ray.serve.scaling.held_sessions import Peer, PeerEnded
-from vlagents_ray.serve.scaling.session_migration import SessionMigrator
+from vlagents_ray.serve.scaling.session_migration import Peer, PeerEnded, SessionMigrator
 
 LENGTH_S = 60.0  # of a world, at most
 _EPOCH_NS = 1_700_000_000 * 10**9

@@ -34,8 +34,7 @@ from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import Sender
 from vlagents_ray.serve.models.checkpoints import Checkpoints
-from vlagents_ray.serve.scaling.held_sessions import Peer, PeerEnded
-from vlagents_ray.serve.scaling.session_migration import SessionMigrator
+from vlagents_ray.serve.scaling.session_migration import Peer, PeerEnded, SessionMigrator
 
 
 class Replicas:

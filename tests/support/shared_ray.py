@@ -33,7 +33,7 @@ def start() -> None:
     global _running, _port  # noqa: PLW0603 - one for each process
     if _running is not None:
         return
-    from vlagents_ray.serve.launch.private_cluster import own_ray
+    from vlagents_ray.serve.launch.server import own_ray
 
     _port = free_port()
     with contextlib.ExitStack() as stack:
@@ -78,8 +78,7 @@ def shared_server(config: Any) -> Iterator[Any]:
     from vlagents_ray.serve.config.deployment import ServerArgs
     from vlagents_ray.serve.launch.deployment_file import with_gateways_at
     from vlagents_ray.serve.launch.haproxy import wait_for_haproxy
-    from vlagents_ray.serve.launch.readiness import wait_until_ready
-    from vlagents_ray.serve.launch.server import Server, deploy, wait_for_proxies
+    from vlagents_ray.serve.launch.server import Server, deploy, wait_for_proxies, wait_until_ready
 
     assert _running is not None, f"the file has to take the fixture {FIXTURE}"
     config = with_gateways_at(config, LOOPBACK)

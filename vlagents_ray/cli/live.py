@@ -19,7 +19,7 @@ from vlagents_ray.serve.access.api_keys import load_keys
 from vlagents_ray.serve.observers.live_page import page_server, require_watch_keys
 from vlagents_ray.serve.observers.live_view import Fleet
 from vlagents_ray.serve.ports import LOOPBACK, is_free
-from vlagents_ray.serve.scaling.replica_views import ReplicaViews
+from vlagents_ray.serve.scaling.sibling_replicas import ReplicaViews
 
 _PORT = 8050  # of the page, if it is free
 _NAME = "eval"  # of the page, where keys are for some applications alone

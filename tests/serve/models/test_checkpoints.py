@@ -28,7 +28,7 @@ from vlagents_ray.policies.base.checkpoint import find_checkpoint
 from vlagents_ray.policies.base.checkpoint_files import digest
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.models import model_cache
+from vlagents_ray.serve.models import model_manager
 from vlagents_ray.serve.models.checkpoints import Checkpoints
 from vlagents_ray.serve.requests import CheckpointChoice, PendingRequest
 from vlagents_ray.serve.sessions import Session
@@ -183,7 +183,7 @@ def test_ten_checkpoints_have_their_turns_with_room_for_two(
     serving: Callable[..., Engine], library: Library, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Ten clients, each with a checkpoint of its own, that begin one episode after the other for ever."""
-    monkeypatch.setattr(model_cache, "PATIENCE_S", 0.0)
+    monkeypatch.setattr(model_manager, "PATIENCE_S", 0.0)
     engine = serving(steps=True)
     replies: queue.SimpleQueue[tuple[int, Reply]] = queue.SimpleQueue()
 

@@ -32,9 +32,8 @@ from vlagents_ray.errors import (
 from vlagents_ray.policies.loading import loading_report
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.python_env.child_agent import ChildAgent
+from vlagents_ray.serve.python_env.child_agent import Child, ChildAgent
 from vlagents_ray.serve.python_env.child_main import Settings
-from vlagents_ray.serve.python_env.child_process import Child
 from vlagents_ray.serve.queue.call_limits import CallLimits
 from vlagents_ray.serve.weights.versions import ModelWeights
 
@@ -293,7 +292,7 @@ def test_why_a_policy_does_not_load_is_said(policy: str, config: dict[str, Any],
 def test_the_child_ends_with_its_replica_that_is_killed() -> None:
     code = (
         "import sys, time\n"
-        "from vlagents_ray.serve.python_env.child_process import Child\n"
+        "from vlagents_ray.serve.python_env.child_agent import Child\n"
         "from vlagents_ray.serve.python_env.child_main import Settings\n"
         "child = Child(sys.executable, Settings('noop', {}, 1, ''), {}); child.start()\n"
         "print(child._process.pid, flush=True)\n"

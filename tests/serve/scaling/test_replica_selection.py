@@ -14,9 +14,9 @@ from vlagents_ray import Act, Agent, Obs
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.session_transfer import DrainList
 from vlagents_ray.serve.scaling import rebalancer as balancing
-from vlagents_ray.serve.scaling.rebalancer import Rebalancer
-from vlagents_ray.serve.scaling.replica_selection import (
+from vlagents_ray.serve.scaling.rebalancer import (
     ClientLocation,
+    Rebalancer,
     ReplicaLoad,
     choose_connections,
     choose_replica,

@@ -21,8 +21,8 @@ from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import Sender
-from vlagents_ray.serve.scaling import held_sessions, session_migration
-from vlagents_ray.serve.scaling.held_sessions import PEER_METHODS, Peer
+from vlagents_ray.serve.scaling import session_migration
+from vlagents_ray.serve.scaling.session_migration import PEER_METHODS, Peer
 
 
 class Counting(Agent):
@@ -225,7 +225,7 @@ def test_a_session_whose_export_takes_too_long_stays(
 ) -> None:
     served = replicas(2)
     a, b = served.engines
-    monkeypatch.setattr(held_sessions, "EXPORT_S", 0.1)
+    monkeypatch.setattr(session_migration, "EXPORT_S", 0.1)
     monkeypatch.setattr(session_migration, "EXPORT_S", 0.1)
     ask(a, "reset", instruction="episode 1")
     ask(a, "reset", "other")

@@ -10,7 +10,7 @@ from ray.exceptions import ActorDiedError, ActorUnavailableError, RayTaskError
 
 from vlagents_ray.errors import InvalidWeights
 from vlagents_ray.serve.scaling import sibling_replicas
-from vlagents_ray.serve.scaling.held_sessions import PeerEnded, PeerUnreachable
+from vlagents_ray.serve.scaling.session_migration import PeerEnded, PeerUnreachable
 from vlagents_ray.serve.weights.updates import PushOptions
 
 

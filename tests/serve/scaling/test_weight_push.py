@@ -15,7 +15,7 @@ from vlagents_ray.errors import InvalidInput, InvalidWeights, Overloaded, Policy
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.scaling.held_sessions import PeerEnded, PeerUnreachable
+from vlagents_ray.serve.scaling.session_migration import PeerEnded, PeerUnreachable
 from vlagents_ray.serve.scaling.weight_push import OwnWeights, WeightPusher, WeightsReplica
 from vlagents_ray.serve.weights.updates import PushOptions, PushResult
 

@@ -34,6 +34,16 @@ logger = logging.getLogger(__name__)
 
 _FOLDER = re.compile(r"^(video|state|language)\.")
 WAITING = 4  # maximum of waiting requests of one client; a REQ socket sends one at a time
+Envelope = tuple[bytes, ...]  # sender of a message: the connection's id, and the parts between it and the payload
+_ENVELOPE = 8  # maximum number of parts
+_HEARTBEAT_MS = 10_000
+_TICK_MS = 500
+_END_S = 3.0
+_STRANGERS = 64  # maximum number of connections without a valid key
+_STRANGERS_MS = 50  # period at which their bytes are counted
+_STRANGER_S = 30.0  # maximum time until a connection shows a valid key
+_RECEIVED = struct.Struct("<Q")  # `tcpi_bytes_received` in Linux' `struct tcp_info`
+_RECEIVED_AT = 128
 
 
 class GR00TConnection:
@@ -182,18 +192,6 @@ def nested_mapping(mapping: KeyMapping) -> tuple[KeyMapping, bool]:
         action={name.removeprefix("action."): one for name, one in mapping.action.items()},
     )
     return nested, nested.cameras != mapping.cameras or nested.state != mapping.state
-
-
-Envelope = tuple[bytes, ...]  # sender of a message: the connection's id, and the parts between it and the payload
-_ENVELOPE = 8  # maximum number of parts
-_HEARTBEAT_MS = 10_000
-_TICK_MS = 500
-_END_S = 3.0
-_STRANGERS = 64  # maximum number of connections without a valid key
-_STRANGERS_MS = 50  # period at which their bytes are counted
-_STRANGER_S = 30.0  # maximum time until a connection shows a valid key
-_RECEIVED = struct.Struct("<Q")  # `tcpi_bytes_received` in Linux' `struct tcp_info`
-_RECEIVED_AT = 128
 
 
 class GR00TDialectConfig(PortConfig):

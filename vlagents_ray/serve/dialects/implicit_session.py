@@ -10,12 +10,7 @@ from vlagents_ray.contract import Contract
 from vlagents_ray.errors import InvalidObservation, UnknownSession
 from vlagents_ray.interface import Obs
 from vlagents_ray.protocol.frames import Decoded
-from vlagents_ray.protocol.messages import (
-    Op,
-    RankName,
-    Reply,
-    Request,
-)
+from vlagents_ray.protocol.messages import Op, RankName, Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import Sender
 from vlagents_ray.serve.requests import Message

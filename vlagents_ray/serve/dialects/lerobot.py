@@ -42,6 +42,24 @@ logger = logging.getLogger(__name__)
 
 _WAIT_S = 2.0  # time for which a request for actions waits for an observation, as at LeRobot's own server
 _HZ = 30.0  # rate of the actions' time stamps if the policy's contract states none, as at LeRobot's own server
+_UPLOAD_S = 30.0  # maximum time of an observation, from its first part to its last
+_TICK_S = 0.5
+_END_S = 3.0
+_REQUESTS = 4  # maximum number of requests of one client at a time; LeRobot's has two
+_HEARTBEAT_MS = 10_000
+_DETAILS = 500  # maximum number of characters of an error, which gRPC sends in a header of 8 KiB at most
+# HTTP status -> name of gRPC's; the client sends a request again by itself if it is UNAVAILABLE or DEADLINE_EXCEEDED
+_STATUS = {
+    400: "INVALID_ARGUMENT",
+    403: "PERMISSION_DENIED",
+    404: "NOT_FOUND",
+    409: "FAILED_PRECONDITION",
+    413: "RESOURCE_EXHAUSTED",
+    422: "INVALID_ARGUMENT",
+    429: "RESOURCE_EXHAUSTED",
+    503: "UNAVAILABLE",
+    504: "DEADLINE_EXCEEDED",
+}
 
 
 @dataclass(slots=True)
@@ -180,26 +198,6 @@ class LeRobotConnection:
         rows: np.ndarray = self._mapping.rows(act.action, None if contract is None else contract.action)
         hz = (contract and contract.control_hz) or _HZ
         return lerobot.write_chunk(rows[: robot.actions_per_chunk], seen.timestamp, seen.timestep, 1 / hz)
-
-
-_UPLOAD_S = 30.0  # maximum time of an observation, from its first part to its last
-_TICK_S = 0.5
-_END_S = 3.0
-_REQUESTS = 4  # maximum number of requests of one client at a time; LeRobot's has two
-_HEARTBEAT_MS = 10_000
-_DETAILS = 500  # maximum number of characters of an error, which gRPC sends in a header of 8 KiB at most
-# HTTP status -> name of gRPC's; the client sends a request again by itself if it is UNAVAILABLE or DEADLINE_EXCEEDED
-_STATUS = {
-    400: "INVALID_ARGUMENT",
-    403: "PERMISSION_DENIED",
-    404: "NOT_FOUND",
-    409: "FAILED_PRECONDITION",
-    413: "RESOURCE_EXHAUSTED",
-    422: "INVALID_ARGUMENT",
-    429: "RESOURCE_EXHAUSTED",
-    503: "UNAVAILABLE",
-    504: "DEADLINE_EXCEEDED",
-}
 
 
 class LeRobotDialectConfig(KeylessPortConfig):

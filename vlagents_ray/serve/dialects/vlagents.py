@@ -42,6 +42,11 @@ logger = logging.getLogger(__name__)
 _FRAME_S = 30.0  # maximum time of a message, from its first byte to its last
 _SEND_S = 10.0  # maximum time for a client to accept a reply
 _METHODS = ("act", "reset", "name", "is_initialized", "git_status")
+_FOLDER = "/dev/shm"  # noqa: S108 - the folder of Linux for shared memory
+# The names that Python's `SharedMemory` generates; clients may name no other file in the folder.
+_NAME = re.compile(r"/?(psm_[0-9a-f]{1,32})")
+_KEPT = 64
+_END_S = 3.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -271,12 +276,6 @@ def shut_down(connection: socket.socket) -> None:
 # them.
 
 
-_FOLDER = "/dev/shm"  # noqa: S108 - the folder of Linux for shared memory
-# The names that Python's `SharedMemory` generates; clients may name no other file in the folder.
-_NAME = re.compile(r"/?(psm_[0-9a-f]{1,32})")
-_KEPT = 64
-
-
 class SharedMemory:
     """The segments of one client, kept open between its requests."""
 
@@ -327,9 +326,6 @@ class SharedMemory:
             os.close(self._open.pop(next(iter(self._open))))
         self._open[match[1]] = descriptor
         return descriptor
-
-
-_END_S = 3.0
 
 
 class GripperArgs(BaseModel):

@@ -13,8 +13,7 @@ from vlagents_ray.errors import PolicyFailed, UnknownSession, VLAgentsError
 from vlagents_ray.protocol.messages import Reply
 from vlagents_ray.serve.engine.responses import require_serializable, timing
 from vlagents_ray.serve.models.loaded_model import LoadedModel
-from vlagents_ray.serve.models.model_cache import too_late
-from vlagents_ray.serve.models.model_manager import ModelManager
+from vlagents_ray.serve.models.model_manager import ModelManager, too_late
 from vlagents_ray.serve.queue.batch_queue import BatchQueue
 from vlagents_ray.serve.requests import Opening, PendingRequest
 from vlagents_ray.serve.sessions import Session, SessionFinder, SessionTable

@@ -10,8 +10,11 @@ import contextlib
 import functools
 import logging
 import os
+import ssl
 import time
-from collections.abc import Callable, Iterator, Mapping
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,7 +22,6 @@ from typing import Any
 from ray.serve.schema import ServeDeploySchema
 
 from vlagents_ray.errors import ConfigError, PolicyUnavailable
-from vlagents_ray.ray_tools.local_servers import announce
 from vlagents_ray.ray_tools.private import (
     build_app,
     end_controller,
@@ -30,24 +32,37 @@ from vlagents_ray.ray_tools.private import (
     proxies_now,
     proxy_timeout_s,
     start_serve,
+    use_loopback,
 )
-from vlagents_ray.ray_tools.session import joined, unless_lost
+from vlagents_ray.ray_tools.reaper import MARK
+from vlagents_ray.ray_tools.session import FILES, announce, joined, ray_folder, start_ray, unless_lost
 from vlagents_ray.serve.access.api_keys import require_access, warn_of_plain_http
 from vlagents_ray.serve.access.tls import Tls
 from vlagents_ray.serve.config.deployment import AccessArgs, ServerArgs
 from vlagents_ray.serve.launch.deployment_file import IMPORT_PATH, gpus_of_candidate, with_gateways_at, with_replicas_on
-from vlagents_ray.serve.launch.haproxy import PublicListener, wait_for_haproxy
-from vlagents_ray.serve.launch.private_cluster import own_ray
-from vlagents_ray.serve.launch.readiness import wait_until_ready
-from vlagents_ray.serve.ports import EVERYWHERE, LOOPBACK, free_port, keep
-
-# Serve as the process sees it that started it: its proxies, and its end.
-
+from vlagents_ray.serve.launch.haproxy import (
+    NO_INGRESS,
+    PublicListener,
+    haproxy_binary,
+    ingress_environment,
+    wait_for_haproxy,
+)
+from vlagents_ray.serve.ports import EVERYWHERE, HOST, LOOPBACK, free_port, is_free, keep
 
 log = logging.getLogger(__name__)
 
 _SHUTDOWN_S = 30.0
 _LOOK_S = 0.2  # between two looks at the proxies that Serve has
+_START_S, _GROW_S = 600.0, 3600.0  # time for a policy to get ready: here; on a cluster that may add a machine first
+_END_S = 0.1  # period at which a replica that ends checks for remaining requests; Serve's own is 2 s
+# Keys of a deployment file, and of an application in it, that Serve does not have to apply.
+_OUR_KEYS = {"applications", "http_options", "proxy_location"}
+_OUR_APP_KEYS = {"name", "route_prefix", "import_path", "args"}
+_MODE = "RAY_AUTH_MODE"
+# If this variable is "0", Ray does not take this machine for a part of a cluster and uses the loopback address as the
+# node's own, so that all its ports are there. (Ray replaces the address given as `_node_ip_address` by another one.)
+_ALONE = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
+_REMIND_S = 30.0
 
 
 def wait_for_proxies(proxies: list[Any], look_again: Callable[[], list[Any]]) -> None:
@@ -100,12 +115,6 @@ def shut_down(client: Any) -> None:
 
 
 __all__ = ["Server", "deploy", "free_port", "running_server", "spread_over_gpus"]
-
-_START_S, _GROW_S = 600.0, 3600.0  # time for a policy to get ready: here; on a cluster that may add a machine first
-_END_S = 0.1  # period at which a replica that ends checks for remaining requests; Serve's own is 2 s
-# Keys of a deployment file, and of an application in it, that Serve does not have to apply.
-_OUR_KEYS = {"applications", "http_options", "proxy_location"}
-_OUR_APP_KEYS = {"name", "route_prefix", "import_path", "args"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -343,3 +352,201 @@ def _internal_url(http: Mapping[str, Any]) -> str:
     """Return Serve's own URL, for a process on its node."""
     scheme = "https" if http.get("ssl_certfile") else "http"
     return f"{scheme}://{LOOPBACK if http['host'] == EVERYWHERE else http['host']}:{http['port']}"
+
+
+@contextlib.contextmanager
+def own_ray(
+    host: str,
+    port: int,
+    *,
+    tls: Tls | None = None,
+    num_cpus: int | None = None,
+    show_logs: bool = False,
+    ingress: bool = True,
+) -> Iterator[PublicListener | None]:
+    """Run a private Ray for the length of the context.
+
+    Args:
+        host: The address at which the server listens.
+        port: The port at which the server listens.
+        tls: The certificate of the server; None for unencrypted HTTP.
+        num_cpus: CPUs that Ray may use; None for all.
+        show_logs: Whether the logs of Ray's workers are shown.
+        ingress: Whether the server listens for HTTP at all.
+
+    Yields:
+        HAProxy's listener for clients; None if Serve listens itself.
+
+    Raises:
+        ConfigError: The port is taken, or the environment excludes Ray's token or HAProxy's settings.
+    """
+    import ray
+
+    if os.environ.get(_MODE, "token").lower() != "token":
+        raise ConfigError(
+            f"{_MODE}={os.environ[_MODE]}: a port of each replica, which runs whatever it is sent, would be open to "
+            f"other machines without Ray's token; unset it"
+        )
+    if not is_free(host, port):
+        raise ConfigError(f"cannot listen on {host}:{port}: it is taken; choose another --port or --host")
+    keep(port)
+    with ray_folder() as folder, contextlib.ExitStack() as stack:
+        # Ray starts its workers with a low priority, so that a policy would wait for all other processes.
+        # Proxies start while policies load: on a slow machine Serve would replace them after three times its 5 s.
+        environment = {"RAY_worker_niceness": "0", "RAY_SERVE_PROXY_READY_CHECK_TIMEOUT_S": "60"}
+        # The address at which replicas listen for WebSockets: loopback if the network may see nothing but TLS.
+        ours = {MARK: str(folder), _ALONE: "0", HOST: host if tls is None else LOOPBACK}
+        listener = None
+        if not ingress:
+            ours |= NO_INGRESS
+        elif (binary := haproxy_binary()) is not None:
+            listener = _public_listener(folder, host, port, tls)
+            settings = ingress_environment(folder, binary, listener)
+            # HAProxy's files and admin socket are in the folder, whatever the user has set for clusters.
+            ours |= {key: value for key, value in settings.items() if value.startswith(str(folder))}
+            environment |= settings
+        stack.enter_context(_environment(environment, ours))
+        stack.enter_context(_alone())
+        if listener is not None:
+            listener.require()
+        start_ray(
+            num_cpus=num_cpus,
+            include_dashboard=False,
+            log_to_driver=show_logs,
+            logging_level="WARNING",
+            _temp_dir=str(folder / FILES),
+        )
+        stack.push(unless_lost(ray.shutdown))
+        yield listener
+
+
+def _public_listener(folder: Path, host: str, port: int, tls: Tls | None) -> PublicListener | None:
+    if tls is None and host in (LOOPBACK, "localhost"):
+        return None
+    return PublicListener(
+        host,
+        port,
+        free_port(),
+        None if tls is None else tls.bundle(folder),
+        None if tls is None or tls.client_ca is None else tls.client_ca.absolute(),
+    )
+
+
+@contextlib.contextmanager
+def _alone() -> Iterator[None]:
+    """Apply `_ALONE` in this process, too, which read the variable when it imported Ray."""
+    before = use_loopback(True)
+    try:
+        yield
+    finally:
+        use_loopback(before)
+
+
+@contextlib.contextmanager
+def _environment(values: Mapping[str, str], ours: Mapping[str, str]) -> Iterator[None]:
+    """Set variables for processes started inside the context; the user's values stay, unless they are in `ours`.
+
+    A process that was started by another server's process has inherited that server's files and ports: those are
+    replaced.
+    """
+    inherited = MARK in os.environ
+    new = {key: value for key, value in values.items() if inherited or key not in os.environ} | dict(ours)
+    before = {key: os.environ.get(key) for key in new}
+    os.environ.update(new)
+    try:
+        yield
+    finally:
+        for key, value in before.items():
+            if value is None:
+                os.environ.pop(key, None)
+            else:
+                os.environ[key] = value
+
+
+def wait_until_ready(
+    serve: Any,
+    apps: Mapping[str, str | None],
+    ours: Collection[str],
+    deadline: float,
+    missing: Callable[[], str | None] = lambda: None,
+) -> None:
+    """Wait until each application runs and responds.
+
+    Args:
+        serve: The module `ray.serve`.
+        apps: The URL of each application; one without a URL is called through a Serve handle.
+        ours: The applications of this package, which report why their policy is not ready yet.
+        deadline: End of the waiting, s, of `time.monotonic()`.
+        missing: Describes the resources that the cluster lacks; logged at once, and again every 30 s.
+
+    Raises:
+        ConfigError: An application failed to deploy, or a policy to load.
+        PolicyUnavailable: The deadline has passed.
+    """
+    remind_at = 0.0
+    while True:
+        status = serve.status().applications
+        for name in apps:
+            app = status.get(name)
+            if app is not None and app.status in ("DEPLOY_FAILED", "UNHEALTHY"):
+                raise ConfigError(f"application {name!r} failed to deploy: {_reason(app)}")
+        if all(name in status and status[name].status == "RUNNING" for name in apps):
+            break
+        if time.monotonic() > deadline:
+            states = {n: str(status[n].status) for n in apps if n in status}
+            raise PolicyUnavailable("; ".join(filter(None, [f"not running in time: {states}", missing()])))
+        if time.monotonic() >= remind_at:
+            remind_at = time.monotonic() + _REMIND_S
+            if (what := missing()) is not None:
+                log.warning("waiting: %s", what)
+        time.sleep(0.1)
+    for name, url in apps.items():
+        while (refusal := _unready_reason(serve, name, url, ours)) is not None:
+            if "did not load" in refusal:
+                raise ConfigError(f"application {name!r}: {refusal}")
+            if time.monotonic() > deadline:
+                raise PolicyUnavailable(f"application {name!r} is not ready: {refusal}")
+            time.sleep(0.05)
+
+
+def _unready_reason(serve: Any, app: str, url: str | None, ours: Collection[str]) -> str | None:
+    """Return the reason why the application is not ready; None if it is.
+
+    The reason comes from a replica, since over HTTP it is reported only to clients with a key.
+    """
+    refusal = None if url is None else _http_reason(url)
+    if app not in ours or (url is not None and refusal is None):
+        return refusal
+    return _replica_reason(serve, app) or refusal
+
+
+def _http_reason(url: str) -> str | None:
+    """Return the reason why `/healthz` does not reply with 200; None if it does."""
+    unverified = ssl._create_unverified_context() if url.startswith("https") else None  # noqa: S323 - our own server
+    try:
+        with urllib.request.urlopen(f"{url}/healthz", timeout=5, context=unverified):  # noqa: S310 - our own URL
+            return None
+    except urllib.error.HTTPError as error:
+        error.close()
+        return f"HTTP {error.code}"
+    except OSError as error:
+        return str(error)
+
+
+def _replica_reason(serve: Any, app: str) -> str | None:
+    """Return the reason why the policy cannot act yet, as its replica reports it; None if it can act."""
+    from ray.exceptions import RayError
+    from ray.serve.exceptions import RayServeException
+
+    try:
+        refusal: str | None = serve.get_app_handle(app).refusal.remote().result(timeout_s=5)
+    except (RayError, RayServeException, TimeoutError) as error:
+        return str(error) or type(error).__name__
+    return refusal
+
+
+def _reason(app: Any) -> str:
+    """Return the last line of Serve's message about a failure, which is the error below its traceback."""
+    texts = [app.message, *(d.message for d in app.deployments.values())]
+    lines = [line.strip() for text in texts for line in (text or "").splitlines() if line.strip()]
+    return lines[-1] if lines else "Serve gives no reason"

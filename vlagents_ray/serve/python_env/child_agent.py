@@ -2,18 +2,215 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import json
+import os
+import queue
+import subprocess
+import sys
+import threading
+from collections import deque
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import Any, ClassVar
 
+from vlagents_ray.client.transports.shm import ShmTransport
 from vlagents_ray.contract import Contract
-from vlagents_ray.errors import NotTrainable, PolicyFailed
+from vlagents_ray.errors import (
+    ConfigError,
+    ConnectionLost,
+    NotTrainable,
+    PolicyFailed,
+    PolicyUnavailable,
+    VLAgentsError,
+)
 from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.policies.loading import report_device, report_progress, report_uncompiled
 from vlagents_ray.policies.wrapper import build_agent
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.config.deployment import ServerArgs
+from vlagents_ray.serve.python_env import child_main
 from vlagents_ray.serve.python_env.child_main import Settings
-from vlagents_ray.serve.python_env.child_process import Child
+
+_FOREVER_S = 1e6  # no limit here: as for any policy, a replica whose call takes too long is replaced
+_CONNECT_S = 10.0
+_CLOSE_S = 10.0
+_EXIT_S = 2.0
+_LAST_WORDS = 20  # last lines of the child's error output that an error quotes
+
+
+class Child:
+    """A child process, which ends with this process, however that ends.
+
+    `call` and the methods below it may be called from any thread.
+    """
+
+    def __init__(self, python: str, settings: Settings, env_vars: Mapping[str, str]) -> None:
+        self.contract: Contract | None = None  # contract of the policy, set by `start`
+        self.weights: dict[str, Any] | None = None  # identity of the weights, set by `start`
+        self.continues_plans = False  # whether the policy's chunks go on from a plan, set by `start`
+        self.sessions: set[str] = set()  # names of the sessions in the child
+        self._python = python
+        self._settings = settings
+        self._env_vars = env_vars
+        self._process: subprocess.Popen[bytes] | None = None
+        self._spawned: queue.SimpleQueue[subprocess.Popen[bytes] | OSError] = queue.SimpleQueue()
+        self._last_words: deque[str] = deque(maxlen=_LAST_WORDS)
+        self._transport: ShmTransport | None = None
+        self._lock = threading.Lock()
+        self._requests = itertools.count(1)
+        self._names = itertools.count(1)
+        self._free: deque[str] = deque()
+        self._left: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+        self._closed = False
+
+    def start(self) -> None:
+        """Start the process, and return when the policy is loaded.
+
+        Raises:
+            ConfigError: The interpreter cannot be started.
+            PolicyFailed: The policy did not load.
+        """
+        # The kernel kills the child when the thread that started it ends: this thread ends after the child.
+        keeper = threading.Thread(target=self._keep, name="policy-process", daemon=True)
+        keeper.start()
+        spawned = self._spawned.get()
+        if isinstance(spawned, OSError):
+            raise ConfigError(f"environment.python: {self._python!r} cannot be started here ({spawned})") from spawned
+        self._process = spawned
+        try:
+            said = self._introduced(spawned, keeper)
+            self._transport = ShmTransport(said["local"])
+            self._transport.connect(_CONNECT_S)
+        except BaseException:
+            self.close()
+            raise
+        self.contract = None if said["contract"] is None else Contract.from_json(said["contract"])
+        self.weights, self.continues_plans = said["weights"], said["continues_plans"]
+        threading.Thread(target=self._close_sessions, name="policy-process-sessions", daemon=True).start()
+
+    def call(self, requests: Sequence[Request]) -> list[Reply]:
+        """Send requests in one message and return their replies; raise `ConnectionLost` if the process has ended."""
+        if self._transport is None:
+            raise PolicyUnavailable("the policy's process has not started")
+        for request in requests:
+            request.request_id = f"{next(self._requests):x}"
+        with self._lock:
+            try:
+                replies = self._transport.call(requests, _FOREVER_S)
+            except PolicyUnavailable as error:
+                raise ConnectionLost(f"{self._ended()}; the replica is being replaced") from error
+        if len(replies) != len(requests):  # a single reply to the message as a whole
+            raise replies[0].error or PolicyFailed(f"got {len(replies)} replies to {len(requests)} requests")
+        return replies
+
+    def open_session(self) -> str:
+        """Return a name for a new session; names are reused, since each takes memory until the connection ends."""
+        try:
+            name = self._free.popleft()
+        except IndexError:
+            name = f"{next(self._names):x}"
+        self.sessions.add(name)
+        return name
+
+    def close_session(self, name: str) -> None:
+        """Have a session closed soon; return at once, as the garbage collector may call this at any moment."""
+        self._left.put(name)
+
+    def require_alive(self) -> None:
+        """Raise `PolicyUnavailable` if the process has ended."""
+        if self._process is None or self._process.poll() is not None:
+            raise PolicyUnavailable(self._ended())
+
+    def close(self) -> None:
+        """Have the policy closed, and end the process."""
+        process = self._process
+        if process is None or self._closed:
+            return
+        self._closed = True
+        self._left.put(None)
+        _write(process, b"\n")
+        try:
+            process.wait(_CLOSE_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+        with self._lock:
+            if self._transport is not None:
+                self._transport.close()
+        for pipe in (process.stdin, process.stdout):
+            if pipe is not None:
+                with contextlib.suppress(BrokenPipeError):
+                    pipe.close()
+
+    def _introduced(self, process: subprocess.Popen[bytes], keeper: threading.Thread) -> dict[str, Any]:
+        """Return the document that the process sends once its policy is loaded; raise `PolicyFailed` if it did not."""
+        _write(process, json.dumps(asdict(self._settings)).encode() + b"\n")
+        while True:
+            line = b"" if process.stdout is None else process.stdout.readline()
+            if not line:
+                keeper.join(_EXIT_S)
+                raise PolicyFailed(f"{self._ended()}; it said:\n{''.join(self._last_words).strip()}")
+            said: dict[str, Any] = json.loads(line)
+            if "step" not in said:
+                break
+            report_progress(said["step"])
+        if "error" in said:
+            raise PolicyFailed(f"in {self._python}: {said['error']}")
+        for what in said["uncompiled"]:
+            report_uncompiled(what)
+        for device in said["devices"]:
+            report_device(device)
+        return said
+
+    def _keep(self) -> None:
+        """Start the process, copy its error output to that of this process, and wait until it ends."""
+        try:
+            process = subprocess.Popen(  # noqa: S603 - the deployment's own interpreter
+                [self._python, "-m", child_main.__name__],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                env={**os.environ, **self._env_vars},
+            )
+        except OSError as error:
+            self._spawned.put(error)
+            return
+        self._spawned.put(process)
+        if process.stderr is not None:
+            with process.stderr as stream:
+                for line in stream:
+                    text = line.decode(errors="replace")
+                    self._last_words.append(text)
+                    sys.stderr.write(text)
+        process.wait()
+
+    def _close_sessions(self) -> None:
+        while (name := self._left.get()) is not None:
+            try:
+                self.call([Request("close", session=name)])
+            except VLAgentsError:  # the process has ended, and its sessions with it
+                return
+            self.sessions.discard(name)
+            self._free.append(name)
+
+    def _ended(self) -> str:
+        """Return a sentence about the end of the process; its exit status is known shortly after its sockets close."""
+        if self._process is None:
+            return "the policy's process has not started"
+        try:
+            return f"the policy's process ended with exit status {self._process.wait(_EXIT_S)}"
+        except subprocess.TimeoutExpired:
+            return "the policy's process closed the connection"
+
+
+def _write(process: subprocess.Popen[bytes], data: bytes) -> None:
+    """Write to the process's standard input; a process that has ended is detected elsewhere."""
+    if process.stdin is not None:
+        with contextlib.suppress(BrokenPipeError):
+            process.stdin.write(data)
+            process.stdin.flush()
 
 
 def make_agent(args: ServerArgs, config: Mapping[str, Any]) -> Agent:

@@ -47,12 +47,9 @@ from vlagents_ray.serve.replica.candidate import CandidateLink
 from vlagents_ray.serve.replica.engine_replica import ReplicaEngine
 from vlagents_ray.serve.replica.metrics import Exporter, tags_of
 from vlagents_ray.serve.scaling.autoscaling import SESSIONS, UTILISATION, WAITING
-from vlagents_ray.serve.scaling.held_sessions import PEER_METHODS
-from vlagents_ray.serve.scaling.rebalancer import Rebalancer
-from vlagents_ray.serve.scaling.replica_selection import ClientLocation, ReplicaLoad
-from vlagents_ray.serve.scaling.replica_views import ReplicaViews
-from vlagents_ray.serve.scaling.session_migration import SessionMigrator
-from vlagents_ray.serve.scaling.sibling_replicas import SiblingApi, SiblingReplicas
+from vlagents_ray.serve.scaling.rebalancer import ClientLocation, Rebalancer, ReplicaLoad
+from vlagents_ray.serve.scaling.session_migration import PEER_METHODS, SessionMigrator
+from vlagents_ray.serve.scaling.sibling_replicas import ReplicaViews, SiblingApi, SiblingReplicas
 from vlagents_ray.serve.scaling.weight_push import OwnWeights, Values, WeightPusher, WeightsReplica
 from vlagents_ray.serve.weights.updates import HeldVersion, NewestVersion, PushOptions, PushResult
 from vlagents_ray.weights.safetensors import ValueSpec

@@ -6,6 +6,7 @@ import asyncio
 import logging
 import time
 from collections.abc import Awaitable, Callable, Collection, Iterator
+from functools import partial
 from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar
 
 import ray
@@ -13,9 +14,10 @@ from ray import serve
 
 from vlagents_ray.client.transports.serve_handle import call_replica
 from vlagents_ray.errors import VLAgentsError
-from vlagents_ray.serve.observers.live_view import Snapshot
-from vlagents_ray.serve.scaling.held_sessions import HeldSessions, Peer, PeerEnded, PeerUnreachable
-from vlagents_ray.serve.scaling.replica_selection import ReplicaLoad
+from vlagents_ray.serve.config.deployment import POLICY
+from vlagents_ray.serve.observers.live_view import OtherReplicas, Snapshot, SnapshotReader
+from vlagents_ray.serve.scaling.rebalancer import ReplicaLoad
+from vlagents_ray.serve.scaling.session_migration import HeldSessions, Peer, PeerEnded, PeerUnreachable
 from vlagents_ray.serve.scaling.weight_push import Values, WeightsReplica
 from vlagents_ray.serve.weights.updates import HeldVersion, NewestVersion, PushOptions
 
@@ -29,6 +31,9 @@ _ANSWER_S = 3.0  # default time limit for an answer; a replica that still loads 
 _TRANSFER_S = 600.0  # time limit for an answer that weights are sent with
 _QUICK_S = 0.3  # time limit for an answer while a client waits to connect
 _SILENT_S = 3.0  # time for which a replica that did not answer is not asked for its load again
+_VIEW_ANSWER_S = 0.3  # time limit for an answer; a replica that is late is asked again
+_PRESS_S = 3.0  # time limit for the answer to a command, which is not repeated
+_VIEW_S = 2.0  # time for which the replicas that were found are not looked up again
 
 
 class SiblingApi(Protocol):
@@ -172,3 +177,55 @@ def _result(reference: Any, timeout_s: float = _ANSWER_S) -> Any:
     except (ray.exceptions.RayError, TimeoutError) as error:
         logger.info("another replica does not answer: %s", error)
         return None
+
+
+class ReplicaViews(OtherReplicas):
+    """Reads the snapshots of the replicas of applications in the Ray cluster that this process is connected to."""
+
+    def __init__(self, apps: Collection[str], but: str = "") -> None:
+        """Read those of the replicas of `apps`, apart from the replica whose full name is `but`."""
+        self._apps = apps
+        self._but = but
+        self._views: dict[str, SnapshotReader] = {}  # found last
+        self._found = float("-inf")
+
+    async def views(self) -> dict[str, SnapshotReader]:
+        """Return the reader of the snapshots of each, by name."""
+        if time.monotonic() - self._found > _VIEW_S:
+            self._found = time.monotonic()
+            actors = await asyncio.to_thread(self._look_up)
+            self._views = {name: partial(_view, actor) for name, actor in actors.items()}
+        return self._views
+
+    async def press(self, session: str, do: str, by: str) -> dict[str, Any] | None:
+        """Give a command to a session of one of them, see `CommandBoard.press`; None if none has the session.
+
+        Raises:
+            VLAgentsError: The replica that has the session refused the command.
+        """
+        actors = await asyncio.to_thread(self._look_up)
+        asked = [
+            asyncio.wait_for(call_replica(actor, SiblingApi.press, session, do, by), _PRESS_S)
+            for actor in actors.values()
+        ]
+        for answer in asyncio.as_completed(asked):
+            try:
+                pressed: dict[str, Any] | None = await answer
+            except (ray.exceptions.RayError, TimeoutError, asyncio.TimeoutError) as error:
+                cause = getattr(error, "cause", None)  # what the replica itself raised
+                if isinstance(cause, VLAgentsError):
+                    raise cause from error
+                logger.info("another replica does not answer: %s", error)
+                continue
+            if pressed is not None:
+                return pressed
+        return None
+
+    def _look_up(self) -> dict[str, Any]:
+        actors = [found for app in self._apps for found in replica_actors(app, POLICY)]
+        return {name: actor for name, actor in actors if name != self._but}
+
+
+async def _view(actor: Any, since: int, shown: Collection[str]) -> Snapshot:
+    snapshot: Snapshot = await asyncio.wait_for(call_replica(actor, SiblingApi.live, since, shown), _VIEW_ANSWER_S)
+    return snapshot

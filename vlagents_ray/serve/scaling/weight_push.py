@@ -15,7 +15,7 @@ from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from typing import Any, Protocol, TypeVar
 
 from vlagents_ray.errors import InvalidInput, InvalidWeights, PolicyUnavailable, VLAgentsError
-from vlagents_ray.serve.scaling.held_sessions import PeerEnded, PeerUnreachable
+from vlagents_ray.serve.scaling.session_migration import PeerEnded, PeerUnreachable
 from vlagents_ray.serve.weights.updates import HeldVersion, NewestVersion, PushOptions, PushResult, WeightUpdates
 from vlagents_ray.weights.shared_values import NotShared, SharedValues, opened
 
