@@ -32,6 +32,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_skeleton_passes_its_own_test(kind: str, folder: Path) -> None:
     assert new(kind, "my_own")[0] == 0

@@ -157,6 +157,7 @@ def haproxy_files(home: Path, times: int = 1) -> dict[str, Path]:
     return {name: Path(value) for name, value in said.items() if value.startswith("/")}
 
 
+@pytest.mark.slow
 def test_no_other_user_reaches_the_socket_that_commands_haproxy(tmp_path: Path) -> None:
     """Not in a folder that somebody has made before, nor through a link."""
     own = ingress_environment(tmp_path, "/bin/true")

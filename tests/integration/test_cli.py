@@ -18,9 +18,10 @@ from eval_fakes import wait_for
 from ray_processes import end, processes, ray_folder, wait_for_end
 from typer.testing import CliRunner
 
-from tests.integration.conftest import serving
 from vlagents_ray.cli.main import app
 from vlagents_ray.evaluate import Results
+from vlagents_ray.serve.launch.deployment_file import deployment
+from vlagents_ray.serve.launch.server import running_server
 
 COMMAND = str(Path(sys.executable).parent / "vlagents-ray")
 
@@ -85,7 +86,7 @@ def test_maniskill_is_solved_whatever_the_number_of_workers(ray_home: Path, tmp_
 
 def test_kill_dash_nine_and_resume_leave_each_episode_once(ray_home: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    words = ["tabletop", "--policy", "scripted", "--episodes", "80", "--workers", "2", "--video", "none"]
+    words = ["tabletop", "--policy", "scripted", "--episodes", "40", "--workers", "2", "--video", "none"]
     words += ["--out", str(out)]
     with subprocess.Popen(
         [COMMAND, "eval", *words], env=os.environ | {"RAY_TMPDIR": str(ray_home)},
@@ -96,19 +97,19 @@ def test_kill_dash_nine_and_resume_leave_each_episode_once(ray_home: Path, tmp_p
     wait_for_end(ray_home, "Rollout", "bin/haproxy")
     end(ray_home)
     before = rows(out)
-    assert 5 <= len(before) < 80
+    assert 5 <= len(before) < 40
     refused = evaluate(ray_home, *words)
     assert refused.returncode == 2
     assert "--resume" in refused.stderr
     done = evaluate(ray_home, *words, "--resume")
     assert done.returncode == 0, done.stderr
     after = rows(out)
-    assert [row[1] for row in after] == list(range(80))
+    assert [row[1] for row in after] == list(range(40))
     assert set(before) <= set(after)
 
 
-def test_a_running_server_is_evaluated_by_its_url(shared_ray: None, ray_home: Path, tmp_path: Path) -> None:
-    with serving("scripted") as server:
+def test_a_running_server_is_evaluated_by_its_url(ray_home: Path, tmp_path: Path) -> None:
+    with running_server(deployment("scripted"), num_cpus=4) as server:
         done = evaluate(
             ray_home,
             "tabletop",

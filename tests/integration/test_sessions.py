@@ -40,7 +40,7 @@ def obs(pixel: int, value: int = 0) -> Obs:
 
 
 @pytest.mark.parametrize("transport", TRANSPORTS)
-def test_two_sessions_interleaved_a_thousand_times_never_mix(server: Server, transport: TransportName) -> None:
+def test_two_sessions_interleaved_never_mix(server: Server, transport: TransportName) -> None:
     choose = random.Random(7)
     with (
         RemoteAgent(url(server, transport), transport=transport) as red,
@@ -52,7 +52,7 @@ def test_two_sessions_interleaved_a_thousand_times_never_mix(server: Server, tra
             assert agent.reset(obs(pixels[name]), f"the {name} cube", seed=1)["instruction"] == f"the {name} cube"
             assert agent.transport == transport
         counts, sums = dict.fromkeys(agents, 0), dict.fromkeys(agents, 0)
-        for _ in range(1000):
+        for _ in range(300):
             name = choose.choice(sorted(agents))
             value = choose.randrange(100)
             counts[name] += 1

@@ -3,7 +3,7 @@
 A file that needs a Ray, but not its own, takes the fixture `shared_ray`. Ray starts when the first such file needs
 it, and ends before the first test of a file without the fixture, which may start a Ray of its own. The order of the
 files in tests/conftest.py makes that happen once. Only tests of launching, of crashes and of settings of Ray itself
-start their own.
+start their own; so do tests of commands that start one, as they would inherit the environment of the shared one.
 """
 
 from __future__ import annotations
