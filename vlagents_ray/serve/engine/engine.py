@@ -284,11 +284,11 @@ class Engine:
 
     def check(self, pending: PendingRequest) -> None:
         """Check a request before it is queued, and note what the server decides about it; raises its errors."""
-        self.require_ready()
         request, origin = pending.request, pending.origin
+        if request.op == "act" and origin.owner and not request.session and pending.session_id not in origin.sessions:
+            raise NotReset("act before reset: this connection has no session yet; reset first")
+        self.require_ready()
         if request.op == "act":
-            if origin.owner and not request.session and pending.session_id not in origin.sessions:
-                raise NotReset("act before reset: this connection has no session yet; reset first")
             pending.session = session = self.sessions.get(pending.session_id)
             if session.agent is None:
                 raise NotReset(f"session {pending.session_id!r}: act before a successful reset; reset first")
