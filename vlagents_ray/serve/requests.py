@@ -4,6 +4,11 @@ An endpoint makes a `Message` when its last byte is there, decodes it, and has a
 `PendingRequest`s. The engine finishes each of these once; when the last one is finished, the endpoint writes all
 answers of the message. What was decoded, a `Request`, is not changed on the way: what the server decides stands in the
 `PendingRequest`. Only the observations are removed once they were used, since they may lie in the sender's memory.
+
+Requests come by the thread that reads the connections (the policy's own, or a reader while a batch runs) or by an event
+loop. The policy's thread runs batches and finishes their requests; answers to simulations may be sent by another one.
+Others finish what does not get that far: the event loop at a deadline or a hanging call, the thread that loads a
+checkpoint, the one that closes the engine.
 """
 
 from __future__ import annotations

@@ -28,6 +28,10 @@ class Sender:
 
     A request names its session; without a name it is for `session_id`, the sender's own session. If the server has
     API keys, a caller cannot reach sessions of other keys: the key's name is part of the session ids in the engine.
+
+    Each message is charged to the key before it is parsed, and each further request in it before it is submitted: over
+    HTTP by the guard on arrival, then by the `admission`; frames by the `admission` alone; the compact form of shared
+    memory by `count_message`, then by `send`; batches of a dialect by its gate's `admission`, then by `count`.
     """
 
     def __init__(
