@@ -30,6 +30,7 @@ from vlagents_ray.cli.robot import _restarting as restarting
 from vlagents_ray.cli.robot import main
 from vlagents_ray.errors import InvalidAction
 from vlagents_ray.robot import Guard, Watchdog, run_loop
+from vlagents_ray.robot.loop import ROBOT, import_class
 from vlagents_ray.robot.pacing import Pacer, empty_loop, jitter, undisturbed
 from vlagents_ray.robot.simulated import SimulatedRobot
 
@@ -831,3 +832,8 @@ def test_errors_of_the_library_end_the_command_with_their_message(
 def test_the_command_says_what_it_cannot_do(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["nonsense"]) == 2
     assert "want http(s)://" in capsys.readouterr().err
+
+
+def test_a_class_that_is_no_robot_is_refused_with_what_it_lacks() -> None:
+    with pytest.raises(ConfigError, match="--robot builtins:dict: lacks observe, apply, stop; want a class with"):
+        import_class("--robot", "builtins:dict", ROBOT)

@@ -22,7 +22,7 @@ from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.commands import CommandInbox
 from vlagents_ray.contract import Contract, require_match
 from vlagents_ray.errors import ConfigError, VLAgentsError
-from vlagents_ray.robot.loop import LoopReport, Restart, Robot, import_class, run_loop
+from vlagents_ray.robot.loop import ROBOT, LoopReport, Restart, Robot, import_class, run_loop
 from vlagents_ray.robot.pacing import empty_loop
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.ros import RosRobot, read_settings
@@ -99,7 +99,7 @@ def _run(options: argparse.Namespace) -> LoopReport:
     deadline_s = 0.0 if options.mode == "async" else WAIT_S
     if options.deadline_ms is not None:
         deadline_s = options.deadline_ms / 1e3
-    make_robot = import_class("--robot", options.robot) if options.robot else None
+    make_robot = import_class("--robot", options.robot, ROBOT) if options.robot else None
     make_leader = import_class("--leader", options.leader) if ":" in (options.leader or "") else None
     with contextlib.ExitStack() as stack:
         topics = None if options.ros is None else stack.enter_context(RosRobot(read_settings(options.ros)))

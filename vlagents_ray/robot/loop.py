@@ -30,6 +30,7 @@ Restart = Literal["manual", "auto"]
 logger = logging.getLogger(__name__)
 
 _COLLECT_S = 2.0
+ROBOT = ("observe", "apply", "stop")  # the methods of a `Robot`
 
 
 class Robot(Protocol):
@@ -57,18 +58,24 @@ class Robot(Protocol):
         ...
 
 
-def import_class(option: str, name: str) -> Any:
-    """Import the class "module:Class" that an option such as "--robot" names; raises `ConfigError` without one."""
+def import_class(option: str, name: str, methods: Sequence[str] = ()) -> Any:
+    """Import the class "module:Class" that an option such as "--robot" names.
+
+    Raises `ConfigError` if there is none, or if it lacks one of the `methods`.
+    """
     module, colon, attribute = name.partition(":")
     if not colon:
         raise ConfigError(f"{option}: got {name!r}, want module:Class")
     try:
-        return getattr(importlib.import_module(module), attribute)
+        found = getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError) as error:
         raise ConfigError(
             f"{option} {name}: {error}; go to the folder of its module ({os.getcwd()} is this one), add that to "
             f"PYTHONPATH, or install it"
         ) from error
+    if missing := [method for method in methods if not callable(getattr(found, method, None))]:
+        raise ConfigError(f"{option} {name}: lacks {', '.join(missing)}; want a class with {', '.join(methods)}")
+    return found
 
 
 @dataclass(slots=True)

@@ -27,7 +27,7 @@ from vlagents_ray.evaluate.run import conclude
 from vlagents_ray.evaluate.workers.rollout import AgentFactory, agents
 from vlagents_ray.ray_tools.private import output_printer, set_output_printer
 from vlagents_ray.registry import require
-from vlagents_ray.robot.loop import Robot, import_class
+from vlagents_ray.robot.loop import ROBOT, Robot, import_class
 
 RECORDINGS = "recordings"
 _LOGGERS = ("vlagents_ray", "ray", "ray.serve", "websockets", "asyncio")  # their messages may name a policy
@@ -72,7 +72,7 @@ def evaluate_on_robot(
             require(module)
     factory = agent_factory or agents(config, None, "robot")
     if robot is None:
-        robot = import_class("--robot", str(planned[0].on_robot[0].arm))()
+        robot = import_class("--robot", str(planned[0].on_robot[0].arm), ROBOT)()
     watched = WatchedRobot(robot, operator)
     with TrialLog(config, planned) as log:
         trials = schedule(planned, log.key)

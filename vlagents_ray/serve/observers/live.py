@@ -245,7 +245,7 @@ class LiveObserver(Observer):
 
 def _answer(number: int, pending: PendingRequest, reply: Reply, executed: Executed | None) -> Answer:
     request, act, error = pending.request, reply.act, reply.error
-    answer = Answer(number, pending.session_id, request.op, request.rank, reply.timing, executed=executed)
+    answer = Answer(number, pending.session_id, request.op, pending.rank.name.lower(), reply.timing, executed=executed)
     if error is not None:
         return answer._replace(error=error.code, detail=str(error)[:TEXT])
     if act is None:

@@ -65,7 +65,11 @@ class RequestSpans(Observer):
         served: _ServedRequest | None = pending.kept.pop(self, None)
         if served is not None:
             error = "" if reply.error is None else f"{reply.error.code}: {reply.error}"[:_TEXT]
-            self._answered.append(served._replace(timing=reply.timing, error=error, answered_ns=time.time_ns()))
+            self._answered.append(
+                served._replace(
+                    rank=pending.rank.name.lower(), timing=reply.timing, error=error, answered_ns=time.time_ns()
+                )
+            )
 
     def export(self) -> None:
         """Make the spans of the answers since the last call, whose timing is complete by now."""
