@@ -483,7 +483,7 @@ class Gr00t(ModelPolicy):
         if places:
             chunks = self.loaded().chunks(
                 [rows[place].rng for place in places],
-                [read[place] for place in places],  # type: ignore[misc]
+                [read[place] for place in places],
                 alike=self.config.deterministic,
             )
             for place, chunk in zip(places, chunks, strict=True):
@@ -495,7 +495,8 @@ class Gr00t(ModelPolicy):
         newest = row.frames[-1]
         if newest.inputs is not None:
             return newest.inputs  # type: ignore[no-any-return]
-        network, frames = self.loaded(), row.history(self.history)
+        network: Gr00tNetwork = self.loaded()
+        frames = row.history(self.history)
         moments = network.embodiment.moments
         try:
             return network.inputs(
