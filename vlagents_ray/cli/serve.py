@@ -23,8 +23,8 @@ from vlagents_ray.viewers.targets import is_live
 if TYPE_CHECKING:
     from ray.serve.schema import ServeDeploySchema
 
-    from vlagents_ray.serve.access.tls import Tls
     from vlagents_ray.serve.config.deployment import ServerArgs
+    from vlagents_ray.serve.launch.haproxy import Tls
 
 
 def serve_command(
@@ -131,7 +131,7 @@ def _address(url: str, path: str) -> str:
 
 
 def _tls(certificate: Path | None, key: Path | None, client_ca: Path | None) -> Tls | None:
-    from vlagents_ray.serve.access.tls import Tls
+    from vlagents_ray.serve.launch.haproxy import Tls
 
     if certificate is None and key is None and client_ca is None:
         return None

@@ -35,7 +35,7 @@ def deployment(policy: str, **args: Any) -> ServeDeploySchema:
 
 
 def read_deployment(
-    source: str, overrides: Mapping[str, Any] | None = None, *, step_follows: bool = False
+    source: str, overrides: Mapping[str, Any] | None = None, *, step_follows: bool = False, shadows: bool = True
 ) -> ServeDeploySchema:
     """Read a deployment and check it.
 
@@ -43,11 +43,26 @@ def read_deployment(
         source: A YAML file, or the name of a policy.
         overrides: The args of a policy that is given by its name.
         step_follows: Whether `with_settings` sets `checkpoint_step` later: then a checkpoint with `{step}` needs none.
+        shadows: Whether the file may have a shadow, which a candidate may not.
 
     Raises:
         ConfigError: The file or a setting is invalid.
     """
-    return _read(source, overrides, step_follows=step_follows)
+    path = Path(source)
+    if path.suffix in (".yaml", ".yml"):
+        if not path.is_file():
+            where = "" if path.is_absolute() else f" in {Path.cwd()}; those of this project are in its checkout"
+            raise ConfigError(f"deployment file {source!r} does not exist{where}")
+        if overrides:
+            raise ConfigError(f"{source!r} holds the settings; edit it instead of giving {sorted(overrides)}")
+        try:
+            document = yaml.safe_load(path.read_text())
+        except yaml.YAMLError as error:
+            raise ConfigError(f"{source}: not YAML ({error})") from error
+        return _checked(document, source, step_follows, shadows=shadows)
+    if ":" not in source and source not in names("policies"):
+        policy_class(source)  # raises with the list of what there is
+    return _of_name(source, overrides or {}, step_follows, shadows=shadows)
 
 
 def server_args(source: str, app: str | None = None) -> ServerArgs:
@@ -89,7 +104,7 @@ def with_candidate(shadow: ShadowArgs) -> ShadowArgs:
     """
     if not isinstance(shadow.policy, str):
         return shadow
-    app = _only(_read(shadow.policy, shadows=False), shadow.policy, None)
+    app = _only(read_deployment(shadow.policy, shadows=False), shadow.policy, None)
     if app.runtime_env:
         raise ConfigError("shadow: the candidate states a runtime_env; state its packages under `environment:`")
     return shadow.model_copy(update={"policy": {**app.args, "config": own_settings(app)}})
@@ -183,27 +198,6 @@ def stated_contract(config: ServeDeploySchema) -> Contract | None:
     if environment.python is not None:
         return check_policy(environment, args.policy, settings, args.wrappers)
     return unloaded_contract(offered.make(settings))
-
-
-def _read(
-    source: str, overrides: Mapping[str, Any] | None = None, *, step_follows: bool = False, shadows: bool = True
-) -> ServeDeploySchema:
-    """See `read_deployment`. Without `shadows`, a file with a shadow is refused, as a candidate has none."""
-    path = Path(source)
-    if path.suffix in (".yaml", ".yml"):
-        if not path.is_file():
-            where = "" if path.is_absolute() else f" in {Path.cwd()}; those of this project are in its checkout"
-            raise ConfigError(f"deployment file {source!r} does not exist{where}")
-        if overrides:
-            raise ConfigError(f"{source!r} holds the settings; edit it instead of giving {sorted(overrides)}")
-        try:
-            document = yaml.safe_load(path.read_text())
-        except yaml.YAMLError as error:
-            raise ConfigError(f"{source}: not YAML ({error})") from error
-        return _checked(document, source, step_follows, shadows=shadows)
-    if ":" not in source and source not in names("policies"):
-        policy_class(source)  # raises with the list of what there is
-    return _of_name(source, overrides or {}, step_follows, shadows=shadows)
 
 
 def _only(config: ServeDeploySchema, source: str, app: str | None) -> ServeApplicationSchema:

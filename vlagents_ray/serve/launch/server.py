@@ -47,12 +47,12 @@ from vlagents_ray.ray_tools.session import (
     variables,
 )
 from vlagents_ray.serve.access.api_keys import require_access, warn_of_plain_http
-from vlagents_ray.serve.access.tls import Tls
 from vlagents_ray.serve.config.deployment import AccessArgs, ServerArgs
 from vlagents_ray.serve.launch.deployment_file import gpus_of_candidate, our_apps, with_gateways_at, with_replicas_on
 from vlagents_ray.serve.launch.haproxy import (
     NO_INGRESS,
     PublicListener,
+    Tls,
     haproxy_binary,
     ingress_environment,
     wait_for_haproxy,

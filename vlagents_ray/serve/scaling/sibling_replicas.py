@@ -105,7 +105,7 @@ class _Sibling(Peer):
         except ray.exceptions.RayTaskError as error:  # the replica itself raised it
             raise error.cause if isinstance(error.cause, VLAgentsError) else PeerUnreachable(str(error)) from error
         except (ray.exceptions.RayError, TimeoutError, asyncio.TimeoutError) as error:  # or the network is partitioned
-            raise PeerUnreachable(str(error) or f"no answer within {limit_s:g} s") from error
+            raise PeerUnreachable(str(error) or f"no answer within {limit_s} s") from error
         return found
 
 
