@@ -36,8 +36,8 @@ from vlagents_ray.protocol.frames import decode_replies, encode_requests
 from vlagents_ray.protocol.messages import LocalAddress, Request
 from vlagents_ray.ray_tools.reaper import MARK
 from vlagents_ray.serve.access.key_store import new_key, revoke
-from vlagents_ray.serve.access.tls import Tls
 from vlagents_ray.serve.launch.deployment_file import deployment
+from vlagents_ray.serve.launch.haproxy import Tls
 from vlagents_ray.serve.launch.server import running_server
 
 EVERYWHERE = "0.0.0.0"  # noqa: S104 - what this is about

@@ -12,9 +12,9 @@ from eval_fakes import wait_for
 from vlagents_ray import ConfigError, Obs, RemoteAgent, Unauthorized
 from vlagents_ray.client.transports.select import TransportName
 from vlagents_ray.serve.access.key_store import new_key
-from vlagents_ray.serve.access.tls import Tls
 from vlagents_ray.serve.launch import server
 from vlagents_ray.serve.launch.deployment_file import deployment
+from vlagents_ray.serve.launch.haproxy import Tls
 from vlagents_ray.serve.launch.server import running_server
 
 WAYS: tuple[TransportName, ...] = ("http", "websocket", "shm", "auto")

@@ -16,7 +16,7 @@ from shared_cpu_memory import GPU, SharedCpuMemory
 from vlagents_ray.errors import InvalidWeights, UnchangedWeights
 from vlagents_ray.learn.publisher import AppTarget
 from vlagents_ray.serve.scaling.weight_push import WeightPusher
-from vlagents_ray.serve.weights.updates import PushOptions
+from vlagents_ray.serve.weights import PushOptions
 from vlagents_ray.weights import shared_values
 from vlagents_ray.weights.shared_values import NotShared, SharedValues, opened, shared
 from vlagents_ray.weights.trainable import portable

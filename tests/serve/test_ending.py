@@ -9,6 +9,7 @@ import ray
 from ray.serve._private.router import SharedRouterLongPollClient
 
 from vlagents_ray.ray_tools import head_monitor
+from vlagents_ray.ray_tools.private import long_polls
 from vlagents_ray.serve.launch import server
 
 
@@ -29,7 +30,7 @@ def test_a_controller_that_ends_or_that_does_not_answer_is_no_error(
     assert ("has not ended within" in caplog.text) is said
 
 
-def test_a_controller_that_is_about_to_end_is_asked_for_no_more_news(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_long_poll_of_a_controller_can_be_stopped_before_it_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ray would tell the user of a failed task, in one end of four."""
     stopped: list[str] = []
     own = SimpleNamespace(stop=lambda: stopped.append("own"))
@@ -39,5 +40,6 @@ def test_a_controller_that_is_about_to_end_is_asked_for_no_more_news(monkeypatch
         _router=SimpleNamespace(_asyncio_router=SimpleNamespace(long_poll_client=own, _event_loop=1))
     )
     unused = SimpleNamespace(_router=None)
-    server._stop_long_polls(SimpleNamespace(_controller=None, handle_cache={"used": used, "unused": unused}))
+    for poll in long_polls(SimpleNamespace(_controller=None, handle_cache={"used": used, "unused": unused})):
+        poll.stop()
     assert stopped == ["own", "shared"]

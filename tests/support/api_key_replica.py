@@ -67,7 +67,7 @@ from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.observers.live_page import live_routes
 from vlagents_ray.serve.observers.live_view import Fleet, ReplicaView
 from vlagents_ray.serve.ports import free_port, reserve
-from vlagents_ray.serve.weights.updates import PushResult
+from vlagents_ray.serve.weights import PushResult
 from vlagents_ray.weights.safetensors import ValueSpec, header_of, read_header
 from vlagents_ray.wire import vla_eval as vla_eval_codec
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.interface import Agent
-from vlagents_ray.serve.weights.versions import ModelWeights
+from vlagents_ray.serve.weights import ModelWeights
 from vlagents_ray.weights.trainable import own_copy
 
 

@@ -14,8 +14,7 @@ from shared_cpu_memory import SharedCpuMemory, files_of_torch
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.serve.scaling.weight_push import OwnWeights
-from vlagents_ray.serve.weights.updates import WeightUpdates
-from vlagents_ray.serve.weights.versions import ModelWeights
+from vlagents_ray.serve.weights import ModelWeights, WeightUpdates
 from vlagents_ray.weights.trainable import portable
 
 

@@ -24,8 +24,8 @@ from vlagents_ray.viewers.targets import is_live
 if TYPE_CHECKING:
     from ray.serve.schema import ServeDeploySchema
 
-    from vlagents_ray.serve.access.tls import Tls
     from vlagents_ray.serve.config.deployment import ServerArgs
+    from vlagents_ray.serve.launch.haproxy import Tls
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class ServeOptions:
 
     def tls(self) -> Tls | None:
         """Return the certificates that the options name; raises `ConfigError` if one of the two is missing."""
-        from vlagents_ray.serve.access.tls import Tls
+        from vlagents_ray.serve.launch.haproxy import Tls
 
         if self.tls_cert is None and self.tls_key is None and self.tls_client_ca is None:
             return None

@@ -26,8 +26,7 @@ from vlagents_ray.protocol.frames import read_error
 from vlagents_ray.serve.endpoints.weights import PATH
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.scaling.weight_push import OwnWeights, Values, WeightPusher, WeightsReplica
-from vlagents_ray.serve.weights.updates import PushOptions, PushResult
-from vlagents_ray.serve.weights.versions import PushMode
+from vlagents_ray.serve.weights import PushMode, PushOptions, PushResult
 from vlagents_ray.weights.safetensors import MESSAGE_BYTES, header_of, parts_of
 from vlagents_ray.weights.shared_values import NotShared, gpu_of, shared
 from vlagents_ray.weights.trainable import is_array, portable

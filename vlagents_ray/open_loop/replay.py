@@ -28,7 +28,7 @@ from vlagents_ray.serve.models.checkpoints import CHOICE, STEP
 from vlagents_ray.serve.python_env.child_agent import make_agent, version_of
 from vlagents_ray.serve.python_env.probe import with_process
 from vlagents_ray.serve.requests import PendingRequest, Rank
-from vlagents_ray.serve.weights.updates import OPTION
+from vlagents_ray.serve.weights import OPTION
 
 Sessions = Callable[[], Agent]
 _WORST = 10

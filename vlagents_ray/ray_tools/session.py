@@ -37,8 +37,10 @@ _REMOVALS = 100  # attempts, 0.05 s apart, as a process that is ending may still
 _FILE = "server.json"  # written to the private folder of a server's Ray when the server is ready
 _DAEMON = b"raylet"
 _ADDRESS = b"--gcs-address="
-_MODE, _TOKENS = "RAY_AUTH_MODE", ("RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
-_ALONE = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"  # "0": Ray uses loopback addresses as they are
+MODE, _TOKENS = "RAY_AUTH_MODE", ("RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
+# If this variable is "0", Ray does not take this machine for a part of a cluster and uses the loopback address as the
+# node's own, so that all its ports are there. (Ray replaces the address given as `_node_ip_address` by another one.)
+ALONE = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
 
 
 @contextlib.contextmanager
@@ -64,7 +66,7 @@ def joined(address: str | None = None, **options: Any) -> Iterator[None]:
         try:
             if address == "local":
                 folder = stack.enter_context(ray_folder())
-                with _marked(folder):
+                with variables({MARK: str(folder)}):
                     start_ray(_temp_dir=str(folder / FILES), **options)
             elif (server := _local_server(address or os.environ.get("RAY_ADDRESS"))) is not None:
                 with own_sigterm():
@@ -117,17 +119,18 @@ def ray_folder() -> Iterator[Path]:
 
 
 @contextlib.contextmanager
-def _marked(folder: Path) -> Iterator[None]:
-    """Mark the processes that are started within the context as belonging to a folder, with which they end."""
-    before = os.environ.get(MARK)
-    os.environ[MARK] = str(folder)
+def variables(values: Mapping[str, str]) -> Iterator[None]:
+    """Set environment variables for processes that are started within the context."""
+    before = {name: os.environ.get(name) for name in values}
+    os.environ.update(values)
     try:
         yield
     finally:
-        if before is None:
-            os.environ.pop(MARK, None)
-        else:
-            os.environ[MARK] = before
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
 
 
 def start_ray(**options: Any) -> None:
@@ -207,6 +210,9 @@ class LocalServer:
 def join(server: str | None = None, **options: Any) -> LocalServer:
     """Connect this process to the Ray cluster of a server on this machine, instead of `ray.init`.
 
+    That Ray is on the loopback address, in a private folder, and requires a token: `ray.init("auto")` finds it, but
+    connects to another address of this machine, and waits there for minutes.
+
     Actors and tasks of this process then run in that cluster, with the server's Python and with the modules of this
     process's script and working directory. `RemoteAgent("serve://APP")` reaches the policy from this process and from
     each of them. They end with the server. `ray.shutdown()` leaves the cluster; the server continues.
@@ -234,14 +240,14 @@ def join(server: str | None = None, **options: Any) -> LocalServer:
             f"got a process in another Ray cluster, {ray.get_runtime_context().gcs_address}; want it in that of "
             f"{chosen.url}: call ray.shutdown() before, or join() in place of ray.init()"
         )
-    if os.environ.get(_MODE, "token").lower() != "token":
-        raise ConfigError(f"{_MODE}={os.environ[_MODE]}: the Ray of {chosen.url} needs its token; unset {_MODE}")
+    if os.environ.get(MODE, "token").lower() != "token":
+        raise ConfigError(f"{MODE}={os.environ[MODE]}: the Ray of {chosen.url} needs its token; unset {MODE}")
     tokens = {one: environment[one] for one in _TOKENS if environment.get(one)}
     if not tokens and environment.get("HOME"):  # where Ray keeps the token, which may not be this program's home
         tokens = {_TOKENS[1]: f"{environment['HOME']}/.ray/auth_token"}
     for one in _TOKENS:
         os.environ.pop(one, None)
-    os.environ.update({_MODE: "token", _ALONE: "0"} | tokens)
+    os.environ.update({MODE: "token", ALONE: "0"} | tokens)
     use_loopback(True)  # Ray read the variables when it was imported
     reread_authentication_mode()
     ray.init(chosen.ray_address, **{"log_to_driver": True, "logging_level": "WARNING"} | options)

@@ -17,7 +17,7 @@ from typing import Generic, Protocol, TypeVar
 from vlagents_ray.errors import PolicyUnavailable, TooManyRequests, UnknownSession
 from vlagents_ray.interface import Agent
 from vlagents_ray.serve.requests import NOWHERE, Origin, PendingRequest
-from vlagents_ray.serve.weights.versions import WeightsVersion
+from vlagents_ray.serve.weights import WeightsVersion
 
 M = TypeVar("M")  # type of a loaded model
 

@@ -22,7 +22,7 @@ from vlagents_ray.policies.compilation import CAPTURES, Compilation, CudaGraph
 from vlagents_ray.policies.loading import report_device
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.weights.versions import ModelWeights
+from vlagents_ray.serve.weights import ModelWeights
 from vlagents_ray.weights.shared_values import _GpuMemory
 
 pytestmark = pytest.mark.torch

@@ -11,8 +11,8 @@ from vlagents_ray.contract import Contract
 from vlagents_ray.errors import InvalidObservation
 from vlagents_ray.interface import Obs
 from vlagents_ray.serve.access.api_keys import NoKey
+from vlagents_ray.serve.dialects.base import ImplicitEpisode
 from vlagents_ray.serve.dialects.gateway_sessions import GatewaySessions
-from vlagents_ray.serve.dialects.implicit_session import ImplicitEpisode
 
 
 def test_an_episode_begins_with_the_first_observation_and_with_each_new_instruction() -> None:

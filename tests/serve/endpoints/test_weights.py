@@ -36,6 +36,7 @@ from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.learn import Publisher
 from vlagents_ray.protocol.frames import read_error
 from vlagents_ray.protocol.messages import Limits
+from vlagents_ray.serve import weights as versions
 from vlagents_ray.serve.access import api_keys
 from vlagents_ray.serve.access.api_keys import Keys
 from vlagents_ray.serve.endpoints import weights as endpoint
@@ -44,8 +45,7 @@ from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.endpoints.weights import weights_routes
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.scaling.weight_push import OwnWeights, WeightPusher
-from vlagents_ray.serve.weights import versions
-from vlagents_ray.serve.weights.updates import PushOptions, PushResult
+from vlagents_ray.serve.weights import PushOptions, PushResult
 from vlagents_ray.weights.safetensors import MESSAGE_BYTES, PART_BYTES, header_of, parts_of, read_header
 
 LENGTH = 3 * 2**20  # 12 MiB, so that there are several parts

@@ -12,8 +12,8 @@ import yaml
 from certificates import authority
 
 from vlagents_ray import ConfigError
-from vlagents_ray.serve.access.tls import Tls
 from vlagents_ray.serve.launch.deployment_file import deployment, listens_at, read_deployment
+from vlagents_ray.serve.launch.haproxy import Tls
 from vlagents_ray.serve.launch.server import running_server
 from vlagents_ray.serve.ports import EVERYWHERE
 

@@ -35,7 +35,7 @@ from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.python_env.child_agent import Child, ChildAgent
 from vlagents_ray.serve.python_env.child_main import Settings
 from vlagents_ray.serve.queue.call_limits import CallLimits
-from vlagents_ray.serve.weights.versions import ModelWeights
+from vlagents_ray.serve.weights import ModelWeights
 
 SUPPORT = Path(__file__).parents[2] / "support"
 ROOT = Path(__file__).parents[3]

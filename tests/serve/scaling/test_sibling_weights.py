@@ -11,7 +11,7 @@ from ray.exceptions import ActorDiedError, ActorUnavailableError, RayTaskError
 from vlagents_ray.errors import InvalidWeights
 from vlagents_ray.serve.scaling import sibling_replicas
 from vlagents_ray.serve.scaling.session_migration import PeerEnded, PeerUnreachable
-from vlagents_ray.serve.weights.updates import PushOptions
+from vlagents_ray.serve.weights import PushOptions
 
 
 def raised(cause: Exception) -> RayTaskError:
@@ -35,7 +35,7 @@ def test_errors_of_another_replica(monkeypatch: pytest.MonkeyPatch, error: Excep
         raise error
 
     monkeypatch.setattr(sibling_replicas, "call_replica", call)
-    replica = sibling_replicas._WeightsOf("r1", "actor")
+    replica = sibling_replicas._Sibling("r1", "actor")
     with pytest.raises(becomes) as found:
         asyncio.run(replica.stage_weights(1, {}, PushOptions()))
     assert type(found.value) is becomes

@@ -17,7 +17,7 @@ from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.scaling.session_migration import PeerEnded, PeerUnreachable
 from vlagents_ray.serve.scaling.weight_push import OwnWeights, WeightPusher, WeightsReplica
-from vlagents_ray.serve.weights.updates import PushOptions, PushResult
+from vlagents_ray.serve.weights import PushOptions, PushResult
 
 
 class Gain(Agent):

@@ -23,9 +23,9 @@ from vlagents_ray.errors import (
 )
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.messages import Reply, Request
+from vlagents_ray.serve import weights as versions
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.weights import versions
-from vlagents_ray.serve.weights.updates import PushOptions
+from vlagents_ray.serve.weights import PushOptions
 from vlagents_ray.weights.trainable import fingerprint
 
 

@@ -8,9 +8,9 @@ import sys
 from collections.abc import Callable, Mapping
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Agent
@@ -24,37 +24,32 @@ from vlagents_ray.serve.queue.call_limits import CallLimits
 from vlagents_ray.settings import wrong_settings
 from vlagents_ray.viewers.targets import is_live, require_no_server
 
-# The settings of the live page, under `live:` of a deployment.
+POLICY, GATEWAY, SHADOW = "Policy", "Gateway", "Shadow"  # the deployments of an application
+_PYTHON = re.compile(r"^# python: (3\.\d+)\s*$", re.MULTILINE)
+
+# Links are not followed: the interpreter of a virtual environment links to that of its creator.
+AbsolutePath = Annotated[str, AfterValidator(lambda path: os.path.abspath(os.path.expanduser(path)))]
 
 
-class LiveArgs(BaseModel):
+class _DeploymentModel(BaseModel):
+    model_config = ConfigDict(extra="forbid", hide_input_in_errors=True)  # errors are logged
+
+
+class LiveArgs(_DeploymentModel):
     """The last seconds of each session, which a press on the live page saves; see `vlagents_ray.serve.observers`."""
 
-    model_config = ConfigDict(extra="forbid", hide_input_in_errors=True)
-
-    folder: str = Field(
+    folder: AbsolutePath = Field(
         description="folder of the datasets, on each replica's own node or shared; each replica writes its own below it"
     )
     ring_s: float = Field(default=30.0, gt=0, le=600, description="how much of each session is held, s")
     memory_mb: float = Field(
         default=256.0, gt=0, description="memory that all sessions of a replica take at most, MB; the oldest goes first"
     )
-
     most_gb: float = Field(default=50.0, gt=0, description="size of the folder at which nothing more is saved, GB")
 
-    @field_validator("folder")
-    @classmethod
-    def _absolute(cls, folder: str) -> str:
-        return os.path.abspath(os.path.expanduser(folder))
 
-
-# The settings under `shadow:` in a deployment file: a candidate beside the policy.
-
-
-class ShadowArgs(BaseModel):
+class ShadowArgs(_DeploymentModel):
     """A candidate that acts on what the policy acts on; its actions are compared with the policy's, never executed."""
-
-    model_config = ConfigDict(extra="forbid", hide_input_in_errors=True)  # errors are logged
 
     policy: str | dict[str, Any] = Field(
         description="the candidate: its deployment file, a registered name, 'module:Class', or the `args` of a "
@@ -64,26 +59,16 @@ class ShadowArgs(BaseModel):
     queue: int = Field(
         default=32, ge=1, description="observations that wait for the candidate at most; further ones are dropped"
     )
-    record: str | None = Field(
+    record: AbsolutePath | None = Field(
         default=None,
         description="folder on the candidate's node, where each comparison becomes a line of JSON; a relative path is "
         "one from the working directory",
     )
     record_mb: int = Field(default=1000, ge=1, description="most MB of these files; the oldest ones are deleted")
 
-    @field_validator("record")
-    @classmethod
-    def _absolute(cls, record: str | None) -> str | None:
-        return None if record is None else os.path.abspath(Path(record).expanduser())
 
-
-# The viewers of a deployment's episodes, under `viewers:` in a deployment file.
-
-
-class ViewerArgs(BaseModel):
+class ViewerArgs(_DeploymentModel):
     """Where the episodes of all sessions are shown; unset: nowhere."""
-
-    model_config = ConfigDict(extra="forbid", hide_input_in_errors=True)  # errors are logged
 
     rerun: str | None = Field(
         default=None, description="an absolute folder for `.rrd` files, or the address of a viewer of Rerun"
@@ -107,24 +92,16 @@ class ViewerArgs(BaseModel):
         return {name: target for name, target in self.model_dump().items() if target is not None}
 
 
-# The settings under `environment:` in a deployment file: the Python environment that the policy runs in.
-
-
-_PYTHON = re.compile(r"^# python: (3\.\d+)\s*$", re.MULTILINE)
-
-
 def python_wanted_by(requirements: Path) -> str | None:
     """Return the Python minor version that a requirements file names in a line `# python: 3.12`; None without one."""
     found = _PYTHON.search(requirements.read_text())
     return None if found is None else found[1]
 
 
-class EnvironmentArgs(BaseModel):
+class EnvironmentArgs(_DeploymentModel):
     """The Python environment of a policy; by default the policy runs in the replica, in the cluster's environment."""
 
-    model_config = ConfigDict(extra="forbid", hide_input_in_errors=True)  # errors are logged
-
-    python: str | None = Field(
+    python: AbsolutePath | None = Field(
         default=None,
         description="interpreter of a virtual environment, on every node the same; a relative path is one from the "
         "working directory",
@@ -139,12 +116,6 @@ class EnvironmentArgs(BaseModel):
     )
     installer: Literal["uv", "pip"] = Field(default="pip", description="of `requirements`")
     env_vars: dict[str, str] = Field(default_factory=dict, description="variables of the policy's process")
-
-    @field_validator("python")
-    @classmethod
-    def _absolute(cls, python: str | None) -> str | None:
-        """Make the path absolute without following links: an environment's interpreter links to that of its creator."""
-        return None if python is None else os.path.abspath(Path(python).expanduser())
 
     @field_validator("requirements", mode="before")
     @classmethod
@@ -193,10 +164,6 @@ class EnvironmentArgs(BaseModel):
 
 
 POLICY, GATEWAY, SHADOW = "Policy", "Gateway", "Shadow"  # the deployments of an application
-
-
-class _DeploymentModel(BaseModel):
-    model_config = ConfigDict(extra="forbid", hide_input_in_errors=True)  # errors are logged
 
 
 class BatchArgs(_DeploymentModel):
@@ -251,12 +218,7 @@ class CheckpointArgs(_DeploymentModel):
         return choices
 
     def of(self, make: Callable[[Mapping[str, Any]], Agent], config: Mapping[str, Any]) -> Checkpoints:
-        """Return the checkpoints of a policy.
-
-        Args:
-            make: Builds the policy with given settings.
-            config: The deployment's settings of the policy.
-        """
+        """Return the checkpoints of a policy, which `make` builds; `config` are the deployment's settings of it."""
         return Checkpoints(make, config, self.choices, steps=self.steps, loaded=self.loaded)
 
 
@@ -288,7 +250,7 @@ class StreamArgs(_DeploymentModel):
 class RecordArgs(_DeploymentModel):
     """The recording of sessions as LeRobotDatasets, see `vlagents_ray.serve.observers.recording`."""
 
-    folder: str = Field(
+    folder: AbsolutePath = Field(
         description="folder of the datasets, on each replica's own node or shared; each replica writes its own below it"
     )
     share: float = Field(default=1.0, gt=0, le=1, description="share of the episodes, drawn at each reset")
@@ -299,11 +261,6 @@ class RecordArgs(_DeploymentModel):
     )
     fps: float = Field(default=10.0, gt=0, description="rate of the frames, one for each act, that the videos assume")
     most_gb: float = Field(default=50.0, gt=0, description="size of the folder at which the recording ends, GB")
-
-    @field_validator("folder")
-    @classmethod
-    def _absolute(cls, folder: str) -> str:
-        return os.path.abspath(os.path.expanduser(folder))
 
 
 class LimitArgs(_DeploymentModel):
@@ -394,11 +351,7 @@ class AccessArgs(_DeploymentModel):
         return self
 
     def keys(self) -> Keys | None:
-        """Return the API keys of the file or the environment; None if requests need no key.
-
-        Raises:
-            ConfigError: The keys cannot be read.
-        """
+        """Return the API keys of the file or the environment, or raise `ConfigError`; None if requests need no key."""
         return None if self.insecure else load_keys(self.keys_file)
 
 

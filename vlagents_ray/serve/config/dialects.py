@@ -116,17 +116,11 @@ def _config_of(name: str) -> type[DialectConfig]:
     return config
 
 
-# Reading of a key mapping in a deployment file: the name of a preset, or an object.
-#
-# The presets are the mappings of known clients, which each dialect defines. Units and orders are those of each system's
-# own examples.
-
-
 def read_mapping(value: str | Mapping[str, Any]) -> KeyMapping:
-    """Read a mapping.
+    """Read a mapping, a preset's name or an object; the fields of an object with `preset` replace those of that preset.
 
-    Args:
-        value: A preset's name, or an object. The fields of an object with `preset` replace those of that preset.
+    The presets are the mappings of known clients, which each dialect defines, with the units and orders of each
+    system's own examples.
 
     Raises:
         ConfigError: The preset is unknown, or the object is invalid.

@@ -16,7 +16,7 @@ A dialect is another system's protocol:
 The following is a complete dialect, for clients that post `{"q": [...], "task": "..."}` and read a list of numbers::
 
     from vlagents_ray.serve.config.dialects import DialectConfig, MappingSetting
-    from vlagents_ray.serve.dialects.http import HttpDialect
+    from vlagents_ray.serve.dialects.base import HttpDialect
     from vlagents_ray.wire import json_numpy
 
 
@@ -42,26 +42,43 @@ The following is a complete dialect, for clients that post `{"q": [...], "task":
 from __future__ import annotations
 
 import abc
+import asyncio
 import logging
 import socket
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
+from starlette.requests import ClientDisconnect
+from starlette.requests import Request as HttpRequest
+from starlette.responses import Response
 from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.websockets import WebSocket
 
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.contract import Contract
-from vlagents_ray.errors import ConfigError, MalformedMessage, PolicyUnavailable, VLAgentsError
+from vlagents_ray.errors import (
+    ConfigError,
+    InvalidObservation,
+    MalformedMessage,
+    PolicyUnavailable,
+    UnknownSession,
+    VLAgentsError,
+)
 from vlagents_ray.interface import Obs
-from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Budget, Limits, RankName, Reply
+from vlagents_ray.protocol.frames import Decoded
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, SESSION_HEADER, Budget, Limits, Op, RankName, Reply, Request
 from vlagents_ray.serve.access.api_keys import Identity, NoKey, current_caller
 from vlagents_ray.serve.config.dialects import DialectConfig, KeylessPortConfig, PortConfig, read_mapping
-from vlagents_ray.serve.dialects.implicit_session import ImplicitSession
-from vlagents_ray.serve.endpoints.http_messages import LONG_BYTES, problem_response
+from vlagents_ray.serve.endpoints.http_messages import (
+    LONG_BYTES,
+    RequestDecoder,
+    problem_response,
+    request_id,
+    session_id,
+)
 from vlagents_ray.serve.engine.admission import Admission, MessageAdmission
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import Sender
@@ -200,6 +217,26 @@ class RouteDialect(Dialect):
         """Return a session of that sender, its own if `name` is empty, which begins without a reset by the client."""
         return ImplicitSession(self.context.engine, sender, self.rank, name)
 
+    async def receive(
+        self, socket: WebSocket, gate: Sender, idle_s: float | None = None
+    ) -> tuple[bytes | None, MessageAdmission] | None:
+        """Wait for the next message of a WebSocket, unless its key is over its rate.
+
+        Args:
+            socket: The connection.
+            gate: The sender that `gate` returned for it.
+            idle_s: Maximum time for the message, s, after which `asyncio.TimeoutError` is raised.
+
+        Returns:
+            The message, None for a text, and its admission; or None if the client is gone.
+        """
+        await gate.wait_unthrottled()
+        event = await asyncio.wait_for(socket.receive(), idle_s)
+        if event["type"] == "websocket.disconnect":
+            return None
+        data = event.get("bytes")
+        return data, gate.admission(self.context.limits, 0 if data is None else len(data), self.rank)
+
     def arrived(self) -> Message:
         """Return the message of an observation that has just arrived."""
         return Message(self.context.engine.stats, self.name, "act", self.rank)
@@ -246,9 +283,14 @@ def _route(endpoint: Callable[..., Any], method: str, path: str) -> BaseRoute:
     return WebSocketRoute(path, endpoint) if method == "WS" else Route(path, endpoint, methods=[method])
 
 
-async def decoded(read: Callable[[bytes, Budget], T], data: bytes, admission: MessageAdmission) -> T:
-    """Return the result of `read` on a message, which counts as one request of the key, even if it is invalid."""
+async def decoded(read: Callable[[bytes, Budget], T], data: bytes | None, admission: MessageAdmission) -> T:
+    """Return the result of `read` on a message, which counts as one request of the key, even if it is invalid.
+
+    `data` is None for a WebSocket's text, which is refused.
+    """
     admission.begin_message()
+    if data is None:
+        raise MalformedMessage("message: got text, want a binary map")
     admission.begin("act")
     return await admission.decoded(partial(read, data), long=len(data) > LONG_BYTES)
 
@@ -277,3 +319,206 @@ async def accept_or_refuse(websocket: WebSocket, context: ReplicaContext) -> boo
         return False
     await websocket.accept()
     return True
+
+
+class ImplicitEpisode:
+    """Decides when an episode begins in a protocol without reset: at the first observation and each new instruction.
+
+    An observation without an instruction keeps the previous instruction.
+    """
+
+    def __init__(self) -> None:
+        self.instruction: str | None = None  # instruction of the last reset
+        self.begun = False  # whether there was an observation of this episode
+
+    def begins(self, instruction: str | None) -> bool:
+        """Whether an observation with that instruction begins an episode."""
+        return not self.begun or (instruction is not None and instruction != self.instruction)
+
+    def opening(self, instruction: str | None, contract: Contract | None) -> str | None:
+        """Return the instruction for the reset; raise `InvalidObservation` if the policy needs one and none is set."""
+        instruction = self.instruction if instruction is None else instruction
+        if instruction is None and contract is not None and contract.instruction:
+            raise InvalidObservation("instruction: got none, the policy needs one; send it with the observation")
+        return instruction
+
+    def began(self, instruction: str | None) -> None:
+        """Note that the session was reset with that instruction."""
+        self.begun, self.instruction = True, instruction
+
+    def end(self) -> None:
+        """Let the next observation begin an episode."""
+        self.begun = False
+
+
+class ImplicitSession:
+    """A session of a client on the server's own port; it must not be called concurrently.
+
+    Args:
+        engine: The engine that serves it.
+        sender: The sender of the client's requests.
+        rank: Class of its requests.
+        name: Name of the session, unique in the replica; empty for the sender's own.
+    """
+
+    def __init__(self, engine: Engine, sender: Sender, rank: RankName = "robot", name: str = "") -> None:
+        self.episode = ImplicitEpisode()
+        self._engine = engine
+        self._sender = sender
+        self._rank: RankName = rank
+        self._name = name
+
+    async def act(self, message: Message, obs: Obs, instruction: str | None, request_id: str, **kwargs: Any) -> Reply:
+        """Return the policy's action; see `act_together`."""
+        (reply,) = await act_together(message, [SessionObs(self, obs, instruction)], request_id, **kwargs)
+        return reply
+
+    async def close(self) -> None:
+        """End the session."""
+        await self._sender.ask(self._sender.message("close"), Decoded([self._request("close", None, None, "", {})], {}))
+
+    def _request(
+        self, op: Op, obs: Obs | None, instruction: str | None, request_id: str, kwargs: dict[str, Any]
+    ) -> Request:
+        return Request(op, obs, instruction, kwargs, session=self._name, rank=self._rank, request_id=request_id)
+
+
+class SessionObs(NamedTuple):
+    """An observation of a session, and its instruction; None if there is none."""
+
+    session: ImplicitSession
+    obs: Obs
+    instruction: str | None
+
+
+async def act_together(message: Message, seen: Sequence[SessionObs], request_id: str, **kwargs: Any) -> list[Reply]:
+    """Return the policy's action for each observation in a client's message; their acts are queued at once.
+
+    A session whose episode begins is reset first, with `kwargs`. One that was removed because it was idle is reset
+    again, which is safe since the observation was not acted on.
+
+    Raises:
+        VLAgentsError: The first error among the replies.
+    """
+    await _reset([one for one in seen if one.session.episode.begins(one.instruction)], request_id, kwargs)
+    replies = await _ask(message, "act", seen, [None] * len(seen), request_id, {})
+    if forgotten := [i for i, reply in enumerate(replies) if isinstance(reply.error, UnknownSession)]:
+        logger.info("%s: a session was forgotten; it begins again (request %s)", message.transport, request_id)
+        again = [seen[i] for i in forgotten]
+        await _reset(again, request_id, kwargs)
+        repeated = await _ask(seen[0].session._sender.message(), "act", again, [None] * len(again), request_id, {})
+        for i, reply in zip(forgotten, repeated, strict=True):
+            replies[i] = reply
+    _raise_first(replies)
+    return replies
+
+
+async def _reset(seen: Sequence[SessionObs], request_id: str, kwargs: dict[str, Any]) -> None:
+    if not seen:
+        return
+    openings = [one.session.episode.opening(one.instruction, one.session._engine.contract) for one in seen]
+    for session, _, _ in seen:
+        session.episode.end()
+    resets = seen[0].session._sender.message("reset", seen[0].session._rank)
+    resets.decoded_alike(len(seen))
+    replies = await _ask(resets, "reset", seen, openings, request_id, kwargs)
+    resets.written(lambda: None)
+    for one, opening, reply in zip(seen, openings, replies, strict=True):
+        if reply.error is None:
+            one.session.episode.began(opening)
+    _raise_first(replies)
+
+
+async def _ask(
+    message: Message,
+    op: Op,
+    seen: Sequence[SessionObs],
+    instructions: Sequence[str | None],
+    request_id: str,
+    kwargs: dict[str, Any],
+) -> list[Reply]:
+    names = [request_id] if len(seen) == 1 else [f"{request_id}-{place}" for place in range(len(seen))]
+    requests = [
+        one.session._request(op, one.obs, instruction, name, kwargs)
+        for one, instruction, name in zip(seen, instructions, names, strict=True)
+    ]
+    return await seen[0].session._sender.ask(message, Decoded(requests, {}))
+
+
+def _raise_first(replies: Sequence[Reply]) -> None:
+    for reply in replies:
+        if reply.error is not None:
+            raise reply.error
+
+
+class HttpDialect(RouteDialect):
+    """A dialect of HTTP requests.
+
+    Each request is an episode of one step, unless it has the header `x-session-id`: then it belongs to that session,
+    in which each new instruction begins an episode. Errors have their status and a problem+json document.
+    """
+
+    def __init__(self, name: str, config: DialectConfig, context: ReplicaContext) -> None:
+        super().__init__(name, config, context)
+        self._requests = RequestDecoder(context.limits)
+        # The sessions by caller and session id in the engine. A new key with the name of a revoked one continues the
+        # sessions of that name, but not with the revoked key.
+        self._kept: dict[tuple[Identity, str], ImplicitSession] = {}
+
+    async def answer(
+        self,
+        http: HttpRequest,
+        read: Callable[[bytes, Budget], Any],
+        write: Callable[[np.ndarray], bytes],
+        media_type: str = "application/json",
+    ) -> Response:
+        """Answer one request.
+
+        Args:
+            http: The request.
+            read: Decodes the body to the client's observation, within a budget; it may run on another thread.
+            write: Encodes the action, (H, D) float32 in the client's convention, as the body of the reply.
+            media_type: The media type of the reply.
+        """
+        name = request_id(http)
+        message = self.arrived()
+        admission = self.gate(counted=True).admission(self.context.limits, rank=self.rank)
+        try:
+            self.context.engine.require_ready()
+            body = await self._requests.body(http, admission)
+            message.arrive()
+            theirs = await decoded(read, body, admission)
+            obs, instruction = self.read(theirs)
+            message.decoded_alike()
+            session = self._kept_session(session_id(http)) if SESSION_HEADER in http.headers else None
+            if session is None or not session.episode.begun:
+                self.mapping.warn_of_unread_cameras(theirs, self.name)
+            if session is not None:
+                reply = await session.act(message, obs, instruction, name)
+            else:
+                sender = self.sender()
+                try:
+                    reply = await self.session(sender).act(message, obs, instruction, name)
+                finally:
+                    sender.release(for_good=True)
+            return Response(message.written(lambda: write(self.rows(reply))), media_type=media_type)
+        except ClientDisconnect:
+            message.refused("disconnected")
+            return Response(status_code=499)
+        except Exception as error:  # noqa: BLE001 - the error is the reply to the client
+            problem = public_problem(error, self.name, name)
+            message.refused(problem.code)
+            return problem_response(problem, name)
+        finally:
+            admission.release()
+
+    def _kept_session(self, name: str) -> ImplicitSession:
+        """Return the session that a client names, which is kept as long as the engine keeps it."""
+        sessions = self.context.engine.sessions
+        if len(self._kept) > 2 * len(sessions) + 16:
+            self._kept = {kept: one for kept, one in self._kept.items() if kept[1] in sessions}
+        sender = self.sender(name)
+        known = (current_caller(), sender.session_id)
+        if known not in self._kept or known[1] not in sessions:
+            self._kept[known] = self.session(sender)
+        return self._kept[known]

@@ -7,10 +7,13 @@ class applies to all its requests.
 
 from __future__ import annotations
 
+import abc
+import logging
 import threading
 import time
+import uuid
 from collections.abc import Callable, Hashable, Sequence
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.contract import Contract
@@ -18,8 +21,11 @@ from vlagents_ray.errors import PolicyUnavailable
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.protocol.messages import RankName
 from vlagents_ray.serve.access.api_keys import Caller, Identity
-from vlagents_ray.serve.dialects.base import Connect, GatewayContext
-from vlagents_ray.serve.dialects.implicit_session import ImplicitEpisode
+from vlagents_ray.serve.dialects.base import Connect, GatewayContext, ImplicitEpisode
+
+logger = logging.getLogger(__name__)
+
+_QUIET_S = 30.0  # a client without a session is removed after this time without a request
 
 
 class GatewaySessions:
@@ -152,6 +158,13 @@ class GatewaySessions:
                 self._caller.admit()
 
 
+def internal_error(dialect: str) -> str:
+    """Log the current exception under a new name, and return the text about it for the client."""
+    name = uuid.uuid4().hex
+    logger.exception("%s: request %s failed", dialect, name)
+    return f"internal error; the server's log has the details under {name}"
+
+
 def _raise_first(found: Sequence[object]) -> None:
     for one in found:
         if isinstance(one, Exception):
@@ -160,28 +173,23 @@ def _raise_first(found: Sequence[object]) -> None:
 
 # Clients of a dialect whose protocol does not say when they are gone.
 
-_QUIET_S = 30.0  # a client without a session is removed after this time without a request
 
-
-class GatewayClient(Protocol):
+class GatewayClient(abc.ABC):
     """One client, with its sessions."""
 
-    @property
-    def begun(self) -> bool:
-        """Whether the client has a session."""
-        ...
+    def __init__(self, context: GatewayContext) -> None:
+        self.sessions = GatewaySessions(context.connect, context.contract)
+        self._context = context
+        self._unanswered = 0  # number of requests without a reply
+        self._used = time.monotonic()  # time of the last reply, s
 
     def quiet_s(self, now: float) -> float:
         """Return the time since the client's last request, s; 0 while it waits for a reply."""
-        ...
+        return 0.0 if self._unanswered else now - self._used
 
-    def refusal(self) -> str | None:
-        """Return the reason if the client's key is no longer valid; None if it is valid or there is none."""
-        ...
-
+    @abc.abstractmethod
     def end(self) -> None:
         """End the client's sessions, after the current request."""
-        ...
 
 
 K = TypeVar("K", bound=Hashable)
@@ -235,13 +243,13 @@ class GatewayClients(Generic[K, C]):
         return _end(clients)
 
     def _is_gone(self, client: C, now: float) -> bool:
-        patience_s = self._context.idle_s if client.begun else min(_QUIET_S, self._context.idle_s)
-        return client.quiet_s(now) > patience_s or client.refusal() is not None
+        patience_s = self._context.idle_s if client.sessions.begun else min(_QUIET_S, self._context.idle_s)
+        return client.quiet_s(now) > patience_s or client.sessions.refusal() is not None
 
     def _idlest(self) -> K:
         """Return the key of the client without a session that has been idle for the longest."""
         now = time.monotonic()
-        idle = [(client.quiet_s(now), key) for key, client in self._clients.items() if not client.begun]
+        idle = [(client.quiet_s(now), key) for key, client in self._clients.items() if not client.sessions.begun]
         quiet_s, key = max(idle, key=lambda one: one[0], default=(0.0, None))
         if key is None or quiet_s <= 0:
             raise PolicyUnavailable(f"{len(self._clients)} clients are connected, the limit; try again later")

@@ -11,7 +11,6 @@ import socket
 import struct
 import threading
 import time
-import uuid
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
@@ -25,7 +24,7 @@ from vlagents_ray.registry import require
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.config.dialects import MappingSetting, PortConfig
 from vlagents_ray.serve.dialects.base import GatewayContext, PortDialect
-from vlagents_ray.serve.dialects.gateway_sessions import GatewayClients, GatewaySessions
+from vlagents_ray.serve.dialects.gateway_sessions import GatewayClient, GatewayClients, internal_error
 from vlagents_ray.wire import gr00t
 from vlagents_ray.wire.gr00t import PRESETS, GR00TRequest, Observations
 from vlagents_ray.wire.mapping import KeyMapping, matches
@@ -46,30 +45,17 @@ _RECEIVED = struct.Struct("<Q")  # `tcpi_bytes_received` in Linux' `struct tcp_i
 _RECEIVED_AT = 128
 
 
-class GR00TConnection:
+class GR00TConnection(GatewayClient):
     """One client's requests, which are processed one after the other on a separate thread."""
 
     def __init__(self, context: GatewayContext, mapping: KeyMapping, answer: Callable[[bytes], None]) -> None:
-        self._context = context
+        super().__init__(context)
         self._mapping, self._flat = nested_mapping(mapping)  # flat: whether the client's last keys were N1.5's
         self._send = answer
-        self._session = GatewaySessions(context.connect, context.contract)
         self._requests: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
-        self._pending = 0  # number of requests without a reply
         self._lock = threading.Lock()
-        self._used = time.monotonic()
         self._thread = threading.Thread(target=self._run, name="gr00t-client", daemon=True)
         self._thread.start()
-
-    @property
-    def known(self) -> bool:
-        """Whether the client has shown a valid key, or needs none."""
-        return self._session.known
-
-    @property
-    def begun(self) -> bool:
-        """Whether the client has a session."""
-        return self._session.begun
 
     def put(self, payload: bytes) -> bool:
         """Queue a request; return False if too many are waiting.
@@ -77,23 +63,14 @@ class GR00TConnection:
         Raises `Overloaded` if the requests of all clients leave no memory for it.
         """
         with self._lock:
-            if self._pending >= WAITING:
+            if self._unanswered >= WAITING:
                 return False
             self._context.admission.hold(len(payload), True, 0)
-            self._pending += 1
+            self._unanswered += 1
         self._requests.put(payload)
         return True
 
-    def refusal(self) -> str | None:
-        """Return the reason if the client's key is no longer valid; None if it is valid or there is none."""
-        return self._session.refusal()
-
-    def quiet_s(self, now: float) -> float:
-        """Return the time since the client's last request, s; 0 while it waits for a reply."""
-        return 0.0 if self._pending else now - self._used
-
     def end(self) -> None:
-        """End the client's sessions, after the current request."""
         self._requests.put(None)
 
     def join(self, timeout_s: float) -> None:
@@ -105,33 +82,31 @@ class GR00TConnection:
             message = self._answer(payload)
             self._context.admission.release(len(payload))
             with self._lock:
-                self._pending -= 1
+                self._unanswered -= 1
                 self._used = time.monotonic()
             self._send(message)
-            time.sleep(self._session.throttled_s())
-        self._session.close()
+            time.sleep(self.sessions.throttled_s())
+        self.sessions.close()
 
     def _answer(self, payload: bytes) -> bytes:
         try:
             self._let_in(payload)
-            self._session.begin()
+            self.sessions.begin()
             request = gr00t.read_request(payload, self._context.limits)
             return gr00t.pack(self._value(request), packed=request.packed)
         except VLAgentsError as error:
             return gr00t.pack({"error": f"{error.code}: {error}"})
-        except Exception:
-            name = uuid.uuid4().hex
-            logger.exception("gr00t: request %s failed", name)
-            return gr00t.pack({"error": f"internal error; the server's log has the details under {name}"})
+        except Exception:  # noqa: BLE001 - logged, and answered
+            return gr00t.pack({"error": internal_error("gr00t")})
 
     def _let_in(self, payload: bytes) -> None:
         """Identify the client by the key in the message, before anything else of that is decoded."""
         check = self._context.check
         if isinstance(check, NoKey):
-            self._session.show(check, None)
+            self.sessions.show(check, None)
         else:
             key = gr00t.read_token(payload, self._context.limits)
-            self._session.show(check(key), key)
+            self.sessions.show(check(key), key)
 
     def _value(self, request: GR00TRequest) -> Any:
         if request.endpoint == "ping":
@@ -139,7 +114,7 @@ class GR00TConnection:
         if request.endpoint == "get_modality_config":
             return gr00t.modality_config(self._modalities(), flat=self._flat)
         if request.endpoint == "reset":
-            self._session.restart()
+            self.sessions.restart()
             return {}
         return self._act(gr00t.read_observations(request.data))
 
@@ -147,9 +122,9 @@ class GR00TConnection:
         mapping, contract = self._mapping, self._context.contract
         self._flat = asked.flat
         seen = [mapping.obs(gr00t.newest(one), self._context.limits, contract) for one in asked.each]
-        if not self._session.begun:
+        if not self.sessions.begun:
             mapping.warn_of_unread_cameras(gr00t.newest(asked.each[0]), "gr00t")
-        acts = self._session.act_batch([obs for obs, _ in seen], [text for _, text in seen])
+        acts = self.sessions.act_batch([obs for obs, _ in seen], [text for _, text in seen])
         spec = None if contract is None else contract.action
         info = {"done": [act.done for act in acts]} | {"timing": acts[0].info.get("timing", {})}
         return gr00t.write_actions([mapping.actions(act.action, spec) for act in acts], asked, info)
@@ -387,7 +362,7 @@ class _Strangers:
 
     def end_overdue(self) -> None:
         """End the connections that take too long or, together, too much; forget those with a valid key."""
-        for descriptor in [one for one, client in self._clients.items() if client.known]:
+        for descriptor in [one for one, client in self._clients.items() if client.sessions.known]:
             self._drop(descriptor)
         late = time.monotonic() - _STRANGER_S
         sizes = {one: _received(connection) for one, (connection, _) in self._since.items()}

@@ -7,7 +7,6 @@ import logging
 import socket
 import threading
 import time
-import uuid
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -32,7 +31,7 @@ from vlagents_ray.registry import require
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.config.dialects import KeylessPortConfig, MappingSetting
 from vlagents_ray.serve.dialects.base import GatewayContext, PortDialect
-from vlagents_ray.serve.dialects.gateway_sessions import GatewayClients, GatewaySessions
+from vlagents_ray.serve.dialects.gateway_sessions import GatewayClient, GatewayClients, internal_error
 from vlagents_ray.serve.engine.admission import MessageAdmission
 from vlagents_ray.wire import lerobot
 from vlagents_ray.wire.lerobot import PRESETS, PolicyInstructions, RobotObservation, TransferState
@@ -72,47 +71,31 @@ class _Waiting:
     admission: MessageAdmission
 
 
-class LeRobotConnection:
+class LeRobotConnection(GatewayClient):
     """One client, from its `Ready` on. Its requests come on several threads; the session is used by one at a time."""
 
     def __init__(self, context: GatewayContext, mapping: KeyMapping, checkpoint: str | None) -> None:
-        self._context = context
+        super().__init__(context)
         self._mapping = mapping
         self._checkpoint = checkpoint
-        self._session = GatewaySessions(context.connect, context.contract)
-        self._session.show(NoKey.OPEN, None)  # the protocol has no key, and the deployment accepted that
+        self.sessions.show(NoKey.OPEN, None)  # the protocol has no key, and the deployment accepted that
         self._robot: PolicyInstructions | None = None
         self._acted = -1  # time step of the last observation that the policy got
         self._waiting: _Waiting | None = None
         self._arrival = threading.Condition()
         self._acting = threading.Lock()
-        self._requests = 0  # number of requests without a reply
-        self._used = time.monotonic()
         self._ended = False
-
-    @property
-    def begun(self) -> bool:
-        """Whether the client has a session."""
-        return self._session.begun
-
-    def quiet_s(self, now: float) -> float:
-        """Return the time since the client's last request, s; 0 while it waits for a reply."""
-        return 0.0 if self._requests else now - self._used
-
-    def refusal(self) -> str | None:
-        """Return None, as the client has no key that could become invalid."""
-        return None
 
     @contextmanager
     def request(self) -> Iterator[None]:
         """Count a request as without a reply."""
         with self._arrival:
-            self._requests += 1
+            self._unanswered += 1
         try:
             yield
         finally:
             with self._arrival:
-                self._requests -= 1
+                self._unanswered -= 1
                 self._used = time.monotonic()
 
     def set_up(self, robot: PolicyInstructions) -> None:
@@ -142,7 +125,7 @@ class LeRobotConnection:
             return
         theirs = lerobot.frame(seen, self._robot)
         obs, instruction = self._mapping.obs(theirs, self._context.limits, self._context.contract)
-        if not self._session.begun:
+        if not self.sessions.begun:
             self._mapping.warn_of_unread_cameras(theirs, "lerobot")
         with self._arrival:
             earlier, self._waiting = self._waiting, _Waiting(seen, obs, instruction, admission)
@@ -164,14 +147,13 @@ class LeRobotConnection:
                 self.end()
 
     def end(self) -> None:
-        """End the client's session, after the current request."""
         with self._arrival:
             self._ended = True
             self._waiting = None
             self._arrival.notify_all()
         if self._acting.acquire(blocking=False):
             try:
-                self._session.close()
+                self.sessions.close()
             except Exception:
                 logger.exception("lerobot: a session did not end")
             finally:
@@ -189,7 +171,7 @@ class LeRobotConnection:
             raise NotReset("SendPolicyInstructions: got none since Ready; start the client again")
         before, self._acted = self._acted, max(self._acted, seen.timestep)
         try:
-            act = self._session.act(waiting.obs, waiting.instruction)
+            act = self.sessions.act(waiting.obs, waiting.instruction)
         except BaseException:
             self._acted = before  # the client's next observation of this time step is not left out
             raise
@@ -289,12 +271,10 @@ class LeRobotDialect(PortDialect):
             return method(request, context)
         except VLAgentsError as error:
             status, text = _STATUS.get(error.status, "INTERNAL"), f"{error.code}: {error}"
-        except Exception as error:
+        except Exception as error:  # noqa: BLE001 - logged, and answered
             if isinstance(error, grpc.RpcError):  # the client is gone
                 return lerobot.EMPTY
-            name = uuid.uuid4().hex
-            logger.exception("lerobot: request %s failed", name)
-            status, text = "INTERNAL", f"internal error; the server's log has the details under {name}"
+            status, text = "INTERNAL", internal_error("lerobot")
         context.abort(getattr(grpc.StatusCode, status), text[:_DETAILS])
         raise AssertionError  # abort raises
 

@@ -1,6 +1,6 @@
 """openpi's clients over WebSocket: requests and replies are binary maps, and the server sends the first message.
 
-RoboArena's clients (`roboarena/`) use nearly the same protocol and also connect to the root. Both dialects may be on:
+RoboArena's clients (`roboarena.py`) use nearly the same protocol and also connect to the root. Both dialects may be on:
 RoboArena's requests name an `endpoint`, openpi's do not. The first message is then RoboArena's configuration, which
 openpi's client takes for metadata.
 
@@ -10,7 +10,7 @@ sends a traceback.
 A batch, `{"batch": [observation, ...]}`, is that of openpi's pull request 941 (its head 5bdadc8), which was open when
 this was written: the reply is one map, whose `actions` are stacked. openpi's own client sends nothing when it is reset;
 the message `{"reset": True}` is that of its derivatives, such as BEHAVIOR-1K's client, which waits for no reply. The
-replies that the latter reads are in `rows.py`.
+latter reads the replies of `Rows`.
 """
 
 from __future__ import annotations
@@ -32,13 +32,16 @@ from vlagents_ray.serve.config.dialects import DialectConfig, MappingSetting
 from vlagents_ray.serve.dialects.base import (
     INTERNAL_ERROR,
     POLICY_VIOLATION,
+    ImplicitSession,
     RouteDialect,
+    SessionObs,
     Stream,
     accept_or_refuse,
+    act_together,
     decoded,
     public_problem,
 )
-from vlagents_ray.serve.dialects.implicit_session import ImplicitSession, SessionObs, act_together
+from vlagents_ray.serve.engine.admission import MessageAdmission
 from vlagents_ray.serve.engine.sender import REFUSED, Sender
 from vlagents_ray.serve.requests import Message
 from vlagents_ray.wire import openpi
@@ -256,12 +259,9 @@ class MapEndpoint:
         gate = self._dialects[0].gate()
         try:
             await socket.send_bytes(openpi.encode(self._dialects[-1].first()))
-            while True:
-                await gate.wait_unthrottled()
-                event = await asyncio.wait_for(socket.receive(), self._dialects[0].idle_s)
-                if event["type"] == "websocket.disconnect":
-                    return
-                if not await self._answer(socket, event.get("bytes"), connections, gate):
+            first = self._dialects[0]
+            while (received := await first.receive(socket, gate, first.idle_s)) is not None:
+                if not await self._answer(socket, *received, connections, gate):
                     return
         except asyncio.TimeoutError:
             await socket.close()
@@ -272,15 +272,16 @@ class MapEndpoint:
                 connection.sender.release(for_good=True)
 
     async def _answer(
-        self, socket: WebSocket, data: bytes | None, connections: dict[str, MapConnection], gate: Sender
+        self,
+        socket: WebSocket,
+        data: bytes | None,
+        admission: MessageAdmission,
+        connections: dict[str, MapConnection],
+        gate: Sender,
     ) -> bool:
         """Reply to one message; return False if the connection was closed."""
         incoming, request_id = self._dialects[0].arrived(), uuid.uuid4().hex
-        admission = gate.admission(self._context.limits, 0 if data is None else len(data), self._dialects[0].rank)
         try:
-            admission.begin_message()
-            if data is None:
-                raise MalformedMessage("message: got text, want a binary map")
             message = await decoded(lambda data, budget: openpi.decode(data, budget.limits), data, admission)
             dialect = next((dialect for dialect in self._dialects if dialect.speaks(message)), self._dialects[0])
             arrived, incoming = incoming.arrived, dialect.arrived()

@@ -15,7 +15,7 @@ from starlette.responses import Response
 
 from vlagents_ray.protocol.messages import Budget
 from vlagents_ray.serve.config.dialects import DialectConfig, MappingSetting
-from vlagents_ray.serve.dialects.http import HttpDialect
+from vlagents_ray.serve.dialects.base import HttpDialect
 from vlagents_ray.wire import openvla
 from vlagents_ray.wire.openvla import PRESETS
 

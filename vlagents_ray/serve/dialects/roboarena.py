@@ -1,4 +1,12 @@
-"""RoboArena's clients: they use openpi's protocol, with a configuration at the start and an `endpoint` per request."""
+"""RoboArena's clients, and those of vLLM-Omni's `/v1/realtime/robot/openpi`, which speak openpi's protocol.
+
+RoboArena's server sends a configuration at the start, and each request has an `endpoint`.
+
+vLLM-Omni's differences are those of its `entrypoints/openpi/connection.py` at 72a58c4 and of its tests' clients: an
+action is the array itself, a reset is answered by a map, an error is a map after which the connection stays open, a
+`seed` may come with an observation, and a client that sends nothing for 30 s is disconnected. Its earliest servers
+answered a reset with text, which their clients did not read.
+"""
 
 from __future__ import annotations
 
@@ -31,10 +39,6 @@ class RoboArenaDialectConfig(DialectConfig):
     )
     bare: bool = Field(default=False, description="answer the array itself, as older clients want it")
 
-    def first(self) -> dict[str, Any]:
-        """Return the fields of PolicyServerConfig."""
-        return self.model_dump(mode="json", exclude={"mapping", "rank", "bare"})
-
 
 class RoboArenaDialect(MapDialect):
     """RoboArena's protocol: an episode ends with `reset`, or with another `session_id`."""
@@ -50,7 +54,8 @@ class RoboArenaDialect(MapDialect):
     config: RoboArenaDialectConfig
 
     def first(self) -> dict[str, Any]:
-        return self.config.first()
+        ours = {"mapping", "rank", "bare"}
+        return self.config.model_dump(mode="json", include=RoboArenaDialectConfig.model_fields.keys() - ours)
 
     def speaks(self, message: dict[str, Any]) -> bool:
         return "endpoint" in message
@@ -86,12 +91,6 @@ class VllmOmniDialectConfig(RoboArenaDialectConfig):
         default_factory=dict, description="added to what the client is sent first, such as action_horizon"
     )
 
-    def first(self) -> dict[str, Any]:
-        """Return the fields of PolicyServerConfig, and those that the deployment adds."""
-        return {
-            key: value for key, value in super().first().items() if key not in ("idle_s", "metadata")
-        } | self.metadata
-
 
 class VllmOmniDialect(RoboArenaDialect):
     """vLLM-Omni's protocol: `reset` or another `session_id` begins an episode, for which a `seed` may be sent."""
@@ -110,6 +109,9 @@ class VllmOmniDialect(RoboArenaDialect):
     @property
     def idle_s(self) -> float | None:
         return self.config.idle_s or None
+
+    def first(self) -> dict[str, Any]:
+        return super().first() | self.config.metadata
 
     def read(self, theirs: Any) -> tuple[Obs, str | None]:
         """Return an observation and its instruction; of a stack of frames, (T, H, W, 3), it has the newest."""

@@ -23,17 +23,17 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from vlagents_ray.chunking.buffer import ChunkBuffer
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge, PolicyUnavailable, VLAgentsError, shown
-from vlagents_ray.protocol.messages import Budget, RankName
+from vlagents_ray.protocol.messages import RankName
 from vlagents_ray.serve.config.dialects import DialectConfig, MappingSetting
 from vlagents_ray.serve.dialects.base import (
     POLICY_VIOLATION,
+    ImplicitSession,
     RouteDialect,
     Stream,
     accept_or_refuse,
     decoded,
     public_problem,
 )
-from vlagents_ray.serve.dialects.implicit_session import ImplicitSession
 from vlagents_ray.serve.endpoints.http_messages import problem_response
 from vlagents_ray.serve.engine.admission import MessageAdmission
 from vlagents_ray.serve.engine.sender import REFUSED, Sender
@@ -199,15 +199,12 @@ class _Inbox:
         """Receive messages until the client is gone, or too many of its messages wait for replies."""
         try:
             while not gate.refused_too_often:
-                await gate.wait_unthrottled()
-                if (event := await socket.receive())["type"] == "websocket.disconnect":
+                if (received := await dialect.receive(socket, gate)) is None:
                     return
-                data = event.get("bytes")
-                admission = gate.admission(dialect.context.limits, 0 if data is None else len(data), dialect.rank)
+                data, admission = received
                 if len(self._messages) >= _WAITING:
                     self.end = f"{_WAITING} messages wait for answers; send no more than that at once"
-                    most = MessageTooLarge(self.end)
-                    self._put(_Received(most, admission))
+                    self._put(_Received(MessageTooLarge(self.end), admission))
                     return
                 self._put(await self._read(data, admission))
             self.end = REFUSED
@@ -218,10 +215,8 @@ class _Inbox:
     async def _read(data: bytes | None, admission: MessageAdmission) -> _Received:
         """Decode a message, which counts as a request of the key."""
         try:
-            admission.begin_message()
-            if data is None:
-                raise MalformedMessage("message: got text, want a binary map")
-            return _Received(await decoded(_read_message, data, admission), admission)
+            message = await decoded(lambda data, budget: vla_eval.decode(data, budget.limits), data, admission)
+            return _Received(message, admission)
         except Exception as error:  # noqa: BLE001 - the client is answered with it
             return _Received(public_problem(error, "vla_eval", "of an unreadable message"), admission)
 
@@ -231,10 +226,6 @@ class _Inbox:
             self._messages.pop()
         self._messages.append(received)
         self._there.set()
-
-
-def _read_message(data: bytes, budget: Budget) -> vla_eval.Message:
-    return vla_eval.decode(data, budget.limits)
 
 
 def _error(error: VLAgentsError, seq: int, request_id: str) -> vla_eval.Message:

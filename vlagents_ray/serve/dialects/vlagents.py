@@ -11,9 +11,7 @@ import socket
 import stat
 import threading
 import time
-import uuid
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -31,10 +29,9 @@ from vlagents_ray.interface import Obs
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.config.dialects import DialectConfig, KeylessPortConfig
 from vlagents_ray.serve.dialects.base import GatewayContext, PortDialect
-from vlagents_ray.serve.dialects.gateway_sessions import GatewaySessions
+from vlagents_ray.serve.dialects.gateway_sessions import GatewaySessions, internal_error
 from vlagents_ray.serve.engine.admission import MessageAdmission
 from vlagents_ray.wire import json_numpy, rpyc, vlagents
-from vlagents_ray.wire.mapping import KeyMapping
 from vlagents_ray.wire.rpyc import Handler, RpycCall
 
 logger = logging.getLogger(__name__)
@@ -49,27 +46,16 @@ _KEPT = 64
 _END_S = 3.0
 
 
-@dataclass(frozen=True, slots=True)
-class Terms:
-    """The settings of the deployment for this protocol."""
-
-    name: str  # name of the model, which clients must state
-    version: str  # version of this package
-    shared_memory: bool  # whether the shared memory of clients on this machine is read
-    mapping: KeyMapping | None  # None if clients use our names
-    parts: Mapping[str, vlagents.Part] | vlagents.Part  # columns of each robot, or of the only one
-
-
 class VlagentsConnection:
     """One connection of a client, from its first byte to its last."""
 
-    def __init__(self, context: GatewayContext, terms: Terms, connection: socket.socket) -> None:
-        self._context = context
-        self._terms = terms
+    def __init__(self, dialect: VlagentsDialect, connection: socket.socket) -> None:
+        self._context = context = dialect.context
+        self._dialect = dialect
         self._connection = connection
         self._session = GatewaySessions(context.connect, context.contract)
         self._session.show(NoKey.OPEN, None)  # the protocol has no key, and the deployment accepted that
-        self._segments = SharedMemory(same_machine=terms.shared_memory and _is_same_machine(connection))
+        self._segments = SharedMemory(same_machine=dialect.config.shared_memory and _is_same_machine(connection))
 
     def run(self) -> None:
         """Process the client's requests until it disconnects, is silent for too long, or sends an invalid message."""
@@ -111,12 +97,8 @@ class VlagentsConnection:
             return rpyc.reply(call.sequence, self._value(call))
         except VLAgentsError as error:
             return rpyc.exception(call.sequence, _builtin(error), f"{error.code}: {error}")
-        except Exception:
-            name = uuid.uuid4().hex
-            logger.exception("vlagents: request %s failed", name)
-            return rpyc.exception(
-                call.sequence, "RuntimeError", f"internal error; the server's log has the details under {name}"
-            )
+        except Exception:  # noqa: BLE001 - logged, and answered
+            return rpyc.exception(call.sequence, "RuntimeError", internal_error("vlagents"))
 
     def _value(self, call: RpycCall) -> Any:
         if call.handler is Handler.PING:
@@ -136,10 +118,10 @@ class VlagentsConnection:
         if args:
             raise MalformedMessage(f"{method}: want no arguments")
         if method == "name":
-            return self._terms.name
+            return self._dialect.config.name or self._context.app
         if method == "is_initialized":
             return True  # the gateway accepts clients only then
-        return json_numpy.dumps({"vlagents_ray": self._terms.version})
+        return json_numpy.dumps({"vlagents_ray": importlib.metadata.version("vlagents-ray")})
 
     def _act(self, text: str | bytes) -> str:
         admission = self._admission(text)
@@ -147,7 +129,7 @@ class VlagentsConnection:
         obs = self._ours(seen.obs)
         act = self._session.act(obs, seen.instruction) if seen.robots else self._session.act_on(obs)
         admission.release()
-        parts = self._terms.parts
+        parts = self._dialect.parts
         if isinstance(parts, vlagents.Part):
             if len(seen.robots) > 1:
                 raise InvalidInput(
@@ -169,14 +151,15 @@ class VlagentsConnection:
 
     def _ours(self, obs: Obs) -> Obs:
         """Return the observation under our names, converted if the deployment has a mapping."""
-        if self._terms.mapping is None:
+        mapping = self._dialect.stated_mapping
+        if mapping is None:
             return obs
         theirs: dict[str, Any] = {"cameras": obs.cameras, "state": obs.state, "info": obs.info}
         if obs.gripper is not None:
             theirs["gripper"] = obs.gripper
-        ours, _ = self._terms.mapping.obs(theirs, self._context.limits, self._context.contract)
+        ours, _ = mapping.obs(theirs, self._context.limits, self._context.contract)
         if not self._session.begun:
-            self._terms.mapping.warn_of_unread_cameras(theirs, "vlagents")
+            mapping.warn_of_unread_cameras(theirs, "vlagents")
         return ours
 
     def _receive(self) -> tuple[bytearray, bool] | None:
@@ -403,16 +386,15 @@ class VlagentsDialect(PortDialect):
 
     def __init__(self, name: str, config: VlagentsDialectConfig, context: GatewayContext) -> None:
         super().__init__(name, config, context)
-        self._terms = Terms(
-            name=config.name or context.app,
-            version=importlib.metadata.version("vlagents-ray"),
-            shared_memory=config.shared_memory,
-            mapping=config.keys(),
-            parts=self._parts(config),
-        )
+        self.stated_mapping = config.keys()  # None if clients use our names
+        spec = ActionSpec() if context.contract is None else context.contract.action
+        # The columns of each robot, or of the only one.
+        self.parts: Mapping[str, vlagents.Part] | vlagents.Part = {
+            name: _part(robot, spec) for name, robot in config.robots.items()
+        } or _part(RobotArgs(gripper=config.gripper), spec)
         self._clients: dict[threading.Thread, socket.socket] = {}
         self._lock = threading.Lock()
-        self._closing = False
+        self._closing = threading.Event()
         self._listener: socket.socket | None = None
         self._accepting: threading.Thread | None = None
 
@@ -431,7 +413,7 @@ class VlagentsDialect(PortDialect):
         return self._accepting is not None and self._accepting.is_alive()
 
     def close(self) -> None:
-        self._closing = True
+        self._closing.set()
         if self._listener is not None:
             shut_down(self._listener)
         with self._lock:
@@ -447,16 +429,16 @@ class VlagentsDialect(PortDialect):
             thread.join(max(0.0, deadline - time.monotonic()))
 
     def _accept(self, listener: socket.socket) -> None:
-        while not self._stopped():
+        while not self._closing.is_set():
             try:
                 connection, peer = listener.accept()
             except OSError as error:
-                if self._stopped():
+                if self._closing.is_set():
                     break
                 logger.warning("vlagents: cannot accept a client: %s", error)
                 time.sleep(0.1)  # if descriptors are exhausted, other connections have to end first
                 continue
-            client = VlagentsConnection(self.context, self._terms, connection)
+            client = VlagentsConnection(self, connection)
             thread = threading.Thread(target=self._serve, args=(client,), name=f"vlagents {peer[0]}", daemon=True)
             with self._lock:
                 full = len(self._clients) >= self.context.sessions
@@ -468,9 +450,6 @@ class VlagentsDialect(PortDialect):
             else:
                 thread.start()
 
-    def _stopped(self) -> bool:
-        return self._closing
-
     def _serve(self, client: VlagentsConnection) -> None:
         try:
             client.run()
@@ -478,22 +457,12 @@ class VlagentsDialect(PortDialect):
             with self._lock:
                 del self._clients[threading.current_thread()]
 
-    def _parts(self, config: VlagentsDialectConfig) -> dict[str, vlagents.Part] | vlagents.Part:
-        if config.robots:
-            return {name: self._part(robot.start, robot.stop, robot.gripper) for name, robot in config.robots.items()}
-        return self._part(None, None, config.gripper)
 
-    def _part(self, start: int | None, stop: int | None, gripper: GripperArgs | None) -> vlagents.Part:
-        if gripper is None:
-            return vlagents.Part(start, stop)
-        spec = ActionSpec() if self.context.contract is None else self.context.contract.action
-        return vlagents.Part(
-            start,
-            stop,
-            gripper.column,
-            _first(gripper.open, spec.gripper_open, 1.0),
-            _first(gripper.closed, spec.gripper_closed, 0.0),
-        )
+def _part(robot: RobotArgs, spec: ActionSpec) -> vlagents.Part:
+    if (gripper := robot.gripper) is None:
+        return vlagents.Part(robot.start, robot.stop)
+    opened, closed = _first(gripper.open, spec.gripper_open, 1.0), _first(gripper.closed, spec.gripper_closed, 0.0)
+    return vlagents.Part(robot.start, robot.stop, gripper.column, opened, closed)
 
 
 def _first(*values: float | None) -> float:

@@ -29,7 +29,7 @@ from vlagents_ray.errors import InvalidInput, MalformedMessage, MessageTooLarge,
 from vlagents_ray.protocol.json_messages import problem
 from vlagents_ray.serve.access.api_keys import Caller, ScopeCheck, current_caller
 from vlagents_ray.serve.endpoints.http_messages import deny, problem_response, request_id
-from vlagents_ray.serve.weights.updates import PushOptions, PushResult
+from vlagents_ray.serve.weights import PushOptions, PushResult
 from vlagents_ray.weights.safetensors import MESSAGE_BYTES, ValueSpec, ValuesReader
 
 logger = logging.getLogger(__name__)

@@ -41,8 +41,7 @@ from vlagents_ray.serve.queue.poller import Poller
 from vlagents_ray.serve.queue.preparation import Preparations
 from vlagents_ray.serve.requests import Opening, PendingRequest, Rank
 from vlagents_ray.serve.sessions import Session, SessionFinder, SessionTable
-from vlagents_ray.serve.weights.updates import WeightUpdates, follows
-from vlagents_ray.serve.weights.versions import WeightsVersion
+from vlagents_ray.serve.weights import WeightsVersion, WeightUpdates, follows
 
 logger = logging.getLogger(__name__)
 

@@ -35,7 +35,7 @@ def deployment(policy: str, **args: Any) -> ServeDeploySchema:
 
 
 def read_deployment(
-    source: str, overrides: Mapping[str, Any] | None = None, *, step_follows: bool = False
+    source: str, overrides: Mapping[str, Any] | None = None, *, step_follows: bool = False, shadows: bool = True
 ) -> ServeDeploySchema:
     """Read a deployment and check it.
 
@@ -43,11 +43,26 @@ def read_deployment(
         source: A YAML file, or the name of a policy.
         overrides: The args of a policy that is given by its name.
         step_follows: Whether `with_settings` sets `checkpoint_step` later: then a checkpoint with `{step}` needs none.
+        shadows: Whether the file may have a shadow, which a candidate may not.
 
     Raises:
         ConfigError: The file or a setting is invalid.
     """
-    return _read(source, overrides, step_follows=step_follows)
+    path = Path(source)
+    if path.suffix in (".yaml", ".yml"):
+        if not path.is_file():
+            where = "" if path.is_absolute() else f" in {Path.cwd()}; those of this project are in its checkout"
+            raise ConfigError(f"deployment file {source!r} does not exist{where}")
+        if overrides:
+            raise ConfigError(f"{source!r} holds the settings; edit it instead of giving {sorted(overrides)}")
+        try:
+            document = yaml.safe_load(path.read_text())
+        except yaml.YAMLError as error:
+            raise ConfigError(f"{source}: not YAML ({error})") from error
+        return _checked(document, source, step_follows, shadows=shadows)
+    if ":" not in source and source not in names("policies"):
+        policy_class(source)  # raises with the list of what there is
+    return _of_name(source, overrides or {}, step_follows, shadows=shadows)
 
 
 def server_args(source: str, app: str | None = None) -> ServerArgs:
@@ -63,7 +78,7 @@ def policy_application(source: str, app: str | None = None) -> ServeApplicationS
 def with_gateways_at(config: ServeDeploySchema, host: str) -> ServeDeploySchema:
     """Return the deployment, with `host` as the default host of dialects that have their own port."""
     changed = config.model_copy(deep=True)
-    for app in _ours(changed):
+    for app in our_apps(changed):
         for name in ServerArgs(**app.args).dialects.gateways():
             app.args["dialects"][name].setdefault("host", host)
     return changed
@@ -72,9 +87,9 @@ def with_gateways_at(config: ServeDeploySchema, host: str) -> ServeDeploySchema:
 def with_dialect(config: ServeDeploySchema, name: str, settings: Mapping[str, Any]) -> ServeDeploySchema:
     """Return the deployment of one application, with these settings of a dialect in place of the file's."""
     changed = config.model_copy(deep=True)
-    if len(_ours(changed)) != 1:
-        raise ConfigError(f"--{name}-port: the file holds {len(_ours(changed))} policies, want one; write it there")
-    args = _ours(changed)[0].args
+    if len(our_apps(changed)) != 1:
+        raise ConfigError(f"--{name}-port: the file holds {len(our_apps(changed))} policies, want one; write it there")
+    args = our_apps(changed)[0].args
     dialects = args.setdefault("dialects", {})
     dialects[name] = {**(dialects.get(name) or {}), **settings}
     ServerArgs(**args)
@@ -89,7 +104,7 @@ def with_candidate(shadow: ShadowArgs) -> ShadowArgs:
     """
     if not isinstance(shadow.policy, str):
         return shadow
-    app = _only(_read(shadow.policy, shadows=False), shadow.policy, None)
+    app = _only(read_deployment(shadow.policy, shadows=False), shadow.policy, None)
     if app.runtime_env:
         raise ConfigError("shadow: the candidate states a runtime_env; state its packages under `environment:`")
     return shadow.model_copy(update={"policy": {**app.args, "config": own_settings(app)}})
@@ -129,7 +144,7 @@ def with_settings(
         step_follows: See `read_deployment`.
     """
     changed = config.model_copy(deep=True)
-    for app in _ours(changed):
+    for app in our_apps(changed):
         app.args["config"] = own_settings(app) | dict(settings)
         app.deployments = [one for one in app.deployments if one.name != POLICY]
         if steps:
@@ -143,7 +158,7 @@ def with_replicas_on(config: ServeDeploySchema, gpus: float) -> ServeDeploySchem
     A policy is not changed if its file states the number of replicas, autoscaling, or zero GPUs.
     """
     changed = config.model_copy(deep=True)
-    for app in _ours(changed):
+    for app in our_apps(changed):
         resources = {"num_gpus": 1.0} | app.args.get("resources", {})
         left = gpus - gpus_of_candidate(ServerArgs(**app.args))
         replicas = int(left / resources["num_gpus"]) if resources["num_gpus"] else 0
@@ -185,29 +200,8 @@ def stated_contract(config: ServeDeploySchema) -> Contract | None:
     return unloaded_contract(offered.make(settings))
 
 
-def _read(
-    source: str, overrides: Mapping[str, Any] | None = None, *, step_follows: bool = False, shadows: bool = True
-) -> ServeDeploySchema:
-    """See `read_deployment`. Without `shadows`, a file with a shadow is refused, as a candidate has none."""
-    path = Path(source)
-    if path.suffix in (".yaml", ".yml"):
-        if not path.is_file():
-            where = "" if path.is_absolute() else f" in {Path.cwd()}; those of this project are in its checkout"
-            raise ConfigError(f"deployment file {source!r} does not exist{where}")
-        if overrides:
-            raise ConfigError(f"{source!r} holds the settings; edit it instead of giving {sorted(overrides)}")
-        try:
-            document = yaml.safe_load(path.read_text())
-        except yaml.YAMLError as error:
-            raise ConfigError(f"{source}: not YAML ({error})") from error
-        return _checked(document, source, step_follows, shadows=shadows)
-    if ":" not in source and source not in names("policies"):
-        policy_class(source)  # raises with the list of what there is
-    return _of_name(source, overrides or {}, step_follows, shadows=shadows)
-
-
 def _only(config: ServeDeploySchema, source: str, app: str | None) -> ServeApplicationSchema:
-    ours: dict[str, ServeApplicationSchema] = {one.name: one for one in _ours(config)}
+    ours: dict[str, ServeApplicationSchema] = {one.name: one for one in our_apps(config)}
     if app is None and len(ours) == 1:
         [app] = ours
     if app not in ours:
@@ -215,20 +209,17 @@ def _only(config: ServeDeploySchema, source: str, app: str | None) -> ServeAppli
     return ours[app]
 
 
-def _ours(config: ServeDeploySchema) -> list[Any]:
+def our_apps(config: ServeDeploySchema) -> list[Any]:
+    """Return the applications of a deployment that serve a policy."""
     return [app for app in config.applications if app.import_path == IMPORT_PATH]
 
 
 def _of_name(
     policy: str, args: Mapping[str, Any], step_follows: bool = False, *, shadows: bool = True
 ) -> ServeDeploySchema:
-    app = _application(policy, {"policy": policy, **args})
+    name = policy.rpartition(":")[2]
+    app = {"name": name, "route_prefix": "/", "import_path": IMPORT_PATH, "args": {"policy": policy, **args}}
     return _checked({"applications": [app]}, f"policy {policy!r}", step_follows, shadows=shadows)
-
-
-def _application(name: str, args: dict[str, Any]) -> dict[str, Any]:
-    short = name.rpartition(":")[2]
-    return {"name": short, "route_prefix": "/", "import_path": IMPORT_PATH, "args": args}
 
 
 def _checked(document: object, source: str, step_follows: bool = False, *, shadows: bool = True) -> ServeDeploySchema:
@@ -237,7 +228,7 @@ def _checked(document: object, source: str, step_follows: bool = False, *, shado
         config = ServeDeploySchema.model_validate(document)
         for runtime_env in _runtime_envs(config):
             require_no_secrets(runtime_env)
-        for app in _ours(config):
+        for app in our_apps(config):
             args = ServerArgs(**app.args)
             # Relative paths refer to this process's folder, so Ray gets absolute ones.
             if "environment" in app.args:
@@ -272,13 +263,8 @@ def _runtime_envs(config: ServeDeploySchema) -> Iterator[Mapping[str, Any]]:
 def _require_policy(args: ServerArgs, own: dict[str, Any], *, installed: bool, step_follows: bool) -> Contract | None:
     """Build the policy in its environment, with each kind of settings, and check that the dialects fit its contract.
 
-    A replica repeats the check.
-
-    Args:
-        args: The settings of the server.
-        own: The settings of the policy.
-        installed: Whether its packages are installed here; False if the application's `runtime_env` brings them.
-        step_follows: Whether a missing step is set later; then everything else is checked.
+    A replica repeats the check. `own` are the policy's settings. Its packages are not `installed` here if the
+    application's `runtime_env` brings them. If `step_follows`, a missing step is set later.
 
     Returns:
         The contract of the policy with its own settings; None if it states none before it is loaded.

@@ -35,14 +35,24 @@ from vlagents_ray.ray_tools.private import (
     use_loopback,
 )
 from vlagents_ray.ray_tools.reaper import MARK
-from vlagents_ray.ray_tools.session import FILES, announce, joined, ray_folder, start_ray, unless_lost
+from vlagents_ray.ray_tools.session import (
+    ALONE,
+    FILES,
+    MODE,
+    announce,
+    joined,
+    ray_folder,
+    start_ray,
+    unless_lost,
+    variables,
+)
 from vlagents_ray.serve.access.api_keys import require_access, warn_of_plain_http
-from vlagents_ray.serve.access.tls import Tls
 from vlagents_ray.serve.config.deployment import AccessArgs, ServerArgs
-from vlagents_ray.serve.launch.deployment_file import IMPORT_PATH, gpus_of_candidate, with_gateways_at, with_replicas_on
+from vlagents_ray.serve.launch.deployment_file import gpus_of_candidate, our_apps, with_gateways_at, with_replicas_on
 from vlagents_ray.serve.launch.haproxy import (
     NO_INGRESS,
     PublicListener,
+    Tls,
     haproxy_binary,
     ingress_environment,
     wait_for_haproxy,
@@ -58,10 +68,6 @@ _END_S = 0.1  # period at which a replica that ends checks for remaining request
 # Keys of a deployment file, and of an application in it, that Serve does not have to apply.
 _OUR_KEYS = {"applications", "http_options", "proxy_location"}
 _OUR_APP_KEYS = {"name", "route_prefix", "import_path", "args"}
-_MODE = "RAY_AUTH_MODE"
-# If this variable is "0", Ray does not take this machine for a part of a cluster and uses the loopback address as the
-# node's own, so that all its ports are there. (Ray replaces the address given as `_node_ip_address` by another one.)
-_ALONE = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
 _REMIND_S = 30.0
 
 
@@ -86,12 +92,6 @@ def wait_for_proxies(proxies: list[Any], look_again: Callable[[], list[Any]]) ->
             return
 
 
-def _stop_long_polls(client: Any) -> None:
-    """Stop long polling of the controller: Ray would report a call in progress at its end as a failed task."""
-    for poll in long_polls(client):
-        poll.stop()
-
-
 def shut_down(client: Any) -> None:
     """End Serve, so that replicas drain and HAProxy stops, like `serve.shutdown`, but without its error message.
 
@@ -103,7 +103,8 @@ def shut_down(client: Any) -> None:
 
     from vlagents_ray.ray_tools.head_monitor import head_is_gone
 
-    _stop_long_polls(client)
+    for poll in long_polls(client):  # Ray would report a call in progress at the controller's end as a failed task
+        poll.stop()
     client.shutdown_cached_handles()
     last = end_controller(client)
     deadline = time.monotonic() + _SHUTDOWN_S
@@ -161,7 +162,7 @@ def running_server(
         _warn_of_plain_http(config, host, tls)
     if tls is not None:
         tls.check()
-    for app in _our_apps(config):
+    for app in our_apps(config):
         keep(*(one.port for one in ServerArgs(**app.args).dialects.gateways().values()))
     import ray
     from ray import serve
@@ -170,7 +171,7 @@ def running_server(
     if own:
         _require_gpus(config, gpus_here())
     with contextlib.ExitStack() as stack:
-        ingress = ingress or not own or len(_our_apps(config)) < len(config.applications)
+        ingress = ingress or not own or len(our_apps(config)) < len(config.applications)
         public = port or free_port(host)
         http = stack.enter_context(_ray(address, host, public, tls, num_cpus, show_logs, ingress))
         location = "Disabled" if not ingress else "HeadOnly" if address is None else "EveryNode"
@@ -189,8 +190,9 @@ def running_server(
         if timeout_s is None:
             timeout_s = _START_S if address is None else _GROW_S
         deadline = time.monotonic() + timeout_s
-        inside = _internal_url(http)
-        ours = {app.name for app in _our_apps(config)}
+        inside = "https" if http.get("ssl_certfile") else "http"
+        inside += f"://{LOOPBACK if http['host'] == EVERYWHERE else http['host']}:{http['port']}"
+        ours = {app.name for app in our_apps(config)}
         urls = {name: inside + path if ingress else None for name, path in paths.items()}
         wait_for_proxies(proxies, lambda: proxies_now(client))
         wait_until_ready(serve, urls, ours, deadline, remind)
@@ -206,7 +208,7 @@ def _access(config: ServeDeploySchema, keys_file: Path | None, insecure: bool, p
     if keys_file is not None and insecure:
         raise ConfigError("keys and insecure exclude each other; keep one")
     changed = config.model_copy(deep=True)
-    for app in _our_apps(changed):
+    for app in our_apps(changed):
         access = dict(app.args.get("access") or {})
         if keys_file is not None or insecure:  # either one replaces both settings of the file
             access |= {"insecure": insecure, "keys_file": None if keys_file is None else str(keys_file.absolute())}
@@ -228,7 +230,7 @@ def deploy(client: Any, config: ServeDeploySchema, *, own: bool, ingress: bool) 
     from vlagents_ray.serve.replica.app import build
 
     stated = [app.model_dump(exclude_defaults=True).keys() for app in config.applications]
-    ours = len(_our_apps(config)) == len(config.applications)
+    ours = len(our_apps(config)) == len(config.applications)
     plain = ours and config.model_fields_set <= _OUR_KEYS and all(keys <= _OUR_APP_KEYS for keys in stated)
     if not plain or not own:
         client.deploy_apps(config)
@@ -259,7 +261,7 @@ def _missing_gpus(config: ServeDeploySchema, here: float | None = None) -> str |
     """Return a sentence about the GPUs that this machine, or the running cluster, lacks; None if it has enough."""
     import ray
 
-    wanted = {app.name: _gpus(ServerArgs(**app.args)) for app in _our_apps(config)}
+    wanted = {app.name: _gpus(ServerArgs(**app.args)) for app in our_apps(config)}
     there = ray.cluster_resources().get("GPU", 0.0) if here is None else here
     if sum(wanted.values()) <= there:
         return None
@@ -279,20 +281,16 @@ def _gpus(args: ServerArgs) -> float:
     return replicas * args.resources.num_gpus + gpus_of_candidate(args)
 
 
-def _our_apps(config: ServeDeploySchema) -> list[Any]:
-    return [app for app in config.applications if app.import_path == IMPORT_PATH]
-
-
 def _require_access(config: ServeDeploySchema, host: str, insecure: bool) -> None:
     """Raise `ConfigError` if an application accepts other machines without keys, or its keys cannot be read."""
-    ours = _our_apps(config)
+    ours = our_apps(config)
     for app in config.applications:  # applications of others require no keys
         access = AccessArgs(**app.args.get("access", {})) if app in ours else AccessArgs(insecure=insecure)
         require_access(host, access.keys() if app in ours else None, access.insecure)
 
 
 def _warn_of_plain_http(config: ServeDeploySchema, host: str, tls: Tls | None) -> None:
-    stated = [AccessArgs(**app.args.get("access", {})) for app in _our_apps(config)]
+    stated = [AccessArgs(**app.args.get("access", {})) for app in our_apps(config)]
     if tls is None and any(access.keys() is not None and not access.plain_http for access in stated):
         warn_of_plain_http(host)
 
@@ -348,12 +346,6 @@ def _serve_address(listener: PublicListener | None, host: str, port: int, tls: T
     return {"host": host, "port": port, "ssl_certfile": str(tls.certificate), "ssl_keyfile": str(tls.key)}
 
 
-def _internal_url(http: Mapping[str, Any]) -> str:
-    """Return Serve's own URL, for a process on its node."""
-    scheme = "https" if http.get("ssl_certfile") else "http"
-    return f"{scheme}://{LOOPBACK if http['host'] == EVERYWHERE else http['host']}:{http['port']}"
-
-
 @contextlib.contextmanager
 def own_ray(
     host: str,
@@ -364,15 +356,9 @@ def own_ray(
     show_logs: bool = False,
     ingress: bool = True,
 ) -> Iterator[PublicListener | None]:
-    """Run a private Ray for the length of the context.
+    """Run a private Ray for the length of the context, which no other machine and no other user can reach.
 
-    Args:
-        host: The address at which the server listens.
-        port: The port at which the server listens.
-        tls: The certificate of the server; None for unencrypted HTTP.
-        num_cpus: CPUs that Ray may use; None for all.
-        show_logs: Whether the logs of Ray's workers are shown.
-        ingress: Whether the server listens for HTTP at all.
+    The other arguments are those of `running_server`; the server will listen at `host` and `port`.
 
     Yields:
         HAProxy's listener for clients; None if Serve listens itself.
@@ -382,9 +368,9 @@ def own_ray(
     """
     import ray
 
-    if os.environ.get(_MODE, "token").lower() != "token":
+    if os.environ.get(MODE, "token").lower() != "token":
         raise ConfigError(
-            f"{_MODE}={os.environ[_MODE]}: a port of each replica, which runs whatever it is sent, would be open to "
+            f"{MODE}={os.environ[MODE]}: a port of each replica, which runs whatever it is sent, would be open to "
             f"other machines without Ray's token; unset it"
         )
     if not is_free(host, port):
@@ -395,7 +381,7 @@ def own_ray(
         # Proxies start while policies load: on a slow machine Serve would replace them after three times its 5 s.
         environment = {"RAY_worker_niceness": "0", "RAY_SERVE_PROXY_READY_CHECK_TIMEOUT_S": "60"}
         # The address at which replicas listen for WebSockets: loopback if the network may see nothing but TLS.
-        ours = {MARK: str(folder), _ALONE: "0", HOST: host if tls is None else LOOPBACK}
+        ours = {MARK: str(folder), ALONE: "0", HOST: host if tls is None else LOOPBACK}
         listener = None
         if not ingress:
             ours |= NO_INGRESS
@@ -405,8 +391,12 @@ def own_ray(
             # HAProxy's files and admin socket are in the folder, whatever the user has set for clusters.
             ours |= {key: value for key, value in settings.items() if value.startswith(str(folder))}
             environment |= settings
-        stack.enter_context(_environment(environment, ours))
-        stack.enter_context(_alone())
+        # A process that another server's process started has inherited that server's files and ports, which are
+        # replaced. Otherwise the user's values stay, unless they are in `ours`.
+        inherited = MARK in os.environ
+        new = {key: value for key, value in environment.items() if inherited or key not in os.environ}
+        stack.enter_context(variables(new | ours))
+        stack.callback(use_loopback, use_loopback(True))  # this process read `ALONE` when it imported Ray
         if listener is not None:
             listener.require()
         start_ray(
@@ -430,37 +420,6 @@ def _public_listener(folder: Path, host: str, port: int, tls: Tls | None) -> Pub
         None if tls is None else tls.bundle(folder),
         None if tls is None or tls.client_ca is None else tls.client_ca.absolute(),
     )
-
-
-@contextlib.contextmanager
-def _alone() -> Iterator[None]:
-    """Apply `_ALONE` in this process, too, which read the variable when it imported Ray."""
-    before = use_loopback(True)
-    try:
-        yield
-    finally:
-        use_loopback(before)
-
-
-@contextlib.contextmanager
-def _environment(values: Mapping[str, str], ours: Mapping[str, str]) -> Iterator[None]:
-    """Set variables for processes started inside the context; the user's values stay, unless they are in `ours`.
-
-    A process that was started by another server's process has inherited that server's files and ports: those are
-    replaced.
-    """
-    inherited = MARK in os.environ
-    new = {key: value for key, value in values.items() if inherited or key not in os.environ} | dict(ours)
-    before = {key: os.environ.get(key) for key in new}
-    os.environ.update(new)
-    try:
-        yield
-    finally:
-        for key, value in before.items():
-            if value is None:
-                os.environ.pop(key, None)
-            else:
-                os.environ[key] = value
 
 
 def wait_until_ready(

@@ -34,16 +34,7 @@ class Checkpoints:
         steps: bool = False,
         loaded: int = 2,
     ) -> None:
-        """Create the checkpoints of a deployment.
-
-        Args:
-            make: Creates an agent from settings, without loading anything.
-            config: The deployment's own settings.
-            choices: Settings by the name of each choice, which replace some of the deployment's own; or `adapter`
-                alone, the folder or hub id of a LoRA adapter over the deployment's own checkpoint.
-            steps: Whether a session may choose the training step.
-            loaded: Largest number of checkpoints in memory at once.
-        """
+        """See `CheckpointArgs`; `make` creates an agent from settings, without loading anything."""
         self.make = make
         self.limit = loaded
         offered = choices or {}

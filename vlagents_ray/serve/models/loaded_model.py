@@ -27,7 +27,7 @@ from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.serve.models.checkpoints import CHOICE, Checkpoints, resolved
 from vlagents_ray.serve.queue.call_limits import LOAD, PolicyCall, PolicyCalls
 from vlagents_ray.serve.requests import CheckpointChoice
-from vlagents_ray.serve.weights.versions import DIGITS, ModelWeights
+from vlagents_ray.serve.weights import DIGITS, ModelWeights
 from vlagents_ray.validation import check_observation
 
 logger = logging.getLogger(__name__)
@@ -106,7 +106,6 @@ class LoadedModel:
 
     choice: CheckpointChoice  # the choice for which it was loaded first
     settings: dict[str, Any]
-    key: str  # `key_of(settings)`
     agent: Agent
     contract: Contract | None
     copies: AgentCopies
@@ -121,6 +120,7 @@ class LoadedModel:
     since: float = field(default_factory=time.monotonic)  # time at which it was loaded, s
     sessions: int = 0  # number of sessions that hold it
     closed: bool = False
+    key: str = field(init=False)  # `key_of(settings)`
     # Held beside `busy` while the agent runs, so that no other model is captured as a CUDA graph meanwhile. Where none
     # can be, it is a lock of no other use, which costs less.
     uncaptured: AbstractContextManager[Any] = field(init=False)
@@ -128,6 +128,7 @@ class LoadedModel:
 
     def __post_init__(self) -> None:
         """Find out whether its process computes on an accelerator."""
+        self.key = key_of(self.settings)
         torch = sys.modules.get("torch")
         on_gpu = any(device["kind"] != "cpu" for device in self.report.devices)
         self.uncaptured = CAPTURES if on_gpu or (torch and torch.cuda.is_initialized()) else threading.RLock()
@@ -257,22 +258,9 @@ class Loader:
         busy = threading.Lock()
         digest = ((weights or {}).get("digest") or "").rpartition(":")[2][:DIGITS]
         parameters = ModelWeights(agent, busy, digest, version)
-        key, calls = key_of(settings), self._calls
+        calls = self._calls
         return LoadedModel(
-            choice,
-            settings,
-            key,
-            agent,
-            contract,
-            copies,
-            padding,
-            weights,
-            files,
-            version,
-            calls,
-            parameters,
-            busy,
-            report,
+            choice, settings, agent, contract, copies, padding, weights, files, version, calls, parameters, busy, report
         )
 
     def version(self, settings: Mapping[str, Any]) -> str:

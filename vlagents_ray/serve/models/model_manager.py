@@ -1,7 +1,7 @@
 """The checkpoints that a replica holds in memory: loaded on demand, and evicted when another needs the memory.
 
 The first checkpoint is loaded on the policy's thread. A loading thread then loads and evicts the others, one at a time,
-while sessions of loaded checkpoints act. `vlagents_ray.serve.models.model_manager` decides which one is next.
+while sessions of loaded checkpoints act. `ModelCache` decides which one is next.
 
 A deployment's own settings can change (`ModelManager.configure`): the new checkpoint is loaded beside the old one. New
 episodes then use the new checkpoint, and the old one is evicted when its last episode has ended.
@@ -25,15 +25,15 @@ from vlagents_ray.serve.models.checkpoints import Checkpoints, resolved
 from vlagents_ray.serve.models.loaded_model import LoadedModel, Loader, key_of
 from vlagents_ray.serve.requests import DEFAULT, CheckpointChoice
 from vlagents_ray.serve.sessions import Session, SessionTable
-from vlagents_ray.serve.weights.versions import ModelWeights
+from vlagents_ray.serve.weights import ModelWeights
 
 PATIENCE_S = 10.0  # waiting time for a slot after which a checkpoint in use accepts no further episodes
 
-OnLoaded = Callable[
-    [VLAgentsError | None], None
-]  # called with None once a session holds its model, else with the error
+# Called with None once a session holds its model, else with the error.
+OnLoaded = Callable[[VLAgentsError | None], None]
 DueCallbacks = list[tuple[OnLoaded, VLAgentsError | None]]  # callbacks to call, each with its argument
 logger = logging.getLogger(__name__)
+
 _CHECK_S = 1.0  # interval of the checks whether waiting callers are still there
 _CLOSE_S = 10.0  # longest wait for the loading thread, and for the running batch of each model
 
@@ -66,7 +66,15 @@ class EvictTask:
 
 
 class ModelCache:
-    """The loaded models, and the sessions that wait for others."""
+    """The eviction policy: the loaded models, the sessions that wait for others, and the next task.
+
+    It uses no threads; the lock of `ModelManager` guards all calls. If all slots are in use:
+
+    - The least recently used checkpoint without a session is evicted.
+    - If all have sessions, the waiting sessions wait for episodes to end. After `PATIENCE_S`, the checkpoint that was
+      loaded first accepts no further episodes, until its sessions have ended and it is evicted. So ten checkpoints can
+      take turns in two slots, each for long enough to be worth loading.
+    """
 
     def __init__(self, source: Checkpoints) -> None:
         self.config = source.config  # the deployment's own settings in effect
@@ -327,7 +335,7 @@ class ModelManager:
         """
         with self._changed:
             self._require_open()
-            self._release_model(session)
+            self.release_model(session)
             model = self._cache.free(choice, follows=session.follows)
             if model is not None and not session.over:
                 return self._cache.assign(session, model)
@@ -368,13 +376,14 @@ class ModelManager:
     def release_model(self, session: Session[LoadedModel]) -> None:
         """Release the model of a session that has no episode."""
         with self._changed:
-            self._release_model(session)
+            if self._cache.release_model(session):
+                self._changed.notify_all()
 
     def release(self, session: Session[LoadedModel]) -> None:
         """Release the model of a session that has ended."""
         with self._changed:
             session.over = True
-            self._release_model(session)
+            self.release_model(session)
 
     def _require_open(self) -> None:
         if self._closed:
@@ -385,10 +394,6 @@ class ModelManager:
         if self._thread.ident is None and self._loaded and not self._closed:
             self._thread.start()
         self._changed.notify_all()
-
-    def _release_model(self, session: Session[LoadedModel]) -> None:
-        if self._cache.release_model(session):
-            self._changed.notify_all()
 
     def _set_step(self, step: str) -> None:
         if not self._loaded:

@@ -41,7 +41,10 @@ _LAST_WORDS = 20  # last lines of the child's error output that an error quotes
 
 
 class Child:
-    """A child process, which ends with this process, however that ends.
+    """A child process, which ends with this process, however that ends; `child_main` is the other side.
+
+    Calls of the replica's engine to the policy travel through shared memory (`vlagents_ray.client.transports.shm`) to
+    an engine in the child: a batch is one message, and each session has a session in the child.
 
     `call` and the methods below it may be called from any thread.
     """
@@ -214,11 +217,9 @@ def _write(process: subprocess.Popen[bytes], data: bytes) -> None:
 
 
 def make_agent(args: ServerArgs, config: Mapping[str, Any]) -> Agent:
-    """Build the policy with these settings, or the proxy for a child process, without loading it.
+    """Build the policy with the settings `config`, or the proxy for a child process, without loading it.
 
-    Args:
-        args: The settings of the server; `environment.process` must be decided, see `probe.with_process`.
-        config: The settings of the policy.
+    `args.environment.process` must be decided, see `probe.with_process`.
     """
     environment = args.environment
     if environment.python is not None and environment.process == "child":

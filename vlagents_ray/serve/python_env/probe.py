@@ -16,8 +16,6 @@ from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, from_code
 from vlagents_ray.serve.config.deployment import EnvironmentArgs
 
-__all__ = ["EnvironmentProbe", "check_policy", "probe", "with_process"]
-
 _PACKAGES = ("ray", "numpy", "vlagents-ray")
 _TIMEOUT_S = 120.0  # imports from a network drive without a cache are slow
 OLDEST = (3, 10)
@@ -65,13 +63,8 @@ def probe(
 ) -> EnvironmentProbe:
     """Start the interpreter once, to get its versions and optionally to build a policy.
 
-    Args:
-        python: The path of the interpreter.
-        policy: The arguments of `child_main.examine`; None to build no policy.
-        env_vars: Further environment variables of the process.
-
-    Raises:
-        ConfigError: No policy of this server can run in the interpreter.
+    `policy` has the arguments of `child_main.examine`; None builds none. Raises `ConfigError` if no policy of this
+    server can run in the interpreter.
     """
     if not Path(python).is_file():
         inside = Path(python) / "bin" / "python"
@@ -115,17 +108,11 @@ def check_policy(
 ) -> Contract | None:
     """Build the policy in its environment, as a replica will, and return its contract.
 
-    Args:
-        environment: The settings of the environment, which must name an interpreter.
-        policy: The policy's name.
-        config: The policy's settings.
-        wrappers: The policy's wrappers.
-
     Returns:
         The contract; None if the policy states none before it is loaded.
 
     Raises:
-        ConfigError: The policy cannot be built there, or the environment cannot be used.
+        ConfigError: The policy cannot be built there, or the environment cannot be used, or names no interpreter.
     """
     if environment.python is None:
         raise ConfigError("environment: names no interpreter to ask")

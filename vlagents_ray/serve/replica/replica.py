@@ -51,7 +51,7 @@ from vlagents_ray.serve.scaling.rebalancer import ClientLocation, Rebalancer, Re
 from vlagents_ray.serve.scaling.session_migration import PEER_METHODS, SessionMigrator
 from vlagents_ray.serve.scaling.sibling_replicas import ReplicaViews, SiblingApi, SiblingReplicas
 from vlagents_ray.serve.scaling.weight_push import OwnWeights, Values, WeightPusher, WeightsReplica
-from vlagents_ray.serve.weights.updates import HeldVersion, NewestVersion, PushOptions, PushResult
+from vlagents_ray.serve.weights import HeldVersion, NewestVersion, PushOptions, PushResult
 from vlagents_ray.weights.safetensors import ValueSpec
 
 logger = logging.getLogger(__name__)
@@ -101,7 +101,7 @@ class PolicyReplica(ClientApi, SiblingApi):
         self._migrator.start(self._engine)
         self._rebalancer = Rebalancer(self._engine, self._peers, self._load_of)
         self._weights = OwnWeights(self._peers.own_name, self._engine.weights)
-        self._pusher = WeightPusher(self._weights, self._peers.other_weights)
+        self._pusher = WeightPusher(self._weights, self._peers.others)
 
         # What is seen of it.
         node = ray.get_runtime_context().get_node_id()[:8]
@@ -323,7 +323,7 @@ class PolicyReplica(ClientApi, SiblingApi):
 
     async def push_received(self, named: Mapping[str, Any], options: PushOptions) -> PushResult:
         """Let all replicas act with new weights, which this one has received over the network."""
-        if not await self._peers.other_weights():
+        if not await self._peers.others():
             return await self._pusher.push(named, options)
         reference = await asyncio.to_thread(ray.put, named)  # a copy, for which no robot on this event loop waits
         return await self._pusher.push([reference], options)
@@ -334,7 +334,7 @@ class PolicyReplica(ClientApi, SiblingApi):
 
     async def versions_of_weights(self) -> list[int]:
         """Return the newest version of each replica that can be reached; called by a learner."""
-        replicas: list[WeightsReplica] = [self._weights, *await self._peers.other_weights()]
+        replicas: list[WeightsReplica] = [self._weights, *await self._peers.others()]
         found = await asyncio.gather(*(replica.newest_weights() for replica in replicas), return_exceptions=True)
         return [newest.number for newest in found if isinstance(newest, NewestVersion)]
 

@@ -17,6 +17,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import Any, Protocol
 
 from vlagents_ray.serve.engine.engine import Engine
@@ -64,23 +65,17 @@ def choose_replica(loads: Sequence[ReplicaLoad], place: ClientLocation) -> Repli
     client needs a near one and there is none.
     """
     accepting = [load for load in loads if load.accepts]
-    near = min((load for load in accepting if place.is_near(load)), key=_sessions, default=None)
-    least = min(accepting, key=_sessions, default=None)
+    near = min((load for load in accepting if place.is_near(load)), key=attrgetter("sessions"), default=None)
+    least = min(accepting, key=attrgetter("sessions"), default=None)
     if place.must_be_near or least is None or (near and near.sessions <= _tolerated(least.sessions)):
         return near
     return least
 
 
 def excess_sessions(mine: int, others: Iterable[int], leaving: int = 0) -> int:
-    """Return how many sessions a replica should send away.
+    """Return how many of its sessions a replica should send away, of which `leaving` are leaving already.
 
-    Args:
-        mine: Number of sessions that this replica holds.
-        others: Numbers of sessions that the other replicas hold.
-        leaving: Number of this replica's sessions that are leaving already.
-
-    Returns:
-        The excess over the mean, rounded down; 0 if it is at most 25 % of the mean or one session.
+    It is the excess over the mean, rounded down; 0 if that is at most 25 % of the mean or one session.
     """
     loads = [mine, *others]
     mean = sum(loads) / len(loads)
@@ -90,16 +85,9 @@ def excess_sessions(mine: int, others: Iterable[int], leaving: int = 0) -> int:
 
 
 def choose_connections(connections: Sequence[int], count: int) -> list[int]:
-    """Choose the connections to send away so that at most `count` sessions leave.
+    """Choose the connections to send away, given the number of sessions of each, and return their indices.
 
-    All sessions of a connection move together, so a connection with more than `count` sessions stays.
-
-    Args:
-        connections: Number of sessions of each connection.
-        count: Largest number of sessions to send away.
-
-    Returns:
-        Indices into `connections`.
+    At most `count` sessions leave. All sessions of a connection move together, so one with more than that stays.
     """
     chosen = []
     for index in sorted(range(len(connections)), key=lambda i: -connections[i]):
@@ -111,10 +99,6 @@ def choose_connections(connections: Sequence[int], count: int) -> list[int]:
 
 def _tolerated(sessions: float) -> float:
     return sessions + max(1.0, _SLACK * sessions)
-
-
-def _sessions(load: ReplicaLoad) -> int:
-    return load.sessions
 
 
 class Siblings(Protocol):

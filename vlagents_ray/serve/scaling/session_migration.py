@@ -69,14 +69,7 @@ class HeldSessions:
     """Exports, releases and adopts the sessions of one engine, on the replica's event loop."""
 
     def __init__(self, engine: Engine, loop: asyncio.AbstractEventLoop, in_thread: InThread, spawn: Spawn) -> None:
-        """Create the operations on the sessions of one engine.
-
-        Args:
-            engine: The engine that holds the sessions.
-            loop: The replica's event loop.
-            in_thread: Runs a call that takes long (unpickling) on another thread.
-            spawn: Starts a task on the replica's event loop.
-        """
+        """`in_thread` runs a call that takes long (unpickling) on another thread; `spawn` starts a task on `loop`."""
         self._engine = engine
         self._loop = loop
         self._in_thread = in_thread
@@ -167,7 +160,7 @@ class HeldSessions:
                 return False
             for peer in peers:
                 try:
-                    if await peer.take_over(session_id, state):
+                    if await peer.ask(HeldSessions.take_over, session_id, state):
                         return True
                 except PeerEnded:
                     continue
@@ -216,26 +209,6 @@ class Peer(ABC):
 
     name: str  # unique name of the replica
 
-    async def held(self, session_ids: Collection[str]) -> dict[str, Version]:
-        """Call `HeldSessions.held` at the other replica."""
-        return await self.ask(HeldSessions.held, session_ids)
-
-    async def copy(self, session_id: str) -> dict[str, Any] | None:
-        """Call `HeldSessions.copy` at the other replica."""
-        return await self.ask(HeldSessions.copy, session_id)
-
-    async def release(self, session_id: str, version: Version, claim: str) -> bool:
-        """Call `HeldSessions.release` at the other replica."""
-        return await self.ask(HeldSessions.release, session_id, version, claim)
-
-    async def take_over(self, session_id: str, state: dict[str, Any]) -> bool:
-        """Call `HeldSessions.take_over` at the other replica."""
-        return await self.ask(HeldSessions.take_over, session_id, state)
-
-    async def drop_older(self, steps: dict[str, int]) -> None:
-        """Call `HeldSessions.drop_older` at the other replica."""
-        await self.ask(HeldSessions.drop_older, steps)
-
     @abstractmethod
     async def ask(
         self, method: Callable[Concatenate[HeldSessions, P], Awaitable[T]], *args: P.args, **kwargs: P.kwargs
@@ -243,16 +216,14 @@ class Peer(ABC):
         """Call `method`, one of `PEER_METHODS`, at the other replica, and return its result."""
 
 
-PEER_METHODS: dict[str, Callable[..., Awaitable[Any]]] = {
-    method.__name__: method
-    for method in (
-        HeldSessions.held,
-        HeldSessions.copy,
-        HeldSessions.release,
-        HeldSessions.take_over,
-        HeldSessions.drop_older,
-    )
-}
+_PEER_METHODS = (
+    HeldSessions.held,
+    HeldSessions.copy,
+    HeldSessions.release,
+    HeldSessions.take_over,
+    HeldSessions.drop_older,
+)
+PEER_METHODS: dict[str, Callable[..., Awaitable[Any]]] = {method.__name__: method for method in _PEER_METHODS}
 """The methods that a replica may call at another one, by name."""
 
 
@@ -398,7 +369,7 @@ class SessionMigrator:
                 holders = await self._holders(session_id, await self._answers(session_id))
                 for version, peer in holders[1:]:
                     if version < holders[0][0]:
-                        self._spawn(self._answer(peer.drop_older({session_id: holders[0][0][0]})))
+                        self._spawn(self._answer(peer.ask(HeldSessions.drop_older, {session_id: holders[0][0][0]})))
                 if holders and await self._move(session_id, holders[0][1]):
                     break
                 misses = 0 if holders or self.held.is_leaving(session_id) else misses + 1
@@ -413,12 +384,12 @@ class SessionMigrator:
 
     async def _move(self, session_id: str, peer: Peer) -> bool:
         """Move the session from that replica to this one; False if its state there has changed meanwhile."""
-        state = await self._answer(peer.copy(session_id), EXPORT_S)
+        state = await self._answer(peer.ask(HeldSessions.copy, session_id), EXPORT_S)
         if state is None:
             return False
         arriving = await self._in_thread(self._engine.transfer.prepare, session_id, state, _LOAD_S)
         version = state["steps"], state["moves"]
-        release = self._spawn(self._answer(peer.release(session_id, version, uuid.uuid4().hex)))
+        release = self._spawn(self._answer(peer.ask(HeldSessions.release, session_id, version, uuid.uuid4().hex)))
         while not (await asyncio.wait([release], timeout=_ANSWER_S))[0]:
             if await self._query_peer(peer, []) is None:  # it hangs: only the copy still waits
                 self._finish(session_id)
@@ -454,7 +425,7 @@ class SessionMigrator:
     async def _query_peer(self, peer: Peer, session_ids: Sequence[str]) -> dict[str, Version] | None:
         """Return that replica's answer; None if it does not answer in time."""
         try:
-            return await asyncio.wait_for(peer.held(session_ids), _ANSWER_S)
+            return await asyncio.wait_for(peer.ask(HeldSessions.held, session_ids), _ANSWER_S)
         except Exception as error:  # noqa: BLE001 - an error of one replica must not stop the search at the others
             logger.info("another replica does not answer: %r", error)
             self._silent[peer.name] = self._loop.time() + _SILENT_S
@@ -495,7 +466,7 @@ class SessionMigrator:
 
     async def _drop_older_at_peers(self, steps: dict[str, int]) -> None:
         for peer in await self._peers():
-            self._spawn(self._answer(peer.drop_older(steps)))
+            self._spawn(self._answer(peer.ask(HeldSessions.drop_older, steps)))
 
     def _finish(self, session_id: str) -> None:
         with self._lock:

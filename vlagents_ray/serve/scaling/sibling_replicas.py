@@ -19,7 +19,7 @@ from vlagents_ray.serve.observers.live_view import OtherReplicas, Snapshot, Snap
 from vlagents_ray.serve.scaling.rebalancer import ReplicaLoad
 from vlagents_ray.serve.scaling.session_migration import HeldSessions, Peer, PeerEnded, PeerUnreachable
 from vlagents_ray.serve.scaling.weight_push import Values, WeightsReplica
-from vlagents_ray.serve.weights.updates import HeldVersion, NewestVersion, PushOptions
+from vlagents_ray.serve.weights import HeldVersion, NewestVersion, PushOptions
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -60,7 +60,9 @@ class SiblingApi(Protocol):
         ...
 
 
-class _Replica(Peer):
+class _Sibling(Peer):
+    """Another replica, for moving sessions and for pushes of weights (`WeightsReplica`)."""
+
     def __init__(self, name: str, actor: Any) -> None:
         self.name = name
         self._actor = actor
@@ -69,48 +71,42 @@ class _Replica(Peer):
         self, method: Callable[Concatenate[HeldSessions, P], Awaitable[T]], *args: P.args, **kwargs: P.kwargs
     ) -> T:
         try:
-            found: T = await call_replica(self._actor, SiblingApi.peer, method.__name__, *args)
-        except ray.exceptions.ActorDiedError as error:
-            raise PeerEnded(str(error)) from error
-        except ray.exceptions.RayError as error:  # the network is partitioned, or the server has another version
+            found: T = await self._call(None, SiblingApi.peer, method.__name__, *args)
+        except VLAgentsError as error:  # the server has another version
             raise PeerUnreachable(str(error)) from error
         return found
 
-
-class _WeightsOf:
-    """A replica among those of a push: `vlagents_ray.serve.scaling.weight_push.WeightsReplica`."""
-
-    def __init__(self, name: str, actor: Any) -> None:
-        self.name = name
-        self._actor = actor
-
     async def newest_weights(self) -> NewestVersion:
-        newest: NewestVersion = await self._ask(_ANSWER_S, WeightsReplica.newest_weights)
-        return newest
+        return await self._call(_ANSWER_S, WeightsReplica.newest_weights)
 
     async def stage_weights(self, number: int, values: Values, options: PushOptions) -> str:
-        digest: str = await self._ask(_TRANSFER_S, WeightsReplica.stage_weights, number, values, options)
-        return digest
+        return await self._call(_TRANSFER_S, WeightsReplica.stage_weights, number, values, options)
 
     async def commit_weights(self, number: int, options: PushOptions) -> None:
-        await self._ask(_ANSWER_S, WeightsReplica.commit_weights, number, options)
+        await self._call(_ANSWER_S, WeightsReplica.commit_weights, number, options)
 
     async def drop_weights(self, number: int) -> None:
-        await self._ask(_ANSWER_S, WeightsReplica.drop_weights, number)
+        await self._call(_ANSWER_S, WeightsReplica.drop_weights, number)
 
     async def held_weights(self) -> list[HeldVersion]:
-        held: list[HeldVersion] = await self._ask(_TRANSFER_S, WeightsReplica.held_weights)
-        return held
+        return await self._call(_TRANSFER_S, WeightsReplica.held_weights)
 
-    async def _ask(self, limit_s: float, method: Callable[..., Awaitable[Any]], *args: Any) -> Any:
+    async def _call(
+        self,
+        limit_s: float | None,
+        method: Callable[Concatenate[Any, P], Awaitable[T]],
+        *args: P.args,
+        **_: P.kwargs,
+    ) -> T:
         try:
-            return await asyncio.wait_for(call_replica(self._actor, method, *args), limit_s)
+            found: T = await asyncio.wait_for(call_replica(self._actor, method, *args), limit_s)
         except ray.exceptions.ActorDiedError as error:
             raise PeerEnded(str(error)) from error
         except ray.exceptions.RayTaskError as error:  # the replica itself raised it
             raise error.cause if isinstance(error.cause, VLAgentsError) else PeerUnreachable(str(error)) from error
-        except (ray.exceptions.RayError, TimeoutError, asyncio.TimeoutError) as error:
-            raise PeerUnreachable(str(error) or f"no answer within {limit_s:g} s") from error
+        except (ray.exceptions.RayError, TimeoutError, asyncio.TimeoutError) as error:  # or the network is partitioned
+            raise PeerUnreachable(str(error) or f"no answer within {limit_s} s") from error
+        return found
 
 
 class SiblingReplicas:
@@ -123,13 +119,9 @@ class SiblingReplicas:
         self.own_name = context.replica_id.to_full_id_str()
         self._silent: dict[str, float] = {}  # time until which a silent replica is not asked, by its name
 
-    async def others(self) -> list[_Replica]:
-        """Return all other replicas, for moving sessions."""
-        return await asyncio.to_thread(lambda: [_Replica(name, actor) for name, actor in self._actors()])
-
-    async def other_weights(self) -> list[_WeightsOf]:
-        """Return all other replicas, for pushes of weights."""
-        return await asyncio.to_thread(lambda: [_WeightsOf(name, actor) for name, actor in self._actors()])
+    async def others(self) -> list[_Sibling]:
+        """Return all other replicas."""
+        return await asyncio.to_thread(lambda: [_Sibling(name, actor) for name, actor in self._actors()])
 
     def loads(self) -> list[ReplicaLoad]:
         """Return the loads of the replicas that answer within 0.3 s."""

@@ -16,7 +16,7 @@ from typing import Any, Protocol, TypeVar
 
 from vlagents_ray.errors import InvalidInput, InvalidWeights, PolicyUnavailable, VLAgentsError
 from vlagents_ray.serve.scaling.session_migration import PeerEnded, PeerUnreachable
-from vlagents_ray.serve.weights.updates import HeldVersion, NewestVersion, PushOptions, PushResult, WeightUpdates
+from vlagents_ray.serve.weights import HeldVersion, NewestVersion, PushOptions, PushResult, WeightUpdates
 from vlagents_ray.weights.shared_values import NotShared, SharedValues, opened
 
 T = TypeVar("T")
@@ -60,7 +60,7 @@ class WeightsReplica(Protocol):
         ...
 
 
-class OwnWeights:
+class OwnWeights(WeightsReplica):
     """This replica among those of a push."""
 
     def __init__(self, name: str, updates: WeightUpdates) -> None:
@@ -70,7 +70,6 @@ class OwnWeights:
 
     @property
     def name(self) -> str:
-        """Name of the replica, for messages."""
         return self._name
 
     def pushed(self, took_ms: float) -> None:
@@ -78,7 +77,6 @@ class OwnWeights:
         self._updates.pushed(took_ms)
 
     async def newest_weights(self) -> NewestVersion:
-        """Return the newest version that acts."""
         return self._updates.newest
 
     async def stage_weights(self, number: int, values: Values, options: PushOptions) -> str:
@@ -93,15 +91,12 @@ class OwnWeights:
             return self._updates.stage(number, named, options)
 
     async def commit_weights(self, number: int, options: PushOptions) -> None:
-        """Act with the staged version."""
         self._updates.commit(number, options)
 
     async def drop_weights(self, number: int) -> None:
-        """Drop the staged version."""
         self._updates.drop(number)
 
     async def held_weights(self) -> list[HeldVersion]:
-        """Return the pushed versions that new episodes act with, for a replica that lacks them."""
         return await asyncio.to_thread(self._updates.held)
 
 
