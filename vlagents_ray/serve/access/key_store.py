@@ -15,6 +15,7 @@ import json
 import os
 import re
 import secrets
+import subprocess
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, fields, replace
@@ -173,6 +174,7 @@ def _change(file: Path, change: Callable[[list[Key]], list[Key]]) -> None:
             Path(name).unlink(missing_ok=True)
             raise
         _sync_folder(file.parent)
+    _require_readable(file)
 
 
 def _belong(descriptor: int, file: Path) -> None:
@@ -203,6 +205,26 @@ def _sync_folder(folder: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def _require_readable(file: Path) -> None:
+    """Raise `ConfigError` if the owner of the file, as whom the server runs, cannot read it."""
+    parse_keys(read_text(file))
+    owner = file.stat()
+    if not _readable_by(file, owner.st_uid, owner.st_gid):
+        raise ConfigError(
+            f"keys file {file}: was changed, and user {owner.st_uid}, whose it is, cannot read it: a server of that "
+            f"user lets nobody in before long; look at the modes of the folders above it"
+        )
+
+
+def _readable_by(file: Path, user: int, group: int) -> bool:
+    """Whether `user` can read the file; assumed to be so unless this process is root, which alone can test it."""
+    if os.geteuid() != 0 or user == 0:
+        return True
+    command = ["test", "-r", str(file.absolute())]
+    who: dict[str, Any] = {"user": user, "group": group, "extra_groups": ()}
+    return subprocess.run(command, check=False, **who).returncode == 0  # noqa: S603 - a program of the system's
 
 
 def _document(key: Key) -> dict[str, Any]:

@@ -84,12 +84,12 @@ class VlaEvalDialect(RouteDialect):
         if not await accept_or_refuse(socket, self.context):
             return
         sender, gate = self.sender(), self.gate()
-        connection = _Connection(self.session(sender))
+        session, chunk = self.session(sender), ChunkBuffer()  # of rows that are not sent yet
         inbox = _Inbox()
         reading = asyncio.ensure_future(inbox.fill(socket, gate, self))
         try:
             while (received := await inbox.next()) is not None:
-                answer = await self._answer(received, connection)
+                answer = await self._answer(received, session, chunk)
                 if answer is not None:
                     await socket.send_bytes(vla_eval.encode(answer))
             if inbox.end is not None:
@@ -102,18 +102,21 @@ class VlaEvalDialect(RouteDialect):
             with contextlib.suppress(asyncio.CancelledError):
                 await reading
 
-    async def _answer(self, received: _Received, connection: _Connection) -> vla_eval.Message | None:
+    async def _answer(
+        self, received: _Received, session: ImplicitSession, chunk: ChunkBuffer
+    ) -> vla_eval.Message | None:
         message = received.message
         if isinstance(message, VLAgentsError):
             return _error(message, 0, uuid.uuid4().hex)
         if message.kind == "hello":
             return self._hello(message)
         if message.kind in ("episode_start", "episode_end"):
-            connection.end_episode()
+            chunk.drop()
+            session.episode.end()
             return None
         if message.kind != "observation":
             return None  # the message reports an error of the client
-        return await self._act(message, received.admission, connection)
+        return await self._act(message, received.admission, session, chunk)
 
     def _hello(self, message: vla_eval.Message) -> vla_eval.Message:
         version = message.payload.get("protocol_version")
@@ -132,40 +135,27 @@ class VlaEvalDialect(RouteDialect):
         return vla_eval.Message("hello", payload, message.seq)
 
     async def _act(
-        self, message: vla_eval.Message, admission: MessageAdmission, connection: _Connection
+        self, message: vla_eval.Message, admission: MessageAdmission, session: ImplicitSession, chunk: ChunkBuffer
     ) -> vla_eval.Message:
         incoming = self.arrived()
         request_id = uuid.uuid4().hex
         try:
             payload = await admission.decoded(partial(vla_eval.decode_images, message.payload))
             obs, instruction = self.read(payload)
-            if not connection.session.episode.begun:
+            if not session.episode.begun:
                 self.mapping.warn_of_unread_cameras(payload, self.name)
-            if connection.chunk.next is None or connection.session.episode.begins(instruction):
+            if chunk.next is None or session.episode.begins(instruction):
                 incoming.decoded_alike()
-                reply = await connection.session.act(incoming, obs, instruction, request_id)
+                reply = await session.act(incoming, obs, instruction, request_id)
                 rows = incoming.written(lambda: self.rows(reply))
-                connection.chunk.replace(rows[: self.config.execute])
-            return vla_eval.Message("action", {"actions": connection.chunk.take().action}, message.seq)
+                chunk.replace(rows[: self.config.execute])
+            return vla_eval.Message("action", {"actions": chunk.take().action}, message.seq)
         except Exception as error:  # noqa: BLE001 - the client is answered with it
             problem = public_problem(error, self.name, request_id)
             incoming.refused(problem.code)
             return _error(problem, message.seq, request_id)
         finally:
             admission.release()
-
-
-class _Connection:
-    """The session of one connection, and the rows of its chunk."""
-
-    def __init__(self, session: ImplicitSession) -> None:
-        self.session = session
-        self.chunk = ChunkBuffer()  # the rows that are not sent yet
-
-    def end_episode(self) -> None:
-        """Let the next observation begin an episode."""
-        self.chunk.drop()
-        self.session.episode.end()
 
 
 @dataclass(slots=True)
