@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 from vlagents_ray.images.codecs import DecodedFiles
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.engine.observer import Observer
+from vlagents_ray.serve.requests import RANKS, PendingRequest
 
 
 def observe(
     observer: Observer, session: str, request: Request, reply: Reply, files: DecodedFiles | None = None
 ) -> None:
-    pending = SimpleNamespace(session_id=session, request=request, files=files, kept={})
+    pending = PendingRequest(session, request, lambda _: None, RANKS[request.rank], kept={})
+    pending.files = files or {}
     observer.on_request(pending)
     request.obs = None  # as the engine does once the policy has acted
     observer.before_answer(pending, reply)
