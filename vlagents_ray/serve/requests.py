@@ -254,7 +254,7 @@ class Message:
         self._written(begun)
         return data
 
-    def refused(self, code: str) -> None:
+    def record_failure(self, code: str) -> None:
         """Record all requests as failed with this error code, also if the caller no longer waits."""
         total_ms = (time.perf_counter() - self.arrived) * 1e3
         for op, rank in self._asked:

@@ -114,3 +114,12 @@ def test_nothing_is_left_after_clear() -> None:
     assert len(waiting.clear()) == 3
     assert waiting.size == 0
     assert waiting.take(4, 0.0) == ([], [])
+
+
+def test_a_simulation_that_is_over_does_not_take_the_turn_of_one_that_waits() -> None:
+    waiting = filled(gone := ticket("gone"), ticket("waits"))
+    for i in range(8):
+        waiting.add(ticket(f"robot{i}", rank=Rank.ROBOT, arrived=PATIENCE_S))
+    gone.over = True
+    assert taken(waiting, 2, 2 * PATIENCE_S) == ["robot0", "robot1"]
+    assert taken(waiting, 2, 2 * PATIENCE_S)[0] == "waits"

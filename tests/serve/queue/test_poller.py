@@ -355,3 +355,16 @@ def test_no_descriptor_and_no_thread_is_left() -> None:
         poller.close()
     assert not descriptors() - files
     assert not running_threads() - running
+
+
+def test_who_wakes_a_closed_poller_writes_into_no_other_file() -> None:
+    poller = Poller()
+    poller.close()
+    ours, theirs = socket.socketpair()  # may have got the numbers of what was closed
+    poller.wake()
+    ours.setblocking(False)
+    theirs.setblocking(False)
+    for one in (ours, theirs):
+        with pytest.raises(BlockingIOError):
+            one.recv(1)
+        one.close()

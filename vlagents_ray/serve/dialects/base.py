@@ -503,11 +503,11 @@ class HttpDialect(RouteDialect):
                     sender.release(for_good=True)
             return Response(message.written(lambda: write(self.rows(reply))), media_type=media_type)
         except ClientDisconnect:
-            message.refused("disconnected")
+            message.record_failure("disconnected")
             return Response(status_code=499)
         except Exception as error:  # noqa: BLE001 - the error is the reply to the client
             problem = public_problem(error, self.name, name)
-            message.refused(problem.code)
+            message.record_failure(problem.code)
             return problem_response(problem, name)
         finally:
             admission.release()

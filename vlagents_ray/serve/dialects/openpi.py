@@ -290,7 +290,7 @@ class MapEndpoint:
             answer = await connection.answer(message, incoming, request_id, gate)
         except Exception as error:  # noqa: BLE001 - the error is the reply to the client
             problem = public_problem(error, incoming.transport, request_id)
-            incoming.refused(problem.code)
+            incoming.record_failure(problem.code)
             text = f"{problem} (request {request_id})"
             failure = self._dialects[0].failure(text)
             await (socket.send_text(text) if failure is None else socket.send_bytes(failure))

@@ -152,7 +152,7 @@ class VlaEvalDialect(RouteDialect):
             return vla_eval.Message("action", {"actions": chunk.take().action}, message.seq)
         except Exception as error:  # noqa: BLE001 - the client is answered with it
             problem = public_problem(error, self.name, request_id)
-            incoming.refused(problem.code)
+            incoming.record_failure(problem.code)
             return _error(problem, message.seq, request_id)
         finally:
             admission.release()

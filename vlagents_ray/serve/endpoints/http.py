@@ -183,13 +183,13 @@ class _HttpEndpoint:
                 step = {} if replies[0].step is None else {STEP_HEADER: str(replies[0].step)}
                 return Response(incoming.document(), headers=step, media_type="application/json")
             except ClientDisconnect:
-                incoming.refused("disconnected")
+                incoming.record_failure("disconnected")
                 return Response(status_code=499)
             except Exception as error:
                 if not isinstance(error, VLAgentsError):
                     logger.exception("%s failed (request %s)", op, name)
                     error = VLAgentsError("internal error; the server's log has the details")
-                incoming.refused(error.code)
+                incoming.record_failure(error.code)
                 return problem_response(error, name)
 
         return handle

@@ -122,9 +122,9 @@ class FairQueue:
         again: list[_SessionQueue] = []
         robots, simulations = self._rank_queues
         yields = bool(robots.sources) and not self._yielded and simulations.impatient(now)
-        self._yielded = yields
         if yields:
             self._pick(simulations.next(), now, batch, expired, again)
+        self._yielded = bool(batch)  # not if all that waited there is over or has expired
         for rank_queue in self._rank_queues:
             while rank_queue.sources and len(batch) < size:
                 self._pick(rank_queue.next(), now, batch, expired, again)

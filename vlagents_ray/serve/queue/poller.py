@@ -45,6 +45,8 @@ class Poller:
         self._lent = threading.Event()  # set while the reader thread may poll
         self._callback_lock = threading.Lock()  # held while the reader runs callbacks
         self._closed = False
+        self._waking = threading.Lock()
+        self._released = False  # whether the descriptors are closed
         self._scheduled: deque[Callable[[], None]] = deque()
         self._timers: list[tuple[float, int, Callable[[], None]]] = []  # a heap of times (s), numbers and callbacks
         self._timer_numbers = itertools.count()  # so that no two callbacks are compared
@@ -73,8 +75,9 @@ class Poller:
 
     def wake(self) -> None:
         """End the current `poll`, or the next one. May be called on any thread."""
-        with contextlib.suppress(BlockingIOError):  # the pipe is full, so that a wake-up is pending already
-            os.write(self._wake_write, b"x")
+        with self._waking, contextlib.suppress(BlockingIOError):  # the pipe is full: a wake-up is pending already
+            if not self._released:
+                os.write(self._wake_write, b"x")
 
     def poll(self, timeout_s: float) -> bool:
         """Wait at most `timeout_s` for watched files, timers or a wake-up call, and run the callbacks that are due.
@@ -111,8 +114,10 @@ class Poller:
             self._lent.set()
             self._reader.join()
         self._poll.close()
-        os.close(self._wake_read)
-        os.close(self._wake_write)
+        with self._waking:  # the number of the pipe's end may soon be another file's
+            self._released = True
+            os.close(self._wake_read)
+            os.close(self._wake_write)
 
     def _read(self) -> None:
         # The reader polls the epoll's own descriptor: two threads inside one epoll would take each other's wake-ups.
