@@ -367,4 +367,4 @@ def test_who_wakes_a_closed_poller_writes_into_no_other_file() -> None:
     for one in (ours, theirs):
         with pytest.raises(BlockingIOError):
             one.recv(1)
-        one.close()
+    ours.close(), theirs.close()
