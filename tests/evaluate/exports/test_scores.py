@@ -139,6 +139,7 @@ def of_suites(*suites: str) -> list[str]:
     return [f"libero/{suite}/{number}" for suite in suites for number in range(10)]
 
 
+@pytest.mark.slow
 def test_libero_pro_has_its_scores_by_suite_and_kind_with_libero_as_the_original(
     libero: Callable[..., Results], tmp_path: Path
 ) -> None:
