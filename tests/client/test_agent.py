@@ -15,6 +15,7 @@ from vlagents_ray.images.codecs import (
     RAW,
     ImageCodec,
 )
+from vlagents_ray.interface import copied
 
 
 @pytest.mark.parametrize(
@@ -106,3 +107,13 @@ def test_a_key_that_goes_unencrypted_over_a_network_is_warned_of_once(
     lines = [record.getMessage() for record in caplog.records if "unencrypted" in record.getMessage()]
     assert len(lines) == warned
     assert "vlr_k" not in caplog.text
+
+
+def test_a_copy_of_an_observation_shares_no_memory_however_its_info_is_nested() -> None:
+    depth = np.zeros((2, 2), np.float32)
+    obs = Obs(info={"depth": {"front": depth}, "scans": [depth], "note": "seen"})
+    copy = copied(obs)
+    depth[:] = 1
+    assert copy.info["note"] == "seen"
+    assert not copy.info["depth"]["front"].any()
+    assert not copy.info["scans"][0].any()

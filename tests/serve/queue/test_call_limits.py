@@ -19,7 +19,7 @@ from in_flight import submit
 from shm_client import call, client, request
 from starlette.testclient import TestClient
 
-from vlagents_ray.errors import DeadlineExceeded, PolicyFailed, PolicyUnavailable
+from vlagents_ray.errors import OutcomeUnknown, PolicyFailed, PolicyUnavailable
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.messages import Limits, Reply, Request
 from vlagents_ray.serve.access.api_keys import NoKey
@@ -33,7 +33,7 @@ from vlagents_ray.serve.queue.call_limits import (
     PolicyCall,
     PolicyCalls,
 )
-from vlagents_ray.serve.requests import DEFAULT
+from vlagents_ray.serve.requests import DEFAULT, PendingRequest
 
 LIMITS = CallLimits(act_s=10.0, warm_up_s=100.0, load_s=1000.0)
 
@@ -156,8 +156,12 @@ def test_those_who_wait_for_it_are_answered_and_no_others_are_let_in(
     engine.notice_hung()
     engine.notice_hung()
     # Not to be repeated elsewhere, where it would hang as well; unlike what had not begun.
-    assert isinstance(begun.get(timeout=10).error, DeadlineExceeded)
+    assert isinstance(begun.get(timeout=10).error, OutcomeUnknown)
     assert isinstance(behind.get(timeout=10).error, PolicyUnavailable)
+    late: queue.SimpleQueue[Reply] = queue.SimpleQueue()  # it was checked just before
+    engine.queue.put(PendingRequest("good", Request("act", Obs()), late.put))
+    engine.notice_hung()
+    assert isinstance(late.get(timeout=10).error, PolicyUnavailable)
     with pytest.raises(PolicyUnavailable, match="another replica"):
         put(engine, "good", "act")
     assert engine.stats.collect().hung == {op: 1}
