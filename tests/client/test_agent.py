@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from vlagents_ray import ConfigError, NotReset, Obs, PolicyUnavailable, RemoteAgent
