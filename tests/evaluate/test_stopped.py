@@ -93,6 +93,4 @@ def test_a_stopped_and_resumed_evaluation_has_each_episode_exactly_once(
     wait_for(lambda: not processes(ray_folder))
     assert episodes(settings) == [(1, i, 1) for i in range(5)] + [(2, i, 1) for i in range(5, 9)]
     summary = json.loads((settings.out / "summary.json").read_text())
-    assert (summary["state"], summary["totals"][0]["episodes"]) == ("complete", 9)
-    # A signal to the whole group reaches Ray, too: a worker may be gone before the evaluation knows why.
-    assert summary["totals"][0]["retries"] <= (number != signal.SIGKILL)
+    assert (summary["state"], summary["totals"][0]["episodes"], summary["totals"][0]["retries"]) == ("complete", 9, 0)

@@ -80,7 +80,7 @@ def test_players_are_told_of_viewers_and_of_nothing_else_that_reads(watched: Wat
     watched.live.renew()
     watched.ask("a", Obs())
     told = [reply.act is not None and WATCHED in reply.act.info for reply in watched.replies]
-    assert told == [False, True, True, False]
+    assert told == [False, True, False, False]
 
 
 def test_observations_are_kept_ten_times_a_second_at_most(watched: Watched) -> None:

@@ -42,6 +42,9 @@ _NUMBERS = ("step", "age_ms", "safe_ticks", "safe_spells", "late", "reconnects")
 _MOST = 2**53  # largest number that JSON keeps
 _OBJECTS = 1000  # bytes of an answer or an observation besides its arrays, files and texts, estimated
 _ENCODING = threading.Lock()
+# Interval at which a session is told that it is watched, which its player believes for 10 s. Not with each answer: one with
+# more than the weights in its info does not travel in the compact form of shared memory.
+_TELL_S = 2.0
 _KEPT_S = 1.0  # time for which pixels are kept for a reader
 
 
@@ -139,6 +142,7 @@ class LiveObserver(Observer):
         self._numbers = itertools.count(1)
         self._answers: deque[Answer] = deque()
         self._observations: dict[str, KeptObservation] = {}  # by session, the oldest first
+        self._told: dict[str, float] = {}  # when a session was told last that it is watched, s
         self._answer_bytes = self._observation_bytes = 0
         self._lock = threading.Lock()
 
@@ -174,6 +178,7 @@ class LiveObserver(Observer):
         """End the lease."""
         self._active = False
         self._observers.remove(self)
+        self._told.clear()
 
     def on_request(self, pending: PendingRequest) -> None:
         """See `Observer`."""
@@ -182,8 +187,14 @@ class LiveObserver(Observer):
             self._commands.read_outcomes(pending.session_id, pending.request)
 
     def before_answer(self, pending: PendingRequest, reply: Reply) -> None:
-        """Add a command, and state whether a viewer watches, so that a player states what it executed."""
-        if reply.act is not None and self._clock() < self._viewed_until:
+        """Add a command, and state from time to time that a viewer watches, so that a player states what it executed."""
+        now, session = self._clock(), pending.session_id
+        if (
+            reply.act is not None
+            and now < self._viewed_until
+            and now - self._told.get(session, float("-inf")) > _TELL_S
+        ):
+            self._told[session] = now
             reply.act.info[WATCHED] = True
         if self._commands is not None:
             self._commands.send(pending.session_id, reply)
@@ -211,7 +222,9 @@ class LiveObserver(Observer):
         return self._observations.get(session)
 
     def forget_others(self, sessions: Collection[str]) -> None:
-        """Drop the observations of all sessions but these, since those have ended."""
+        """Drop what is kept of all sessions but these, since those have ended."""
+        for session in self._told.keys() - set(sessions):
+            self._told.pop(session, None)
         with self._lock:
             for session in self._observations.keys() - set(sessions):
                 self._observation_bytes -= self._observations.pop(session).counted
