@@ -42,8 +42,8 @@ _NUMBERS = ("step", "age_ms", "safe_ticks", "safe_spells", "late", "reconnects")
 _MOST = 2**53  # largest number that JSON keeps
 _OBJECTS = 1000  # bytes of an answer or an observation besides its arrays, files and texts, estimated
 _ENCODING = threading.Lock()
-# Interval at which a session is told that it is watched, which its player believes for 10 s. Not with each answer: one with
-# more than the weights in its info does not travel in the compact form of shared memory.
+# Interval at which a session is told that it is watched, which its player believes for 10 s. Not with each answer: with
+# more than the weights in its info, one does not travel in the compact form of shared memory.
 _TELL_S = 2.0
 _KEPT_S = 1.0  # time for which pixels are kept for a reader
 
@@ -187,13 +187,10 @@ class LiveObserver(Observer):
             self._commands.read_outcomes(pending.session_id, pending.request)
 
     def before_answer(self, pending: PendingRequest, reply: Reply) -> None:
-        """Add a command, and state from time to time that a viewer watches, so that a player states what it executed."""
+        """Add a command, and say now and then that a viewer watches, so that a player states what it executed."""
         now, session = self._clock(), pending.session_id
-        if (
-            reply.act is not None
-            and now < self._viewed_until
-            and now - self._told.get(session, float("-inf")) > _TELL_S
-        ):
+        is_due = now - self._told.get(session, float("-inf")) > _TELL_S
+        if is_due and now < self._viewed_until and reply.act is not None:
             self._told[session] = now
             reply.act.info[WATCHED] = True
         if self._commands is not None:
