@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from vlagents_ray.policies.base.model_inputs import KEPT, KEPT_CHARACTERS, keeping_tokens
 from vlagents_ray.policies.lerobot.processors import cached_tokenizer
 
 
@@ -30,3 +31,16 @@ def test_rows_of_tensors_are_those_of_the_tokenizer_and_changes_of_a_batch_do_no
         assert all(torch.equal(got[name], want[name]) for name in want)
         got["input_ids"].zero_()
     assert sum(texts == ["push"] for texts in asked) == 1
+
+
+def test_few_instructions_are_kept_and_none_that_is_very_long() -> None:
+    asked: list[str] = []
+    tokens = keeping_tokens(lambda text: asked.append(text) or [len(text)])
+    long = "a" * (KEPT_CHARACTERS + 1)
+    for text in ("lift", "lift", long, long):
+        assert tokens(text) == [len(text)]
+    assert asked == ["lift", long, long]
+    for number in range(KEPT):
+        tokens(f"lift {number}")
+    tokens("lift")
+    assert asked.count("lift") == 2, "the one used least recently was dropped"

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from functools import lru_cache
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -15,9 +16,12 @@ from vlagents_ray.interface import LEFTOVER, SAMPLES, WANT, Obs
 from vlagents_ray.policies.base.config import ModelConfig
 from vlagents_ray.registry import require
 
+T = TypeVar("T")
+
 GRIPPER = "gripper"  # the part of the state that is `Obs.gripper`
 CLOSED = "gripper_closed"  # the part that is its closedness: 1 - `Obs.gripper`
-KEPT = 256  # instructions of which a policy keeps the tokens: more than a server has tasks, and at most some MB
+KEPT = 256  # instructions of which a policy keeps the tokens: more than a server has tasks
+KEPT_CHARACTERS = 1000  # of the longest such instruction, as clients choose it: all together take some 10 MB at most
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,3 +194,9 @@ def resize_with_pad(image: np.ndarray, height: int, width: int) -> np.ndarray:
     top, left = (height - inner_height) // 2, (width - inner_width) // 2
     padded[top : top + inner_height, left : left + inner_width] = small
     return padded
+
+
+def keeping_tokens(tokenize: Callable[[str], T]) -> Callable[[str], T]:
+    """Return `tokenize`, which keeps its results for the instructions used last, unless these are very long."""
+    kept = lru_cache(maxsize=KEPT)(tokenize)
+    return lambda text: kept(text) if len(text) <= KEPT_CHARACTERS else tokenize(text)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import inspect
 import json
 from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ from vlagents_ray.dataset_contract import BYTES, STATISTICS, DatasetContract
 from vlagents_ray.errors import ConfigError, MissingDependency
 from vlagents_ray.policies.base import Row
 from vlagents_ray.policies.base.model_code import CURE
-from vlagents_ray.policies.base.model_inputs import KEPT
+from vlagents_ray.policies.base.model_inputs import keeping_tokens
 from vlagents_ray.policies.lerobot.config import LeRobotConfig
 from vlagents_ray.policies.lerobot.kinds import groot_dataset, require_groot_statistics
 from vlagents_ray.registry import require
@@ -314,7 +313,7 @@ def cached_tokenizer(tokenizer: Any, **settings: Any) -> Callable[[list[str]], d
         settings: Further arguments of its calls, such as `max_length`.
     """
 
-    @lru_cache(maxsize=KEPT)
+    @keeping_tokens
     def tokenized(text: str) -> dict[str, Any]:
         return dict(tokenizer([text], padding="max_length", return_tensors="pt", **settings).items())
 

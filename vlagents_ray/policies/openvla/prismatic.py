@@ -30,7 +30,7 @@ from vlagents_ray.interface import Obs
 from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row
 from vlagents_ray.policies.base.accelerator import ensure_torchvision, torch_device, torch_dtype
 from vlagents_ray.policies.base.checkpoint import SavedTensors, find_checkpoint, require_loaded
-from vlagents_ray.policies.base.model_inputs import KEPT
+from vlagents_ray.policies.base.model_inputs import keeping_tokens
 from vlagents_ray.registry import require
 
 Bounds = Literal["q99", "min_max"]  # of each dimension: 1st and 99th percentile, or minimum and maximum
@@ -174,7 +174,7 @@ class Prismatic:
     def _tokenized(self) -> Callable[[str], list[int]]:
         """The tokens of an instruction, which is the same at each act of a session."""
 
-        @lru_cache(maxsize=KEPT)
+        @keeping_tokens
         def tokenized(instruction: str) -> list[int]:
             ids: list[int] = self.tokenizer(self.prompt.format(instruction.lower())).input_ids
             return ids if ids[-1] == _SPACE else [*ids, _SPACE]
