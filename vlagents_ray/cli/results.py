@@ -61,7 +61,7 @@ def export_command(
         str,
         typer.Option(
             help="json, csv, parquet: a row an episode; lerobot: a dataset of what was seen; hub: scores for a model's "
-            "repository; vla-eval: for its leaderboard."
+            "repository."
         ),
     ],
     policy: Annotated[str | None, typer.Option(help="Only this one: NAME, or NAME@STEP in a sweep.")] = None,
@@ -77,13 +77,13 @@ def export_command(
     ] = False,
     settings: Annotated[
         list[str],
-        typer.Option("--set", metavar="KEY=VALUE", help="hub: dataset=OWNER/NAME; vla-eval: curated_by=@handle, …"),
+        typer.Option("--set", metavar="KEY=VALUE", help="hub: dataset=OWNER/NAME, …"),
     ] = [],  # noqa: B006 - typer reads it
 ) -> None:
     """Write the episodes of an evaluation as JSON, CSV, Parquet or a LeRobotDataset v3.0; or its scores, to publish."""
     from vlagents_ray.evaluate import Results
     from vlagents_ray.evaluate.artifacts.storage import storing
-    from vlagents_ray.evaluate.exports import EXPORTS, SCORES
+    from vlagents_ray.evaluate.exports import EXPORTS
 
     with errors():
         if to not in EXPORTS:
@@ -94,8 +94,8 @@ def export_command(
         if chosen and to != "lerobot":
             given = ", ".join(f"--{name.replace('_', '-')}" for name in chosen)
             raise ConfigError(f"{given}: got --to {to}, want --to lerobot, whose frames they choose")
-        if settings and to not in SCORES:
-            raise ConfigError(f"--set: got --to {to}, want one of {', '.join(SCORES)}")
+        if settings and to != "hub":
+            raise ConfigError(f"--set: got --to {to}, want --to hub, whose scores they describe")
         chosen |= parse_settings(settings, "--set")
         results = Results.load(folder).only(policy, env)
         with storing(path.parent):
