@@ -8,7 +8,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from benchmarks import autoscaling, evaluation, far_away, hop, link, report, rtt, scaling
+from benchmarks import autoscaling, evaluation, far_away, hop, report, rtt, scaling
 from benchmarks.checkpoints import __main__ as checkpoints
 
 
@@ -23,7 +23,6 @@ from benchmarks.checkpoints import __main__ as checkpoints
         (evaluation, ["--peers", "nobody"], "nobody"),
         (far_away, ["--modes", "async,nobody"], "nobody"),
         (hop, ["--python", "nowhere"], "nowhere"),
-        (link, ["--plot", "a.gif"], ".png"),
         (report, ["--page", "nowhere.md"], "nowhere.md"),
         (rtt, ["--peers", "nobody"], "nobody"),
         (scaling, ["--workers", "2,4"], "from 1 on"),

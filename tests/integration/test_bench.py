@@ -37,8 +37,8 @@ def bench(ray_home: Path, *words: str) -> subprocess.CompletedProcess[str]:
 def test_every_way_is_measured_and_shared_memory_is_the_fastest_to_a_local_process(
     ray_home: Path, tmp_path: Path
 ) -> None:
-    file, plot = tmp_path / "rtt.json", tmp_path / "rtt.svg"
-    done = bench(ray_home, "rtt", "--calls", "50", "--json", str(file), "--plot", str(plot))
+    file = tmp_path / "rtt.json"
+    done = bench(ray_home, "rtt", "--calls", "50", "--json", str(file))
     assert done.returncode == 0, done.stdout + done.stderr
     found = json.loads(file.read_text())
     medians = {way["way"]: way["median_ms"] for way in found["ways"]}
@@ -49,7 +49,6 @@ def test_every_way_is_measured_and_shared_memory_is_the_fastest_to_a_local_proce
     lost = {way["way"]: way["psnr_db"] for way in found["ways"]}
     assert lost["shm"] is None
     assert lost["websocket, jpeg"] > 30
-    assert plot.stat().st_size > 1000
 
 
 @pytest.mark.slow

@@ -1,27 +1,21 @@
-"""The figures of measurements: medians, intervals and ratios without assuming a distribution; a picture; two runs."""
+"""The figures of measurements: medians, intervals and ratios without assuming a distribution."""
 
 from __future__ import annotations
 
 import datetime
 import importlib.metadata
-import json
 import os
 import platform
 import shlex
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from vlagents_ray.errors import ConfigError
-from vlagents_ray.registry import require
-
 RESAMPLES = 2000
-SUFFIXES = (".png", ".svg", ".pdf")
-OURS, THEIRS = "#1f6f8b", "#b0b0b0"  # colours
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,50 +106,6 @@ def lost_db(images: Mapping[str, np.ndarray], sent: Mapping[str, np.ndarray]) ->
     return None if error == 0 else float(10 * np.log10(255**2 / error))
 
 
-def check_plot_file(file: Path | None) -> None:
-    """Raise `ConfigError` for a suffix that is not .png, .svg or .pdf, `MissingDependency` without matplotlib."""
-    if file is None:
-        return
-    if file.suffix not in SUFFIXES:
-        raise ConfigError(f"--plot: got {file.name!r}, want a name that ends in one of {list(SUFFIXES)}")
-    require("matplotlib")
-
-
-def plot_round_trips(found: Mapping[str, Any], file: Path, title: str = "round trip of one act") -> None:
-    """Draw bars, the fastest on top, on a logarithmic axis; ours in colour. Raises as `check_plot_file` does."""
-    check_plot_file(file)
-    figure_of = require("matplotlib.figure").Figure
-    ours = {way["way"] for way in found["ways"]}
-    rows = sorted([*found["ways"], *found["peers"]], key=lambda way: float(way["median_ms"]), reverse=True)
-    medians = [way["median_ms"] for way in rows]
-    below = [way["median_ms"] - way["ci95_ms"][0] for way in rows]
-    above = [way["ci95_ms"][1] - way["median_ms"] for way in rows]
-    figure = figure_of(figsize=(8, 0.4 * len(rows) + 1.2), layout="constrained")
-    axes = figure.subplots()
-    axes.barh(
-        [way["way"] for way in rows],
-        medians,
-        color=[OURS if way["way"] in ours else THEIRS for way in rows],
-        xerr=[below, above],
-        error_kw={"elinewidth": 1, "capsize": 3, "ecolor": "#303030"},
-    )
-    for number, way in enumerate(rows):
-        axes.annotate(
-            f"{way['median_ms']:.2f}",
-            (way["ci95_ms"][1], number),
-            (6, 0),
-            textcoords="offset points",
-            va="center",
-            fontsize=8,
-        )
-    axes.set_xscale("log")
-    axes.margins(x=0.15)
-    axes.set_xlabel("median, ms (bars: 95 % interval)")
-    axes.set_title(f"{title}, two 224x224 RGB cameras", loc="left", fontsize=10)
-    axes.spines[["top", "right"]].set_visible(False)
-    figure.savefig(file, dpi=150)
-
-
 PACKAGES = ("vlagents-ray", "ray", "numpy", "torch", "jax", "transformers", "lerobot")
 
 
@@ -189,94 +139,3 @@ def _machine() -> dict[str, Any]:
         "kernel": platform.release().partition("-")[0],
         "load": os.getloadavg()[0],
     }
-
-
-_NAMES = ("way", "clients", "batch")  # keys of which one names a row of a list
-_COMPARED = ("_ms", "_per_s", "_mib", "of_ideal", "mean_batch", "_bytes", "wall_s", "per_minute")  # ends of their names
-_SAME = ("cpu", "cores", "memory_gb", "kernel")  # of the machine
-
-
-@dataclass(frozen=True, slots=True)
-class ComparedFigure:
-    """One figure of both files."""
-
-    name: str  # its place in the files, with spaced slashes
-    old: float
-    new: float
-    overlap: bool | None = None  # whether the 95 % intervals of both overlap; None: they have none
-
-    @property
-    def ratio(self) -> float:
-        """The new figure over the old one; 1 if both are the same, also if both are 0."""
-        if self.new == self.old:
-            return 1.0
-        return self.new / self.old if self.old else float("inf")
-
-
-@dataclass(frozen=True, slots=True)
-class FigureComparison:
-    """The common figures of two files, and their other differences."""
-
-    figures: tuple[ComparedFigure, ...]
-    only_old: tuple[str, ...]  # figures that one file alone has
-    only_new: tuple[str, ...]
-    circumstances: tuple[str, ...]  # differences of machines and versions, a sentence each
-
-
-def compare_figures(old: Mapping[str, Any], new: Mapping[str, Any]) -> FigureComparison:
-    """Compare the figures of two measurements, in the order of the new one."""
-    before, after = dict(_figures(old)), dict(_figures(new))
-    figures = [
-        ComparedFigure(name, before[name][0], value, _overlap(before[name][1], interval))
-        for name, (value, interval) in after.items()
-        if name in before
-    ]
-    return FigureComparison(
-        tuple(figures),
-        tuple(name for name in before if name not in after),
-        tuple(name for name in after if name not in before),
-        tuple(_circumstances(old, new)),
-    )
-
-
-def read_figures(file: Path) -> dict[str, Any]:
-    """Read a file of figures; raises `ConfigError` for any other file."""
-    try:
-        found = json.loads(file.read_text())
-    except (OSError, ValueError) as error:
-        raise ConfigError(f"{file}: cannot be read ({error}); want what `bench … --json FILE` wrote") from error
-    if not isinstance(found, dict) or not any(True for _ in _figures(found)):
-        raise ConfigError(f"{file}: holds no figures; want what `bench … --json FILE` wrote")
-    return found
-
-
-def _figures(node: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, tuple[float, Any]]]:
-    """Yield name, value and 95 % interval of each figure below a node of JSON."""
-    if isinstance(node, Mapping):
-        for key, value in node.items():
-            if isinstance(value, int | float) and not isinstance(value, bool) and key.endswith(_COMPARED):
-                interval = node.get(f"ci95{key.removeprefix('median')}") if key.startswith("median") else None
-                yield " / ".join((*path, key)), (float(value), interval)
-            elif isinstance(value, Mapping | list):
-                yield from _figures(value, (*path, key))
-    elif isinstance(node, list):
-        for one in node:
-            if isinstance(one, Mapping) and (name := next((key for key in _NAMES if key in one), None)) is not None:
-                label = str(one[name]) if name == "way" else f"{name} {one[name]}"
-                yield from _figures(one, (*path, label))
-
-
-def _overlap(old: Any, new: Any) -> bool | None:
-    if old is None or new is None:
-        return None
-    return bool(old[0] <= new[1] and new[0] <= old[1])
-
-
-def _circumstances(old: Mapping[str, Any], new: Mapping[str, Any]) -> Iterator[str]:
-    for part, names in (("machine", _SAME), ("versions", None)):
-        before, after = old.get(part) or {}, new.get(part) or {}
-        if not before or not after:
-            continue
-        for name in names or sorted({*before, *after}):
-            if before.get(name) != after.get(name):
-                yield f"{name}: {before.get(name, 'none')} before, {after.get(name, 'none')} now"

@@ -23,24 +23,20 @@ Calls = Annotated[int, typer.Option(min=1, help="Round trips by each way.")]
 Seconds = Annotated[float, typer.Option(min=0.1, help="Of each measurement.")]
 Rounds = Annotated[int, typer.Option(min=1)]
 Json = Annotated[Path | None, typer.Option("--json", help="Write the figures here.")]
-Plot = Annotated[Path | None, typer.Option("--plot", help="Draw the figures here: .png, .svg or .pdf.")]
 Transports = Annotated[str, typer.Option(help="shm,websocket,http,handle,plasma; default: all.")]
 
 
 @bench.command("rtt")
-def bench_rtt(calls: Calls = 1000, transports: Transports = "", json_file: Json = None, plot: Plot = None) -> None:
+def bench_rtt(calls: Calls = 1000, transports: Transports = "", json_file: Json = None) -> None:
     """Round trips to a `noop` policy on this machine by every transport, in turns."""
-    from vlagents_ray.bench.figures import check_plot_file, measured_on, plot_round_trips
+    from vlagents_ray.bench.figures import measured_on
     from vlagents_ray.bench.rtt import measure_rtt
 
     with errors():
-        check_plot_file(plot)
         origin = measured_on()
         found = measure_rtt(calls, transports=parse_list(transports), progress=progress).to_json()
         show_round_trips(found, "round trip of one act on this machine")
         save({**origin, **found}, json_file)
-        if plot is not None:
-            plot_round_trips(found, plot)
 
 
 @bench.command("throughput")
@@ -101,28 +97,6 @@ def bench_policy(
         found = measure_policy(plan, progress)
     show_policy(found)
     save({**origin, **found}, json_file)
-
-
-@bench.command("compare")
-def bench_compare(
-    old: Annotated[Path, typer.Argument(help="A file of `bench … --json`.")],
-    new: Annotated[Path, typer.Argument(help="Another one, of the same command.")],
-) -> None:
-    """Two runs side by side: each figure of both, and in what their machines and versions differ."""
-    from vlagents_ray.bench.figures import compare_figures, read_figures
-
-    with errors():
-        found = compare_figures(read_figures(old), read_figures(new))
-    rows = table("figure", "old", "new", "new / old", "95 % intervals")
-    for one in found.figures:
-        intervals = {True: "overlap", False: "apart", None: ""}[one.overlap]
-        rows.add_row(one.name, f"{one.old:.4g}", f"{one.new:.4g}", f"{one.ratio:.2f}", intervals)
-    out.print(rows)
-    for title, lines in (
-        ("differs", found.circumstances), (f"only in {old}", found.only_old), (f"only in {new}", found.only_new),
-    ):  # fmt: skip
-        for line in lines:
-            out.print(f"{title}: {line}", style="yellow")
 
 
 def show_round_trips(found: Mapping[str, Any], title: str) -> None:
