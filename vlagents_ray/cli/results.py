@@ -179,7 +179,7 @@ def replay_command(
     """Play an episode of an evaluation again: exit code 0 if all is the same. Or play a dataset to another policy.
 
     A dataset is what a server recorded, or any LeRobotDataset: its errors by joint and by step of the horizon are
-    printed, and written as JSON and as a page.
+    printed, and written as JSON.
     """
     with errors():
         if is_dataset(folder):
@@ -227,9 +227,8 @@ def is_dataset(folder: Path) -> bool:
 
 
 def replay_dataset(folder: Path, policy: str, into: Path, plan: ReplayPlan) -> None:
-    """Play a dataset to a policy, print the errors, and write the report."""
-    from vlagents_ray.open_loop.replay import candidate, replay
-    from vlagents_ray.open_loop.report import write_files
+    """Play a dataset to a policy, print the errors, and write them as JSON."""
+    from vlagents_ray.open_loop.replay import candidate, replay, write_result
 
     with candidate(policy) as sessions:
         result = replay(folder, sessions, plan)
@@ -240,8 +239,7 @@ def replay_dataset(folder: Path, policy: str, into: Path, plan: ReplayPlan) -> N
     )
     for one in table["by_joint"]:
         out.print(f"  {one['joint']}: {one['mae']:.4g}, {one['rmse']:.4g}, {one['max']:.4g}")
-    for path in write_files(result, policy, into):
-        out.print(f"wrote {path}")
+    out.print(f"wrote {write_result(result, policy, into)}")
 
 
 def parse_episodes(text: str) -> Sequence[int]:
