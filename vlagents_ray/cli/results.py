@@ -126,7 +126,7 @@ def bundle_command(
     file: Annotated[Path | None, typer.Option("--out", help="The file; default: OUT.bundle.zip beside OUT.")] = None,
     videos: Annotated[bool, typer.Option("--videos", help="With its videos, which may be large.")] = False,
 ) -> None:
-    """Write an evaluation as one file: database, report, settings, versions of packages, trajectories, digests."""
+    """Write an evaluation as one file: database, differences from commits, trajectories, digests."""
     from vlagents_ray.evaluate.bundle import write_bundle
 
     with errors():
@@ -144,7 +144,7 @@ def verify_command(
 ) -> None:
     """Check a bundle, also a stranger's: what is equal, what differs, what could not be checked.
 
-    Exit code 0 if nothing contradicts it, 1 if something does: a digest, the tables, a recording, an outcome of a
+    Exit code 0 if nothing contradicts it, 1 if something does: a digest, the table, a recording, an outcome of a
     replay. Other versions of software here are named, and contradict nothing.
     """
     from vlagents_ray.evaluate.bundle import verify
