@@ -9,10 +9,10 @@ from typing import Any
 import typer
 
 from benchmarks import peers as others
-from vlagents_ray.bench.clients import own_clients
-from vlagents_ray.bench.figures import measured_on
-from vlagents_ray.bench.rtt import measure
-from vlagents_ray.cli.bench import Calls, Json, Transports, show_round_trips
+from benchmarks.console import Calls, Json, Transports, show_round_trips
+from benchmarks.figures import measured_on
+from benchmarks.own_clients import own_clients
+from benchmarks.round_trips import measure
 from vlagents_ray.cli.console import errors, progress, save
 from vlagents_ray.cli.options import parse_list
 
@@ -35,7 +35,7 @@ def measure_with_peers(
         progress: Is called with lines of progress.
 
     Returns:
-        What `vlagents_ray.bench.rtt.measure(...).to_json()` returns, and the "versions" of the peers' packages.
+        What `benchmarks.round_trips.measure(...).to_json()` returns, and the "versions" of the peers' packages.
     """
     own, skipped = own_clients(transports)
     found, absent, versions = others.peer_clients(peers, peers_python)

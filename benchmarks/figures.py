@@ -85,20 +85,6 @@ def ratios(ours: Sequence[RoundTrips], theirs: Sequence[RoundTrips]) -> dict[str
     }
 
 
-def rate_of(calls: Sequence[Sequence[tuple[float, ...]]]) -> float:
-    """Return actions a second: the slope of the line through all ends of calls.
-
-    They come in batches, so that counting them in a time would be wrong by up to a batch. 0 for fewer than two calls.
-
-    Args:
-        calls: The calls of each client; the first number of a call is its end, s.
-    """
-    ends = np.sort([call[0] for one in calls for call in one])
-    if len(ends) < 2 or ends[0] == ends[-1]:
-        return 0.0
-    return float(np.polyfit(ends - ends[0], np.arange(len(ends)), 1)[0])
-
-
 def lost_db(images: Mapping[str, np.ndarray], sent: Mapping[str, np.ndarray]) -> float | None:
     """Return the peak signal-to-noise ratio of all images against what was `sent`, dB; None if they are equal."""
     squares = [(images[name].astype(np.float64) - sent[name]) ** 2 for name in sent]

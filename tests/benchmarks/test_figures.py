@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from vlagents_ray.bench.figures import RoundTrips, lost_db, measured_on, median_interval, median_ratio, ratios
+from benchmarks.figures import RoundTrips, lost_db, measured_on, median_interval, median_ratio, ratios
 
 
 def trips(name: str, median: float, rounds: int = 20, seed: int = 0) -> RoundTrips:
