@@ -83,7 +83,7 @@ class EvalOptions:
     until: Annotated[int | None, typer.Option(min=0, metavar="STEP", help="End --watch with this step.")] = None
     settle: Annotated[float | None, typer.Option(min=0, help="With --watch: s without a change; default: 10.")] = None
     marker: Annotated[str | None, typer.Option(metavar="NAME", help="With --watch: the trainer's last file.")] = None
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print plan and estimated time; play nothing.")] = False
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the plan, and the time left; play nothing.")] = False
     end_at: Annotated[
         str | None,
         typer.Option(metavar="TIME", help="Begin no episode that would end later: 2027-01-31T18:30, or s since 1970."),
