@@ -1,13 +1,12 @@
-"""Measurements that developers repeat, in a checkout: `python -m benchmarks.NAME --help`.
+"""Measurements, in a checkout: `python -m benchmarks.NAME --help`.
 
 `rtt` and `link` compare round trips with those of other policy servers (`peers`), on one machine and over a link;
-`report` measures these and throughput, judges them, and writes docs/measured.md; `checkpoints` makes checkpoints of
-random weights.
+`throughput` loads one replica with many clients; `policy` measures a policy without a server; `report` measures round
+trips and throughput, judges them, and writes docs/measured.md; `checkpoints` makes checkpoints of random weights.
 `overhead` compares an evaluation with bare environments, `evaluation` with the peers' own; `soak` lets one run for
 long; `scaling` has more and more workers play on a Ray cluster over several `hosts`, which are made on one machine;
 `autoscaling` watches replicas while `robots` and rollouts come and go; `hop` measures a child process behind a replica,
 `adapters` sessions of many fine-tunes; `push` new weights under acting sessions, `rollouts` those of a learner;
 `clients` clients in other languages, `ros` a robot behind topics of ROS 2, `far_away` one whose policy is behind a
 long, lossy or cut link.
-What users repeat is `vlagents-ray bench`.
 """

@@ -21,7 +21,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from vlagents_ray.cli.bench import Json
+from benchmarks.console import Json
 from vlagents_ray.cli.console import errors, save
 from vlagents_ray.cli.options import parse_dims
 from vlagents_ray.interface import Act, Agent, Obs

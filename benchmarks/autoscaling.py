@@ -22,13 +22,13 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 import typer
 
+from benchmarks.console import Json
 from benchmarks.environments import ACTION_DIM, SLEEPING_ENV
 from benchmarks.robots import RobotBurst
-from vlagents_ray.bench.figures import OURS, THEIRS, check_plot_file
 from vlagents_ray.bench.line_process import LineProcess, ProcessFailed, our_environment
-from vlagents_ray.cli.bench import Json, Plot
 from vlagents_ray.cli.console import errors, out, progress, save, table
 from vlagents_ray.client.transports.serve_handle import call_replica
+from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig, Results, SuiteConfig, evaluate
 from vlagents_ray.registry import require
 from vlagents_ray.serve.config.deployment import POLICY
@@ -36,7 +36,8 @@ from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.serve.launch.server import running_server
 from vlagents_ray.serve.scaling.sibling_replicas import SiblingApi
 
-_SESSIONS = "#e0a030"  # a colour
+_SUFFIXES = (".png", ".svg", ".pdf")
+_SESSIONS, _BLUE, _GREY = "#e0a030", "#1f6f8b", "#b0b0b0"  # colours
 _APP = "noop"
 _EVERY_S = 0.5  # between two looks at the replicas
 _ANSWER_S = 0.3  # that a replica may take to say how many sessions it holds
@@ -251,13 +252,21 @@ def _most(samples: Sequence[ScaleSample], phase: LoadPhase) -> int:
     return max((one.running for one in samples if phase.begun <= one.at <= phase.ended), default=0)
 
 
+def check_plot_file(file: Path | None) -> None:
+    """Raise `ConfigError` for a suffix that is not .png, .svg or .pdf, `MissingDependency` without matplotlib."""
+    if file is None:
+        return
+    if file.suffix not in _SUFFIXES:
+        raise ConfigError(f"--plot: got {file.name!r}, want a name that ends in one of {list(_SUFFIXES)}")
+    require("matplotlib")
+
+
 def plot_autoscaling(found: Mapping[str, Any], file: Path) -> None:
-    """Draw replicas and sessions over time, and below how long acts took. Raises as `check_plot_file` does."""
-    check_plot_file(file)
+    """Draw replicas and sessions over time, and below how long acts took."""
     figure = require("matplotlib.figure").Figure(figsize=(9, 5), layout="constrained")
     above, below = figure.subplots(2, 1, sharex=True)
     times = [one["at"] for one in found["samples"]]
-    for name, colour, style in (("wanted", THEIRS, "--"), ("running", OURS, "-")):
+    for name, colour, style in (("wanted", _GREY, "--"), ("running", _BLUE, "-")):
         numbers = [one[name] for one in found["samples"]]
         above.step(times, numbers, style, where="post", color=colour, label=f"replicas {name}")
     above.set_ylabel("replicas")
@@ -269,8 +278,8 @@ def plot_autoscaling(found: Mapping[str, Any], file: Path) -> None:
     above.legend(loc="upper left", fontsize=8, frameon=False)
     for phase in found["phases"]:
         at = [one["at"] for one in phase["seconds"]]
-        below.plot(at, [one["median_ms"] for one in phase["seconds"]], ".-", color=OURS, markersize=3)
-        below.plot(at, [one["p95_ms"] for one in phase["seconds"]], ".", color=THEIRS, markersize=3)
+        below.plot(at, [one["median_ms"] for one in phase["seconds"]], ".-", color=_BLUE, markersize=3)
+        below.plot(at, [one["p95_ms"] for one in phase["seconds"]], ".", color=_GREY, markersize=3)
         waited = "" if phase["first_reset_s"] is None else f"\nfirst reset {phase['first_reset_s']:.1f} s"
         text = f"{phase['name']}\n{len(phase['failed'])} failed{waited}"
         below.annotate(text, (phase["begun"], 1.0), xycoords=("data", "axes fraction"), va="top", fontsize=7)
@@ -301,7 +310,7 @@ def main(
     workers: Annotated[int, typer.Option(min=1, help="Of the evaluation that comes after them.")] = 8,
     seconds: Annotated[float, typer.Option(min=1, help="That each of the two stays, about.")] = 25.0,
     json_file: Json = None,
-    plot: Plot = None,
+    plot: Annotated[Path | None, typer.Option("--plot", help="Draw the figures here: .png, .svg or .pdf.")] = None,
 ) -> None:
     """Replicas over time while robots and rollouts come and go, from no replica and back to none."""
     with errors():

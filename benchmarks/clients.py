@@ -17,10 +17,10 @@ from typing import Annotated
 
 import typer
 
-from vlagents_ray.bench.clients import OwnClient, connected, observation
+from benchmarks.console import Json, show_round_trips
+from benchmarks.own_clients import OwnClient, connected, observation
+from benchmarks.round_trips import POLICY, RoundTripsOfAll, in_turns
 from vlagents_ray.bench.line_process import Driver, LineProcess
-from vlagents_ray.bench.rtt import POLICY, RoundTripsOfAll, in_turns
-from vlagents_ray.cli.bench import Json, show_round_trips
 from vlagents_ray.cli.console import errors, progress, save
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Obs

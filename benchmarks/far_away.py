@@ -18,12 +18,12 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
+from benchmarks.console import Json
 from benchmarks.far_carrier import Conditions
 from benchmarks.far_link import FarLink
 from benchmarks.far_robot import HZ, MODES
 from benchmarks.hosts import Host, hosts
 from vlagents_ray.bench.line_process import LineProcess, our_environment
-from vlagents_ray.cli.bench import Json
 from vlagents_ray.cli.console import errors, out, progress, save, table
 from vlagents_ray.errors import ConfigError
 

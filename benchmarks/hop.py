@@ -10,9 +10,9 @@ from typing import Annotated, Any
 
 import typer
 
-from vlagents_ray.bench.clients import observation
-from vlagents_ray.bench.rtt import RoundTripsOfAll, in_turns
-from vlagents_ray.cli.bench import Json, show_round_trips
+from benchmarks.console import Json, show_round_trips
+from benchmarks.own_clients import observation
+from benchmarks.round_trips import RoundTripsOfAll, in_turns
 from vlagents_ray.cli.console import errors, progress, save
 from vlagents_ray.interface import Agent
 from vlagents_ray.policies.noop import Noop

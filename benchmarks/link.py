@@ -23,12 +23,12 @@ from typing import Annotated, Any
 import typer
 
 from benchmarks import peers as others
-from vlagents_ray.bench.clients import OwnClient
-from vlagents_ray.bench.figures import check_plot_file, measured_on, plot_round_trips
+from benchmarks.console import Calls, Json, show_round_trips
+from benchmarks.figures import measured_on
+from benchmarks.own_clients import OwnClient
+from benchmarks.round_trips import measure
 from vlagents_ray.bench.line_client import die_with_parent, own_stdout
 from vlagents_ray.bench.line_process import LineProcess, our_environment
-from vlagents_ray.bench.rtt import measure
-from vlagents_ray.cli.bench import Calls, Json, Plot, show_round_trips
 from vlagents_ray.cli.console import errors, progress, save
 from vlagents_ray.cli.options import parse_list
 from vlagents_ray.errors import ConfigError, VLAgentsError
@@ -240,20 +240,15 @@ def main(
     peers: others.Peers = "vlagents,openpi",
     peers_python: others.PeersPython = others.PYTHON,
     json_file: Json = None,
-    plot: Plot = None,
 ) -> None:
     """Round trips over a link of 1 Gbit/s between two network namespaces on this machine."""
     with errors():
-        check_plot_file(plot)
         origin = measured_on("python -m benchmarks.link")
         found = measure_link(
             calls, rate=rate, delay=delay, peers=parse_list(peers), peers_python=peers_python, progress=progress
         )  # fmt: skip
-        title = f"round trip of one act over {found['link']['measured_mbit_per_s']:.0f} Mbit/s"
-        show_round_trips(found, title)
+        show_round_trips(found, f"round trip of one act over {found['link']['measured_mbit_per_s']:.0f} Mbit/s")
         save({**origin, **found, "versions": origin["versions"] | found["versions"]}, json_file)
-        if plot is not None:
-            plot_round_trips(found, plot, title)
 
 
 if __name__ == "__main__":

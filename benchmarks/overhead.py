@@ -27,7 +27,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 import typer
 
-from vlagents_ray.cli.bench import Json
+from benchmarks.console import Json
 from vlagents_ray.cli.console import errors, out, progress, save, table
 from vlagents_ray.cli.options import parse_settings
 from vlagents_ray.envs import make_env

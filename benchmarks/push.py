@@ -15,8 +15,8 @@ import ray
 import typer
 from pydantic import BaseModel
 
+from benchmarks.console import Json
 from vlagents_ray import RemoteAgent
-from vlagents_ray.cli.bench import Json
 from vlagents_ray.cli.console import out, save
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.interface import Act, Agent, Obs

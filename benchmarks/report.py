@@ -15,11 +15,11 @@ import typer
 from rich.text import Text
 
 from benchmarks import link
+from benchmarks.console import Calls
+from benchmarks.figures import measured_on
 from benchmarks.peers import PYTHON, PeersPython
 from benchmarks.rtt import measure_with_peers
-from vlagents_ray.bench.figures import measured_on
-from vlagents_ray.bench.throughput import ThroughputPlan, measure_throughput
-from vlagents_ray.cli.bench import Calls
+from benchmarks.throughput import ThroughputPlan, measure_throughput
 from vlagents_ray.cli.console import errors, out, progress, table
 from vlagents_ray.errors import ConfigError
 

@@ -12,7 +12,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
-from vlagents_ray.bench.clients import observation
+from benchmarks.own_clients import observation
 from vlagents_ray.bench.line_client import die_with_parent, own_stdout
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.errors import VLAgentsError

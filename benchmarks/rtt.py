@@ -9,10 +9,10 @@ from typing import Any
 import typer
 
 from benchmarks import peers as others
-from vlagents_ray.bench.clients import own_clients
-from vlagents_ray.bench.figures import check_plot_file, measured_on, plot_round_trips
-from vlagents_ray.bench.rtt import measure
-from vlagents_ray.cli.bench import Calls, Json, Plot, Transports, show_round_trips
+from benchmarks.console import Calls, Json, Transports, show_round_trips
+from benchmarks.figures import measured_on
+from benchmarks.own_clients import own_clients
+from benchmarks.round_trips import measure
 from vlagents_ray.cli.console import errors, progress, save
 from vlagents_ray.cli.options import parse_list
 
@@ -35,7 +35,7 @@ def measure_with_peers(
         progress: Is called with lines of progress.
 
     Returns:
-        What `vlagents_ray.bench.rtt.measure(...).to_json()` returns, and the "versions" of the peers' packages.
+        What `benchmarks.round_trips.measure(...).to_json()` returns, and the "versions" of the peers' packages.
     """
     own, skipped = own_clients(transports)
     found, absent, versions = others.peer_clients(peers, peers_python)
@@ -49,11 +49,9 @@ def main(
     peers: others.Peers = "all",
     peers_python: others.PeersPython = others.PYTHON,
     json_file: Json = None,
-    plot: Plot = None,
 ) -> None:
     """Round trips to a `noop` policy on this machine: every transport, and other policy servers, in turns."""
     with errors():
-        check_plot_file(plot)
         origin = measured_on("python -m benchmarks.rtt")
         found = measure_with_peers(
             calls, peers=parse_list(peers), peers_python=peers_python, transports=parse_list(transports),
@@ -61,8 +59,6 @@ def main(
         )  # fmt: skip
         show_round_trips(found, "round trip of one act on this machine")
         save({**origin, **found, "versions": origin["versions"] | found["versions"]}, json_file)
-        if plot is not None:
-            plot_round_trips(found, plot)
 
 
 if __name__ == "__main__":

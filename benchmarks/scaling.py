@@ -25,10 +25,10 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
+from benchmarks.console import Json
 from benchmarks.hosts import hosts, ray_cluster
 from benchmarks.scaling_driver import Fleet, PlayedEpisodes, ScalingRound
 from vlagents_ray.bench.line_process import LineProcess, our_environment
-from vlagents_ray.cli.bench import Json
 from vlagents_ray.cli.console import errors, out, progress, save, table
 from vlagents_ray.cli.options import parse_counts
 from vlagents_ray.errors import ConfigError

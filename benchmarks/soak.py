@@ -24,9 +24,9 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 import typer
 
+from benchmarks.console import Json
 from benchmarks.environments import TIMED_TABLETOP, EpisodeTimes, read_episode_times
 from benchmarks.report import Outcome, show_outcomes, unmeasured
-from vlagents_ray.cli.bench import Json
 from vlagents_ray.cli.console import errors, out, progress, save
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig, Progress, Results, SuiteConfig, evaluate
 from vlagents_ray.evaluate.episode.records import EpisodeResult

@@ -18,8 +18,8 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 from websockets.sync.server import serve
 
-from vlagents_ray.bench.rtt import RoundTripsOfAll, in_turns
-from vlagents_ray.cli.bench import Json, show_round_trips
+from benchmarks.console import Json, show_round_trips
+from benchmarks.round_trips import RoundTripsOfAll, in_turns
 from vlagents_ray.cli.console import errors, progress, save
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.interface import Obs

@@ -20,7 +20,9 @@ def main(
     """Random weights of a family's true size, and a deployment file of them; run it in the family's environment."""
     with errors():
         written = write_checkpoint(family, folder, size, dtype)
-    out.print(f"{written.parameters:,} parameters: vlagents-ray bench policy {folder / 'deployment.yaml'} --json FILE")
+    out.print(
+        f"{written.parameters:,} parameters: python -m benchmarks.policy {folder / 'deployment.yaml'} --json FILE"
+    )
 
 
 if __name__ == "__main__":

@@ -20,8 +20,8 @@ from typing import Annotated
 
 import typer
 
+from benchmarks.round_trips import LOOPBACK, StartClient
 from vlagents_ray.bench.line_process import START_S, Driver, LineProcess
-from vlagents_ray.bench.rtt import LOOPBACK, StartClient
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.launch.server import free_port
 

@@ -8,7 +8,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from benchmarks import autoscaling, evaluation, far_away, hop, link, report, rtt, scaling
+from benchmarks import autoscaling, evaluation, far_away, hop, policy, report, rtt, scaling, throughput
 from benchmarks.checkpoints import __main__ as checkpoints
 
 
@@ -23,11 +23,17 @@ from benchmarks.checkpoints import __main__ as checkpoints
         (evaluation, ["--peers", "nobody"], "nobody"),
         (far_away, ["--modes", "async,nobody"], "nobody"),
         (hop, ["--python", "nowhere"], "nowhere"),
-        (link, ["--plot", "a.gif"], ".png"),
         (report, ["--page", "nowhere.md"], "nowhere.md"),
+        (policy, ["noop", "--batch", "0"], "from 1"),
+        (policy, ["noop", "--state", "joints=some"], "joints"),
+        (policy, ["noop", "--set", "colour=blue"], "colour"),
+        (policy, ["nowhere.yaml"], "nowhere.yaml"),
         (rtt, ["--peers", "nobody"], "nobody"),
+        (rtt, ["--transports", "smoke"], "smoke"),
         (scaling, ["--workers", "2,4"], "from 1 on"),
         (scaling, ["--nodes", "none"], "--nodes"),
+        (throughput, ["--clients", "few"], "few"),
+        (throughput, ["--set", "base_ms=1"], "--policy"),
     ],
 )
 def test_mistakes_are_reported_in_a_line(module: ModuleType, words: list[str], text: str) -> None:

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from eval_fakes import wait_for
 
+from benchmarks.own_clients import observation, save_observation
 from benchmarks.peers import SCRIPTS, PeerClient, installed, peer_clients, peer_connected
-from vlagents_ray.bench.clients import observation, save_observation
 from vlagents_ray.bench.line_process import ProcessFailed
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.launch.server import free_port

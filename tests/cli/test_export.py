@@ -54,7 +54,7 @@ def test_a_table_has_no_frames_to_choose(played: Path, tmp_path: Path) -> None:
 def test_scores_have_settings_and_tables_have_none(played: Path, tmp_path: Path) -> None:
     done = export(played, tmp_path / "t.csv", "--to", "csv", "--set", "dataset=a/b")
     assert done.exit_code == 2
-    assert "--set: got --to csv, want one of hub, vla-eval" in " ".join(done.output.split())
+    assert "--set: got --to csv, want --to hub" in " ".join(done.output.split())
     done = export(played, tmp_path / "card", "--to", "hub", "--set", "dataset=a/b", "--set", "task_id=roll")
     assert done.exit_code == 0, done.output
     assert "task_id: roll" in (tmp_path / "card/.eval_results/a_b.yaml").read_text()

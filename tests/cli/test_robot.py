@@ -12,14 +12,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from manual_clock import Clock
 from typer.testing import CliRunner
 
 from vlagents_ray.cli.main import app
-from vlagents_ray.cli.simulated_robot import TerminalView, blocks
 from vlagents_ray.policies.scripted import Scripted
 
 REPEATS = 20  # the loop has ten ticks in that time
@@ -109,40 +106,19 @@ def test_a_human_corrects_a_policy(tmp_path: Path) -> None:
     assert labels(tmp_path) == ["success"]
 
 
-def test_cameras_are_drawn_two_pixels_a_character_and_redrawn_in_place(monkeypatch: pytest.MonkeyPatch) -> None:
-    clock, written = Clock(), []
-    monkeypatch.setattr("vlagents_ray.cli.simulated_robot.time.monotonic", clock)
-    monkeypatch.setattr("shutil.get_terminal_size", lambda **_: os.terminal_size((80, 10)))
-    view = TerminalView(written.append)
-    image = np.zeros((16, 16, 3), np.uint8)
-    image[:8, :, 0] = 255
-    for clock.now in (1.0, 1.1, 1.3):
-        view.draw({"front": image})
-    assert len(written) == 2, "five times a second"
-    first, second = written
-    assert first.count("\n") == 4  # eight pixels, as six lines are left for text
-    assert first.count("\x1b[38;2;255;0;0;48;2;255;0;0m▀") == 2 * 8
-    assert second == f"\x1b[4A{first}"
-    view.leave()
-    clock.now = 2.0
-    view.draw({"front": image})
-    assert written[-1] == first
-
-
-def test_cameras_of_any_shape_stand_side_by_side() -> None:
-    wide, tall = np.full((10, 40, 3), 9, np.uint8), np.full((40, 10, 3), 7, np.uint8)
-    lines = blocks([wide, tall], 8)
-    assert [line.count("▀") for line in lines] == [8 + 1 + 2 + 1] * 4
-    assert [line.count("38;2;9;9;9;48;2;9;9;9") for line in lines] == [8, 0, 0, 0]
-    assert [line.count("38;2;7;7;7") for line in lines] == [2] * 4
-
-
 def test_a_policy_alone_is_recorded_without_columns_that_nobody_fills(tmp_path: Path) -> None:
     run = robot("scripted", *QUICK, "--episodes", "2", "--hz", "200", "--record", str(tmp_path))
     assert run.exit_code == 0, run.output
     assert run.output.count("success: ") == 2
     assert "recorded: 2 episodes" in run.output
     assert "intervention" not in frames(tmp_path, 1)
+
+
+@pytest.mark.library("rerun")
+def test_episodes_are_shown_in_a_viewer(tmp_path: Path) -> None:
+    run = robot("scripted", *QUICK, "--episodes", "2", "--hz", "200", "--rerun", str(tmp_path))
+    assert run.exit_code == 0, run.output
+    assert len(list(tmp_path.glob("*.rrd"))) == 2
 
 
 def test_ctrl_c_says_what_was_recorded(tmp_path: Path) -> None:

@@ -82,27 +82,3 @@ def test_mistakes_are_told_in_a_line(file: Path, words: list[str], text: str, mo
     assert done.exit_code == 2, done.output
     assert text in done.stderr
     assert "Traceback" not in done.output
-
-
-@pytest.mark.ray
-@pytest.mark.server
-def test_a_file_of_runs_gets_workers_and_environments(tmp_path: Path) -> None:
-    file = tmp_path / "runs.yaml"
-    file.write_text(
-        "# mine\npolicies: [{source: scripted}]\nsuites: [{envs: [tabletop], env_options: {max_steps: 5}}]\n"
-    )
-    done = CliRunner().invoke(app, ["tune", str(file), "--max-workers", "1", "--minutes", "0.2"])
-    assert done.exit_code == 0, done.output
-    [words] = re.findall("^chosen: 1 worker with (.*)", done.output, re.MULTILINE)
-    if words.startswith("1 environment each"):
-        assert "nothing to change" in done.output
-    else:
-        assert words.startswith(f"{printed_settings(done.output)['suites'][0]['num_envs']} environments each")
-
-
-def test_options_of_deployment_files_are_refused_for_a_file_of_runs(tmp_path: Path) -> None:
-    file = tmp_path / "runs.yaml"
-    file.write_text("policies: [{source: noop}]\nsuites: [{envs: [tabletop]}]\n")
-    done = CliRunner().invoke(app, ["tune", str(file), "--dtypes", "int8"])
-    assert done.exit_code == 2
-    assert "are of deployment files" in done.output

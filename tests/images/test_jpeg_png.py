@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from PIL import Image
 
-from vlagents_ray.bench.clients import observation
+from benchmarks.own_clients import observation
 from vlagents_ray.errors import InvalidObservation, MalformedMessage, MessageTooLarge
 from vlagents_ray.images import jpeg_png
 

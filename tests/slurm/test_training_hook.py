@@ -5,25 +5,20 @@ from __future__ import annotations
 import json
 import logging
 import os
-import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import pytest
-from eval_fakes import wait_for
 
-from vlagents_ray.slurm import submit_evaluation, training_hook
+from vlagents_ray.slurm import submit_evaluation
 from vlagents_ray.slurm.training_hook import HookFailed
 
 WORDS = ["env/*", "--policy", "p", "--set", "checkpoint={checkpoint}", "--out", "runs/{step}"]
 PYTHON = """#!/bin/bash
 printf '%s\\n' "${{@:3}}" >>"{folder}/words"
-while [ -e "{folder}/slow" ]; do sleep 0.05; done
 [ -e "{folder}/broken" ] && {{ echo 'no partition' >&2; exit 2; }}
 echo 77
 """
@@ -70,89 +65,48 @@ def test_a_failure_is_logged_training_goes_on_and_a_later_call_tries_again(
     assert submit_evaluation(WORDS, checkpoint="/c", step=5, record=tmp_path / "record", python=python) == "77"
 
 
-TRAINING = """
-import sys
-from vlagents_ray.slurm import submit_evaluation
-folder = sys.argv[1]
-submit_evaluation({words}, checkpoint="/c/20", step=20, record=folder + "/record", python=folder + "/python")
-"""
-
-
-@pytest.fixture
-def killed(tmp_path: Path, python: Path) -> Iterator[Path]:
-    """The record of a training that was killed while its submission was under way; that lives as long as `slow` is."""
-    (tmp_path / "slow").touch()
-    training = subprocess.Popen([sys.executable, "-c", TRAINING.format(words=WORDS), str(tmp_path)])
-    wait_for(
-        lambda: [*tmp_path.glob("record/*.json")] and "child" in mark_of(tmp_path) and (tmp_path / "words").exists()
-    )
-    wait_for(lambda: mark_of(tmp_path)["child"])
-    training.kill()
-    training.wait()
-    yield tmp_path
-    (tmp_path / "slow").unlink(missing_ok=True)
-
-
-def mark_of(folder: Path) -> dict[str, Any]:
-    [mark] = (folder / "record").glob("*.json")
-    found: dict[str, Any] = json.loads(mark.read_text() or "{}")
-    return found
-
-
 def call_for(folder: Path, step: int = 20) -> str | None:
     return submit_evaluation(
         WORDS, checkpoint=f"/c/{step}", step=step, record=folder / "record", python=folder / "python", raise_errors=True
     )
 
 
-def end_submission(folder: Path) -> None:
-    child = mark_of(folder)["child"]
-    os.kill(child, signal.SIGKILL)
-    wait_for(lambda: not training_hook._is_alive(child))
+@pytest.fixture
+def claimed(tmp_path: Path, python: Path) -> Path:
+    """The claim of a training that was killed before its submission had an answer."""
+    assert call_for(tmp_path) == "77"
+    [mark] = (tmp_path / "record").iterdir()
+    claim = json.loads(mark.read_text())
+    del claim["job"]
+    mark.write_text(json.dumps(claim))
+    return mark
 
 
-def test_a_training_that_is_killed_with_its_submission_is_made_up_for_by_the_next_call(killed: Path) -> None:
-    end_submission(killed)
-    (killed / "slow").unlink()
+@pytest.mark.parametrize("empty", [False, True])
+@pytest.mark.parametrize(("age_s", "jobs"), [(60.0, []), (361.0, ["77"])])
+def test_a_claim_without_a_job_holds_for_as_long_as_a_submission_may_take(
+    claimed: Path, empty: bool, age_s: float, jobs: list[str]
+) -> None:
+    if empty:  # killed before anything was written
+        claimed.write_text("")
+    then = time.time() - age_s
+    os.utime(claimed, (then, then))
+    folder = claimed.parents[1]
     with ThreadPoolExecutor(8) as ranks:
-        found = list(ranks.map(lambda _rank: call_for(killed), range(8)))
-    assert sorted(found, key=str) == ["77", *[None] * 7]
-    assert calls(killed) == 2  # that of the killed one, which reached nobody, and this
-    assert mark_of(killed)["job"] == "77"
+        found = list(ranks.map(lambda _rank: call_for(folder), range(8)))
+    assert [job for job in found if job is not None] == jobs
+    assert calls(folder) == 1 + len(jobs)
 
 
-def test_a_submission_that_outlives_its_training_is_not_made_twice(killed: Path) -> None:
-    assert call_for(killed) is None  # it is under way
-    child = mark_of(killed)["child"]
-    (killed / "slow").unlink()
-    wait_for(lambda: not training_hook._is_alive(child))
-    assert call_for(killed) == "77"
-    assert call_for(killed) is None
-    assert calls(killed) == 1
-
-
-def test_the_call_for_a_later_checkpoint_makes_up_for_an_earlier_one(killed: Path) -> None:
-    end_submission(killed)
-    (killed / "slow").unlink()
-    assert call_for(killed, step=30) == "77"
-    said = [json.loads(path.read_text()) for path in sorted((killed / "record").glob("*.json"))]
+def test_the_call_for_a_later_checkpoint_makes_up_for_an_earlier_one(claimed: Path) -> None:
+    then = time.time() - 361.0
+    os.utime(claimed, (then, then))
+    assert call_for(claimed.parents[1], step=30) == "77"
+    said = [json.loads(path.read_text()) for path in sorted(claimed.parent.glob("*.json"))]
     assert [(one["step"], one["job"], one["words"][-1]) for one in said] == [
         (20, "77", "runs/20"),
         (30, "77", "runs/30"),
     ]
-
-
-@pytest.mark.parametrize(("age_s", "job"), [(60.0, None), (361.0, "77")])
-@pytest.mark.parametrize("claim", ["elsewhere", "empty"])
-def test_a_claim_of_another_machine_holds_for_as_long_as_a_submission_may_take(
-    claim: str, age_s: float, job: str | None, tmp_path: Path, python: Path
-) -> None:
-    assert call_for(tmp_path) == "77"
-    [mark] = (tmp_path / "record").iterdir()
-    then = time.time() - age_s
-    mark.write_text(json.dumps({"host": "elsewhere", "pid": 1, "at": then}) if claim == "elsewhere" else "")
-    os.utime(mark, (then, then))
-    assert call_for(tmp_path) == job
 
 
 def test_a_python_that_is_not_there_does_not_stop_training(tmp_path: Path) -> None:

@@ -1,8 +1,6 @@
-"""Measurements that users can repeat on their own machines: `vlagents-ray bench …` and `vlagents-ray tune`.
+"""`vlagents-ray tune`: the settings of a deployment file that serve best on this machine.
 
-`rtt` measures round trips by every transport, in turns; `throughput` loads one replica with many clients; `policy`
-measures a policy without a server. `tuner` measures variants of a deployment file, each in a process
-(`tuning_process`), and `tuning_choice` chooses; `evaluation` tunes a file of runs. `figures` has what all results have
-in common. Each of the `clients` runs in a process that obeys a line protocol (`line_process`, `line_client`), or in a
-Ray actor. What only developers repeat is the folder `benchmarks/` of the checkout.
+`tuner` measures variants of the file, each in a process (`tuning_process`, `measured_policy`), and `tuning_choice`
+chooses. Processes obey a line protocol (`line_process`, `line_client`), as those of the folder `benchmarks/` of the
+checkout do.
 """

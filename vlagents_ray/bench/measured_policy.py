@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from typing_extensions import Self
 
-from vlagents_ray.bench.figures import rate_of
 from vlagents_ray.contract import Contract
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.messages import RankName, Reply, Request
@@ -163,6 +162,20 @@ class MeasuredPolicy:
                 raise act
             acts.append(act)
         return acts
+
+
+def rate_of(calls: Sequence[Sequence[tuple[float, ...]]]) -> float:
+    """Return actions a second: the slope of the line through all ends of calls.
+
+    They come in batches, so that counting them in a time would be wrong by up to a batch. 0 for fewer than two calls.
+
+    Args:
+        calls: The calls of each client; the first number of a call is its end, s.
+    """
+    ends = np.sort([call[0] for one in calls for call in one])
+    if len(ends) < 2 or ends[0] == ends[-1]:
+        return 0.0
+    return float(np.polyfit(ends - ends[0], np.arange(len(ends)), 1)[0])
 
 
 def cuda() -> Any:

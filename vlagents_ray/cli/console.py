@@ -79,9 +79,8 @@ def _model_of(error: ValidationError) -> tuple[type | None, str | None]:
     """Return the model that these settings are of, if users write it, and the option that sets its fields."""
     from vlagents_ray.evaluate import EvalConfig
     from vlagents_ray.evaluate.exports.scores import HubSettings
-    from vlagents_ray.evaluate.exports.vla_eval import VlaEvalSettings
 
-    options = {EvalConfig: None, HubSettings: "--set", VlaEvalSettings: "--set"}
+    options = {EvalConfig: None, HubSettings: "--set"}
     return next(((model, option) for model, option in options.items() if model.__name__ == error.title), (None, None))
 
 

@@ -58,8 +58,6 @@ class EvalOptions:
     seeds: Annotated[int | None, typer.Option("--seed", min=0, help="Episode i uses seed + i; default: 0.")] = None
     video: Annotated[str | None, typer.Option(help="none, failures (default) or all.")] = None
     record: Annotated[str | None, typer.Option(help="Trajectories: none (default), failures or all.")] = None
-    rerun: Annotated[str | None, typer.Option(metavar="DIR", help="Write .rrd files for Rerun; or 'live'.")] = None
-    foxglove: Annotated[str | None, typer.Option(metavar="DIR", help="Write .mcap files for Foxglove.")] = None
     track: Annotated[str, typer.Option(help="wandb, trackio, tensorboard, with commas between them.")] = ""
     resume: Annotated[bool, typer.Option(help="Go on with the results in --out.")] = False
     accept_changes: Annotated[
@@ -83,7 +81,7 @@ class EvalOptions:
     until: Annotated[int | None, typer.Option(min=0, metavar="STEP", help="End --watch with this step.")] = None
     settle: Annotated[float | None, typer.Option(min=0, help="With --watch: s without a change; default: 10.")] = None
     marker: Annotated[str | None, typer.Option(metavar="NAME", help="With --watch: the trainer's last file.")] = None
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print plan and estimated time; play nothing.")] = False
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the plan, and the time left; play nothing.")] = False
     end_at: Annotated[
         str | None,
         typer.Option(metavar="TIME", help="Begin no episode that would end later: 2027-01-31T18:30, or s since 1970."),
@@ -139,7 +137,7 @@ def evaluate_command(options: EvalOptions) -> None:
     """Evaluate policies: episodes in parallel, success rates with confidence intervals, videos.
 
     A file holds policies, their checkpoints, suites of environments, seeds; --out, --workers, --video, --record,
-    --rerun, --foxglove, --track, --retries and --resume win over it.
+    --track, --retries and --resume win over it.
 
     Exit status: 0 when every episode has its result; 75 when --end-at left some over, 130 if interrupted (resume both
     with --resume); 2 for invalid settings; 3 when an error of the policy ended every episode of a cell; 1 for any other

@@ -5,7 +5,9 @@ from __future__ import annotations
 import contextlib
 import datetime
 import threading
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,8 +20,8 @@ from vlagents_ray.cli.policies import policy_deployment, resolve_policies, serve
 from vlagents_ray.errors import ConfigError, PolicyFailed
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig, Results
 from vlagents_ray.evaluate.checkpoint_watcher import CheckpointWatcher, rounds
-from vlagents_ray.evaluate.estimate import Forecast, forecasts
-from vlagents_ray.evaluate.plan.cases import cells
+from vlagents_ray.evaluate.plan.cases import EvalCase, cells
+from vlagents_ray.evaluate.plan.jobs import plan
 from vlagents_ray.evaluate.results.database import FILE
 from vlagents_ray.evaluate.workers.cluster import ray_cluster
 from vlagents_ray.policies.base.checkpoint import STEP
@@ -33,10 +35,6 @@ if TYPE_CHECKING:
 
 POLICY_ERRORS = 3  # exit status: an error of the policy ended every episode of a cell
 LOOK_S = 1.0  # between two looks at the folder
-_BASES = {
-    "results": "from episodes that were played before",
-    "measured": "at most, as every episode may end early; without the time that the policy takes",
-}
 
 
 def run_evaluation(
@@ -101,7 +99,6 @@ def require_results(config: EvalConfig, summary: Summary) -> None:
 
     With status 1, if an episode has no result: infrastructure lost it.
     """
-    from vlagents_ray.evaluate.plan.cases import cells
     from vlagents_ray.evaluate.results.summary import errors_of_policies, failing_cells
 
     wanted = {cell.fingerprint for cell in cells(config)}
@@ -216,54 +213,79 @@ def run_on_robot(config: EvalConfig, address: str | None, *, operator: str, unbl
     print_summary(out, summary)
 
 
+@dataclass(frozen=True, slots=True)
+class Forecast:
+    """The episodes that one cell has left, and the time that one of them takes."""
+
+    cell: EvalCase
+    finished: int  # episodes, among those that are planned
+    left: int  # episodes that would be played; fewer than the rest where the cell has stopped early
+    seconds: float | None  # of one episode, the mean of those that its policy played in its env; None: not known
+
+
 def print_plan(config: EvalConfig) -> None:
-    """Print a row for each cell, the sum, and where the times come from. Nothing is served or written."""
+    """Print a row for each cell, and the sum. Nothing is served, played or written."""
     config, _ = resolve_policies(config, ask=False)
-    planned = cells(config)
     results = Results.load(config.out) if (config.out / FILE).is_file() else None
-    found = forecasts(config, planned, results)
+    found = forecasts(cells(config), results)
     out.print(_table(found))
     for line in _sum(config, found):
         out.print(line)
 
 
+def forecasts(planned: Sequence[EvalCase], results: Results | None) -> list[Forecast]:
+    """Return the forecast of each cell, in their order, from the episodes in `results`."""
+    earlier = results.cells if results is not None else ()
+    found = []
+    for cell in planned:
+        same = next((one for one in earlier if (one.contender, one.suite, one.env) == cell.name), None)
+        recorded = () if same is None else same.episodes
+        done = {
+            (one.result.key.episode, one.result.key.seed) for one in recorded if one.result.status != "infra_failed"
+        }
+        finished = sum((job.key.episode, job.key.seed) in done for job in plan([cell]))
+        has_stopped = same is not None and same.stopped_at is not None
+        alike = [one for one in earlier if (one.policy, one.env) == (cell.policy.name, cell.env)]
+        seconds = [episode.seconds for one in alike for episode in one.counted]
+        mean = sum(seconds) / len(seconds) if seconds else None
+        found.append(Forecast(cell, finished, 0 if has_stopped else cell.planned - finished, mean))
+    return found
+
+
 def _table(found: list[Forecast]) -> Table:
-    table = Table(box=SIMPLE_HEAD, padding=0, pad_edge=False)
+    shown = Table(box=SIMPLE_HEAD, padding=0, pad_edge=False)
     for title in ("policy", "env"):
-        table.add_column(title, overflow="fold")
+        shown.add_column(title, overflow="fold")
     for title in ("seeds", "episodes", "finished", "to play", "s each", "time"):
-        table.add_column(title, justify="right", no_wrap=True)
+        shown.add_column(title, justify="right", no_wrap=True)
     for one in found:
-        about = "" if one.basis == "results" else "≤ "
-        table.add_row(
+        shown.add_row(
             one.cell.contender,
             " ".join(filter(None, one.cell.name[1:])),
             str(len(one.cell.suite.seeds)),
             str(one.cell.planned),
             str(one.finished),
             str(one.left),
-            "?" if one.seconds is None else f"{about}{one.seconds:.3g}",
-            "?" if one.seconds is None else f"{about}{_time(one.left * one.seconds)}",
+            "?" if one.seconds is None else f"{one.seconds:.3g}",
+            "?" if one.seconds is None else _time(one.left * one.seconds),
         )
-    return table
+    return shown
 
 
 def _sum(config: EvalConfig, found: list[Forecast]) -> list[str]:
-    planned, finished, left = (
-        sum(column) for column in zip(*((f.cell.planned, f.finished, f.left) for f in found), strict=True)
-    )
+    cases = [one.cell for one in found]
+    policies, envs = len({case.contender for case in cases}), len({(case.suite.name, case.env) for case in cases})
+    planned, finished = sum(case.planned for case in cases), sum(one.finished for one in found)
+    left = sum(one.left for one in found)
     # Workers share one queue; what is short of a worker's turn is a single episode at the end.
     seconds = sum(one.left * (one.seconds or 0.0) for one in found) / max(1, min(config.workers, left))
-    cells = [one.cell for one in found]
-    policies, envs = len({cell.contender for cell in cells}), len({(cell.suite.name, cell.env) for cell in cells})
-    bases = [text for basis, text in _BASES.items() if any(one.basis == basis for one in found)]
-    lines = [
+    unknown = sum(one.seconds is None for one in found)
+    beside = f", and {unknown} cells whose envs were not played yet" if unknown else ""
+    return [
         f"{len(found)} cells: {policies} policies at their checkpoints x {envs} environments of suites",
         f"{planned} episodes, {finished} of them finished in {config.out}, {left} to play",
-        f"{_time(seconds)} with {config.workers} workers ({'; '.join(bases) or 'nothing is known of the time'})",
+        f"{_time(seconds)} with {config.workers} workers, as long as episodes before{beside}",
     ]
-    unknown = {one.cell.env: one.why for one in found if one.seconds is None}
-    return lines + [f"{env}: time unknown: {why}" for env, why in unknown.items()]
 
 
 def _time(seconds: float) -> str:

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from vlagents_ray.cli.bench import bench
 from vlagents_ray.cli.console import errors, fail, fresh, out, progress, table
 from vlagents_ray.cli.evaluate import evaluate_command
 from vlagents_ray.cli.keys import keys
@@ -69,7 +68,6 @@ app.command("replay")(replay_command)
 app.command("report")(report_command)
 app.command("tune")(tune_command)
 app.command("verify")(verify_command)
-app.add_typer(bench, name="bench")
 app.add_typer(env, name="env")
 app.add_typer(keys, name="keys")
 app.add_typer(new, name="new")

@@ -139,12 +139,3 @@ def read_run_file(file: Path, kind: str, keys: str) -> dict[str, Any]:
     if not isinstance(document, dict):
         raise ConfigError(f"{file}: got {type(document).__name__}, want a mapping with {keys}")
     return {"out": Path("runs") / file.stem} | document
-
-
-def is_run_file(file: Path) -> bool:
-    """Return whether a YAML file is a file of runs, and no deployment file."""
-    try:
-        document = yaml.safe_load(file.read_text())
-    except (OSError, yaml.YAMLError):
-        return False  # who reads it as a deployment file says what is wrong
-    return isinstance(document, dict) and "suites" in document

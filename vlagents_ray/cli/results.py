@@ -61,7 +61,7 @@ def export_command(
         str,
         typer.Option(
             help="json, csv, parquet: a row an episode; lerobot: a dataset of what was seen; hub: scores for a model's "
-            "repository; vla-eval: for its leaderboard."
+            "repository."
         ),
     ],
     policy: Annotated[str | None, typer.Option(help="Only this one: NAME, or NAME@STEP in a sweep.")] = None,
@@ -77,13 +77,13 @@ def export_command(
     ] = False,
     settings: Annotated[
         list[str],
-        typer.Option("--set", metavar="KEY=VALUE", help="hub: dataset=OWNER/NAME; vla-eval: curated_by=@handle, …"),
+        typer.Option("--set", metavar="KEY=VALUE", help="hub: dataset=OWNER/NAME, …"),
     ] = [],  # noqa: B006 - typer reads it
 ) -> None:
     """Write the episodes of an evaluation as JSON, CSV, Parquet or a LeRobotDataset v3.0; or its scores, to publish."""
     from vlagents_ray.evaluate import Results
     from vlagents_ray.evaluate.artifacts.storage import storing
-    from vlagents_ray.evaluate.exports import EXPORTS, SCORES
+    from vlagents_ray.evaluate.exports import EXPORTS
 
     with errors():
         if to not in EXPORTS:
@@ -94,8 +94,8 @@ def export_command(
         if chosen and to != "lerobot":
             given = ", ".join(f"--{name.replace('_', '-')}" for name in chosen)
             raise ConfigError(f"{given}: got --to {to}, want --to lerobot, whose frames they choose")
-        if settings and to not in SCORES:
-            raise ConfigError(f"--set: got --to {to}, want one of {', '.join(SCORES)}")
+        if settings and to != "hub":
+            raise ConfigError(f"--set: got --to {to}, want --to hub, whose scores they describe")
         chosen |= parse_settings(settings, "--set")
         results = Results.load(folder).only(policy, env)
         with storing(path.parent):
@@ -126,7 +126,7 @@ def bundle_command(
     file: Annotated[Path | None, typer.Option("--out", help="The file; default: OUT.bundle.zip beside OUT.")] = None,
     videos: Annotated[bool, typer.Option("--videos", help="With its videos, which may be large.")] = False,
 ) -> None:
-    """Write an evaluation as one file: database, report, settings, versions of packages, trajectories, digests."""
+    """Write an evaluation as one file: database, differences from commits, trajectories, digests."""
     from vlagents_ray.evaluate.bundle import write_bundle
 
     with errors():
@@ -144,7 +144,7 @@ def verify_command(
 ) -> None:
     """Check a bundle, also a stranger's: what is equal, what differs, what could not be checked.
 
-    Exit code 0 if nothing contradicts it, 1 if something does: a digest, the tables, a recording, an outcome of a
+    Exit code 0 if nothing contradicts it, 1 if something does: a digest, the table, a recording, an outcome of a
     replay. Other versions of software here are named, and contradict nothing.
     """
     from vlagents_ray.evaluate.bundle import verify
@@ -179,7 +179,7 @@ def replay_command(
     """Play an episode of an evaluation again: exit code 0 if all is the same. Or play a dataset to another policy.
 
     A dataset is what a server recorded, or any LeRobotDataset: its errors by joint and by step of the horizon are
-    printed, and written as JSON and as a page.
+    printed, and written as JSON.
     """
     with errors():
         if is_dataset(folder):
@@ -227,9 +227,8 @@ def is_dataset(folder: Path) -> bool:
 
 
 def replay_dataset(folder: Path, policy: str, into: Path, plan: ReplayPlan) -> None:
-    """Play a dataset to a policy, print the errors, and write the report."""
-    from vlagents_ray.open_loop.replay import candidate, replay
-    from vlagents_ray.open_loop.report import write_files
+    """Play a dataset to a policy, print the errors, and write them as JSON."""
+    from vlagents_ray.open_loop.replay import candidate, replay, write_result
 
     with candidate(policy) as sessions:
         result = replay(folder, sessions, plan)
@@ -240,8 +239,7 @@ def replay_dataset(folder: Path, policy: str, into: Path, plan: ReplayPlan) -> N
     )
     for one in table["by_joint"]:
         out.print(f"  {one['joint']}: {one['mae']:.4g}, {one['rmse']:.4g}, {one['max']:.4g}")
-    for path in write_files(result, policy, into):
-        out.print(f"wrote {path}")
+    out.print(f"wrote {write_result(result, policy, into)}")
 
 
 def parse_episodes(text: str) -> Sequence[int]:

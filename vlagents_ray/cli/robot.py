@@ -303,8 +303,8 @@ def command_parser() -> tuple[argparse.ArgumentParser, list[argparse.Action], li
     real("--timeout-s", type=seconds, default=10.0, help="time after which a request is given up (%(default)s)")
     real("--transport", choices=("auto", "shm", "websocket", "http"), default="auto", help="(%(default)s)")
     add("--record", metavar="DIR", help="record a LeRobotDataset v3.0 there; needs the extra 'record'")
-    real("--rerun", metavar="DIR", help="write a .rrd file there for Rerun, or 'live': show the run in its viewer")
-    real("--foxglove", metavar="DIR", help="write an .mcap file there for Foxglove, or 'live': let it connect")
+    add("--rerun", metavar="DIR", help="write a .rrd file there for Rerun, or 'live': show the run in its viewer")
+    add("--foxglove", metavar="DIR", help="write an .mcap file there for Foxglove, or 'live': let it connect")
     buttons = "obey the buttons of the server's live page: pause, stop, success, failure"
     real("--operate", action="store_true", help=buttons)
     real("--real-time", action="store_true", help="ask for SCHED_FIFO in place of a nice value")

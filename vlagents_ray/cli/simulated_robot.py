@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import shutil
-import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Sequence
 from typing import Any
 
-import numpy as np
 import typer
 
 from vlagents_ray.chunking.control import Control, Leader
@@ -27,10 +24,9 @@ from vlagents_ray.robot.episode import Label
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.simulated import EnvRobot
 from vlagents_ray.robot.teleoperation import HELP, AxesDevice, AxesLeader, Keyboard, SpaceMouse, TeleoperatedAgent
+from vlagents_ray.viewers.targets import open_viewers
+from vlagents_ray.viewers.viewer import EpisodeViewer
 
-_PERIOD_S = 0.2
-_LARGEST = 64  # px of the side of a picture; a terminal over SSH is slow
-_TEXT_LINES = 6  # of the terminal, which the pictures leave
 DEVICES = ("keyboard", "spacemouse")
 KEYS = "p pauses and continues; y success, n failure, x discard end the episode; q quits"
 _HZ = 10.0  # of environments that state no rate
@@ -39,52 +35,6 @@ _MOVES = {
     "human": "you move the robot",
     "paused": "nothing moves the robot",
 }
-
-
-class TerminalView:
-    """Shows cameras side by side in a terminal, redrawn in place five times a second at most."""
-
-    def __init__(self, write: Callable[[str], object]) -> None:
-        self._write = write
-        self._lines = 0  # of the pictures above the cursor
-        self._next_s = 0.0  # of `time.monotonic`
-
-    def draw(self, cameras: Mapping[str, np.ndarray]) -> None:
-        """Draw the cameras' images, (H, W, 3) uint8 RGB, over those drawn last, if it is time."""
-        now = time.monotonic()
-        if not cameras or now < self._next_s:
-            return
-        self._next_s = now + _PERIOD_S
-        terminal = shutil.get_terminal_size()
-        side = min(_LARGEST, terminal.columns // len(cameras) - 1, 2 * (terminal.lines - _TEXT_LINES))
-        lines = blocks([image for _, image in sorted(cameras.items())], max(2, side - side % 2))
-        up = f"\x1b[{self._lines}A" if self._lines else ""
-        self._write(up + "".join(f"\r{line}\x1b[0m\x1b[K\n" for line in lines))
-        self._lines = len(lines)
-
-    def leave(self) -> None:
-        """Leave the pictures as they are, and draw the next ones below what is written in between."""
-        self._lines = 0
-
-
-def blocks(images: list[np.ndarray], side: int) -> list[str]:
-    """Draw images, (H, W, 3) uint8 RGB, side by side, two pixels a character, in 24-bit colours; return the lines.
-
-    `side` is the larger side of each, in pixels, and even.
-    """
-    rows = [np.zeros((side, 0, 3), np.uint8)]
-    for image in images:
-        height, width = (max(2, round(side * n / max(image.shape[:2]))) for n in image.shape[:2])
-        y, x = np.arange(height) * image.shape[0] // height, np.arange(width) * image.shape[1] // width
-        padded = np.zeros((side, width + 1, 3), np.uint8)
-        padded[:height, :width] = image[y][:, x]
-        rows.append(padded)
-    pixels = np.concatenate(rows, axis=1)
-    return ["".join(map(_cell, *pair)) for pair in zip(pixels[::2].tolist(), pixels[1::2].tolist(), strict=True)]
-
-
-def _cell(above: list[int], below: list[int]) -> str:
-    return "\x1b[38;2;{};{};{};48;2;{};{};{}m▀".format(*above, *below)
 
 
 class EnvPolicy(Wrapper):
@@ -142,7 +92,7 @@ class RobotRun:
         self.over = False  # the human wants no further episode
         self.recorder: Recorder | None = None
         self._control: Control | None = None
-        self._view: TerminalView | None = None
+        self._viewers: Sequence[EpisodeViewer] = ()
         self._said: str | None = None  # what moves the robot, as printed
 
     def play(self, seeds: Iterable[int]) -> None:
@@ -163,8 +113,8 @@ class RobotRun:
                 self.recorder = stack.enter_context(opened)
             if self.options.leader == "keyboard":
                 out.print(f"{HELP}\n{KEYS}")
-            if self.options.leader is not None and out.is_terminal:
-                self._view = TerminalView(_write)
+            opened_viewers = open_viewers(self.options.rerun, self.options.foxglove)
+            self._viewers = [stack.enter_context(viewer) for viewer in opened_viewers]
             for seed in seeds:
                 if self.over:
                     break
@@ -172,11 +122,13 @@ class RobotRun:
         if (recorder := self.recorder) is not None:  # closed, so everything is written
             kept = f"{recorder.episodes} episodes in {self.options.record}"
             out.print(f"recorded: {kept}, {recorder.dropped} frames dropped")
+        for viewer in self._viewers:
+            out.print(viewer.report())
 
     def _play(self, env: EvalEnv, agent: Agent, seed: int, hz: float) -> None:
         self.verdict, recorder = None, self.recorder
         robot = EnvRobot(env, seed, endless=self.options.leader is not None)
-        self._say(f"seed {seed}: {env.instruction}")
+        out.print(f"seed {seed}: {env.instruction}")
 
         def label() -> Label:
             return self.verdict or ("success" if robot.success else "failure")
@@ -185,8 +137,6 @@ class RobotRun:
             if recorder is not None and (recorder.interventions or self.over):
                 recorder.label(label())
             self._say_who_moves(begun=robot.steps > 0)
-            if self._view is not None:
-                self._view.draw(robot.observe().cameras)
             return robot.ended or self.verdict is not None
 
         options = {} if self.options.policy is None else {"seed": seed, "env": self.options.env}
@@ -199,9 +149,10 @@ class RobotRun:
             reset_options=options,
             guard=guard,
             recorder=recorder,
+            viewers=self._viewers,
             until=ended,
         )
-        self._say(
+        out.print(
             f"  {label()}: {robot.steps} steps, {report.interventions} of them a human's; {report.paused} ticks paused"
         )
 
@@ -255,18 +206,8 @@ class RobotRun:
         if now != self._said:
             if reason is not None:
                 out.bell()
-            self._say(f"  {now}")
+            out.print(f"  {now}")
         self._said = now
-
-    def _say(self, text: str) -> None:
-        if self._view is not None:
-            self._view.leave()
-        out.print(text)
 
     def _quit(self) -> None:
         self.verdict, self.over = "discard", True
-
-
-def _write(text: str) -> None:
-    out.file.write(text)
-    out.file.flush()

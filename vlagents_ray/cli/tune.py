@@ -1,8 +1,7 @@
-"""`vlagents-ray tune`: settings of a deployment file or a file of runs, measured on this machine."""
+"""`vlagents-ray tune`: settings of a deployment file, measured on this machine."""
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Mapping, Sequence
 from enum import Enum
@@ -13,11 +12,10 @@ import typer
 import yaml
 
 from vlagents_ray.cli.console import errors, out, progress, table
-from vlagents_ray.cli.options import YAML_SUFFIXES, StateDims, is_run_file, parse_dims, parse_list
+from vlagents_ray.cli.options import YAML_SUFFIXES, StateDims, parse_dims, parse_list
 from vlagents_ray.errors import ConfigError
 
 if TYPE_CHECKING:
-    from vlagents_ray.bench.evaluation import MeasuredEvaluation
     from vlagents_ray.bench.tuning_choice import MeasuredPoint
 
 
@@ -29,13 +27,12 @@ class Wanted(str, Enum):
 
 
 def tune_command(
-    file: Annotated[Path, typer.Argument(help="A deployment file, or a file of runs of `vlagents-ray eval`.")],
+    file: Annotated[Path, typer.Argument(help="A deployment file.")],
     wanted: Annotated[
         Wanted, typer.Option("--for", help="The most actions a second, or the most robots within --p99-ms.")
     ] = Wanted.throughput,
     p99_ms: Annotated[float | None, typer.Option("--p99-ms", min=0, help="Of robots: the longest p99, ms.")] = None,
     minutes: Annotated[float, typer.Option(min=0.1, help="That all of it may take.")] = 5.0,
-    max_workers: Annotated[int | None, typer.Option(min=1, help="Of a file of runs; default: twice the cores.")] = None,
     max_batch: Annotated[int, typer.Option(min=1, help="The largest batch to try.")] = 32,
     seconds: Annotated[float, typer.Option(min=0.1, help="Of each measurement.")] = 2.0,
     dtypes: Annotated[str | None, typer.Option(help="To try, as bfloat16,int8; default: the accelerator's.")] = None,
@@ -45,10 +42,7 @@ def tune_command(
     image: Annotated[int, typer.Option(min=1, help="Pixels a side, where the policy takes any image.")] = 224,
     state: StateDims = [],  # noqa: B006
 ) -> None:
-    """Find the best settings of a file by measuring, and print those to change.
-
-    Of a deployment file: batch size, compilation and precision. Of a file of runs: workers, and environments a worker.
-    """
+    """Find the best batch size, compilation and precision by measuring, and print the settings to change."""
     began = time.monotonic()
     from vlagents_ray.bench.tuner import TunePlan, Tuner
     from vlagents_ray.bench.tuning_choice import (
@@ -64,12 +58,7 @@ def tune_command(
     with errors():
         goal = TuningGoal(wanted.value, p99_ms)
         if file.suffix not in YAML_SUFFIXES:
-            raise ConfigError(f"got {str(file)!r}, want a deployment file or a file of runs (.yaml)")
-        if is_run_file(file):
-            if goal.kind != "throughput" or dtypes or frames or app or state:
-                raise ConfigError("--for, --dtypes, --frames, --app, --state are of deployment files; leave them out")
-            tune_evaluation(file, minutes=minutes, max_workers=max_workers, began=began)
-            return
+            raise ConfigError(f"got {str(file)!r}, want a deployment file (.yaml)")
         application = policy_application(str(file), app)
         args = ServerArgs(**application.args)
         plan = TunePlan(
@@ -84,41 +73,6 @@ def tune_command(
         chosen, default = choose(points, goal), default_point(points, goal, args.batch.max_size)
         settings = chosen_settings(chosen, args.batch, tuner.fixed)
         _show_choice(_words(chosen), _words(default), began, f"below args of {application.name!r} in {file}", settings)
-
-
-def tune_evaluation(file: Path, *, minutes: float, max_workers: int | None, began: float) -> None:
-    """Serve the policies of a file of runs, measure, and print the numbers to change."""
-    from vlagents_ray.bench.evaluation import EvaluationTuner
-    from vlagents_ray.cli.evaluate import read_run
-    from vlagents_ray.cli.policies import served
-    from vlagents_ray.evaluate import EvalConfig
-
-    config = EvalConfig.model_validate(read_run(file))
-    most = max(max_workers or 2 * (os.cpu_count() or 1), config.workers)
-    with served(config.model_copy(update={"workers": most})) as ready:
-        own = ready.model_copy(update={"workers": config.workers})
-        tuner = EvaluationTuner(own, began + 60 * minutes, most, progress=progress)
-        tuner.measure()
-    _show(_HEAD, [_row(one) for one in tuner.found], tuner.left_out, f"{file}, on {os.cpu_count()} cores")
-    before, chosen = tuner.found[0], tuner.chosen
-    settings: dict[str, Any] = {} if chosen.workers == before.workers else {"workers": chosen.workers}
-    if chosen.num_envs != before.num_envs:
-        settings["suites"] = [{"num_envs": chosen.num_envs} for _ in config.suites]
-    _show_choice(_evaluation_words(chosen), _evaluation_words(before), began, f"in {file}", settings)
-
-
-_HEAD = ("workers", "envs a worker", "episodes/min", "start s", "memory MiB", "whole evaluation, min")
-
-
-def _row(one: MeasuredEvaluation) -> list[str]:
-    numbers = [f"{one.episodes_per_min:.1f}", f"{one.start_s:.1f}", f"{one.memory_mib:.0f}", f"{one.total_s / 60:.1f}"]
-    return [str(one.workers), str(one.num_envs), *numbers]
-
-
-def _evaluation_words(one: MeasuredEvaluation) -> str:
-    workers = f"{one.workers} worker{'s' if one.workers > 1 else ''}"
-    envs = f"{one.num_envs} environment{'s' if one.num_envs > 1 else ''} each"
-    return f"{workers} with {envs}, {one.total_s / 60:.1f} minutes"
 
 
 def _words(point: MeasuredPoint | None) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import threading
 import uuid
 from collections.abc import Callable, Iterator, Sequence
@@ -18,6 +19,7 @@ import numpy as np
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, PolicyFailed, VLAgentsError
+from vlagents_ray.evaluate.artifacts.storage import storing, whole
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.open_loop.recorded import Names, RecordedDataset, RecordedEpisode, RecordedSession, find_datasets
 from vlagents_ray.protocol.messages import Reply, Request
@@ -31,9 +33,10 @@ from vlagents_ray.serve.requests import PendingRequest, Rank
 from vlagents_ray.serve.weights import OPTION
 
 Sessions = Callable[[], Agent]
-_WORST = 10
-_SHOWN = 500  # most frames of the episode that is drawn
 """Opens a session; each is closed by who asked for it."""
+
+FILE = "open_loop.json"
+_WORST = 10
 
 
 class LocalAgent(Agent):
@@ -163,10 +166,6 @@ class FrameError:
     mae: float
 
 
-def worst(errors: list[FrameError]) -> list[FrameError]:
-    return sorted(errors, key=lambda one: -one.mae)[:_WORST]
-
-
 @dataclass(frozen=True, slots=True)
 class ReplayPlan:
     """The settings of a replay."""
@@ -189,7 +188,6 @@ class OpenLoopResult:
     sessions: int = 0
     missing: int = 0  # acts that the recording lacks, so that a policy with a history saw less
     frames: list[FrameError] = field(default_factory=list)
-    drawn: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)  # (D,) expected and got, first rows
 
     def to_json(self) -> dict[str, Any]:
         by_episode: dict[tuple[str, int], list[float]] = {}
@@ -206,7 +204,7 @@ class OpenLoopResult:
                 {"dataset": dataset, "episode": episode, "frames": len(errors), "mae": float(np.mean(errors))}
                 for (dataset, episode), errors in sorted(by_episode.items())
             ],
-            "worst": [asdict(one) for one in worst(self.frames)],
+            "worst": [asdict(one) for one in sorted(self.frames, key=lambda one: -one.mae)[:_WORST]],
         }
 
 
@@ -295,13 +293,17 @@ class _Replaying:
         with self.lock:
             mae = self.result.table.add(expected, got)
             self.result.frames.append(FrameError(part.dataset.root.name, part.index, frame, mae))
-            shown = self.result.frames[0]
-            if (part.dataset.root.name, part.index) == (shown.dataset, shown.episode) and len(
-                self.result.drawn
-            ) < _SHOWN:
-                self.result.drawn.append((expected[0], got[0]))
 
 
 def _options(play: RecordedSession) -> dict[str, Any]:
     """Return the options of the reset that are the policy's, not the choice of its weights."""
     return {name: value for name, value in play.options.items() if name not in (CHOICE, STEP, OPTION)}
+
+
+def write_result(result: OpenLoopResult, policy: str, folder: Path) -> Path:
+    """Write `open_loop.json` into a folder, which is made; return its path."""
+    with storing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        with whole(folder / FILE) as part:
+            part.write_text(json.dumps({"policy": policy, **result.to_json()}, indent=2, ensure_ascii=False), "utf-8")
+    return folder / FILE

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
 import logging
 import os
-import socket
 import subprocess
 import sys
-import tempfile
 import time
+import uuid
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -21,7 +19,7 @@ from vlagents_ray.errors import VLAgentsError
 log = logging.getLogger(__name__)
 
 _SUBMISSION_S = 300.0
-_ABANDONED_S = _SUBMISSION_S + 60.0  # age at which a claim without a job is abandoned, on any machine
+_ABANDONED_S = _SUBMISSION_S + 60.0  # age at which a claim without a job is that of a process that was killed
 
 
 class HookFailed(VLAgentsError):
@@ -40,8 +38,8 @@ def submit_evaluation(
     """Submit a job that evaluates a checkpoint which has just been written, while the training continues.
 
     A checkpoint is submitted once, by the first process that calls this, also after a restart of the training. If a
-    call fails, a later one tries again. If the training is killed during a call, the next call, for any checkpoint,
-    submits the interrupted one as well: at once on the same machine, after 6 minutes on another one.
+    call fails, a later one tries again. If the training is killed during a call, the first call after 6 minutes, for
+    any checkpoint, submits the interrupted one as well.
 
     Args:
         words: The arguments of `vlagents-ray slurm eval`, in which `{checkpoint}` and `{step}` are replaced.
@@ -71,96 +69,71 @@ def _submit_once(words: list[str], checkpoint: str, step: int, record: Path, pyt
     name = hashlib.sha256(json.dumps([os.path.abspath(checkpoint), step, words]).encode()).hexdigest()[:16]
     record.mkdir(parents=True, exist_ok=True)
     mark = record / f"step-{step}-{name}.json"
-    what = {"step": step, "checkpoint": checkpoint, "words": filled}
-    _resume_others(record, mark, python)
-    return _submit(mark, what, python) if _claimed(mark, what) else None
+    _submit_abandoned(record, mark, python)
+    claim = {"step": step, "checkpoint": checkpoint, "words": filled}
+    return _submit(mark, claim, python) if _is_claimed(mark, claim) else None
 
 
-def _submit(mark: Path, what: dict[str, Any], python: str) -> str:
-    """Submit a checkpoint that this process has claimed; a failure releases the claim."""
-    output = mark.with_suffix(".said")  # the command's output in a file, as the command may outlive this process
+def _is_claimed(mark: Path, claim: dict[str, Any]) -> bool:
+    """Whether this process submits the checkpoint: the first to claim it, or another one if that was killed."""
     try:
-        job = output.read_text().strip() if output.exists() else ""
-        job = job or _submitted(what["words"], python, mark, what, output)
-        _replace(mark, what | {"job": job})
+        mark.open("x").close()
+    except FileExistsError:
+        since = _abandoned_since(mark)
+        if since is None:
+            return False
+        try:
+            mark.with_suffix(f".{since}").open("x").close()  # by one of the processes that find this claim abandoned
+        except FileExistsError:
+            return False
+    _replace(mark, claim)
+    return True
+
+
+def _abandoned_since(mark: Path) -> int | None:
+    """Return the time of a claim whose process was killed, ns since 1970; None if it was submitted, or may be yet."""
+    try:
+        since = mark.stat().st_mtime_ns
+    except FileNotFoundError:
+        return None
+    return None if "job" in _read(mark) or time.time() - since / 1e9 < _ABANDONED_S else since
+
+
+def _submit_abandoned(record: Path, mark: Path, python: str) -> None:
+    """Submit other checkpoints, claimed by processes that were killed, as no other call may come for them."""
+    for other in sorted(record.glob("step-*.json")):
+        claim = _read(other)
+        if other == mark or "words" not in claim or _abandoned_since(other) is None:
+            continue
+        try:
+            if _is_claimed(other, claim):
+                job = _submit(other, claim, python)
+                log.info("step %s: submitted as job %s, in place of a training that was killed", claim["step"], job)
+        except Exception:
+            log.exception("the evaluation of step %s was not submitted; training continues", claim["step"])
+
+
+def _submit(mark: Path, claim: dict[str, Any], python: str) -> str:
+    """Submit a checkpoint that this process has claimed; a failure releases the claim."""
+    command = [python, "-c", "from vlagents_ray.cli import main; main()", "slurm", "eval", "--parsable"]
+    try:
+        done = subprocess.run(  # noqa: S603 - the caller's arguments
+            [*command, *claim["words"]], capture_output=True, text=True, timeout=_SUBMISSION_S, check=False
+        )
+        if done.returncode:
+            raise HookFailed(f"`vlagents-ray slurm eval` ended with {done.returncode}: {done.stderr.strip()}")
     except BaseException:
         mark.unlink(missing_ok=True)
         raise
-    finally:
-        output.unlink(missing_ok=True)
+    job = done.stdout.strip()
+    _replace(mark, claim | {"job": job})
     return job
 
 
-def _resume_others(record: Path, mark: Path, python: str) -> None:
-    """Submit the checkpoints claimed by processes that have ended, as no other call may come for them."""
-    for other in sorted(record.glob("step-*.json")):
-        what = _read(other)
-        if other == mark or not _is_abandoned(other, what) or "words" not in what:
-            continue
-        what = {name: what[name] for name in ("step", "checkpoint", "words")}
-        try:
-            if _claimed(other, what):
-                job = _submit(other, what, python)
-                log.info("step %s: submitted as job %s, in place of a training that was killed", what["step"], job)
-        except Exception:
-            log.exception("the evaluation of step %s was not submitted; training continues", what["step"])
-
-
-def _claimed(mark: Path, what: dict[str, Any]) -> bool:
-    """Whether this process submits the checkpoint: the first one to claim it, or another one if that was killed."""
-    claim = json.dumps(what | _claim(), indent=2)
-    try:
-        with mark.open("x") as file:
-            file.write(claim)
-    except FileExistsError:
-        pass
-    else:
-        return True
-    if not _is_abandoned(mark, _read(mark)):
-        return False
-    try:
-        with (mark.parent / ".lock").open("w") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)
-            if not _is_abandoned(mark, _read(mark)):  # another process has claimed it
-                return False
-            _replace(mark, what | _claim())
-            return True
-    except OSError as error:
-        log.warning("%s: its process has ended, and the file system has no locks to claim it again (%s)", mark, error)
-        return False
-
-
-def _claim(child: int | None = None) -> dict[str, Any]:
-    return {"host": _host(), "pid": os.getpid(), "child": child, "at": time.time()}
-
-
-def _is_abandoned(mark: Path, what: dict[str, Any]) -> bool:
-    """Whether the checkpoint was claimed by a process that has ended, and not submitted."""
-    if what.get("job"):
-        return False
-    try:
-        since = what.get("at") or mark.stat().st_mtime  # the file of a process that was killed has no time
-    except FileNotFoundError:
-        return False
-    if time.time() - since > _ABANDONED_S:
-        return True
-    here = what.get("host") == _host()
-    return here and not any(_is_alive(what[name]) for name in ("pid", "child") if what.get(name))
-
-
-def _host() -> str:
-    """Identify the machine and the namespace in which process numbers are valid."""
-    try:
-        return f"{socket.gethostname()} {os.readlink('/proc/self/ns/pid')}"
-    except OSError:
-        return socket.gethostname()
-
-
-def _is_alive(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"  # a zombie
-    except OSError:
-        return False
+def _replace(mark: Path, content: dict[str, Any]) -> None:
+    part = mark.with_suffix(f".{uuid.uuid4().hex}.part")
+    part.write_text(json.dumps(content, indent=2) + "\n")
+    os.replace(part, mark)
 
 
 def _read(mark: Path) -> dict[str, Any]:
@@ -169,26 +142,3 @@ def _read(mark: Path) -> dict[str, Any]:
     except (FileNotFoundError, ValueError):
         return {}
     return found if isinstance(found, dict) else {}
-
-
-def _replace(mark: Path, what: dict[str, Any]) -> None:
-    part = mark.with_suffix(f".{os.getpid()}.part")
-    part.write_text(json.dumps(what, indent=2) + "\n")
-    os.replace(part, mark)
-
-
-def _submitted(words: list[str], python: str, mark: Path, what: dict[str, Any], output: Path) -> str:
-    """Run the command, and return the number of the job, which is also in the file `output` for later calls."""
-    command = [python, "-c", "from vlagents_ray.cli import main; main()", "slurm", "eval", "--parsable", *words]
-    with output.open("w") as out, tempfile.TemporaryFile("w+") as errors:  # no pipes: it may outlive this process
-        with subprocess.Popen(command, stdout=out, stderr=errors, text=True) as running:  # noqa: S603 - the caller's arguments
-            _replace(mark, what | _claim(running.pid))
-            try:
-                running.wait(_SUBMISSION_S)
-            except BaseException:
-                running.kill()
-                raise
-        if running.returncode:
-            errors.seek(0)
-            raise HookFailed(f"`vlagents-ray slurm eval` ended with {running.returncode}: {errors.read().strip()}")
-    return output.read_text().strip()

@@ -12,7 +12,6 @@ _FORMATS: dict[str, Callable[[str], EpisodeFormat]] = {
     "rerun": rerun.RerunRecordings,
     "foxglove": foxglove.FoxgloveRecordings,
 }
-SUFFIXES = {"rerun": ".rrd", "foxglove": ".mcap"}
 _LIVE = {"rerun": rerun.LIVE, "foxglove": foxglove.LIVE}
 _SCHEMES = {"rerun": "rerun+", "foxglove": "ws://"}
 

@@ -7,7 +7,6 @@ member yields more bytes than it states. Nothing is unpickled, and nothing of it
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import json
 import re
@@ -19,11 +18,10 @@ import zlib
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from glob import escape
-from importlib.metadata import distributions
 from pathlib import Path
 from typing import IO, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.artifacts.storage import (
@@ -34,32 +32,24 @@ from vlagents_ray.evaluate.artifacts.storage import (
     link_or_copy,
     require_below,
     storing,
-    versions,
     whole,
 )
 from vlagents_ray.evaluate.plan.config import canonical
-from vlagents_ray.evaluate.report.page import FILE as REPORT
-from vlagents_ray.evaluate.report.page import write_report
-from vlagents_ray.evaluate.report.provenance import repeat
 from vlagents_ray.evaluate.results.database import FILE as DATABASE
 from vlagents_ray.evaluate.results.reader import Results, reading
-from vlagents_ray.evaluate.results.summary import FILE as SUMMARY
-from vlagents_ray.evaluate.results.summary import Summary, summarize, write_summary
 
-MANIFEST, PACKAGES, CONFIG = "bundle.json", "packages.txt", "config"
+MANIFEST = "bundle.json"
 MOST_BYTES = 16 * 10**9  # of all members, unpacked
 _MOST_MEMBERS = 200_000
 _MOST_MANIFEST = 64 * 2**20  # bytes
 _CHUNK = 2**20
 _PART = r"[\w@-][\w.@-]{0,200}"  # of a path, as `naming.plain` leaves names: it neither is nor begins with a dot
 _KNOWN = re.compile(
-    rf"{re.escape(MANIFEST)}|{re.escape(DATABASE)}|{re.escape(SUMMARY)}|{re.escape(REPORT)}|{re.escape(PACKAGES)}"
-    rf"|{CONFIG}(-[0-9]{{1,6}})?\.yaml|{PROVENANCE}/[0-9a-f]{{64}}\.diff"
+    rf"{re.escape(MANIFEST)}|{re.escape(DATABASE)}|{PROVENANCE}/[0-9a-f]{{64}}\.diff"
     rf"|{TRAJECTORIES}/({_PART}/){{1,3}}{_PART}\.(npz|mp4)|{VIDEOS}/({_PART}/){{1,3}}{_PART}\.mp4"
 )
 _BROKEN = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError)
 _DISTRUST = "no `vlagents-ray bundle` writes that: do not trust whoever made this bundle"
-_PIN = re.compile(r"([A-Za-z0-9][\w.-]{0,100})==([\w.+!-]{1,100})")
 
 
 class FileDigest(BaseModel):
@@ -78,7 +68,6 @@ class Manifest(BaseModel):
 
     format: Literal["vlagents-ray bundle"] = "vlagents-ray bundle"
     version: Literal[1] = 1
-    written_by: dict[str, JsonValue]  # versions of Python, packages and code where the bundle was written
     files: dict[str, FileDigest]  # all others, by their paths
 
 
@@ -91,7 +80,7 @@ def digest_of(path: Path) -> FileDigest:
     return FileDigest(sha256=sha256.hexdigest(), size=size)
 
 
-def pack(folder: Path, archive: Path, written_by: dict[str, JsonValue]) -> str:
+def pack(folder: Path, archive: Path) -> str:
     """Write all files of `folder` into the bundle `archive`, whole or not at all; the same files give the same bytes.
 
     Returns:
@@ -101,7 +90,7 @@ def pack(folder: Path, archive: Path, written_by: dict[str, JsonValue]) -> str:
     names = {path.relative_to(folder).as_posix(): path for path in paths}
     if odd := [name for name in names if not _KNOWN.fullmatch(name) or name == MANIFEST]:
         raise ConfigError(f"{folder}: got the files {odd[:5]}, which a bundle may not hold; rename or remove them")
-    manifest = Manifest(written_by=written_by, files={name: digest_of(path) for name, path in names.items()})
+    manifest = Manifest(files={name: digest_of(path) for name, path in names.items()})
     text = (manifest.model_dump_json(indent=1) + "\n").encode()
     with whole(archive) as part, zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED) as file:
         file.writestr(_member(MANIFEST), text, zipfile.ZIP_DEFLATED)
@@ -214,58 +203,17 @@ def _differences(stated: dict[str, FileDigest], found: dict[str, FileDigest]) ->
     return sorted(odd)
 
 
-@functools.cache
-def pins() -> str:
-    """The packages of this environment at the first call, a line each: `numpy==2.4.6`.
-
-    One that was not installed from an index, such as a checkout, has a comment instead of its path or URL.
-    """
-    lines: dict[str, str] = {}
-    for one in distributions():
-        metadata = one.metadata  # parsed at each access
-        name = _canonical(str(metadata["Name"]))
-        elsewhere = "  # not from an index" if one.read_text("direct_url.json") is not None else ""
-        lines.setdefault(name, f"{name}=={metadata['Version']}{elsewhere}")
-    return "".join(f"{lines[name]}\n" for name in sorted(lines))
-
-
-def versions_of(text: str) -> dict[str, str]:
-    """The versions of packages by name, from the text of `pins`; other lines are skipped."""
-    found = (_PIN.match(line) for line in text.splitlines())
-    return {_canonical(one[1]): one[2] for one in found if one is not None}
-
-
-def compared(there: dict[str, str], here: dict[str, str]) -> tuple[int, list[str]]:
-    """Compare two environments.
-
-    Returns:
-        The number of packages that are the same, and the others of `there`, a phrase each.
-    """
-    same = sum(here.get(name) == version for name, version in there.items())
-    odd = [
-        f"{name} {version} there, {here.get(name, 'none')} here"
-        for name, version in there.items()
-        if here.get(name) != version
-    ]
-    return same, odd
-
-
-def _canonical(name: str) -> str:
-    return re.sub(r"[-_.]+", "-", name).lower()
-
-
 def write_bundle(folder: Path, archive: Path, *, videos: bool = False) -> str:
     """Write the results in `folder` as one file that others can check (`verify`).
 
-    It holds results.db as it is now, `summary.json` and `report.html` computed from that, the settings as
-    `config.yaml` (one for each folder, of merged results), the versions of all packages here as `packages.txt`, the
-    differences from the commits, and the trajectories, with which episodes are played again. The database names the
-    files that are in the bundle, so that its results can be merged with others.
+    It holds results.db as it is now, the differences from the commits, and the trajectories, with which episodes are
+    played again. Nothing that is computed from these is in it. The database names the files that are in the bundle, so
+    that its results can be merged with others.
 
     Args:
         folder: A folder of results, which may be written to meanwhile; nothing in it is changed.
         archive: The file.
-        videos: Whether the bundle holds the videos, too: of the report, and of what the policy saw.
+        videos: Whether the bundle also holds the videos: of the report, and of what the policy saw.
 
     Returns:
         The SHA-256 of its manifest, which stands for all that is in it.
@@ -277,36 +225,14 @@ def write_bundle(folder: Path, archive: Path, *, videos: bool = False) -> str:
     with storing(archive.parent):
         archive.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=f"{archive.name}.part-", dir=archive.parent) as temporary:
-            stage = Path(temporary) / "bundle"  # its name is in the page
-            stage.mkdir()
+            stage = Path(temporary)
             # One consistent state, also while an evaluation writes to it.
             with reading(folder) as source, closing(sqlite3.connect(stage / DATABASE)) as target:
                 source.backup(target)
                 target.execute("PRAGMA journal_mode = DELETE")
-            results = Results.load(stage)
-            _link_files(folder, stage, results, videos=videos)
+            _link_files(folder, stage, Results.load(stage), videos=videos)
             _name_what_is_there(stage)
-            write_derived(Results.load(stage), videos=videos)
-            (stage / PACKAGES).write_text(pins(), encoding="utf-8")
-            return pack(stage, archive, versions())
-
-
-def write_derived(results: Results, *, videos: bool) -> Summary:
-    """Write the files that are computed from the database: summary, report and settings; return the summary."""
-    summary = summarize(results)
-    write_summary(summary)
-    for name, text in configurations(summary).items():
-        (results.out / name).write_text(text, encoding="utf-8")
-    write_report(results, results.out / REPORT, videos="link" if videos else "none")
-    return summary
-
-
-def configurations(summary: Summary) -> dict[str, str]:
-    """The settings of the runs as files that `vlagents-ray eval` takes, by their names."""
-    texts = [one.yaml + "\n" for one in repeat(summary).runs]
-    if len(texts) == 1:
-        return {f"{CONFIG}.yaml": texts[0]}
-    return {f"{CONFIG}-{number}.yaml": text for number, text in enumerate(texts, 1)}
+            return pack(stage, archive)
 
 
 def _link_files(folder: Path, stage: Path, results: Results, *, videos: bool) -> None:

@@ -5,45 +5,56 @@ A replay plays the recorded actions in their environment, and compares. No polic
 
 from __future__ import annotations
 
+import hashlib
+import math
 import os
 import re
 import sqlite3
 import tempfile
+import zipfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from vlagents_ray.envs.base import make_batch
 from vlagents_ray.errors import ConfigError, VLAgentsError
-from vlagents_ray.evaluate.artifacts.storage import storing
+from vlagents_ray.evaluate.artifacts.storage import storing, versions
 from vlagents_ray.evaluate.artifacts.trajectory import Trajectory
-from vlagents_ray.evaluate.bundle.archive import CONFIG, MOST_BYTES, PACKAGES, Manifest, unpack, write_derived
-from vlagents_ray.evaluate.bundle.checks import (
-    Finding,
-    check_cells,
-    check_derived,
-    check_digests,
-    check_packages,
-    check_trajectories,
-    check_versions,
-    check_weights,
-    recorded,
-    same_software,
-)
+from vlagents_ray.evaluate.bundle.archive import MANIFEST, MOST_BYTES, Manifest, unpack
 from vlagents_ray.evaluate.episode.episode import options_of_reset
 from vlagents_ray.evaluate.episode.failures import env_side
 from vlagents_ray.evaluate.episode.second_pass import play_actions
+from vlagents_ray.evaluate.plan.config import fingerprint
 from vlagents_ray.evaluate.report.page import FILE as REPORT
+from vlagents_ray.evaluate.report.page import write_report
 from vlagents_ray.evaluate.results.database import FILE as DATABASE
-from vlagents_ray.evaluate.results.reader import CellResults, Episode, Results
-from vlagents_ray.evaluate.results.summary import FILE as SUMMARY
+from vlagents_ray.evaluate.results.reader import CellResults, Episode, Results, reading, table
+from vlagents_ray.evaluate.results.summary import summarize, write_summary
 from vlagents_ray.interface import Obs
 from vlagents_ray.registry import env_suite, names
 
-_MOST_DERIVED = 2**28  # bytes of a summary, a report, settings or a lock
+Verdict = Literal["equal", "differs", "other here", "not checked"]
+MOST_TRAJECTORY = 2**30  # bytes of one, unpacked
+_TOLERANCE = 1e-9  # relative: sums of floating-point numbers may differ in their last bits
+_SHOWN = 3  # differences in a finding
+_LENGTH = 80  # characters of a value in a finding
+_SOFTWARE = ("python", "platform", "vlagents-ray", "ray", "numpy", "av")  # those that `versions` names
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One check.
+
+    "differs" means that the bundle contradicts itself, or that a replay had another outcome; "other here" that software
+    or numbers here are not those there, which alone is no fault of the bundle.
+    """
+
+    subject: str
+    verdict: Verdict
+    detail: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +81,7 @@ def verify(
     Args:
         bundle: The file.
         into: A new folder for its results, which then can be read, merged and exported as any others; None: they are
-            removed again. Summary, report and settings there are written from the database, not taken from the bundle.
+            removed again. Summary and report there are written from the database.
         replay: The number of episodes whose recorded actions are played again.
         trust: Whether its environments are made whatever code and files they name.
         most_bytes: The most bytes that its files may have together.
@@ -89,10 +100,11 @@ def verify(
         if parent is not None:
             parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix="bundle.part-", dir=parent) as temporary:
-            folder = Path(temporary) / "bundle"  # its name is in the page
+            folder = Path(temporary) / (into or bundle).name  # which is in the page
             folder.mkdir()
             manifest, digest, odd = unpack(bundle, folder, most_bytes=most_bytes)
-            findings = [check_digests(odd, len(manifest.files))]
+            fine = f"{len(manifest.files)} files have the SHA-256 that {MANIFEST} states"
+            findings = [_finding("digests", odd, fine)]
             try:
                 findings += _check(folder, manifest, replay, trust=trust)
             except (VLAgentsError, sqlite3.Error):
@@ -108,40 +120,124 @@ def verify(
 
 
 def _check(folder: Path, manifest: Manifest, replay: int, *, trust: bool) -> Iterator[Finding]:
-    """All findings but that of the digests; the files that the database gives are written again on the way."""
+    """All findings but that of the digests; summary and report are written on the way."""
     if not (folder / DATABASE).is_file():
         raise ConfigError(f"got no {DATABASE} in the bundle; want one that `vlagents-ray bundle` wrote")
-    stated = _take_derived(folder)
     results = Results.load(folder)
     if not results.runs or not results.cells:
         raise ConfigError(f"{DATABASE}: has no run, or no cell; want the results of an evaluation")
-    lock = stated.pop(PACKAGES, b"").decode("utf-8", "replace")
-    yield check_cells(results)
-    write_derived(results, videos=any(name.endswith(".mp4") for name in manifest.files))
-    yield from check_derived(stated, folder, same_software=same_software(manifest.written_by))
-    yield check_trajectories(results)
-    yield from check_versions(results)
-    yield from check_packages(lock, results)
-    yield from check_weights(results)
-    yield from check_replays(results, replay, trust=trust)
-    (folder / PACKAGES).write_text(lock, encoding="utf-8")
+    yield _check_cells(results)
+    write_summary(summarize(results))
+    has_videos = any(name.endswith(".mp4") for name in manifest.files)
+    write_report(results, folder / REPORT, videos="link" if has_videos else "none")
+    yield _check_trajectories(results)
+    yield _check_versions(results)
+    yield from _check_replays(results, replay, trust=trust)
 
 
-def _take_derived(folder: Path) -> dict[str, bytes]:
-    """Read the files that can be written again, and remove them: a stranger's page is not left for a browser."""
-    found = {}
-    for path in [folder / SUMMARY, folder / REPORT, folder / PACKAGES, *sorted(folder.glob(f"{CONFIG}*.yaml"))]:
-        if path.is_file():
-            if path.stat().st_size > _MOST_DERIVED:
-                raise ConfigError(f"{path.name}: has {path.stat().st_size} bytes, want at most {_MOST_DERIVED}")
-            found[path.name] = path.read_bytes()
-            path.unlink()
-    return found
+def _check_cells(results: Results) -> Finding:
+    """Check that the cells and the keys of their episodes are those of their settings."""
+    odd = []
+    for cell in results.cells:
+        settings = cell.settings
+        if fingerprint(settings) != cell.cell or (settings.get("env"), settings.get("policy")) != (
+            cell.env,
+            cell.policy,
+        ):
+            odd.append(f"{cell.contender} in {cell.task}: its settings are not those of its key")
+        odd += [
+            f"{one.result.key}: is of another cell or env" for one in cell.episodes if one.result.key.env != cell.env
+        ]
+    stated = {str(one.result.key) for cell in results.cells for one in cell.episodes}
+    with reading(results.out) as db:
+        keys = {row["key"] for row in table(db, "episodes")}
+    odd += [f"{key}: its key does not match its columns, or it has no cell" for key in sorted(keys - stated)]
+    return _finding("database", odd, f"{len(results.cells)} cells and {len(keys)} episodes have their settings' keys")
+
+
+def _check_trajectories(results: Results) -> Finding:
+    """Check that each recording has the actions, steps, rewards and success that the table says of its episode."""
+    odd: list[str] = []
+    checked, missing = 0, 0
+    for cell in results.cells:
+        for one in cell.episodes:
+            if one.result.status != "done":
+                continue
+            if (trajectory := _recorded(results, one)) is None:
+                missing += 1
+                continue
+            checked += 1
+            odd += [f"{one.result.key}: {text}" for text in _contradictions(one, trajectory)]
+    if not checked and not odd:
+        return Finding("trajectories", "not checked", f"the bundle has none of {missing} episodes (eval --record all)")
+    rest = f"; {missing} others have none" if missing else ""
+    return _finding("trajectories", odd, f"{checked} have the actions, rewards and outcomes of the table{rest}")
+
+
+def _recorded(results: Results, episode: Episode) -> Trajectory | None:
+    """The recording of an episode; None if the bundle has none. Raises `ConfigError` if it cannot be read."""
+    if episode.trajectory is None or not (path := results.file(episode.trajectory)).is_file():
+        return None
+    try:
+        with zipfile.ZipFile(path) as file:
+            size = sum(member.file_size for member in file.infolist())
+    except (OSError, zipfile.BadZipFile) as error:
+        raise ConfigError(f"{episode.trajectory}: cannot be read as a trajectory ({error})") from error
+    if size > MOST_TRAJECTORY:
+        raise ConfigError(f"{episode.trajectory}: unpacks to {size} bytes, want at most {MOST_TRAJECTORY}")
+    try:
+        return Trajectory.load(path)
+    except MemoryError as error:  # its header states a size that it does not have
+        raise ConfigError(f"{episode.trajectory}: states a size that does not fit into memory") from error
+
+
+def _contradictions(episode: Episode, trajectory: Trajectory) -> Iterator[str]:
+    result, steps = episode.result, len(trajectory.actions)
+    shapes = [trajectory.rewards.shape == (steps,), trajectory.success.shape == (steps,)]
+    shapes += [len(values) == steps + 1 for values in trajectory.state.values()]
+    shapes += [] if trajectory.gripper is None else [trajectory.gripper.shape == (steps + 1,)]
+    if not all(shapes) or result.steps != steps:
+        yield f"{result.steps} steps in the table, other lengths in the recording"
+        return
+    if hashlib.sha256(np.ascontiguousarray(trajectory.actions, "<f4").tobytes()).hexdigest() != result.actions_sha256:
+        yield "the recorded actions are not those of the table's digest"
+    if not math.isclose(
+        float(sum(trajectory.rewards.tolist())), result.episode_return, rel_tol=_TOLERANCE, abs_tol=1e-12
+    ):
+        yield "the recorded rewards have another sum"
+    success = trajectory.success.astype(bool).tolist()
+    first = next((number for number, solved in enumerate(success, 1) if solved), None)
+    if (first, bool(success and success[-1])) != (result.first_success, result.success_at_end):
+        yield "the recorded success is not that of the table"
+
+
+def _finding(subject: str, odd: list[str], fine: str) -> Finding:
+    if not odd:
+        return Finding(subject, "equal", fine)
+    more = f"; and {len(odd) - _SHOWN} more" if len(odd) > _SHOWN else ""
+    return Finding(subject, "differs", "; ".join(odd[:_SHOWN]) + more)
+
+
+def _check_versions(results: Results) -> Finding:
+    """Compare what the last run was made with to what is here."""
+    there, here = results.runs[-1].versions, versions()
+    stated = {name: (there.get(name), here[name]) for name in _SOFTWARE} | {"commit": (_commit(there), _commit(here))}
+    odd = [f"{name} {was} there, {now} here" for name, (was, now) in stated.items() if was != now]
+    if odd:
+        return Finding("versions", "other here", "; ".join(odd))
+    return Finding("versions", "equal", ", ".join(f"{name} {now}" for name, (_, now) in stated.items()))
+
+
+def _commit(found: Mapping[str, Any]) -> str:
+    code = found.get("code")
+    state = code.get("vlagents_ray") if isinstance(code, dict) else None
+    if not isinstance(state, dict) or state.get("commit") is None:
+        return "unknown"
+    return f"{state['commit']} with changes" if state.get("diff_sha256") else str(state["commit"])
 
 
 _CODE = re.compile("trust.*|module|source_dir")  # options that say whose code is run, though they may be words
 _WORD = re.compile(r"\w[\w.+-]{0,63}")  # a value that is text, and no path, URL or "module:Class"
-_SHOWN = 80  # characters of a value
 
 
 @dataclass(frozen=True, slots=True)
@@ -254,7 +350,7 @@ def _is_plain(value: object) -> bool:
     return value is None or isinstance(value, bool | int | float)
 
 
-def check_replays(results: Results, most: int, *, trust: bool) -> Iterator[Finding]:
+def _check_replays(results: Results, most: int, *, trust: bool) -> Iterator[Finding]:
     """Play the recorded actions of up to `most` episodes, of as many cells as possible."""
     if not most:
         yield Finding("replay", "not checked", "was not asked for (--replay 0)")
@@ -279,7 +375,7 @@ def _chosen(results: Results, most: int) -> list[tuple[CellResults, Episode, Tra
             one = next(episodes, None)
             if one is None:
                 left.remove(pair)
-            elif len(found) < most and (trajectory := recorded(results, one)) is not None:
+            elif len(found) < most and (trajectory := _recorded(results, one)) is not None:
                 found.append((cell, one, trajectory))
     return found
 
@@ -312,7 +408,7 @@ def _from(played: Replayed) -> str:
 
 def _described(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
     odd = [
-        f"{name} {str(here.get(name))[:_SHOWN]}, there {str(there.get(name))[:_SHOWN]}"
+        f"{name} {str(here.get(name))[:_LENGTH]}, there {str(there.get(name))[:_LENGTH]}"
         for name in sorted(there.keys() | here.keys())
         if there.get(name) != here.get(name)
     ]

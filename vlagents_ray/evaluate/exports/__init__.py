@@ -1,11 +1,10 @@
-"""Results for other programs: tables of episodes, datasets of their steps, and scores for the Hub and leaderboards."""
+"""Results for other programs: tables of episodes, datasets of their steps, and scores for the Hub."""
 
 from collections.abc import Callable
 
 from vlagents_ray.evaluate.exports.lerobot import to_lerobot
 from vlagents_ray.evaluate.exports.scores import to_hub
 from vlagents_ray.evaluate.exports.tables import COLUMNS, Column, rows, to_csv, to_json, to_parquet
-from vlagents_ray.evaluate.exports.vla_eval import to_vla_eval
 
 EXPORTS: dict[str, Callable[..., int]] = {
     "json": to_json,
@@ -13,16 +12,11 @@ EXPORTS: dict[str, Callable[..., int]] = {
     "parquet": to_parquet,
     "lerobot": to_lerobot,
     "hub": to_hub,
-    "vla-eval": to_vla_eval,
 }
-
-SCORES = ("hub", "vla-eval")
-"""The exports of scores, whose settings are given by name."""
 
 __all__ = [
     "COLUMNS",
     "EXPORTS",
-    "SCORES",
     "Column",
     "rows",
     "to_csv",
@@ -30,5 +24,4 @@ __all__ = [
     "to_json",
     "to_lerobot",
     "to_parquet",
-    "to_vla_eval",
 ]

@@ -1,14 +1,13 @@
 """Success rates as others quote them: with the episodes, the interval, the protocol, the weights and the code.
 
-`to_hub` writes them for a model repository of the Hugging Face Hub: `.eval_results/*.yaml`, and a model card's
-`model-index`. The formats are those of the Hub's documentation, https://huggingface.co/docs/hub/eval-results and
-https://github.com/huggingface/hub-docs/blob/main/modelcard.md; `huggingface_hub` 2.4 reads both.
+`to_hub` writes them for a model repository of the Hugging Face Hub, in the format of
+https://huggingface.co/docs/hub/eval-results, which `huggingface_hub` 2.4 reads.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
@@ -26,7 +25,7 @@ from vlagents_ray.naming import distinct, plain
 
 Metric = Literal["success_once", "success_at_end"]
 _AT_END = "at the end"  # SIMPLER's protocol: the last state decides
-_MOST_NOTED = 5  # deviations in a note; `Score.facts` has all
+_MOST_NOTED = 5  # deviations in a note
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,45 +60,28 @@ class Score:
         return list(dict.fromkeys(found))
 
     @property
-    def facts(self) -> dict[str, Any]:
-        """All that pools or doubts the rate, as plain JSON values."""
-        low, high = self.rate.interval
-        kind = "Wilson" if self.rate.error_rate is None else "confidence sequence"
-        level = 0.95 if self.rate.error_rate is None else 1 - self.rate.error_rate
-        seeds = sorted({one.key.seed for cell in self.cells for one in cell.counted})
-        return {
-            "episodes": self.rate.episodes,
-            "successes": self.rate.successes,
-            "interval": {"low": low, "high": high, "level": level, "kind": kind},
-            "policy_errors": sum(one.status == "policy_error" for cell in self.cells for one in cell.counted),
-            "seeds": [seeds[0], seeds[-1]],
-            "tasks": {cell.env: rate_of([cell], self.metric).to_json() for cell in self.cells},
-            "protocols": _distinct([_protocol(cell) for cell in self.cells]),
-            "deviations": self.deviations,
-            "settings": sorted(cell.cell for cell in self.cells),
-            "checkpoints": _distinct([checkpoint_of(cell) for cell in self.cells]),
-            "weights": _distinct([weights_of(cell) for cell in self.cells]),
-            "pushed_weights": _distinct([pushed_of(cell) for cell in self.cells]),
-            "policies": _distinct([self.results.policies.get(cell.policy, {}).get("policy") for cell in self.cells]),
-            "code": _distinct([_code(run.versions) for run in self.results.runs]),
-        }
-
-    @property
     def note(self) -> str:
-        """The facts in one line of text."""
-        facts, low_high = self.facts, [f"{100 * bound:.1f}" for bound in self.rate.interval]
-        kind, level = facts["interval"]["kind"], facts["interval"]["level"]
-        odd = facts["deviations"]
+        """All that pools or doubts the rate, in one line of text."""
+        rate, counted = self.rate, [one for cell in self.cells for one in cell.counted]
+        low, high = (f"{100 * bound:.1f}" for bound in rate.interval)
+        kind = "95 % interval (Wilson)"
+        if rate.error_rate is not None:
+            kind = f"{100 * (1 - rate.error_rate):g} % interval (confidence sequence)"
+        seeds = sorted(one.key.seed for one in counted)
+        odd = self.deviations
         more = f"; and {len(odd) - _MOST_NOTED} more" if len(odd) > _MOST_NOTED else ""
-        names = [str(one["name"]) for one in facts["protocols"] if "name" in one]
-        stated = ", ".join(dict.fromkeys(names)) or ("the environment's" if facts["protocols"] else "none stated")
-        weights = ", ".join(facts["weights"] or facts["checkpoints"]) or "no digest reported"
+        protocols = [_protocol(cell) for cell in self.cells]
+        named = _distinct(one.get("name") for one in protocols)
+        protocol = ", ".join(named) or ("the environment's" if any(protocols) else "none stated")
+        weights = _distinct(of(cell) for of in (weights_of, pushed_of) for cell in self.cells)
+        weights = weights or _distinct(checkpoint_of(cell) for cell in self.cells) or ["no digest reported"]
+        errors = sum(one.status == "policy_error" for one in counted)
         return (
-            f"success rate in %, {_WHEN[self.metric]}; {facts['successes']} of {facts['episodes']} episodes, "
-            f"{100 * level:g} % interval ({kind}) {low_high[0]} to {low_high[1]}; "
-            f"seeds {facts['seeds'][0]} to {facts['seeds'][1]}; protocol: {stated}; "
-            f"deviations: {'; '.join(odd[:_MOST_NOTED]) or 'none'}{more}; weights: {weights}; "
-            f"code: {', '.join(_code_text(one) for one in facts['code'])}"
+            f"success rate in %, {_WHEN[self.metric]}; {rate.successes} of {rate.episodes} episodes, {kind} {low} to "
+            f"{high}; ended by an error of the policy: {errors}; seeds {seeds[0]} to {seeds[-1]}; "
+            f"protocol: {protocol}; deviations: {'; '.join(odd[:_MOST_NOTED]) or 'none'}{more}; "
+            f"weights: {', '.join(weights)}; "
+            f"code: {', '.join(_distinct(_code(run.versions) for run in self.results.runs))}"
         )
 
 
@@ -151,29 +133,18 @@ def _deviations(cell: CellResults) -> list[str]:
     return found
 
 
-def _distinct(values: Sequence[Any]) -> list[Any]:
-    found: list[Any] = []
-    for value in values:
-        if value and value not in found:
-            found.append(value)
-    return found
+def _distinct(values: Iterable[Any]) -> list[str]:
+    return list(dict.fromkeys(str(value) for value in values if value))
 
 
-def _code(versions: dict[str, Any]) -> dict[str, Any]:
+def _code(versions: dict[str, Any]) -> str:
     state = (versions.get("code") or {}).get("vlagents_ray") or {}
-    return {"vlagents-ray": versions.get("vlagents-ray")} | {
-        name: state[name] for name in ("commit", "diff_sha256") if state.get(name)
-    }
-
-
-def _code_text(code: dict[str, Any]) -> str:
-    commit = f" at commit {code['commit']}" if "commit" in code else ""
-    changed = f" with changes (SHA-256 {code['diff_sha256']})" if "diff_sha256" in code else ""
-    return f"vlagents-ray {code.get('vlagents-ray')}{commit}{changed}"
+    commit = f" at commit {state['commit']}" if state.get("commit") else ""
+    changed = f" with changes (SHA-256 {state['diff_sha256']})" if state.get("diff_sha256") else ""
+    return f"vlagents-ray {versions.get('vlagents-ray')}{commit}{changed}"
 
 
 _ID = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
-_NAMES = {"success_once": "success rate (after some step)", "success_at_end": "success rate (after the last step)"}
 
 
 class HubSettings(BaseModel):
@@ -181,11 +152,8 @@ class HubSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
-    dataset: str = Field(
-        examples=["OWNER/NAME"]
-    )  # the benchmark's dataset on the Hub, OWNER/NAME, where its leaderboard is
+    dataset: str = Field(examples=["OWNER/NAME"])  # the benchmark's on the Hub, where its leaderboard is
     task_id: str | None = None  # of that benchmark's eval.yaml; None: the name of the score, without its simulator
-    model: str | None = None  # name in the model-index; None: the policy's in the evaluation
     source_url: str | None = None  # of the bundle, or of a paper
 
     @field_validator("dataset")
@@ -197,12 +165,10 @@ class HubSettings(BaseModel):
 
 
 def to_hub(results: Results, path: Path, **settings: Any) -> int:
-    """Write the new folder `path`, whose files go into the model's repository.
+    """Write the new folder `path`, whose `.eval_results/DATASET.yaml` goes into the model's repository.
 
-    `.eval_results/DATASET.yaml` has an entry for each score, whose `value` is in per cent and whose `notes` say the
-    episodes, the interval, the protocol, the deviations, the digest of the weights and the commit in one line.
-    `README.md` is a model card with a `model-index`, whose metrics have all of that as `args`; merge its head into the
-    card that the repository has.
+    It has an entry for each score. Its `value` is in per cent, and its `notes` say the episodes, the interval, the
+    protocol, the deviations, the digest of the weights and the commit in one line.
 
     Args:
         results: Of one policy id.
@@ -224,20 +190,18 @@ def to_hub(results: Results, path: Path, **settings: Any) -> int:
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
         raise ConfigError(f"{path}: is there already; want a new folder")
     ids = _task_ids([one.name for one in found])
-    tasks = [(one, given.task_id or ids[one.name]) for one in found]
-    card = {"tags": ["robotics"], "model-index": _index(tasks, given)}
+    entries = [_entry(one, given.task_id or ids[one.name], given) for one in found]
     with whole_folder(path) as folder:
-        entries = folder / ".eval_results" / f"{plain(given.dataset)}.yaml"
-        entries.parent.mkdir()
-        entries.write_text(_yaml([_entry(one, task, given) for one, task in tasks]), encoding="utf-8")
-        (folder / "README.md").write_text(f"---\n{_yaml(card)}---\n\n{_table(found)}", encoding="utf-8")
+        file = folder / ".eval_results" / f"{plain(given.dataset)}.yaml"
+        file.parent.mkdir()
+        file.write_text(yaml.safe_dump(entries, sort_keys=False, allow_unicode=True, width=100), encoding="utf-8")
     return sum(one.rate.episodes for one in found)
 
 
 def _entry(score: Score, task: str, given: HubSettings) -> dict[str, Any]:
     entry: dict[str, Any] = {
         "dataset": {"id": given.dataset, "task_id": task},
-        "value": _percent(score.rate.rate),
+        "value": round(100 * (score.rate.rate or 0.0), 2),
         "date": score.date.isoformat().replace("+00:00", "Z"),
         "notes": score.note,
     }
@@ -246,64 +210,7 @@ def _entry(score: Score, task: str, given: HubSettings) -> dict[str, Any]:
     return entry
 
 
-def _index(found: list[tuple[Score, str]], given: HubSettings) -> list[dict[str, Any]]:
-    source = (
-        {} if given.source_url is None else {"source": {"url": given.source_url, "name": "results by vlagents-ray"}}
-    )
-    return [
-        {
-            "name": given.model or found[0][0].results.contenders[0],
-            "results": [
-                {
-                    "task": {"type": "robotics", "name": "Robotics"},
-                    "dataset": {"name": one.name, "type": given.dataset, "config": task},
-                    "metrics": _metrics(one),
-                    **source,
-                }
-                for one, task in found
-            ],
-        }
-    ]
-
-
-def _metrics(score: Score) -> list[dict[str, Any]]:
-    """The success that the protocol counts, with all facts; then the other one, with its interval."""
-    other: Metric = "success_at_end" if score.metric == "success_once" else "success_once"
-    return [
-        {"type": score.metric, "name": _NAMES[score.metric], "value": _percent(score.rate.rate), "args": score.facts},
-        {
-            "type": other,
-            "name": _NAMES[other],
-            "value": _percent(rate_of(score.cells, other).rate),
-            "args": rate_of(score.cells, other).to_json(),
-        },
-    ]
-
-
 def _task_ids(names: list[str]) -> dict[str, str]:
     """The names without their simulator, "libero_spatial" of "libero/libero_spatial", where that tells them apart."""
     short = [plain(name.rpartition("/")[2]) for name in names]
     return dict(zip(names, short, strict=True)) if len(set(short)) == len(short) else distinct(names)
-
-
-def _percent(rate: float | None) -> float:
-    return round(100 * (rate or 0.0), 2)
-
-
-def _table(found: list[Score]) -> str:
-    """The scores as Markdown, in which names are code: they are text of others."""
-    lines = ["# Evaluation", "", "| benchmark | success | episodes | interval |", "| --- | --- | --- | --- |"]
-    for one in found:
-        low, high = (f"{100 * bound:.1f}" for bound in one.rate.interval)
-        success = f"{_percent(one.rate.rate):g} %"
-        lines.append(f"| {_as_code(one.name)} | {success} | {one.rate.episodes} | {low} to {high} % |")
-    return "\n".join([*lines, "", *(f"- {_as_code(one.name)}: {_as_code(one.note)}" for one in found)]) + "\n"
-
-
-def _as_code(text: str) -> str:
-    plain_text = " ".join(text.split()).replace("`", "'").replace("|", "/")
-    return f"`{plain_text}`"
-
-
-def _yaml(value: Any) -> str:
-    return str(yaml.safe_dump(value, sort_keys=False, allow_unicode=True, width=100))

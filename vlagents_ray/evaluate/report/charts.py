@@ -13,8 +13,6 @@ from datetime import datetime, timezone
 from itertools import pairwise
 from typing import NamedTuple
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
-
 from vlagents_ray.evaluate.results.statistics import Rate
 
 NONE, MINUS = "\u2013", "\u2212"
@@ -252,9 +250,3 @@ def _corners(points: Sequence[tuple[float, float]], stepped: bool) -> list[tuple
 
 def _path(points: Iterable[tuple[float, float]]) -> str:
     return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in points)
-
-
-def templates(package: str) -> Environment:
-    """Return the templates of a package, which escape whatever they are given: names and errors are text of others."""
-    loader = PackageLoader(package)
-    return Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)

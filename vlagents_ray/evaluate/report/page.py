@@ -15,7 +15,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from jinja2 import Environment
+from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from vlagents_ray.evaluate.artifacts.storage import storing, whole
@@ -153,7 +153,9 @@ def _solved(summary: Summary) -> Figure:
 
 @cache
 def _templates() -> Environment:
-    env = charts.templates(__package__ or "")
+    # Names and errors are text of others, so whatever a template is given is escaped.
+    loader = PackageLoader(__package__ or "")
+    env = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     formats = ("duration", "interval", "interval_name", "moment", "number", "p_value", "percent", "points", "quantity")
     env.filters.update({name: getattr(charts, name) for name in formats})
     env.filters.update(interval_glyph=charts.interval_glyph, px=charts.px, json=partial(json.dumps, ensure_ascii=False))

@@ -166,8 +166,6 @@ class Rollout:
             setup.worker = _worker_info(cell.policy.name, agent, env)
         with contextlib.ExitStack() as stack:
             recordings = [stack.enter_context(self._recorders(self._config, env.contract.control_hz)) for _ in jobs]
-            for job, recording in zip(jobs, recordings, strict=True):
-                recording.begin(job)
             outcomes = self._play(agent, env, jobs, recordings)
             return [
                 Report(result=one, artifacts=self._finished(env, job, one, recording))

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from vlagents_ray.bench.figures import rate_of
-from vlagents_ray.bench.policy import BarePolicy
-from vlagents_ray.bench.throughput import ThroughputPlan
+from benchmarks.bare_policy import BarePolicy
+from benchmarks.throughput import ThroughputPlan
+from vlagents_ray.bench.measured_policy import rate_of
 
 
 def test_the_ideal_of_the_default_policy() -> None:

@@ -1,4 +1,4 @@
-"""Our clients, each in a process or a Ray actor: `python -m vlagents_ray.bench.clients JSON`.
+"""Our clients, each in a process or a Ray actor: `python -m benchmarks.own_clients JSON`.
 
 A process holds one client, which makes calls when it is its turn (`BenchCaller`), or several, which make load
 (`LoadGenerator`).
@@ -208,7 +208,7 @@ def connected(client: OwnClient, url: str, app: str, prefix: Sequence[str] = ())
             ray.kill(actor)
         return
     settings = json.dumps({"url": url, "transport": client.transport, "codec": client.codec})
-    command = [*prefix, sys.executable, "-m", "vlagents_ray.bench.clients", settings]
+    command = [*prefix, sys.executable, "-m", "benchmarks.own_clients", settings]
     with LineProcess(client.name, command, our_environment()) as child:
         yield child
 

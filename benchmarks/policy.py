@@ -1,31 +1,30 @@
 """The speed of a policy on this machine by batch size, without Ray: bare, and behind a replica's batch queue.
 
 Bare is `act_batch` on full batches, one after another. Behind the queue as many sessions as the batch has rows ask
-again as soon as they are answered. The policy is loaded once for both. `python -m vlagents_ray.bench.policy JSON` is
-the bare policy of `bench throughput`, as a process.
+again as soon as they are answered. The policy is loaded once for both.
 """
 
 from __future__ import annotations
 
-import json
 import statistics
-import sys
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+import typer
 
-from vlagents_ray.bench.clients import observation
-from vlagents_ray.bench.line_client import die_with_parent, own_stdout
+from benchmarks.console import Json, Rounds, Seconds
+from benchmarks.figures import measured_on
 from vlagents_ray.bench.measured_policy import MeasuredPolicy, QueuedTurn, device_name, forget_peak, peak_mib
+from vlagents_ray.cli.console import errors, out, progress, save, table
+from vlagents_ray.cli.options import Set, StateDims, parse_counts, parse_dims, parse_settings
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Agent, Obs
 from vlagents_ray.policies.wrapper import build_agent
-from vlagents_ray.registry import policy_class
 from vlagents_ray.serve.config.deployment import ServerArgs
+from vlagents_ray.serve.launch.deployment_file import server_args
 from vlagents_ray.testing.observations import random_observation
 
 
@@ -106,41 +105,45 @@ def _medians(rounds: list[dict[str, float]]) -> dict[str, float]:
     return {name: statistics.median(one[name] for one in rounds) for name in rounds[0]}
 
 
-class BarePolicy:
-    """A policy without any server, `batch` observations at a time: what a served one is compared with."""
-
-    def __init__(self, policy: str, config: dict[str, Any], batch: int) -> None:
-        self._agent = policy_class(policy).from_config(config)
-        self._agent.initialize()
-        self._obs = [observation()] * batch
-        self._agent.reset(self._obs[0], "measure")
-        self._batch()
-
-    def rate(self, seconds: float) -> float:
-        """Measure for at least that time, s; returns actions a second."""
-        begun = time.perf_counter()
-        batches = 0
-        while (taken := time.perf_counter() - begun) < seconds or batches == 0:
-            self._batch()
-            batches += 1
-            taken = time.perf_counter() - begun
-        return batches * len(self._obs) / taken
-
-    def _batch(self) -> None:
-        for act in self._agent.act_batch(self._obs, [self._agent] * len(self._obs)):
-            if isinstance(act, Exception):
-                raise act
+def main(
+    file: Annotated[str, typer.Argument(help="A deployment file, or a registered policy.")],
+    batch: Annotated[str, typer.Option(help="Batch sizes, with commas between them.")] = "1,8",
+    seconds: Seconds = 2.0,
+    rounds: Rounds = 3,
+    app: Annotated[str | None, typer.Option(help="Of the file, if it holds several.")] = None,
+    image: Annotated[int, typer.Option(min=1, help="Pixels a side, where the policy takes any image.")] = 224,
+    state: StateDims = [],  # noqa: B006
+    settings: Set = [],  # noqa: B006
+    json_file: Json = None,
+) -> None:
+    """Actions a second of one policy alone, by batch size: bare, and behind its batch queue; without Ray."""
+    with errors():
+        origin = measured_on("python -m benchmarks.policy")
+        args, batches = server_args(file, app), parse_counts(batch, "--batch")
+        args = args.model_copy(update={"config": args.config | parse_settings(settings, "--set")})
+        plan = PolicyPlan(args, batches, seconds, rounds, image, parse_dims(state, "--state"))
+        found = measure_policy(plan, progress)
+    show_policy(found)
+    save({**origin, **found}, json_file)
 
 
-def main() -> None:
-    """Run a bare policy as a process: its settings are JSON; each line is a number of seconds, answered by the rate."""
-    die_with_parent()
-    out = own_stdout()
-    bare = BarePolicy(**json.loads(sys.argv[1]))
-    print(json.dumps(True), file=out, flush=True)
-    for line in sys.stdin:
-        print(json.dumps(bare.rate(float(line))), file=out, flush=True)
+def show_policy(found: Mapping[str, Any]) -> None:
+    """Print a row for each batch size."""
+    rows = table(
+        "batch", "bare actions/s", "ms a batch", "queued actions/s", "of bare", "round trip ms", "p99 ms",
+        "mean batch", "peak MiB",
+    )  # fmt: skip
+    chunk = f", {found['chunk']} rows an action" if (found["chunk"] or 1) > 1 else ""
+    rows.title = f"{found['policy']} on {found['device']}{chunk}"
+    for row in found["batches"]:
+        bare, queued = row["bare"], row["queued"]
+        rows.add_row(
+            str(row["batch"]), f"{bare['actions_per_s']:.1f}", f"{bare['batch_ms']:.2f}",
+            f"{queued['actions_per_s']:.1f}", f"{row['queued_share']:.1%}", f"{queued['round_trip_ms']:.2f}",
+            f"{queued['p99_ms']:.2f}", f"{queued['mean_batch']:.2f}", f"{row['peak_mib']:.0f}",
+        )  # fmt: skip
+    out.print(rows)
 
 
 if __name__ == "__main__":
-    main()
+    typer.run(main)

@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.bench.clients import OwnClient, connected, observation, own_clients, save_observation
-from vlagents_ray.bench.figures import RoundTrips, lost_db, ratios
+from benchmarks.figures import RoundTrips, lost_db, ratios
+from benchmarks.own_clients import OwnClient, connected, observation, save_observation
 from vlagents_ray.bench.line_process import Driver
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Obs
@@ -29,7 +29,7 @@ from vlagents_ray.policies.noop import Noop
 from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.serve.launch.server import running_server
 
-POLICY = "vlagents_ray.bench.rtt:MeasuredNoop"
+POLICY = "benchmarks.round_trips:MeasuredNoop"
 LOOPBACK = "127.0.0.1"
 ROUND = 100  # calls of one way before it is the next one's turn
 UNBROKEN = 200  # rounds' worth of calls without a break: a second or two
@@ -66,14 +66,6 @@ class RoundTripsOfAll:
             "steady": [trips.to_json() for trips in self.steady],
             "skipped": dict(self.skipped),
         }
-
-
-def measure_rtt(
-    calls: int = 1000, *, transports: Sequence[str] = (), progress: Callable[[str], None] = lambda _: None
-) -> RoundTripsOfAll:
-    """Measure `calls` round trips by each transport (rounded up to whole rounds), on a server started for them."""
-    own, skipped = own_clients(transports)
-    return measure(own, calls, progress, skipped=skipped)
 
 
 def measure(

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
+import typer
+from typer.testing import CliRunner
 
-from vlagents_ray.bench.policy import PolicyPlan, measure_policy
+from benchmarks.policy import PolicyPlan, main, measure_policy
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.errors import ConfigError, InvalidObservation
 from vlagents_ray.interface import Act, Agent, Obs
@@ -80,3 +83,14 @@ def test_one_policy_of_a_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"noop.*random"):
         server_args(str(file))
     assert server_args("noop").policy == "noop"
+
+
+def test_a_policy_is_measured_with_other_settings_than_its_files(tmp_path: Path) -> None:
+    command = typer.Typer()
+    command.command()(main)
+    words = ["noop", "--set", "base_ms=20", "--batch", "1", "--seconds", "0.1", "--rounds", "1"]
+    done = CliRunner().invoke(command, [*words, "--json", str(tmp_path / "found.json")])
+    assert done.exit_code == 0, done.output
+    [row] = json.loads((tmp_path / "found.json").read_text())["batches"]
+    assert row["bare"]["batch_ms"] >= 20
+    assert row["queued_share"] == pytest.approx(row["queued"]["actions_per_s"] / row["bare"]["actions_per_s"])

@@ -14,13 +14,19 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+import typer
 
-from vlagents_ray.bench.clients import ROBOT, SIMULATION, Call, LoadGenerator, OwnClient, own_clients
-from vlagents_ray.bench.figures import rate_of
+from benchmarks.console import Json, Rounds, Seconds, show_skipped
+from benchmarks.figures import measured_on
+from benchmarks.own_clients import ROBOT, SIMULATION, Call, LoadGenerator, OwnClient, own_clients
 from vlagents_ray.bench.line_process import START_S, LineProcess, our_environment
+from vlagents_ray.bench.measured_policy import rate_of
+from vlagents_ray.cli.console import errors, out, progress, save, table
+from vlagents_ray.cli.options import Set, parse_counts, parse_list, parse_settings
+from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.serve.launch.server import running_server
 
@@ -30,7 +36,7 @@ SLOW_NOOP = ("noop", {"base_ms": BASE_MS, "per_item_ms": PER_ITEM_MS})
 _PROCESSES = 4  # that the clients share, besides the robot's
 _WARM_S = 0.5
 _LATE_S = 60.0
-_BARE = "vlagents_ray.bench.policy"
+_BARE = "benchmarks.bare_policy"
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,7 +164,7 @@ def _fleet(client: OwnClient, url: str, app: str, clients: int) -> Iterator[_Fle
 @contextlib.contextmanager
 def _process(client: OwnClient, url: str, ranks: list[str]) -> Iterator[_Part]:
     settings = json.dumps({"url": url, "transport": client.transport, "codec": client.codec, "ranks": ranks})
-    command = [sys.executable, "-m", "vlagents_ray.bench.clients", settings]
+    command = [sys.executable, "-m", "benchmarks.own_clients", settings]
     with LineProcess(f"clients by {client.name}", command, our_environment()) as child:
         child.read(START_S)
         yield _Part(lambda spec: child.send(json.dumps(spec)), lambda _, late: child.read(late))
@@ -229,3 +235,59 @@ def _waiting(calls: Sequence[Call]) -> dict[str, Any] | None:
         "round_trip_p50_ms": float(np.median(round_trip)),
         "round_trip_p99_ms": float(np.quantile(round_trip, 0.99)),
     }
+
+
+def main(
+    transports: Annotated[str, typer.Option(help="With commas between them.")] = "plasma,handle,shm,websocket",
+    clients: Annotated[str, typer.Option(help="Numbers; the largest is compared with the ideal.")] = "1,2,4,8,16,32",
+    batch: Annotated[int, typer.Option(min=1, help="Observations in one forward pass, at most.")] = 16,
+    seconds: Seconds = 2.0,
+    rounds: Rounds = 3,
+    robot_seconds: Annotated[float, typer.Option(min=0, help="How long a robot is watched; 0: not at all.")] = 10.0,
+    policy: Annotated[str | None, typer.Option(help="Default: noop, 20 ms + 1 ms an observation.")] = None,
+    settings: Set = [],  # noqa: B006
+    num_gpus: Annotated[float, typer.Option(min=0, help="That Ray gives to the replica.")] = 0.0,
+    json_file: Json = None,
+) -> None:
+    """Actions a second of many clients on one replica, against the ideal, or the bare policy in the same run."""
+    with errors():
+        origin = measured_on("python -m benchmarks.throughput")
+        if settings and policy is None:
+            raise ConfigError("--set: is for --policy; name one")
+        chosen: dict[str, Any] = (
+            {} if policy is None else {"policy": policy, "config": parse_settings(settings, "--set")}
+        )
+        counts = parse_counts(clients, "--clients")
+        plan = ThroughputPlan(
+            **chosen, num_gpus=num_gpus, batch=batch, clients=counts, seconds=seconds, rounds=rounds,
+            robot_seconds=robot_seconds, transports=parse_list(transports),
+        )  # fmt: skip
+        found = measure_throughput(plan, progress)
+    show_throughput(found)
+    save({**origin, **found}, json_file)
+
+
+def show_throughput(found: Mapping[str, Any]) -> None:
+    """Print a row for each number of clients, and a sentence for each transport."""
+    rows = table("transport", "clients", "actions/s", "of ideal", "mean batch", "p50 ms", "p99 ms")
+    rows.title = f"{found['policy']}, ideal {found['ideal_actions_per_s']:.0f} actions/s ({found['ideal_is']})"
+    for name, row in found["transports"].items():
+        for point in row["curve"]:
+            numbers = [point[key] for key in ("of_ideal", "mean_batch", "p50_ms", "p99_ms")]
+            cells = ["" if number is None else f"{number:.3g}" for number in numbers]
+            rows.add_row(name, str(point["clients"]), f"{point['actions_per_s']:.1f}", *cells)
+        rows.add_section()
+    out.print(rows)
+    for name, row in found["transports"].items():
+        robot = row["robot"]
+        waits = (
+            f"; a robot among simulations waits {robot['wait_p50_ms']:.1f} ms (p99 {robot['wait_p99_ms']:.1f})"
+            if robot
+            else ""
+        )
+        out.print(f"{name}: {row['actions_per_s']:.1f} actions/s, {row['of_ideal']:.3f} of the ideal{waits}")
+    show_skipped(found)
+
+
+if __name__ == "__main__":
+    typer.run(main)

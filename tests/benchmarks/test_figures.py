@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
-from vlagents_ray.bench.figures import RoundTrips, lost_db, median_interval, median_ratio, ratios
+from benchmarks.figures import RoundTrips, lost_db, measured_on, median_interval, median_ratio, ratios
 
 
 def trips(name: str, median: float, rounds: int = 20, seed: int = 0) -> RoundTrips:
@@ -59,3 +61,10 @@ def test_what_images_lost() -> None:
     sent = {"front": np.full((4, 4, 3), 100, np.uint8)}
     assert lost_db(sent, sent) is None
     assert lost_db({"front": sent["front"] + np.uint8(1)}, sent) == pytest.approx(48.13, abs=0.01)  # 20 log10(255)
+
+
+def test_what_figures_depend_on_is_json_without_names_of_hosts() -> None:
+    said = json.loads(json.dumps(measured_on()))
+    assert said.keys() == {"date", "command", "machine", "versions"}
+    assert said["versions"].keys() >= {"vlagents-ray", "numpy", "Python"}
+    assert said["machine"].keys() == {"cpu", "cores", "memory_gb", "kernel", "load"}

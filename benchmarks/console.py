@@ -1,0 +1,44 @@
+"""Options that several measurements have, and the table of round trips."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.text import Text
+
+from vlagents_ray.cli.console import out, table
+
+Calls = Annotated[int, typer.Option(min=1, help="Round trips by each way.")]
+Seconds = Annotated[float, typer.Option(min=0.1, help="Of each measurement.")]
+Rounds = Annotated[int, typer.Option(min=1)]
+Json = Annotated[Path | None, typer.Option("--json", help="Write the figures here.")]
+Transports = Annotated[str, typer.Option(help="shm,websocket,http,handle,plasma; default: all.")]
+
+
+def show_round_trips(found: Mapping[str, Any], title: str) -> None:
+    """Print a row for each client, the fastest first; beside ours, the ratios to other servers."""
+    theirs = [peer["way"] for peer in found["peers"]]
+    rows = table("way", "median ms", "95 % interval", "p99 ms", *(f"/ {name}" for name in theirs))
+    rows.title = f"{title}: two 224x224 RGB cameras, no-op policy"
+    for row in sorted([*found["ways"], *found["peers"]], key=lambda one: float(one["median_ms"])):
+        low, high = row["ci95_ms"]
+        ratios = found["ratios"].get(row["way"], {})
+        cells = []
+        for name in theirs:
+            one = ratios.get(name)
+            cells.append(f"{one['ratio']:.2f} ({one['ci95'][0]:.2f}-{one['ci95'][1]:.2f})" if one else "")
+        rows.add_row(
+            row["way"], f"{row['median_ms']:.3f}", f"{low:.3f} to {high:.3f}", f"{row['p99_ms']:.3f}", *cells,
+            style="dim" if row["way"] in theirs else None,
+        )  # fmt: skip
+    out.print(rows)
+    show_skipped(found)
+
+
+def show_skipped(found: Mapping[str, Any]) -> None:
+    """Print what could not be measured, and why."""
+    for name, reason in found["skipped"].items():
+        out.print(Text.assemble((f"skipped {name}", "yellow"), f": {reason}"))
