@@ -43,7 +43,6 @@ from vlagents_ray.serve.observers.live_view import Fleet, Snapshot
 from vlagents_ray.serve.observers.opening import open_observers
 from vlagents_ray.serve.ports import EVERYWHERE, HOST, LOOPBACK
 from vlagents_ray.serve.queue.batch_queue import LoadMeter
-from vlagents_ray.serve.replica.candidate import CandidateLink
 from vlagents_ray.serve.replica.engine_replica import ReplicaEngine
 from vlagents_ray.serve.replica.metrics import Exporter, tags_of
 from vlagents_ray.serve.scaling.autoscaling import SESSIONS, UTILISATION, WAITING
@@ -74,9 +73,9 @@ class PolicyReplica(ClientApi, SiblingApi):
     _opened = False  # whether there is something to close
 
     async def __init__(  # type: ignore[misc]  # Serve awaits it
-        self, args: dict[str, Any], gateway: Any = None, candidate: Any = None
+        self, args: dict[str, Any], gateway: Any = None
     ) -> None:
-        """Make the replica with the settings `args`; handles make the other two a part of the application."""
+        """Make the replica with the settings `args`; the handle makes the gateway a part of the application."""
         self._args = settings = ServerArgs(**args)
         self._gateway = gateway
         self._gateways: dict[str, Any] = {}
@@ -105,11 +104,10 @@ class PolicyReplica(ClientApi, SiblingApi):
 
         # What is seen of it.
         node = ray.get_runtime_context().get_node_id()[:8]
-        ask = None if candidate is None else CandidateLink(candidate)
-        self._observers = open_observers(self._engine, settings, self._peers.own_name, node, self.metadata, ask)
+        self._observers = open_observers(self._engine, settings, self._peers.own_name, node, self.metadata)
         self._fleet = Fleet(self._observers.view, ReplicaViews([self._app], but=self._peers.own_name))
         self._meter = LoadMeter(self._engine.queue)
-        self._metrics = Exporter(self._engine, tags_of(settings.policy), self._keys, self._observers)
+        self._metrics = Exporter(self._engine, tags_of(settings.policy), self._keys, self._observers.recorder)
         self._metrics.start()
 
         # The ways in.
@@ -213,7 +211,7 @@ class PolicyReplica(ClientApi, SiblingApi):
 
     def metadata(self) -> dict[str, Any]:
         """Return the document of `GET /v1/metadata` and `RemoteAgent.metadata`."""
-        contract, models, shadow = self._engine.contract, self._engine.models, self._args.shadow
+        contract, models = self._engine.contract, self._engine.models
         return {
             "policy": self._args.policy,
             "checkpoint": resolved(models.config),
@@ -231,7 +229,6 @@ class PolicyReplica(ClientApi, SiblingApi):
             "dialects": describe(self._args.dialects) | self._gateways,
             "local": None if self._local is None else asdict(self._local.address),
             "stream": None if self._stream is None else asdict(self._stream.address),
-            "shadow": None if shadow is None else shadow.model_dump(include={"policy", "share"}),
         }
 
     # Clients inside the cluster: `ClientApi`.
