@@ -92,16 +92,14 @@ class Publisher:
         Args:
             named: The values by name, as `Agent.parameters` names them: numpy or JAX arrays or torch tensors, e.g. a
                 `state_dict`. They are copied before this returns, so that the learner can go on.
-            mode: When sessions change: at their next reset ("next_episode"), between two acts ("keep"), or once the
-                episodes of all sessions of their replica have ended, until when resets wait ("wait").
+            mode: When sessions change: at their next reset ("next_episode"), or between two acts ("keep").
             partial: Whether names may be missing, whose values stay, as when only adapters are trained.
             allow_same: Whether all values may equal those that the policy holds.
             pin: Whether robots, and others that do not follow, also act with it from their next reset on.
             version: The number of the version, such as the step of training; by default the newest one's + 1.
 
         Returns:
-            The version, as in `act.info["policy"]["version"]`. With "wait", replicas act with it
-            later; see `acknowledged`.
+            The version, as in `act.info["policy"]["version"]`.
 
         Raises:
             InvalidWeights: The values do not fit the policy; nothing was changed.
