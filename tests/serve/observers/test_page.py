@@ -165,9 +165,6 @@ def test_buttons_act_on_a_session(page: Page, server: LiveServer, width: int, sc
         page.value(f"({PRESS})('Pause')")
         until(page, outcome, "pause: done")
         assert page.value("document.documentElement.scrollWidth") <= width
-        page.value(f"({PRESS})('Follow versions')")  # a robot is pinned unless it is told otherwise
-        until(page, outcome, "follow: done")
-        until(page, "[...document.querySelectorAll('article button')].some((one) => one.value === 'pin')", want=True)
         shown = "[...document.querySelectorAll('article button')].map((one) => one.textContent)"
         assert page.value(shown)[:4] == ["Stop", "Pause", "Success", "Failure"]
         page.value(f"({PRESS})('Failure')")
@@ -210,7 +207,7 @@ def test_a_session_is_saved(page: Page, tmp_path: Path) -> None:
 def test_a_key_without_the_scope_sees_no_buttons(page: Page, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(api_keys, "_CHECK_S", 0.0)
     keys = ChangingKeys()
-    for name, scopes, buttons in (("watching", ["watch"], 0), ("lab", ["watch", "operate"], 5)):
+    for name, scopes, buttons in (("watching", ["watch"], 0), ("lab", ["watch", "operate"], 4)):
         key = keys.add(name, scopes=scopes)
         with live_server(Noop.from_config({"action_dim": 7}), keys=keys.keys) as server, operated(server, key):
             show(page, server)

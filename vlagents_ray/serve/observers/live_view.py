@@ -177,7 +177,6 @@ def _session(session: Session[LoadedModel], last: Answer | None) -> dict[str, An
         "instruction": session.instruction[:_INSTRUCTION],
         "silent_s": round(time.monotonic() - session.used, 2),
         "version": None if weights is None else weights.number,
-        "follows": session.follows,
         "pictures": {},
     }
     return described if last is None else described | {"rank": last.rank, "last": _act(last)}

@@ -254,10 +254,8 @@ class Card {
       this.plot(`state: ${part}`, rows);
     }
     this.operated.hidden = !mayOperate || this.rank !== "robot";
-    this.follows.textContent = said.follows ? "Pin version" : "Follow versions";
     this.save.hidden = !ring;
     this.save.textContent = `Save last ${ring} s`;
-    this.follows.value = said.follows ? "pin" : "follow";
     this.commands(said.commands);
     if (said.last) this.act(said.last);
     this.root.classList.toggle("silent", said.silent_s > 5);
@@ -280,11 +278,10 @@ class Card {
   buttons() {
     const button = (text, command, className = "") => element("button", { type: "button", className, value: command,
       ariaLabel: `${text}: ${this.id}`, onclick: (event) => this.press(event.currentTarget.value) }, text);
-    this.follows = button("Pin version", "pin", "quiet");
     this.save = button("Save", "save", "quiet");
     return element("div", { className: "operate", hidden: true },
       element("div", { className: "row" }, button("Stop", "stop", "stop"), button("Pause", "pause"), button("Success", "success", "quiet"), button("Failure", "failure", "quiet")),
-      element("div", { className: "row" }, this.follows, this.save), this.outcome);
+      element("div", { className: "row" }, this.save), this.outcome);
   }
 
   async press(command) {
