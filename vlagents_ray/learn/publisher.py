@@ -25,7 +25,7 @@ from vlagents_ray.errors import ConfigError, InvalidWeights, PolicyUnavailable, 
 from vlagents_ray.protocol.frames import read_error
 from vlagents_ray.serve.endpoints.weights import PATH
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.scaling.weight_push import OwnWeights, Values, WeightPusher, WeightsReplica
+from vlagents_ray.serve.scaling.weight_push import ThisReplica, Values, WeightPusher, WeightsReplica
 from vlagents_ray.serve.weights import PushMode, PushOptions, PushResult
 from vlagents_ray.weights.safetensors import MESSAGE_BYTES, header_of, parts_of
 from vlagents_ray.weights.shared_values import NotShared, gpu_of, shared
@@ -149,13 +149,15 @@ class EngineTarget(WeightsTarget):
 
     def __init__(self, engine: Engine) -> None:
         """Push to that engine alone."""
-        self._own = OwnWeights("this process", engine.weights)
+        self._engine = engine
 
     def push(self, named: Mapping[str, Any], options: PushOptions) -> int:
-        return asyncio.run(WeightPusher(self._own, _no_siblings).push(named, options)).version
+        return asyncio.run(
+            WeightPusher(ThisReplica("this process", self._engine.weights), _no_siblings).push(named, options)
+        ).version
 
     def versions(self) -> list[int]:
-        return [asyncio.run(self._own.newest_weights()).number]
+        return [self._engine.weights.number]
 
 
 class AppTarget(WeightsTarget):

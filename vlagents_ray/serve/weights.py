@@ -11,6 +11,7 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol, get_args
 from weakref import WeakValueDictionary
@@ -29,7 +30,7 @@ from vlagents_ray.errors import (
 from vlagents_ray.interface import POLICY, Agent
 from vlagents_ray.policies.compilation import CAPTURES
 from vlagents_ray.weights.safetensors import ValueSpec, read_header
-from vlagents_ray.weights.shared_values import gpu_of
+from vlagents_ray.weights.shared_values import SharedValues, gpu_of, opened
 from vlagents_ray.weights.trainable import fingerprint, fitted, is_copied, own_copy, portable, require_fit
 
 DIGITS = 16  # of a checkpoint's digest in place of a fingerprint, hexadecimal
@@ -331,9 +332,10 @@ class WeightUpdates:
         """Check values before they arrive; see `ModelWeights.read_header`."""
         return self._own().read_header(header, partial=options.partial)
 
-    def stage(self, number: int, pushed: Mapping[str, Any], options: PushOptions) -> str:
+    def stage(self, number: int, pushed: Mapping[str, Any] | SharedValues, options: PushOptions) -> str:
         """Check and hold a new version, and return its fingerprint; see `ModelWeights.stage`."""
-        return self._own().stage(number, pushed, partial=options.partial, allow_same=options.allow_same)
+        with opened(pushed) if isinstance(pushed, SharedValues) else nullcontext(pushed) as named:
+            return self._own().stage(number, named, partial=options.partial, allow_same=options.allow_same)
 
     def commit(self, number: int, options: PushOptions) -> None:
         """Act with the staged version; see `ModelWeights.commit`."""
@@ -358,9 +360,8 @@ class WeightUpdates:
             return None
         return {"newest": own.newest.describe(), "pinned": own.pinned.describe()}
 
-    @property
     def newest(self) -> NewestVersion:
-        """The newest version; raises `PolicyUnavailable` while the policy loads."""
+        """Return the newest version; raises `PolicyUnavailable` while the policy loads."""
         own = self._own()
         return NewestVersion(own.newest.number, own.model, own.gpu)
 
@@ -368,7 +369,7 @@ class WeightUpdates:
     def number(self) -> int:
         """Number of the newest version; 0 while the policy loads."""
         try:
-            return self.newest.number
+            return self._own().newest.number
         except PolicyUnavailable:
             return 0
 

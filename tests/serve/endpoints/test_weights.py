@@ -44,7 +44,7 @@ from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.endpoints.weights import weights_routes
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.scaling.weight_push import OwnWeights, WeightPusher
+from vlagents_ray.serve.scaling.weight_push import ThisReplica, WeightPusher
 from vlagents_ray.serve.weights import PushOptions, PushResult
 from vlagents_ray.weights.safetensors import MESSAGE_BYTES, PART_BYTES, header_of, parts_of, read_header
 
@@ -70,7 +70,7 @@ class Alone:
     """One replica."""
 
     def __init__(self, engine: Engine) -> None:
-        own = OwnWeights("this", engine.weights)
+        own = ThisReplica("this", engine.weights)
 
         async def others() -> tuple[()]:
             return ()
@@ -144,10 +144,11 @@ def test_a_learner_elsewhere_pushes_and_asks_which_replicas_act_with_it(serving:
 def test_values_that_are_received_are_not_copied_again(serving: Serving, monkeypatch: pytest.MonkeyPatch) -> None:
     server = serving()
     received: list[Mapping[str, Any]] = []
-    stage = server.engine.weights.stage
-    monkeypatch.setattr(server.engine.weights, "stage", lambda *args: (received.append(args[1]), stage(*args))[1])
+    own = server.engine.models.own_weights
+    stage = own.stage
+    monkeypatch.setattr(own, "stage", lambda *args, **how: (received.append(args[1]), stage(*args, **how))[1])
     Publisher(server.url).push(gains(1))
-    assert np.shares_memory(server.engine.models.own_weights.newest.values["gain"], received[0]["gain"])
+    assert np.shares_memory(own.newest.values["gain"], received[0]["gain"])
 
 
 def test_what_does_not_fit_is_refused_before_it_is_sent(serving: Serving, monkeypatch: pytest.MonkeyPatch) -> None:

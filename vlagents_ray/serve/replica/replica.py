@@ -53,8 +53,8 @@ from vlagents_ray.serve.scaling.autoscaling import SESSIONS, UTILISATION, WAITIN
 from vlagents_ray.serve.scaling.rebalancer import ClientLocation, Rebalancer, ReplicaLoad
 from vlagents_ray.serve.scaling.session_migration import PEER_METHODS, SessionMigrator
 from vlagents_ray.serve.scaling.sibling_replicas import ReplicaViews, SiblingApi, SiblingReplicas
-from vlagents_ray.serve.scaling.weight_push import OwnWeights, Values, WeightPusher, WeightsReplica
-from vlagents_ray.serve.weights import HeldVersion, NewestVersion, PushOptions, PushResult
+from vlagents_ray.serve.scaling.weight_push import WEIGHT_METHODS, ThisReplica, Values, WeightPusher, WeightsReplica
+from vlagents_ray.serve.weights import NewestVersion, PushOptions, PushResult, WeightUpdates
 from vlagents_ray.weights.safetensors import ValueSpec
 
 logger = logging.getLogger(__name__)
@@ -70,7 +70,7 @@ class PolicyReplica(ClientApi, SiblingApi):
     """One replica of the policy, with all the ways in that clients use.
 
     Ray calls its methods by name: Serve those of a deployment, clients inside the cluster those of `ClientApi`, and
-    other replicas those of `SiblingApi` and `WeightsReplica`. Until the first replica runs, Serve's proxies reply for
+    other replicas those of `SiblingApi`. Until the first replica runs, Serve's proxies reply for
     the application: see `vlagents_ray.serve.scaling.router` and `vlagents_ray.serve.launch.haproxy`.
     """
 
@@ -104,7 +104,7 @@ class PolicyReplica(ClientApi, SiblingApi):
         self._configured = False
         self._migrator.start(self._engine)
         self._rebalancer = Rebalancer(self._engine, self._peers, self._load_of)
-        self._weights = OwnWeights(self._peers.own_name, self._engine.weights)
+        self._weights = ThisReplica(self._peers.own_name, self._engine.weights)
         self._pusher = WeightPusher(self._weights, self._peers.others)
 
         # What is seen of it.
@@ -337,7 +337,7 @@ class PolicyReplica(ClientApi, SiblingApi):
         except UnknownSession:
             return None
 
-    # New weights: from learners, and from the replica that coordinates a push (`WeightsReplica`).
+    # New weights: from learners, and from the replica that coordinates a push.
 
     async def push_weights(self, values: Values, options: PushOptions) -> PushResult:
         """Let all replicas act with new weights; called by a learner."""
@@ -357,28 +357,14 @@ class PolicyReplica(ClientApi, SiblingApi):
     async def versions_of_weights(self) -> list[int]:
         """Return the newest version of each replica that can be reached; called by a learner."""
         replicas: list[WeightsReplica] = [self._weights, *await self._peers.others()]
-        found = await asyncio.gather(*(replica.newest_weights() for replica in replicas), return_exceptions=True)
+        found = await asyncio.gather(
+            *(replica.weights(WeightUpdates.newest) for replica in replicas), return_exceptions=True
+        )
         return [newest.number for newest in found if isinstance(newest, NewestVersion)]
 
-    async def newest_weights(self) -> NewestVersion:
-        """Return the newest version that acts here."""
-        return await self._weights.newest_weights()
-
-    async def stage_weights(self, number: int, values: Values, options: PushOptions) -> str:
-        """Check and hold a version."""
-        return await self._weights.stage_weights(number, values, options)
-
-    async def commit_weights(self, number: int, options: PushOptions) -> None:
-        """Act with the staged version."""
-        await self._weights.commit_weights(number, options)
-
-    async def drop_weights(self, number: int) -> None:
-        """Drop the staged version."""
-        await self._weights.drop_weights(number)
-
-    async def held_weights(self) -> list[HeldVersion]:
-        """Return the pushed versions that new episodes act with."""
-        return await self._weights.held_weights()
+    async def weights(self, method: str, *args: Any) -> Any:
+        """Call one of `WEIGHT_METHODS` for another replica, which coordinates a push or has missed one."""
+        return await self._weights.weights(WEIGHT_METHODS[method], *args)
 
     # What the replica does by itself.
 

@@ -18,8 +18,7 @@ from vlagents_ray.serve.config.deployment import POLICY
 from vlagents_ray.serve.observers.live_view import OtherReplicas, Snapshot, SnapshotReader
 from vlagents_ray.serve.scaling.rebalancer import ReplicaLoad
 from vlagents_ray.serve.scaling.session_migration import HeldSessions, Peer, PeerEnded, PeerUnreachable
-from vlagents_ray.serve.scaling.weight_push import Values, WeightsReplica
-from vlagents_ray.serve.weights import HeldVersion, NewestVersion, PushOptions
+from vlagents_ray.serve.weights import WeightUpdates
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -51,6 +50,10 @@ class SiblingApi(Protocol):
         """Call the method of that name in `PEER_METHODS`, for moving sessions, and return its result."""
         ...
 
+    async def weights(self, method: str, *args: Any) -> Any:
+        """Call the method of that name in `WEIGHT_METHODS`, for pushes of weights, and return its result."""
+        ...
+
     async def live(self, since: int, shown: Collection[str]) -> Snapshot:
         """Return what happened since a snapshot, with pictures of the sessions `shown`."""
         ...
@@ -76,20 +79,10 @@ class _Sibling(Peer):
             raise PeerUnreachable(str(error)) from error
         return found
 
-    async def newest_weights(self) -> NewestVersion:
-        return await self._call(_ANSWER_S, WeightsReplica.newest_weights)
-
-    async def stage_weights(self, number: int, values: Values, options: PushOptions) -> str:
-        return await self._call(_TRANSFER_S, WeightsReplica.stage_weights, number, values, options)
-
-    async def commit_weights(self, number: int, options: PushOptions) -> None:
-        await self._call(_ANSWER_S, WeightsReplica.commit_weights, number, options)
-
-    async def drop_weights(self, number: int) -> None:
-        await self._call(_ANSWER_S, WeightsReplica.drop_weights, number)
-
-    async def held_weights(self) -> list[HeldVersion]:
-        return await self._call(_TRANSFER_S, WeightsReplica.held_weights)
+    async def weights(self, method: Callable[..., T], *args: Any) -> T:
+        transfers = method in (WeightUpdates.stage, WeightUpdates.held)
+        found: T = await self._call(_TRANSFER_S if transfers else _ANSWER_S, SiblingApi.weights, method.__name__, *args)
+        return found
 
     async def _call(
         self,
