@@ -312,10 +312,10 @@ def test_text_is_no_part(serving: Serving) -> None:
 def test_an_error_of_the_server_itself_is_not_shown(serving: Serving, monkeypatch: pytest.MonkeyPatch) -> None:
     server = serving()
 
-    def fail(*args: Any) -> str:
+    def fail(*args: Any, **how: Any) -> str:
         raise RuntimeError("secret")
 
-    monkeypatch.setattr(server.engine.weights, "stage", fail)
+    monkeypatch.setattr(server.engine.models.own_weights, "stage", fail)
     with pytest.raises(VLAgentsError, match="internal error"):
         Publisher(server.url).push(gains(1))
 
@@ -325,10 +325,9 @@ def test_a_push_whose_learner_leaves_after_the_last_part_is_completed(
 ) -> None:
     server = serving()
     begun, may_go_on = threading.Event(), threading.Event()
-    stage = server.engine.weights.stage
-    monkeypatch.setattr(
-        server.engine.weights, "stage", lambda *args: (begun.set(), may_go_on.wait(30), stage(*args))[2]
-    )
+    own = server.engine.models.own_weights
+    stage = own.stage
+    monkeypatch.setattr(own, "stage", lambda *args, **how: (begun.set(), may_go_on.wait(30), stage(*args, **how))[2])
     values = {"offset": np.ones(2, np.float32)}
     with opened(server, "?partial=true") as socket:
         answer(socket, header_of(values))
