@@ -52,7 +52,7 @@ from vlagents_ray.serve.replica.metrics import Exporter, tags_of
 from vlagents_ray.serve.scaling.autoscaling import SESSIONS, UTILISATION, WAITING
 from vlagents_ray.serve.scaling.rebalancer import ClientLocation, Rebalancer, ReplicaLoad
 from vlagents_ray.serve.scaling.session_migration import PEER_METHODS, SessionMigrator
-from vlagents_ray.serve.scaling.sibling_replicas import ReplicaViews, SiblingApi, SiblingReplicas
+from vlagents_ray.serve.scaling.sibling_replicas import SiblingApi, SiblingReplicas
 from vlagents_ray.serve.scaling.weight_push import WEIGHT_METHODS, ThisReplica, Values, WeightPusher, WeightsReplica
 from vlagents_ray.serve.weights import NewestVersion, PushOptions, PushResult, WeightUpdates
 from vlagents_ray.weights.safetensors import ValueSpec
@@ -110,7 +110,7 @@ class PolicyReplica(ClientApi, SiblingApi):
         # What is seen of it.
         node = ray.get_runtime_context().get_node_id()[:8]
         self._observers = open_observers(self._engine, settings, self._peers.own_name, node, self.metadata)
-        self._fleet = Fleet(self._observers.view, ReplicaViews([self._app], but=self._peers.own_name))
+        self._fleet = Fleet(self._observers.view, self._peers)
         self._meter = LoadMeter(self._engine.queue)
         self._metrics = Exporter(self._engine, tags_of(settings.policy), self._keys, self._observers.recorder)
         self._metrics.start()
