@@ -13,7 +13,6 @@ import ray
 from vlagents_ray.errors import BY_CODE
 from vlagents_ray.interface import Agent
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.observers.comparison import Comparer
 from vlagents_ray.serve.replica import metrics
 
 ROOT = Path(__file__).parents[2]
@@ -31,7 +30,7 @@ class Series(NamedTuple):
 
 @pytest.fixture(scope="module")
 def exported() -> dict[str, Series]:
-    """The series that the exporters of a replica and of a candidate declare, by the name that Prometheus reads."""
+    """The series that the exporter of a replica declares, by the name that Prometheus reads."""
     series = {}
 
     def declared(kind: str) -> Any:
@@ -51,7 +50,6 @@ def exported() -> dict[str, Series]:
             patch.setattr(metrics, kind, declared(kind))
         engine = Engine(Agent())
         metrics.Exporter(engine, dict.fromkeys(TAGS, "x"))
-        metrics.ShadowExporter(Comparer(), dict.fromkeys(TAGS, "x"))
         engine.close()
     return series
 

@@ -193,9 +193,9 @@ class Server:
         return UnixLine(f"\0{self._own.address.socket}")
 
     def _handle(self, engine: Engine, name: str) -> Line:
-        from vlagents_ray.serve.replica.engine_replica import ReplicaEngine
+        from vlagents_ray.serve.replica.replica import answer_frame
 
-        call = partial(ReplicaEngine(engine, LIMITS, {}).call, f"session-{name}")
+        call = partial(answer_frame, engine, LIMITS, f"session-{name}")
         return CallLine(lambda data, _: ("binary", masked(asyncio.run(call(data)))))
 
     def _open_gateway(self, name: str) -> None:

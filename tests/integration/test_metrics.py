@@ -21,16 +21,11 @@ from vlagents_ray.serve.launch.server import Server
 ACTS = 30
 APP = "measured"
 DASHBOARD = Path(__file__).parents[2] / "cluster/grafana/policy_server.json"
-NOT_YET = {  # no call hung, no memory ran out, no weights were pushed, nothing is recorded, there is no shadow
+NOT_YET = {  # no call hung, no memory ran out, no weights were pushed, nothing is recorded
     "vlagents_hung_calls_total",
     "vlagents_out_of_memory_total",
     "vlagents_weight_push_ms_bucket",
     "vlagents_recorded_frames_total",
-    "vlagents_shadow_difference_bucket",
-    "vlagents_shadow_dropped_total",
-    "vlagents_shadow_joint_difference",
-    "vlagents_shadow_latency_ms_bucket",
-    "vlagents_shadow_observations_total",
 }
 STAGES = ("decode", "queue", "inference", "encode")
 

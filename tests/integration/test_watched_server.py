@@ -1,12 +1,10 @@
-"""What a server writes for those who watch it: traces for OpenTelemetry, recordings for viewers."""
+"""What a server writes for those who watch it: traces for OpenTelemetry."""
 
 from __future__ import annotations
 
-import importlib.util
 import threading
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,15 +13,12 @@ from opentelemetry.proto.collector.trace.v1.trace_service_pb2 import ExportTrace
 from opentelemetry.proto.trace.v1.trace_pb2 import Span
 from readme_blocks import ENV
 from serve_command import serving
-from viewer_files import read_mcap
 
 from vlagents_ray import Obs, RemoteAgent, tracing
 
 pytestmark = [pytest.mark.ray, pytest.mark.server]
 
 ACTS = 5
-MAGIC = b"\x89MCAP0\r\n"  # at both ends of a whole file
-HAS_FOXGLOVE = importlib.util.find_spec("foxglove") is not None
 
 
 class Collector(ThreadingHTTPServer):
@@ -57,23 +52,17 @@ def collector() -> Iterator[Collector]:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("recordings")
-
-
-@pytest.fixture(scope="module")
-def address(collector: Collector, folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+def address(collector: Collector, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     variables = {
         "VLAGENTS_RAY_OTEL": "1",
         "OTEL_EXPORTER_OTLP_ENDPOINT": f"http://127.0.0.1:{collector.server_port}",
         "OTEL_BSP_SCHEDULE_DELAY": "200",  # ms
     }
-    options = ["--foxglove", str(folder)] if HAS_FOXGLOVE else []
     with pytest.MonkeyPatch.context() as patch:
         for name, value in variables.items():
             patch.setenv(name, value)
             patch.setitem(ENV, name, value)
-        with serving("noop", tmp_path_factory.mktemp("log") / "serve.log", None, *options) as address:
+        with serving("noop", tmp_path_factory.mktemp("log") / "serve.log") as address:
             yield address
         tracing._provider().shutdown()
         tracing._provider.cache_clear()
@@ -114,24 +103,3 @@ def test_client_and_replica_export_one_trace_of_each_request(
         # One machine has one clock.
         assert sent.start_time_unix_nano <= batch.start_time_unix_nano < batch.end_time_unix_nano
     assert len({one.trace_id for one in batches}) == ACTS
-
-
-@pytest.mark.library("foxglove")
-@pytest.mark.library("mcap")
-def test_a_session_has_a_recording_with_every_answer(address: str, folder: Path) -> None:
-    before = set(folder.iterdir())
-    act(address, "shm")
-
-    # The end of the file, which its reader wants, is written with that of the session.
-    wait_for(
-        lambda: any(
-            file.read_bytes().endswith(MAGIC) and file not in before
-            for file in folder.iterdir()
-            if file.stat().st_size > 100
-        )
-    )
-    [file] = set(folder.iterdir()) - before
-    found = read_mcap(file)
-    assert len(found["/chunk"]) == ACTS
-    assert found["/state"][0]["joints"] == [0, 0, 0]
-    assert len(found["/cameras/front"]) >= 1

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from shared_cpu_memory import GPU, SharedCpuMemory
 from vlagents_ray.errors import InvalidWeights, UnchangedWeights
 from vlagents_ray.learn.publisher import AppTarget
 from vlagents_ray.serve.scaling.weight_push import WeightPusher
-from vlagents_ray.serve.weights import PushOptions
+from vlagents_ray.serve.weights import PushOptions, WeightUpdates
 from vlagents_ray.weights import shared_values
 from vlagents_ray.weights.shared_values import NotShared, SharedValues, opened, shared
 from vlagents_ray.weights.trainable import portable
@@ -115,10 +115,11 @@ def test_the_learner_keeps_its_memory_until_the_replica_has_answered(
         def __init__(self) -> None:
             self._pipe, self._process = replica._pipe, replica._process
 
-        async def stage_weights(self, *args: Any) -> Any:
-            held.append(memory.handles)
-            answer = self.ask("stage_weights", *args)
-            held.append(memory.handles)
+        async def weights(self, method: Callable[..., Any], *args: Any) -> Any:
+            before = memory.handles
+            answer = await super().weights(method, *args)
+            if method is WeightUpdates.stage:
+                held.extend((before, memory.handles))
             return answer
 
     learner = model(device)
@@ -147,7 +148,7 @@ def test_what_does_not_fit_is_refused_as_ever_and_nothing_stays_open(
         with pytest.raises(InvalidWeights, match=message):
             app.push(wrong, PIN)
     assert replica.ask("memory") == before
-    assert replica.ask("newest_weights").number == 0
+    assert replica.ask("newest").number == 0
     assert app.push(values, PIN) == 1
     assert all(isinstance(sent, SharedValues) for sent in app.sent)
 

@@ -15,7 +15,7 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.ray_tools.private import gpus_here
 from vlagents_ray.serve.launch import server
 from vlagents_ray.serve.launch.deployment_file import deployment, with_replicas_on
-from vlagents_ray.serve.replica import engine_replica
+from vlagents_ray.serve.replica import replica
 
 
 def args(gpus: float, **said: Any) -> dict[str, Any]:
@@ -121,7 +121,7 @@ def test_gpus_are_hidden_from_a_replica_to_which_ray_gave_none(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch, given: list[str], visible: str
 ) -> None:
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "2")
-    monkeypatch.setattr(engine_replica, "gpus_here", lambda: 4.0)
-    engine_replica.hide_gpus(given)
+    monkeypatch.setattr(replica, "gpus_here", lambda: 4.0)
+    replica.hide_gpus(given)
     assert os.environ["CUDA_VISIBLE_DEVICES"] == visible
     assert ("resources: {num_gpus: 1}" in caplog.text) == (not given)

@@ -16,14 +16,12 @@ from ray.serve._private.api import call_user_app_builder_with_args_if_necessary
 from ray.serve.exceptions import RayServeException
 
 from vlagents_ray.errors import MissingDependency, PolicyFailed
-from vlagents_ray.protocol.messages import DEFAULT_LIMITS
 from vlagents_ray.serve.access.key_store import new_key
 from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.launch.deployment_file import IMPORT_PATH
 from vlagents_ray.serve.ports import HOST
 from vlagents_ray.serve.replica import replica as module
 from vlagents_ray.serve.replica.app import build
-from vlagents_ray.serve.replica.engine_replica import ReplicaEngine
 from vlagents_ray.serve.replica.replica import PolicyReplica
 
 
@@ -39,7 +37,9 @@ def replica(start: Any) -> Bare:
     engine: Any = SimpleNamespace(start=start, models=SimpleNamespace(configure=lambda _: None))
     one = object.__new__(Bare)
     vars(one).update(
-        _policy=ReplicaEngine(engine, DEFAULT_LIMITS, {}),
+        _args=ServerArgs(policy="noop"),
+        _engine=engine,
+        _configured=False,
         _gateway=None,
         _rebalancer=SimpleNamespace(start=lambda: None),
         _pusher=SimpleNamespace(catch_up=lambda: asyncio.sleep(0)),
@@ -87,7 +87,7 @@ def test_only_the_traceback_of_a_policys_own_bug_is_shown(
 
     one = replica(fail)
     with pytest.raises(PolicyFailed, match="the policy did not load: no jax") as failed:
-        asyncio.run(one._policy.load())
+        asyncio.run(one.reconfigure({}, None))
     lines = traceback.format_exception(failed.value)
     assert ("direct cause" in "".join(lines)) == shown
     assert ("in fail" in "".join(lines)) == shown

@@ -463,11 +463,11 @@ def over_plasma(visitor: Visitor, _when: str) -> str:
 
 def over_handle(visitor: Visitor, _when: str) -> str:
     """The actor's own entry point, as a Serve handle calls it."""
-    from vlagents_ray.serve.replica.engine_replica import ReplicaEngine
+    from vlagents_ray.serve.replica.replica import answer_frame
 
     visitor.become()
     frame = encode_request(Request("reset", Obs(), visitor.mark))
-    [reply] = decode_replies(asyncio.run(ReplicaEngine(visitor.replica.engine, LIMITS, {}).call(visitor.name, frame)))
+    [reply] = decode_replies(asyncio.run(answer_frame(visitor.replica.engine, LIMITS, visitor.name, frame)))
     return "done" if reply.error is None else str(reply.error.status)
 
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import asyncio
 import multiprocessing
 import threading
+from collections.abc import Callable
 from types import TracebackType
 from typing import Any, ClassVar
 
@@ -13,7 +13,6 @@ from shared_cpu_memory import SharedCpuMemory, files_of_torch
 
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.serve.scaling.weight_push import OwnWeights
 from vlagents_ray.serve.weights import ModelWeights, WeightUpdates
 from vlagents_ray.weights.trainable import portable
 
@@ -64,7 +63,7 @@ class _Replica:
         self.agent.initialize()
         self.left_open: set[str] = set()
         self.weights = ModelWeights(self.agent, threading.Lock())
-        self.own = OwnWeights("replica", WeightUpdates(lambda: self.weights, list))
+        self.updates = WeightUpdates(lambda: self.weights, list)
 
     def values(self) -> dict[str, np.ndarray]:
         """Act with the newest version, and return its values."""
@@ -83,9 +82,8 @@ def _serve(pipe: Any, device: str, gpu: str) -> None:
     while (asked := pipe.recv()) is not None:
         method, args = asked
         try:
-            found = getattr(replica, method, None) or getattr(replica.own, method)
+            found = getattr(replica, method, None) or getattr(replica.updates, method)
             answer = found(*args)
-            answer = asyncio.run(answer) if asyncio.iscoroutine(answer) else answer
         except VLAgentsError as error:
             answer = error  # which holds all local variables of its frames
         replica.left_open |= files_of_torch()
@@ -93,7 +91,7 @@ def _serve(pipe: Any, device: str, gpu: str) -> None:
 
 
 class ReplicaProcess:
-    """The replica as a push sees it: `vlagents_ray.serve.scaling.weight_push.OwnWeights`."""
+    """The replica as a push sees it: `vlagents_ray.serve.scaling.weight_push.WeightsReplica`."""
 
     name = "replica"
 
@@ -112,20 +110,8 @@ class ReplicaProcess:
             raise answer
         return answer
 
-    def pushed(self, took_ms: float) -> None:
-        self.ask("pushed", took_ms)
-
-    async def newest_weights(self) -> Any:
-        return self.ask("newest_weights")
-
-    async def stage_weights(self, number: int, values: Any, options: Any) -> Any:
-        return self.ask("stage_weights", number, await values[0] if isinstance(values, list) else values, options)
-
-    async def commit_weights(self, *args: Any) -> None:
-        self.ask("commit_weights", *args)
-
-    async def drop_weights(self, *args: Any) -> None:
-        self.ask("drop_weights", *args)
+    async def weights(self, method: Callable[..., Any], *args: Any) -> Any:
+        return self.ask(method.__name__, *[await one[0] if isinstance(one, list) else one for one in args])
 
     def __enter__(self) -> ReplicaProcess:
         return self

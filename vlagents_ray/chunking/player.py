@@ -39,6 +39,7 @@ from vlagents_ray.chunking.fallback import (
     Safe,
     SafeAction,
     refused,
+    unanswered,
 )
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import ConfigError, InvalidAction, InvalidInput, NotReset, VLAgentsError
@@ -272,7 +273,7 @@ class ChunkPlayer(Agent):
         at which it holds the robot; call it in your own loop when you stop or take over the robot.
         """
         self._begin_again(STOPPED)
-        self._execution.interrupt(STOPPED.reason)
+        self._execution.interrupt()
         self._motion.stop()
 
     def observe(self, obs: Obs, action: np.ndarray | None = None) -> None:
@@ -317,7 +318,7 @@ class ChunkPlayer(Agent):
         if led and SAFE not in act.info:  # the human's action is executed in place of a row
             self._execution.note_in_place(act.action)
             self._plan.advance()
-        return self._execution.note(act, self._plan.executed)
+        return act
 
     def close(self) -> None:
         """Close the policy, at once or as soon as the request in progress is over."""
@@ -401,11 +402,10 @@ class ChunkPlayer(Agent):
             return
         if isinstance(answer, InvalidInput) or not isinstance(answer, VLAgentsError):
             raise answer
-        self._trouble = self._execution.failed(answer)
+        self._trouble = unanswered(answer)
 
     def _take(self, act: Act, now: int) -> None:
         act = replace(act, info={key: value for key, value in act.info.items() if key not in OF_THE_LOOP})
-        self._execution.heard(act)
         tick, step, seen_at = self._request
         rows = Act(check_action(act.action, self._contract)).rows()[: self.settings.horizon]
         if self.settings.mode == "open_loop" and act.done and self.settings.execute is not None:
@@ -417,7 +417,7 @@ class ChunkPlayer(Agent):
         self._trouble = WAITING if added else LATE
 
     def _extras(self) -> dict[str, Any]:
-        extras = self._execution.report(self._plan.executed, self._agent)
+        extras = self._execution.report()
         if self.settings.samples is not None:
             extras[SAMPLES] = self.settings.samples
         if self.settings.timeout_s is not None:

@@ -19,7 +19,7 @@ from vlagents_ray.serve.access.api_keys import load_keys
 from vlagents_ray.serve.observers.live_page import page_server, require_watch_keys
 from vlagents_ray.serve.observers.live_view import Fleet
 from vlagents_ray.serve.ports import LOOPBACK, is_free
-from vlagents_ray.serve.scaling.sibling_replicas import ReplicaViews
+from vlagents_ray.serve.scaling.sibling_replicas import ReplicasInCluster
 
 _PORT = 8050  # of the page, if it is free
 _NAME = "eval"  # of the page, where keys are for some applications alone
@@ -59,7 +59,7 @@ def live_progress(
         return
     document = ProgressDocument(results, shown, goes_on=goes_on)
     apps = [url.removeprefix("serve://") for url in urls if url is not None and url.startswith("serve://")]
-    others = ReplicaViews(apps) if apps and ray.is_initialized() else None
+    others = ReplicasInCluster(apps) if apps and ray.is_initialized() else None
     with _page(document, others, address):
         try:
             yield document
@@ -78,7 +78,7 @@ def follow(results: Path, address: tuple[str, int]) -> None:
 
 
 @contextlib.contextmanager
-def _page(document: ResultsDocument, others: ReplicaViews | None, address: tuple[str, int]) -> Iterator[None]:
+def _page(document: ResultsDocument, others: ReplicasInCluster | None, address: tuple[str, int]) -> Iterator[None]:
     fleet = Fleet(None, others, document.read)
     with page_server(fleet, address, load_keys(), name=_NAME, videos=document.video) as url:
         out.print(f"live: {url}")

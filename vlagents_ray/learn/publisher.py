@@ -25,7 +25,7 @@ from vlagents_ray.errors import ConfigError, InvalidWeights, PolicyUnavailable, 
 from vlagents_ray.protocol.frames import read_error
 from vlagents_ray.serve.endpoints.weights import PATH
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.scaling.weight_push import OwnWeights, Values, WeightPusher, WeightsReplica
+from vlagents_ray.serve.scaling.weight_push import ThisReplica, Values, WeightPusher, WeightsReplica
 from vlagents_ray.serve.weights import PushMode, PushOptions, PushResult
 from vlagents_ray.weights.safetensors import MESSAGE_BYTES, header_of, parts_of
 from vlagents_ray.weights.shared_values import NotShared, gpu_of, shared
@@ -92,16 +92,14 @@ class Publisher:
         Args:
             named: The values by name, as `Agent.parameters` names them: numpy or JAX arrays or torch tensors, e.g. a
                 `state_dict`. They are copied before this returns, so that the learner can go on.
-            mode: When sessions change: at their next reset ("next_episode"), between two acts ("keep"), or once the
-                episodes of all sessions of their replica have ended, until when resets wait ("wait").
+            mode: When sessions change: at their next reset ("next_episode"), or between two acts ("keep").
             partial: Whether names may be missing, whose values stay, as when only adapters are trained.
             allow_same: Whether all values may equal those that the policy holds.
             pin: Whether robots, and others that do not follow, also act with it from their next reset on.
             version: The number of the version, such as the step of training; by default the newest one's + 1.
 
         Returns:
-            The version, as in `act.info["policy"]["version"]`. With "wait", replicas act with it
-            later; see `acknowledged`.
+            The version, as in `act.info["policy"]["version"]`.
 
         Raises:
             InvalidWeights: The values do not fit the policy; nothing was changed.
@@ -151,13 +149,15 @@ class EngineTarget(WeightsTarget):
 
     def __init__(self, engine: Engine) -> None:
         """Push to that engine alone."""
-        self._own = OwnWeights("this process", engine.weights)
+        self._engine = engine
 
     def push(self, named: Mapping[str, Any], options: PushOptions) -> int:
-        return asyncio.run(WeightPusher(self._own, _no_siblings).push(named, options)).version
+        return asyncio.run(
+            WeightPusher(ThisReplica("this process", self._engine.weights), _no_siblings).push(named, options)
+        ).version
 
     def versions(self) -> list[int]:
-        return [asyncio.run(self._own.newest_weights()).number]
+        return [self._engine.weights.number]
 
 
 class AppTarget(WeightsTarget):

@@ -11,7 +11,6 @@ from ray.serve.exceptions import RayServeException
 
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.serve.config.deployment import ServerArgs
-from vlagents_ray.serve.launch.deployment_file import with_candidate
 from vlagents_ray.serve.replica import app
 from vlagents_ray.settings import wrong_settings
 
@@ -26,10 +25,7 @@ def build(args: Mapping[str, Any] | ServerArgs) -> Application:
             this exception alone, and a traceback of forty lines for any other.
     """
     try:
-        settings = ServerArgs.model_validate(args)
-        if settings.shadow is not None:
-            settings = settings.model_copy(update={"shadow": with_candidate(settings.shadow)})
-        return app.build(settings)
+        return app.build(ServerArgs.model_validate(args))
     except ValidationError as error:
         raise RayServeException(wrong_settings(error, ServerArgs)) from None
     except VLAgentsError as error:

@@ -47,7 +47,6 @@ class Session(Generic[M]):
     weights: WeightsVersion | None = None  # version of the model's weights with which it acts
     instruction: str = ""  # of its last reset
     follows: bool = True  # whether it takes the newest version of the weights, otherwise the pinned one
-    told_to_follow: bool | None = None  # what an operator wants of its later episodes; None: what their resets say
     over: bool = False  # whether the session has ended, so that no table contains it
     resetting: PendingRequest | None = None  # reset that waits for its checkpoint
     origin: Origin = NOWHERE  # of its last request; without an owner it ends when it is closed or idle for long

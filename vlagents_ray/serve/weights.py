@@ -9,9 +9,9 @@ no time if it is that already. A version is freed when no session acts with it a
 from __future__ import annotations
 
 import threading
-import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol, get_args
 from weakref import WeakValueDictionary
@@ -30,16 +30,14 @@ from vlagents_ray.errors import (
 from vlagents_ray.interface import POLICY, Agent
 from vlagents_ray.policies.compilation import CAPTURES
 from vlagents_ray.weights.safetensors import ValueSpec, read_header
-from vlagents_ray.weights.shared_values import gpu_of
+from vlagents_ray.weights.shared_values import SharedValues, gpu_of, opened
 from vlagents_ray.weights.trainable import fingerprint, fitted, is_copied, own_copy, portable, require_fit
 
 DIGITS = 16  # of a checkpoint's digest in place of a fingerprint, hexadecimal
-WAIT_S = 600.0  # time for which a commit with the mode "wait" holds up resets, s: a session may never end its episode
 STAGED_S = 60.0  # time for which a staged version waits for its commit, s
 
-PushMode = Literal["keep", "next_episode", "wait"]
-"""When a session changes to a new version: between two of its acts; at its next reset; or once the episodes of all
-sessions have ended, until when resets wait."""
+PushMode = Literal["keep", "next_episode"]
+"""When a session changes to a new version: between two of its acts, or at its next reset."""
 OPTION = "weights"  # of a reset
 _COLLECTED = 1000  # most durations of pushes that wait to be collected
 _LARGEST = 2**53 - 1  # number of a version, which JSON carries exactly
@@ -67,14 +65,6 @@ class FollowingSession(Protocol):
 
     weights: WeightsVersion | None  # with which it acts; None without an episode
     follows: bool  # whether it takes the newest version, otherwise the pinned one
-
-
-@dataclass(frozen=True, slots=True)
-class _Commit:
-    number: int
-    sessions: Callable[[], Iterable[FollowingSession]]
-    pin: bool
-    until: float  # time.monotonic()
 
 
 class ModelWeights:
@@ -106,7 +96,6 @@ class ModelWeights:
         self.newest = self.pinned = first
         self._staged: WeightsVersion | None = None
         self._timer: threading.Timer | None = None
-        self._waiting: _Commit | None = None  # of the staged version, once the running episodes have ended
         self._live: WeightsVersion | None = first  # which the agent has; None if it could not be loaded
         self._alive = WeakValueDictionary({0: first})
 
@@ -194,9 +183,7 @@ class ModelWeights:
                     f"faster; push again"
                 )
             if self._staged is not None:
-                raise Overloaded(
-                    "weights: another push is under way, or waits for the end of episodes; push again when it is over"
-                )
+                raise Overloaded("weights: another push is under way; push again when it is over")
             self._staged = placeholder
         try:
             with CAPTURES.pushes:
@@ -229,40 +216,19 @@ class ModelWeights:
             WeightsNotStaged: It is neither staged nor the newest.
         """
         with self._lock:
-            if self.newest.number == number or (self._waiting is not None and self._waiting.number == number):
+            if self.newest.number == number:
                 return
             if self._staged is None or self._staged.number != number or self._staged.values is None:
                 raise WeightsNotStaged(
                     f"weights: version {number} is not staged here; push it again, and commit within {STAGED_S:g} s"
                 )
-            self._stop_timer()
-            self._waiting = _Commit(number, sessions, pin, time.monotonic() + WAIT_S)
-            if mode != "wait":
-                self._finish(self._waiting)
+            self.newest = self._alive[number] = self._staged
+            if pin:
+                self.pinned = self.newest
+            self._forget_staged()
             if mode == "keep":
                 for session in self._running(sessions):
                     session.weights = self.newest
-        self.settle()
-
-    def settle(self) -> bool:
-        """Finish a commit that waits for the end of all episodes; return whether none waits.
-
-        It is finished once they have ended, or after `WAIT_S`: sessions that still run change at their next reset.
-        """
-        if self._waiting is None:
-            return True
-        with self._lock:
-            waiting = self._waiting
-            if waiting is not None and (time.monotonic() > waiting.until or not self._running(waiting.sessions)):
-                self._finish(waiting)
-            return self._waiting is None
-
-    def _finish(self, commit: _Commit) -> None:
-        if self._staged is not None:
-            self.newest = self._alive[commit.number] = self._staged
-        if commit.pin:
-            self.pinned = self.newest
-        self._forget_staged()
 
     def _running(self, sessions: Callable[[], Iterable[FollowingSession]]) -> list[FollowingSession]:
         """Return the sessions that follow and have an episode with a version of this model."""
@@ -286,10 +252,7 @@ class ModelWeights:
             return {name: portable(value) for name, value in self._values(version).items()}
 
     def _forget_staged(self) -> None:
-        self._staged = self._waiting = None
-        self._stop_timer()
-
-    def _stop_timer(self) -> None:
+        self._staged = None
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
@@ -369,9 +332,10 @@ class WeightUpdates:
         """Check values before they arrive; see `ModelWeights.read_header`."""
         return self._own().read_header(header, partial=options.partial)
 
-    def stage(self, number: int, pushed: Mapping[str, Any], options: PushOptions) -> str:
+    def stage(self, number: int, pushed: Mapping[str, Any] | SharedValues, options: PushOptions) -> str:
         """Check and hold a new version, and return its fingerprint; see `ModelWeights.stage`."""
-        return self._own().stage(number, pushed, partial=options.partial, allow_same=options.allow_same)
+        with opened(pushed) if isinstance(pushed, SharedValues) else nullcontext(pushed) as named:
+            return self._own().stage(number, named, partial=options.partial, allow_same=options.allow_same)
 
     def commit(self, number: int, options: PushOptions) -> None:
         """Act with the staged version; see `ModelWeights.commit`."""
@@ -396,18 +360,16 @@ class WeightUpdates:
             return None
         return {"newest": own.newest.describe(), "pinned": own.pinned.describe()}
 
-    @property
     def newest(self) -> NewestVersion:
-        """The newest version; raises `PolicyUnavailable` while the policy loads."""
+        """Return the newest version; raises `PolicyUnavailable` while the policy loads."""
         own = self._own()
-        own.settle()
         return NewestVersion(own.newest.number, own.model, own.gpu)
 
     @property
     def number(self) -> int:
         """Number of the newest version; 0 while the policy loads."""
         try:
-            return self.newest.number
+            return self._own().newest.number
         except PolicyUnavailable:
             return 0
 

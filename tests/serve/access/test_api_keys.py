@@ -286,18 +286,6 @@ def test_a_file_that_cannot_be_given_to_its_owner_is_left_as_it_is(file: Path, m
     assert list(file.parent.iterdir()) == [file]
 
 
-def test_the_command_says_that_the_server_cannot_read_the_file(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    new_key(file, "arm")
-    if os.geteuid() == 0:
-        file.parent.chmod(0o700)
-        os.chown(file, 1234, 1234)
-    else:  # as if this were root's command, and the file another's
-        monkeypatch.setattr(key_store, "_readable_by", lambda *_: False)
-    with pytest.raises(ConfigError, match="cannot read it"):
-        revoke(file, "arm")
-    assert read_keys(file)[0].revoked
-
-
 def test_a_rate_is_kept_by_name_over_all_connections(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     now = 1000.0
     monkeypatch.setattr(api_keys.time, "monotonic", lambda: now)

@@ -44,7 +44,7 @@ from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.endpoints.weights import weights_routes
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.scaling.weight_push import OwnWeights, WeightPusher
+from vlagents_ray.serve.scaling.weight_push import ThisReplica, WeightPusher
 from vlagents_ray.serve.weights import PushOptions, PushResult
 from vlagents_ray.weights.safetensors import MESSAGE_BYTES, PART_BYTES, header_of, parts_of, read_header
 
@@ -70,7 +70,7 @@ class Alone:
     """One replica."""
 
     def __init__(self, engine: Engine) -> None:
-        own = OwnWeights("this", engine.weights)
+        own = ThisReplica("this", engine.weights)
 
         async def others() -> tuple[()]:
             return ()
@@ -144,10 +144,11 @@ def test_a_learner_elsewhere_pushes_and_asks_which_replicas_act_with_it(serving:
 def test_values_that_are_received_are_not_copied_again(serving: Serving, monkeypatch: pytest.MonkeyPatch) -> None:
     server = serving()
     received: list[Mapping[str, Any]] = []
-    stage = server.engine.weights.stage
-    monkeypatch.setattr(server.engine.weights, "stage", lambda *args: (received.append(args[1]), stage(*args))[1])
+    own = server.engine.models.own_weights
+    stage = own.stage
+    monkeypatch.setattr(own, "stage", lambda *args, **how: (received.append(args[1]), stage(*args, **how))[1])
     Publisher(server.url).push(gains(1))
-    assert np.shares_memory(server.engine.models.own_weights.newest.values["gain"], received[0]["gain"])
+    assert np.shares_memory(own.newest.values["gain"], received[0]["gain"])
 
 
 def test_what_does_not_fit_is_refused_before_it_is_sent(serving: Serving, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -311,10 +312,10 @@ def test_text_is_no_part(serving: Serving) -> None:
 def test_an_error_of_the_server_itself_is_not_shown(serving: Serving, monkeypatch: pytest.MonkeyPatch) -> None:
     server = serving()
 
-    def fail(*args: Any) -> str:
+    def fail(*args: Any, **how: Any) -> str:
         raise RuntimeError("secret")
 
-    monkeypatch.setattr(server.engine.weights, "stage", fail)
+    monkeypatch.setattr(server.engine.models.own_weights, "stage", fail)
     with pytest.raises(VLAgentsError, match="internal error"):
         Publisher(server.url).push(gains(1))
 
@@ -324,10 +325,9 @@ def test_a_push_whose_learner_leaves_after_the_last_part_is_completed(
 ) -> None:
     server = serving()
     begun, may_go_on = threading.Event(), threading.Event()
-    stage = server.engine.weights.stage
-    monkeypatch.setattr(
-        server.engine.weights, "stage", lambda *args: (begun.set(), may_go_on.wait(30), stage(*args))[2]
-    )
+    own = server.engine.models.own_weights
+    stage = own.stage
+    monkeypatch.setattr(own, "stage", lambda *args, **how: (begun.set(), may_go_on.wait(30), stage(*args, **how))[2])
     values = {"offset": np.ones(2, np.float32)}
     with opened(server, "?partial=true") as socket:
         answer(socket, header_of(values))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Iterator
 
 import pytest
@@ -17,7 +16,6 @@ from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.observer import Observer, Observers
 from vlagents_ray.serve.engine.sender import Sender
-from vlagents_ray.serve.observers.worker import Worker
 from vlagents_ray.serve.requests import Message, PendingRequest
 
 
@@ -87,18 +85,3 @@ def test_an_engine_is_observed_as_long_as_there_is_an_observer() -> None:
     observers.remove(one)
     observers.remove(two)
     assert observers.any is False
-
-
-def test_a_worker_goes_on_after_an_error_and_makes_the_calls_that_wait_before_it_ends() -> None:
-    worker, made, go_on = Worker("test"), list[int](), threading.Event()
-
-    def wait() -> None:
-        assert go_on.wait(10)
-        made.append(1)
-
-    worker.put(wait)
-    worker.put(lambda: made.append(1 // 0))
-    worker.put(lambda: made.append(3))
-    go_on.set()
-    worker.close()
-    assert made == [1, 3]

@@ -19,7 +19,6 @@ from manual_clock import Clock
 from many import many
 from observed import observe
 
-from vlagents_ray.chunking.execution import PLAYED
 from vlagents_ray.errors import InvalidInput, MessageTooLarge, Overloaded, StorageFailed
 from vlagents_ray.images import jpeg_png
 from vlagents_ray.images.codecs import DecodedFiles
@@ -47,22 +46,12 @@ def acted(**info: Any) -> Reply:
     return Reply(act=Act(np.zeros((2, 7), np.float32), info=info))
 
 
-def played(**stated: Any) -> Message:
-    return Obs(info={PLAYED: {"steps": np.zeros(0, np.int64), "rows": np.zeros((0, 0), np.float32), **stated}}), acted()
-
-
 def small_image_of_a_large_message() -> Message:
     pixels = np.frombuffer(bytes(LARGE), np.uint8)
     return Obs({"front": pixels[:192].reshape(8, 8, 3)}), acted()
 
 
 MESSAGES: dict[str, Callable[[], Message]] = {
-    "a text in played": lambda: played(safe="x" * LARGE),
-    "a number in played": lambda: played(step=1 << (8 * LARGE)),
-    "a text in place of a number": lambda: played(age_ms="x" * LARGE),
-    "many rows in played": lambda: played(steps=np.zeros(2**12, np.int64), rows=np.ones((2**12, 64), np.float32)),
-    "wide rows in played": lambda: played(steps=np.zeros(1, np.int64), rows=np.ones((1, 2**18), np.float32)),
-    "an unknown entry of played": lambda: played(more=bytes(LARGE)),
     "a text in info": lambda: (Obs(info={"note": "x" * LARGE}), acted()),
     "a large state": lambda: (Obs(state={"joints": np.zeros(LARGE // 4, np.float32)}), acted()),
     "many parts of a state": lambda: (Obs(state={str(i): np.zeros(1, np.float32) for i in range(500)}), acted()),
@@ -110,7 +99,7 @@ def send(watched: LiveObserver, session: str, message: Message, files: DecodedFi
 @pytest.mark.parametrize("kind", MESSAGES)
 def test_many_messages_of_the_largest_size_leave_bounded_memory_in_the_live_observer(budgets: None, kind: str) -> None:
     watched = LiveObserver(Observers(), clock=Clock())
-    watched.renew(viewer=True)
+    watched.renew()
     with Kept() as kept:
         for number in range(200):
             send(watched, f"key/{number}", MESSAGES[kind]())
@@ -135,7 +124,7 @@ def test_messages_of_all_kinds_in_any_order_leave_bounded_memory_in_the_live_obs
         watched = LiveObserver(Observers(), clock=clock)
         with Kept() as kept:
             for kind, session, then in sent:
-                watched.renew(viewer=True)
+                watched.renew()
                 send(watched, str(session), MESSAGES[kind]())
                 clock.now += 2.0 if then == "old" else 0.2
                 if then == "read" and watched.observation(str(session)) is not None:

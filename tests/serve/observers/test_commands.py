@@ -242,17 +242,6 @@ def test_a_robot_that_has_not_opted_in_goes_on(server: LiveServer) -> None:
         assert arm.stops == 0
 
 
-def test_a_session_is_pinned_until_it_is_told_to_follow_again(server: LiveServer) -> None:
-    with RemoteAgent(server.url, rank="simulation") as agent:
-        agent.reset(Obs())
-        [session] = server.engine.sessions.ids()
-        for do, follows in (("pin", False), ("follow", True)):
-            assert post(server, {"session": session, "do": do})[1]["state"] == "done"
-            assert server.engine.sessions.get(session).follows is follows
-            agent.reset(Obs(), weights="pinned" if follows else "follow")  # the robot's own wish comes second
-            assert server.engine.sessions.get(session).follows is follows
-
-
 def test_viewers_see_the_commands_and_whether_they_may_give_some(server: LiveServer) -> None:
     with RemoteAgent(server.url) as agent, server.viewer() as viewer:
         agent.reset(Obs())

@@ -10,7 +10,6 @@ import pytest
 from manual_clock import Clock
 from observed import observe
 
-from vlagents_ray.chunking.execution import WATCHED
 from vlagents_ray.images.codecs import DecodedFiles
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.protocol.messages import Reply, Request
@@ -67,20 +66,6 @@ def test_answers_are_kept_in_order(watched: Watched) -> None:
     first, second = watched.live.answers(0)
     assert (first.session, first.op, second.session, second.op) == ("a", "act", "b", "reset")
     assert watched.live.answers(first.number) == [second]
-
-
-def test_players_are_told_of_viewers_and_of_nothing_else_that_reads(watched: Watched) -> None:
-    """What they then state with each request costs half a millisecond over shared memory."""
-    watched.live.renew()
-    watched.ask("a", Obs())
-    watched.live.renew(viewer=True)
-    watched.ask("a", Obs())
-    watched.ask("a", Obs())
-    watched.clock.now += LEASE_S
-    watched.live.renew()
-    watched.ask("a", Obs())
-    told = [reply.act is not None and WATCHED in reply.act.info for reply in watched.replies]
-    assert told == [False, True, False, False]
 
 
 def test_observations_are_kept_ten_times_a_second_at_most(watched: Watched) -> None:

@@ -26,7 +26,7 @@ from vlagents_ray.protocol.values import from_text
 from vlagents_ray.robot.dataset import Dataset
 from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.observers import episodes, recording
-from vlagents_ray.serve.observers.recording import SessionRecorder
+from vlagents_ray.serve.observers.recording import SessionRecorder, Worker
 
 
 def rows(root: Path, episode: int = 0) -> dict[str, list]:
@@ -354,3 +354,18 @@ def test_two_recorders_see_the_same(tmp_path: Path) -> None:
         second.close()
     one, two = only(tmp_path / "one"), only(tmp_path / "two")
     assert rows(one)["chunk"] == rows(two)["chunk"]
+
+
+def test_a_worker_goes_on_after_an_error_and_makes_the_calls_that_wait_before_it_ends() -> None:
+    worker, made, go_on = Worker("test"), list[int](), threading.Event()
+
+    def wait() -> None:
+        assert go_on.wait(10)
+        made.append(1)
+
+    worker.put(wait)
+    worker.put(lambda: made.append(1 // 0))
+    worker.put(lambda: made.append(3))
+    go_on.set()
+    worker.close(10)
+    assert made == [1, 3]

@@ -11,11 +11,11 @@ from ray.exceptions import ActorDiedError, ActorUnavailableError, RayTaskError
 from vlagents_ray.errors import InvalidWeights
 from vlagents_ray.serve.scaling import sibling_replicas
 from vlagents_ray.serve.scaling.session_migration import PeerEnded, PeerUnreachable
-from vlagents_ray.serve.weights import PushOptions
+from vlagents_ray.serve.weights import PushOptions, WeightUpdates
 
 
 def raised(cause: Exception) -> RayTaskError:
-    return RayTaskError("stage_weights", "a traceback", cause)
+    return RayTaskError("weights", "a traceback", cause)
 
 
 @pytest.mark.parametrize(
@@ -31,12 +31,12 @@ def raised(cause: Exception) -> RayTaskError:
 )
 def test_errors_of_another_replica(monkeypatch: pytest.MonkeyPatch, error: Exception, becomes: type[Exception]) -> None:
     async def call(actor: Any, method: Any, *args: Any) -> Any:
-        assert (actor, method.__name__, args) == ("actor", "stage_weights", (1, {}, PushOptions()))
+        assert (actor, method.__name__, args) == ("actor", "weights", ("stage", 1, {}, PushOptions()))
         raise error
 
     monkeypatch.setattr(sibling_replicas, "call_replica", call)
     replica = sibling_replicas._Sibling("r1", "actor")
     with pytest.raises(becomes) as found:
-        asyncio.run(replica.stage_weights(1, {}, PushOptions()))
+        asyncio.run(replica.weights(WeightUpdates.stage, 1, {}, PushOptions()))
     assert type(found.value) is becomes
     assert str(found.value)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import queue
-from collections.abc import Awaitable, Callable, Iterator, Mapping
-from typing import Any, ClassVar
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import pytest
@@ -16,8 +16,10 @@ from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.scaling.session_migration import PeerEnded, PeerUnreachable
-from vlagents_ray.serve.scaling.weight_push import OwnWeights, WeightPusher, WeightsReplica
+from vlagents_ray.serve.scaling.weight_push import ThisReplica, WeightPusher, WeightsReplica
 from vlagents_ray.serve.weights import PushOptions, PushResult
+
+T = TypeVar("T")
 
 
 class Gain(Agent):
@@ -35,7 +37,7 @@ class Gain(Agent):
         return Act(self.tree["gain"].copy())
 
 
-class Replica(OwnWeights):
+class Replica(ThisReplica):
     """A replica in this process, of which the calls of other replicas fail on demand."""
 
     def __init__(self, name: str, agent: Agent) -> None:
@@ -66,14 +68,11 @@ class _Seen:
         self._replica = replica
         self.name = replica.name
 
-    def __getattr__(self, method: str) -> Callable[..., Awaitable[Any]]:
-        async def call(*args: Any) -> Any:
-            self._replica.calls.append(method)
-            if method in self._replica.fails:
-                raise self._replica.fails[method]
-            return await getattr(self._replica, method)(*args)
-
-        return call
+    async def weights(self, method: Callable[..., T], *args: Any) -> T:
+        self._replica.calls.append(method.__name__)
+        if method.__name__ in self._replica.fails:
+            raise self._replica.fails[method.__name__]
+        return await self._replica.weights(method, *args)
 
 
 class Application:
@@ -172,7 +171,7 @@ def test_a_learner_numbers_versions_as_it_likes_if_they_rise(app: Application) -
 
 def test_if_one_replica_cannot_be_reached_none_acts_with_it(app: Application) -> None:
     _, far = app.start(Gain(), Gain())
-    far.fails["stage_weights"] = PeerUnreachable("no route")
+    far.fails["stage"] = PeerUnreachable("no route")
     with pytest.raises(PolicyUnavailable, match="replica r1 cannot be reached, so that nothing was changed"):
         app.push(5)
     far.fails.clear()
@@ -180,7 +179,7 @@ def test_if_one_replica_cannot_be_reached_none_acts_with_it(app: Application) ->
     app.push(5)
 
 
-@pytest.mark.parametrize("phase", ["newest_weights", "stage_weights", "commit_weights"])
+@pytest.mark.parametrize("phase", ["newest", "stage", "commit"])
 def test_a_replica_that_ends_does_not_hold_up_the_others(app: Application, phase: str) -> None:
     _, ending, _ = app.start(Gain(), Gain(), Gain())
     ending.fails[phase] = PeerEnded("killed")
@@ -214,13 +213,13 @@ def test_a_replica_that_loads_does_not_hold_up_the_others_and_one_that_is_lost_d
     _, other = app.start(Gain(), Gain())
     pusher = app.pusher(app.replicas[0])
     for error in (PeerUnreachable("no answer"), PolicyUnavailable("the policy is loading")):
-        other.fails["newest_weights"] = error
+        other.fails["newest"] = error
         pushed = asyncio.run(pusher.push(_gains(len(str(error))), PushOptions()))
         assert pushed.replicas == ("r0",)
     other.fails.clear()
     assert app.catch_up(other) == 2
     asyncio.run(pusher.push(_gains(5), PushOptions()))
-    other.fails["newest_weights"] = PeerUnreachable("no answer")
+    other.fails["newest"] = PeerUnreachable("no answer")
     with pytest.raises(PolicyUnavailable, match="replica r1 cannot be reached"):
         asyncio.run(pusher.push(_gains(6), PushOptions()))
     assert app.gains() == [(3, 5.0)] * 2
@@ -228,10 +227,10 @@ def test_a_replica_that_loads_does_not_hold_up_the_others_and_one_that_is_lost_d
 
 def test_a_replica_that_missed_a_commit_catches_up(app: Application) -> None:
     _, far = app.start(Gain(), Gain())
-    far.fails["commit_weights"] = PeerUnreachable("no route")
+    far.fails["commit"] = PeerUnreachable("no route")
     result = app.push(5)
     assert result.replicas == ("r0",)
-    assert far.calls.count("commit_weights") > 1
+    assert far.calls.count("commit") > 1
     assert far.gain() == (0, 0.0)
     far.engine.weights.drop(1)  # as after a minute
     assert app.catch_up(far) == 1
@@ -240,7 +239,7 @@ def test_a_replica_that_missed_a_commit_catches_up(app: Application) -> None:
 
 def test_a_replica_without_others_to_ask_stays_as_it_is(app: Application) -> None:
     mute, alone = app.start(Gain(), Gain())
-    mute.fails["newest_weights"] = PeerUnreachable("no route")
+    mute.fails["newest"] = PeerUnreachable("no route")
     assert app.catch_up(alone) == 0
 
 

@@ -145,49 +145,6 @@ def test_with_keep_running_episodes_change_at_once(serving: Callable[..., Served
     assert served.act("a") == (1, 1.0)
 
 
-def test_with_wait_no_episode_begins_until_all_have_ended_and_robots_are_not_held_up(
-    serving: Callable[..., Served],
-) -> None:
-    served = serving(Gain())
-    for session in "ab":
-        served.reset(session)
-    served.reset("robot", "robot")
-    served.push(1, "wait")
-    served.learn.commit(1, PushOptions("wait"))  # as when its reply was lost
-    assert served.learn.number == 0
-    waiting: queue.SimpleQueue[Reply] = queue.SimpleQueue()
-    for session in ("a", "new"):
-        submit(served.engine, session, Request("reset", Obs(), rank="simulation"), waiting.put)
-    assert served.act("b") == (0, 0.0)
-    served.reset("robot", "robot")
-    assert served.act("robot") == (0, 0.0)
-    assert waiting.empty()
-    with pytest.raises(Overloaded, match="or waits for the end of episodes"):
-        served.learn.stage(2, gains(2), PushOptions())
-    served.ask("b", Request("close"))
-    for _ in range(2):
-        assert waiting.get(timeout=30).info == {"gain": 1.0}
-    assert [served.act(session) for session in ("a", "new", "robot")] == [(1, 1.0), (1, 1.0), (0, 0.0)]
-    served.push(2, "wait")
-    served.ask("new", Request("close"))
-    served.ask("a", Request("close"))
-    assert served.learn.number == 2  # without a reset
-
-
-def test_with_wait_a_session_that_never_ends_holds_up_resets_for_a_limited_time(
-    serving: Callable[..., Served], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    served = serving(Gain())
-    served.reset("endless")
-    monkeypatch.setattr(versions, "WAIT_S", 0.2)
-    served.push(1, "wait")
-    served.reset("new")
-    assert served.act("new") == (1, 1.0)
-    assert served.act("endless") == (0, 0.0)
-    served.reset("endless")
-    assert served.act("endless") == (1, 1.0)
-
-
 @AGENTS
 def test_the_fingerprint_is_that_of_what_the_agent_holds(serving: Callable[..., Served], agent: type[Gain]) -> None:
     served = serving(agent())

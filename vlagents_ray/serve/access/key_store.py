@@ -15,7 +15,6 @@ import json
 import os
 import re
 import secrets
-import subprocess
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, fields, replace
@@ -27,7 +26,6 @@ from vlagents_ray.protocol.messages import RANKS, RankName
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _SHA256 = re.compile(r"[0-9a-f]{64}")
-_ACL = "system.posix_acl_access"  # the extended attribute that holds a file's access list
 # What a key may do besides commanding the policy: push new weights, watch all sessions on the live page, and press its
 # buttons, which pause, stop, mark or, where a robot offers that, move them.
 SCOPES = ("weights", "watch", "operate")
@@ -174,11 +172,10 @@ def _change(file: Path, change: Callable[[list[Key]], list[Key]]) -> None:
             Path(name).unlink(missing_ok=True)
             raise
         _sync_folder(file.parent)
-    _require_readable(file)
 
 
 def _belong(descriptor: int, file: Path) -> None:
-    """Give the open file `descriptor` the owner, group, mode and access list of `file`, which it will replace."""
+    """Give the open file `descriptor` the owner, group and mode of `file`, which it will replace."""
     try:
         old = file.stat()
     except FileNotFoundError:
@@ -189,8 +186,6 @@ def _belong(descriptor: int, file: Path) -> None:
         if (old.st_uid, old.st_gid) != (new.st_uid, new.st_gid):
             os.fchown(descriptor, old.st_uid, old.st_gid)
         os.fchmod(descriptor, old.st_mode & 0o777)
-        if hasattr(os, "listxattr") and _ACL in os.listxattr(file):
-            os.setxattr(descriptor, _ACL, os.getxattr(file, _ACL))
     except OSError as error:
         raise ConfigError(
             f"keys file {file}: is user {old.st_uid}'s (group {old.st_gid}), which a new one cannot be made "
@@ -205,26 +200,6 @@ def _sync_folder(folder: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
-
-
-def _require_readable(file: Path) -> None:
-    """Raise `ConfigError` if the owner of the file, as whom the server runs, cannot read it."""
-    parse_keys(read_text(file))
-    owner = file.stat()
-    if not _readable_by(file, owner.st_uid, owner.st_gid):
-        raise ConfigError(
-            f"keys file {file}: was changed, and user {owner.st_uid}, whose it is, cannot read it: a server of that "
-            f"user lets nobody in before long; look at the modes of the folders above it"
-        )
-
-
-def _readable_by(file: Path, user: int, group: int) -> bool:
-    """Whether `user` can read the file; assumed to be so unless this process is root, which alone can test it."""
-    if os.geteuid() != 0 or user == 0:
-        return True
-    command = ["test", "-r", str(file.absolute())]
-    who: dict[str, Any] = {"user": user, "group": group, "extra_groups": ()}
-    return subprocess.run(command, check=False, **who).returncode == 0  # noqa: S603 - a program of the system's
 
 
 def _document(key: Key) -> dict[str, Any]:

@@ -10,9 +10,8 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Agent
 from vlagents_ray.policies.adapters import ADAPTER
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
@@ -21,10 +20,8 @@ from vlagents_ray.serve.access.api_keys import Keys, load_keys
 from vlagents_ray.serve.config.dialects import DialectArgs
 from vlagents_ray.serve.models.checkpoints import Checkpoints
 from vlagents_ray.serve.queue.call_limits import CallLimits
-from vlagents_ray.settings import wrong_settings
-from vlagents_ray.viewers.targets import is_live, require_no_server
 
-POLICY, GATEWAY, SHADOW = "Policy", "Gateway", "Shadow"  # the deployments of an application
+POLICY, GATEWAY = "Policy", "Gateway"  # the deployments of an application
 _PYTHON = re.compile(r"^# python: (3\.\d+)\s*$", re.MULTILINE)
 
 # Links are not followed: the interpreter of a virtual environment links to that of its creator.
@@ -46,50 +43,6 @@ class LiveArgs(_DeploymentModel):
         default=256.0, gt=0, description="memory that all sessions of a replica take at most, MB; the oldest goes first"
     )
     most_gb: float = Field(default=50.0, gt=0, description="size of the folder at which nothing more is saved, GB")
-
-
-class ShadowArgs(_DeploymentModel):
-    """A candidate that acts on what the policy acts on; its actions are compared with the policy's, never executed."""
-
-    policy: str | dict[str, Any] = Field(
-        description="the candidate: its deployment file, a registered name, 'module:Class', or the `args` of a "
-        "deployment. It has one replica, with the file's resources and environment"
-    )
-    share: float = Field(default=0.1, gt=0, le=1, description="share of the sessions that the candidate follows")
-    queue: int = Field(
-        default=32, ge=1, description="observations that wait for the candidate at most; further ones are dropped"
-    )
-    record: AbsolutePath | None = Field(
-        default=None,
-        description="folder on the candidate's node, where each comparison becomes a line of JSON; a relative path is "
-        "one from the working directory",
-    )
-    record_mb: int = Field(default=1000, ge=1, description="most MB of these files; the oldest ones are deleted")
-
-
-class ViewerArgs(_DeploymentModel):
-    """Where the episodes of all sessions are shown; unset: nowhere."""
-
-    rerun: str | None = Field(
-        default=None, description="an absolute folder for `.rrd` files, or the address of a viewer of Rerun"
-    )
-    foxglove: str | None = Field(default=None, description="an absolute folder for `.mcap` files")
-
-    @field_validator("foxglove")
-    @classmethod
-    def _no_server(cls, foxglove: str | None) -> str | None:
-        return require_no_server(foxglove)
-
-    @field_validator("rerun", "foxglove")
-    @classmethod
-    def _absolute(cls, target: str | None) -> str | None:
-        if target is not None and not is_live("rerun", target) and not Path(target).is_absolute():
-            raise ValueError(f"got {target!r}, want an absolute folder: replicas run in another one than this command")
-        return target
-
-    def targets(self) -> dict[str, str]:
-        """Return the target of each viewer that has one."""
-        return {name: target for name, target in self.model_dump().items() if target is not None}
 
 
 def python_wanted_by(requirements: Path) -> str | None:
@@ -161,9 +114,6 @@ class EnvironmentArgs(_DeploymentModel):
         if self.env_vars:
             found["env_vars"] = self.env_vars
         return found
-
-
-POLICY, GATEWAY, SHADOW = "Policy", "Gateway", "Shadow"  # the deployments of an application
 
 
 class BatchArgs(_DeploymentModel):
@@ -427,28 +377,9 @@ class ServerArgs(_DeploymentModel):
     record: RecordArgs | None = Field(default=None, description="keeps requests and answers; unset: nothing is kept")
     environment: EnvironmentArgs = Field(default=EnvironmentArgs(), description="the Python that the policy runs in")
     dialects: DialectArgs = Field(default=DialectArgs(), description="other systems' clients that may connect")
-    shadow: ShadowArgs | None = Field(
-        default=None, description="a candidate that acts on live observations; its actions are never executed"
-    )
-    viewers: ViewerArgs = Field(default=ViewerArgs(), description="recordings of all sessions for Rerun and Foxglove")
 
     @model_validator(mode="after")
     def _one_scaling(self) -> ServerArgs:
         if self.replicas is not None and self.autoscaling is not None:
             raise ValueError("replicas and autoscaling exclude each other; keep one")
         return self
-
-
-def candidate_of(shadow: ShadowArgs) -> ServerArgs:
-    """Return the settings of a shadow's candidate, which stand in `policy` in place of a file.
-
-    Raises:
-        ConfigError: One of them is wrong, or the candidate has a shadow itself.
-    """
-    try:
-        args = ServerArgs.model_validate(shadow.policy)
-    except ValidationError as error:
-        raise ConfigError(f"shadow.policy: {wrong_settings(error, ServerArgs)}") from error
-    if args.shadow is not None:
-        raise ConfigError("shadow: the candidate has a shadow itself, want one candidate; leave its `shadow:` out")
-    return args

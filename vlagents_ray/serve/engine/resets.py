@@ -55,8 +55,6 @@ class Resets:
             if self._sessions.is_past(session_id, opening.first):
                 raise UnknownSession(f"session {session_id!r}: reset elsewhere, or ended, while this reset waited")
             session = self._sessions.open(session_id, pending.origin)
-            if session.told_to_follow is not None:
-                opening.follows = session.told_to_follow
             session.agent, session.weights, session.follows = None, None, opening.follows
             session.steps, session.resetting = opening.first, pending
             session.first, session.moves = opening.first, 0

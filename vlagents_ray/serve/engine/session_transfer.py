@@ -58,7 +58,6 @@ class SessionTransfer:
                 arriving.agent = model.copies.load(state["agent"])
             arriving.weights = model.parameters.find(*state["parameters"])
             arriving.follows, arriving.instruction = state["follows"], state["instruction"]
-            arriving.told_to_follow = state["told_to_follow"]
         except BaseException:
             self.discard(arriving)
             raise
@@ -95,7 +94,6 @@ class SessionTransfer:
             "settings": model.settings,
             "parameters": [weights.number, weights.fingerprint],
             "follows": session.follows,
-            "told_to_follow": session.told_to_follow,
             "instruction": session.instruction,
         }
 

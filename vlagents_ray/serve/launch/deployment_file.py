@@ -17,10 +17,9 @@ from vlagents_ray.policies.base.checkpoint import STEP as STEP_PLACE
 from vlagents_ray.policies.wrapper import build_agent
 from vlagents_ray.ray_tools.runtime_env import require_no_secrets
 from vlagents_ray.registry import names, policy_class
-from vlagents_ray.serve.config.deployment import POLICY, ServerArgs, ShadowArgs, candidate_of
+from vlagents_ray.serve.config.deployment import POLICY, ServerArgs
 from vlagents_ray.serve.dialects.routes import require_fit, require_packages
 from vlagents_ray.serve.models.checkpoints import CHOICE, STEP
-from vlagents_ray.serve.observers.comparison import require_comparable
 from vlagents_ray.serve.python_env.child_main import unloaded_contract
 from vlagents_ray.serve.python_env.probe import check_policy, with_process
 from vlagents_ray.settings import wrong_settings
@@ -35,7 +34,7 @@ def deployment(policy: str, **args: Any) -> ServeDeploySchema:
 
 
 def read_deployment(
-    source: str, overrides: Mapping[str, Any] | None = None, *, step_follows: bool = False, shadows: bool = True
+    source: str, overrides: Mapping[str, Any] | None = None, *, step_follows: bool = False
 ) -> ServeDeploySchema:
     """Read a deployment and check it.
 
@@ -43,7 +42,6 @@ def read_deployment(
         source: A YAML file, or the name of a policy.
         overrides: The args of a policy that is given by its name.
         step_follows: Whether `with_settings` sets `checkpoint_step` later: then a checkpoint with `{step}` needs none.
-        shadows: Whether the file may have a shadow, which a candidate may not.
 
     Raises:
         ConfigError: The file or a setting is invalid.
@@ -59,10 +57,10 @@ def read_deployment(
             document = yaml.safe_load(path.read_text())
         except yaml.YAMLError as error:
             raise ConfigError(f"{source}: not YAML ({error})") from error
-        return _checked(document, source, step_follows, shadows=shadows)
+        return _checked(document, source, step_follows)
     if ":" not in source and source not in names("policies"):
         policy_class(source)  # raises with the list of what there is
-    return _of_name(source, overrides or {}, step_follows, shadows=shadows)
+    return _of_name(source, overrides or {}, step_follows)
 
 
 def server_args(source: str, app: str | None = None) -> ServerArgs:
@@ -94,25 +92,6 @@ def with_dialect(config: ServeDeploySchema, name: str, settings: Mapping[str, An
     dialects[name] = {**(dialects.get(name) or {}), **settings}
     ServerArgs(**args)
     return changed
-
-
-def with_candidate(shadow: ShadowArgs) -> ShadowArgs:
-    """Return the settings of a shadow, with those of its candidate in place of a file or a name.
-
-    Raises:
-        ConfigError: The candidate's deployment cannot be used as one.
-    """
-    if not isinstance(shadow.policy, str):
-        return shadow
-    app = _only(read_deployment(shadow.policy, shadows=False), shadow.policy, None)
-    if app.runtime_env:
-        raise ConfigError("shadow: the candidate states a runtime_env; state its packages under `environment:`")
-    return shadow.model_copy(update={"policy": {**app.args, "config": own_settings(app)}})
-
-
-def gpus_of_candidate(args: ServerArgs) -> float:
-    """Return the number of GPUs of the shadow's candidate; 0 if there is none."""
-    return 0.0 if args.shadow is None else candidate_of(with_candidate(args.shadow)).resources.num_gpus
 
 
 def together(policies: Mapping[str, ServeDeploySchema]) -> ServeDeploySchema:
@@ -160,8 +139,7 @@ def with_replicas_on(config: ServeDeploySchema, gpus: float) -> ServeDeploySchem
     changed = config.model_copy(deep=True)
     for app in our_apps(changed):
         resources = {"num_gpus": 1.0} | app.args.get("resources", {})
-        left = gpus - gpus_of_candidate(ServerArgs(**app.args))
-        replicas = int(left / resources["num_gpus"]) if resources["num_gpus"] else 0
+        replicas = int(gpus / resources["num_gpus"]) if resources["num_gpus"] else 0
         if replicas and app.args.get("replicas") is None and app.args.get("autoscaling") is None:
             app.args |= {"replicas": replicas, "resources": resources}
     return changed
@@ -214,15 +192,13 @@ def our_apps(config: ServeDeploySchema) -> list[Any]:
     return [app for app in config.applications if app.import_path == IMPORT_PATH]
 
 
-def _of_name(
-    policy: str, args: Mapping[str, Any], step_follows: bool = False, *, shadows: bool = True
-) -> ServeDeploySchema:
+def _of_name(policy: str, args: Mapping[str, Any], step_follows: bool = False) -> ServeDeploySchema:
     name = policy.rpartition(":")[2]
     app = {"name": name, "route_prefix": "/", "import_path": IMPORT_PATH, "args": {"policy": policy, **args}}
-    return _checked({"applications": [app]}, f"policy {policy!r}", step_follows, shadows=shadows)
+    return _checked({"applications": [app]}, f"policy {policy!r}", step_follows)
 
 
-def _checked(document: object, source: str, step_follows: bool = False, *, shadows: bool = True) -> ServeDeploySchema:
+def _checked(document: object, source: str, step_follows: bool = False) -> ServeDeploySchema:
     """Return the document as Serve's schema, with the `args` of this package checked before anything starts."""
     try:
         config = ServeDeploySchema.model_validate(document)
@@ -236,15 +212,7 @@ def _checked(document: object, source: str, step_follows: bool = False, *, shado
             if args.record is not None:
                 app.args["record"] = args.record.model_dump(exclude_unset=True)
             installed = not (app.runtime_env or {})
-            contract = _require_policy(args, own_settings(app), installed=installed, step_follows=step_follows)
-            if args.shadow is not None:
-                if not shadows:
-                    raise ConfigError(f"shadow: {source} has a shadow itself; a candidate has none, leave it out there")
-                shadow = with_candidate(args.shadow)
-                app.args["shadow"] = shadow.model_dump(exclude_unset=True)
-                candidate = candidate_of(shadow)
-                theirs = _require_policy(candidate, candidate.config, installed=True, step_follows=False)
-                require_comparable(contract, theirs)
+            _require_policy(args, own_settings(app), installed=installed, step_follows=step_follows)
     except ValidationError as error:
         model = ServerArgs if error.title == ServerArgs.__name__ else ServeDeploySchema
         raise ConfigError(f"{source}: {wrong_settings(error, model)}") from error
@@ -260,14 +228,11 @@ def _runtime_envs(config: ServeDeploySchema) -> Iterator[Mapping[str, Any]]:
             yield options.get("runtime_env") or {}
 
 
-def _require_policy(args: ServerArgs, own: dict[str, Any], *, installed: bool, step_follows: bool) -> Contract | None:
+def _require_policy(args: ServerArgs, own: dict[str, Any], *, installed: bool, step_follows: bool) -> None:
     """Build the policy in its environment, with each kind of settings, and check that the dialects fit its contract.
 
     A replica repeats the check. `own` are the policy's settings. Its packages are not `installed` here if the
     application's `runtime_env` brings them. If `step_follows`, a missing step is set later.
-
-    Returns:
-        The contract of the policy with its own settings; None if it states none before it is loaded.
     """
     environment = args.environment
     if not installed:
@@ -275,22 +240,20 @@ def _require_policy(args: ServerArgs, own: dict[str, Any], *, installed: bool, s
             policy_class(args.policy)
         else:
             with_process(environment)
-        return None
+        return
     require_packages(args.dialects)
     offered = args.checkpoints.of(partial(build_agent, args.policy, wrappers=args.wrappers), own)
-    contracts: list[Contract | None] = []
     for choice in offered.examples():
         settings = offered.settings(choice, offered.config)
         if step_follows and STEP_PLACE in str(settings.get(CHOICE)) and settings.get(STEP) is None:
             settings |= {STEP: 0}
         try:
             if environment.python is not None:
-                contracts.append(check_policy(environment, args.policy, settings, args.wrappers))
+                contract = check_policy(environment, args.policy, settings, args.wrappers)
             else:
-                contracts.append(unloaded_contract(offered.make(settings)))
+                contract = unloaded_contract(offered.make(settings))
         except (MissingDependency, UnknownPolicy, UnknownWrapper):
             if environment.requirements is None:  # otherwise the requirements may install it
                 raise
         else:
-            require_fit(args.dialects, contracts[-1])
-    return contracts[0] if contracts else None
+            require_fit(args.dialects, contract)

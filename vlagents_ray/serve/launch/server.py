@@ -48,7 +48,7 @@ from vlagents_ray.ray_tools.session import (
 )
 from vlagents_ray.serve.access.api_keys import require_access, warn_of_plain_http
 from vlagents_ray.serve.config.deployment import AccessArgs, ServerArgs
-from vlagents_ray.serve.launch.deployment_file import gpus_of_candidate, our_apps, with_gateways_at, with_replicas_on
+from vlagents_ray.serve.launch.deployment_file import our_apps, with_gateways_at, with_replicas_on
 from vlagents_ray.serve.launch.haproxy import (
     NO_INGRESS,
     PublicListener,
@@ -274,11 +274,11 @@ def _missing_gpus(config: ServeDeploySchema, here: float | None = None) -> str |
 
 
 def _gpus(args: ServerArgs) -> float:
-    """Return the number of GPUs that the initial replicas need together, with the candidate of a shadow."""
+    """Return the number of GPUs that the initial replicas need together."""
     replicas = args.replicas or 1
     if args.autoscaling is not None:
         replicas = max(args.autoscaling.min_replicas, args.autoscaling.initial_replicas or 0)
-    return replicas * args.resources.num_gpus + gpus_of_candidate(args)
+    return replicas * args.resources.num_gpus
 
 
 def _require_access(config: ServeDeploySchema, host: str, insecure: bool) -> None:

@@ -104,17 +104,10 @@ class ModelCache:
         """Return the model with which an episode of that choice would begin now, or None if it is not loaded."""
         return self.loaded.get(key_of(self._settings(choice)))
 
-    def free(self, choice: CheckpointChoice, *, follows: bool) -> LoadedModel | None:
-        """Return the model with which an episode may begin now; None if it has to wait for it, or for its weights.
-
-        Args:
-            choice: The chosen checkpoint.
-            follows: Whether the episode takes the newest version of the weights.
-        """
+    def free(self, choice: CheckpointChoice) -> LoadedModel | None:
+        """Return the model with which an episode of that choice may begin now; None if it has to wait for it."""
         model = self.find(choice)
-        if model is None or model.key == self.draining:
-            return None
-        return model if not follows or model.parameters.settle() else None
+        return None if model is None or model.key == self.draining else model
 
     def assign(self, session: Session[LoadedModel], model: LoadedModel) -> LoadedModel:
         """Let the session hold the model, in place of any other, and return the model."""
@@ -147,7 +140,7 @@ class ModelCache:
                 error = UnknownSession(f"session {waiter.session.id!r}: closed while it waited for {waiter.choice}")
             elif waiter.is_abandoned():
                 error = too_late(waiter.choice)
-            elif (model := self.free(waiter.choice, follows=waiter.session.follows)) is None:
+            elif (model := self.free(waiter.choice)) is None:
                 continue
             else:
                 self.assign(waiter.session, model)
@@ -336,7 +329,7 @@ class ModelManager:
         with self._changed:
             self._require_open()
             self.release_model(session)
-            model = self._cache.free(choice, follows=session.follows)
+            model = self._cache.free(choice)
             if model is not None and not session.over:
                 return self._cache.assign(session, model)
             self._cache.waiting.append(Waiter(session, choice, on_loaded, is_abandoned))

@@ -3,7 +3,7 @@
 From a network a robot can only be made to stop: it is paused, stopped, or its episode is marked. What makes it move
 (resuming, another instruction, a human's motion) is done at the robot. A command travels in the answer to the next
 request of the robot, within `_WAITS_S` or never, since a late one would surprise the person beside it; a later request
-states the outcome. The server itself executes `HERE` and `SAVE`.
+states the outcome. The server itself executes `SAVE`.
 """
 
 from __future__ import annotations
@@ -27,11 +27,9 @@ logger = logging.getLogger(__name__)
 
 TO_ROBOT = ("pause", "stop", "success", "failure")
 """The commands that are sent to a robot. None of them makes it move."""
-HERE = {"follow": True, "pin": False}
-"""The commands that the server executes: whether a session's later episodes take the newest weights."""
 SAVE = "save"
-"""The command that saves the session's last seconds, which the server does as well."""
-COMMANDS = (*TO_ROBOT, *HERE, SAVE)
+"""The command that saves the session's last seconds, which the server does."""
+COMMANDS = (*TO_ROBOT, SAVE)
 
 TRACKED_S = 15.0  # time for which the outcome of a command is awaited
 _WAITS_S = 5.0  # time within which a command has to reach the robot
@@ -93,8 +91,7 @@ class CommandBoard:
                 f"do: got {do[:40]!r}, want one of {list(COMMANDS)}; resume a robot, change its instruction or move "
                 f"it at the robot"
             )
-        session = next((one for one in self._sessions.all() if one.id == session_id), None)  # `get` would mark it used
-        if session is None:
+        if session_id not in self._sessions:
             raise UnknownSession(f"session {session_id[:80]!r}: is not here; it ended, or has begun again elsewhere")
         pressed = Press(f"{self._prefix}-{next(self._numbers)}", do, by, self._clock())
         self.forget_others(self._sessions.ids())
@@ -109,10 +106,7 @@ class CommandBoard:
                     raise Overloaded(f"session {session_id!r}: {_SHOWN} commands wait already for its robot's request")
                 held.remove(over)
             held.append(pressed)
-        if do in HERE:
-            session.told_to_follow = session.follows = HERE[do]
-            pressed.state = "done"
-        elif do == SAVE:
+        if do == SAVE:
             pressed.state = "saving"
             threading.Thread(target=self._save_now, args=(session_id, pressed), daemon=True).start()
         return pressed.describe()

@@ -18,9 +18,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from vlagents_ray.chunking.execution import PLAYED, WATCHED
 from vlagents_ray.images.codecs import JPEG
-from vlagents_ray.protocol.messages import Reply, Request
+from vlagents_ray.protocol.messages import Reply
 from vlagents_ray.serve.engine.observer import Observer, Observers
 from vlagents_ray.serve.observers.commands import CommandBoard
 from vlagents_ray.serve.requests import PendingRequest
@@ -31,45 +30,17 @@ LEASE_S = 2.0  # time after the last reading at which nothing is kept any more
 ANSWER_BYTES = 2**25  # most bytes of the answers that are kept
 OBSERVATION_BYTES = 2**28  # most bytes of the observations: 70 sessions of four unencoded VGA cameras
 VALUES = 64  # most numbers of one part of a state, or of one action
-ROWS = 128  # most actions of a chunk, or executed before a request
+ROWS = 128  # most actions of a chunk
 TEXT = 200  # most characters of a text
 SHOWN_OPS = ("act", "reset")
 _ACTION = 4096  # an action of more numbers is not kept with its observation
 _PARTS = 64  # an observation with more cameras, or parts of its state, is not kept
 _INFO = 24  # most entries of an act's info
-_OWN = (WATCHED, "timing", "policy", "behaviour", "distribution")  # of an act's info: shown elsewhere, or our own
-_NUMBERS = ("step", "age_ms", "safe_ticks", "safe_spells", "late", "reconnects")  # that a client states
+_OWN = ("timing", "policy", "behaviour", "distribution")  # of an act's info: shown elsewhere, or our own
 _MOST = 2**53  # largest number that JSON keeps
 _OBJECTS = 1000  # bytes of an answer or an observation besides its arrays, files and texts, estimated
 _ENCODING = threading.Lock()
-# Interval at which a session is told that it is watched, which its player believes for 10 s. Not with each answer: with
-# more than the weights in its info, one does not travel in the compact form of shared memory.
-_TELL_S = 2.0
 _KEPT_S = 1.0  # time for which pixels are kept for a reader
-
-
-class Executed(NamedTuple):
-    """What a client states of the actions that it executed: `vlagents_ray.chunking.execution`."""
-
-    steps: np.ndarray  # (n,) int64, the steps of the rows
-    rows: np.ndarray  # (n, D) float32
-    numbers: dict[str, float | str]  # `step`, `age_ms`, … as far as they are numbers, and the text `safe`
-
-    @classmethod
-    def from_request(cls, request: Request) -> Executed | None:
-        """Return a copy of what a request states; None if that is nothing, or has another form."""
-        stated = None if request.obs is None else request.obs.info.get(PLAYED)
-        if not isinstance(stated, dict):
-            return None
-        steps, rows = stated.get("steps"), stated.get("rows")
-        if not isinstance(steps, np.ndarray) or not isinstance(rows, np.ndarray) or rows.ndim != 2:
-            return None
-        if steps.shape != rows.shape[:1] or steps.dtype.kind not in "iu" or rows.dtype.kind != "f":
-            return None
-        numbers: dict[str, float | str] = {name: stated[name] for name in _NUMBERS if _is_number(stated.get(name))}
-        if isinstance(safe := stated.get("safe"), str):
-            numbers["safe"] = safe[:TEXT]
-        return cls(steps[:ROWS].astype(np.int64), rows[:ROWS, :VALUES].astype(np.float32), numbers)
 
 
 class Answer(NamedTuple):
@@ -86,14 +57,11 @@ class Answer(NamedTuple):
     action: np.ndarray | None = None  # (rows, D) float32, as far as `ROWS` and `VALUES` reach; None without an act
     done: bool = False
     info: Mapping[str, Any] = MappingProxyType({})  # the numbers and short texts that the policy says
-    executed: Executed | None = None  # before this request
 
     @property
     def size(self) -> int:
         """The memory that it takes, bytes."""
         arrays = 0 if self.action is None else self.action.nbytes
-        if self.executed is not None:
-            arrays += self.executed.steps.nbytes + self.executed.rows.nbytes
         texts = (self.session, self.detail, *self.info, *self.info.values())
         return _OBJECTS + arrays + sum(4 * len(text) for text in texts if isinstance(text, str))
 
@@ -137,24 +105,16 @@ class LiveObserver(Observer):
         self._commands = commands
         self._clock = clock
         self._until = float("-inf")  # end of the lease, s
-        self._viewed_until = float("-inf")  # end of that of the last viewer
         self._active = False
         self._numbers = itertools.count(1)
         self._answers: deque[Answer] = deque()
         self._observations: dict[str, KeptObservation] = {}  # by session, the oldest first
-        self._told: dict[str, float] = {}  # when a session was told last that it is watched, s
         self._answer_bytes = self._observation_bytes = 0
         self._lock = threading.Lock()
 
-    def renew(self, lease_s: float = LEASE_S, *, viewer: bool = False) -> None:
-        """Keep what happens for `lease_s` more seconds.
-
-        `viewer`: a person watches. Executed actions are collected for people only: stating them costs a client time.
-        """
-        until = self._clock() + lease_s
-        self._until = max(self._until, until)
-        if viewer:
-            self._viewed_until = until
+    def renew(self, lease_s: float = LEASE_S) -> None:
+        """Keep what happens for `lease_s` more seconds."""
+        self._until = max(self._until, self._clock() + lease_s)
         if not self._active:
             self._active = True
             self._observers.add(self)
@@ -178,30 +138,24 @@ class LiveObserver(Observer):
         """End the lease."""
         self._active = False
         self._observers.remove(self)
-        self._told.clear()
 
     def on_request(self, pending: PendingRequest) -> None:
         """See `Observer`."""
-        pending.kept[self] = Executed.from_request(pending.request), self._keep(pending)
+        pending.kept[self] = self._keep(pending)
         if self._commands is not None:
             self._commands.read_outcomes(pending.session_id, pending.request)
 
     def before_answer(self, pending: PendingRequest, reply: Reply) -> None:
-        """Add a command, and say now and then that a viewer watches, so that a player states what it executed."""
-        now, session = self._clock(), pending.session_id
-        is_due = now - self._told.get(session, float("-inf")) > _TELL_S
-        if is_due and now < self._viewed_until and reply.act is not None:
-            self._told[session] = now
-            reply.act.info[WATCHED] = True
+        """Add a command to the session's robot."""
         if self._commands is not None:
             self._commands.send(pending.session_id, reply)
 
     def on_answer(self, pending: PendingRequest, reply: Reply) -> None:
         """See `Observer`."""
-        executed, observation = pending.kept.pop(self, (None, None))
+        observation = pending.kept.pop(self, None)
         if observation is not None and reply.act is not None and (row := reply.act.rows()[0]).size <= _ACTION:
             observation.action = np.array(row)
-        answer = _answer(next(self._numbers), pending, reply, executed)
+        answer = _answer(next(self._numbers), pending, reply)
         with self._lock:
             self._answers.append(answer)
             self._answer_bytes += answer.size
@@ -220,8 +174,6 @@ class LiveObserver(Observer):
 
     def forget_others(self, sessions: Collection[str]) -> None:
         """Drop what is kept of all sessions but these, since those have ended."""
-        for session in self._told.keys() - set(sessions):
-            self._told.pop(session, None)
         with self._lock:
             for session in self._observations.keys() - set(sessions):
                 self._observation_bytes -= self._observations.pop(session).counted
@@ -253,9 +205,9 @@ class LiveObserver(Observer):
         return kept
 
 
-def _answer(number: int, pending: PendingRequest, reply: Reply, executed: Executed | None) -> Answer:
+def _answer(number: int, pending: PendingRequest, reply: Reply) -> Answer:
     request, act, error = pending.request, reply.act, reply.error
-    answer = Answer(number, pending.session_id, request.op, pending.rank.name.lower(), reply.timing, executed=executed)
+    answer = Answer(number, pending.session_id, request.op, pending.rank.name.lower(), reply.timing)
     if error is not None:
         return answer._replace(error=error.code, detail=str(error)[:TEXT])
     if act is None:

@@ -28,11 +28,9 @@ from vlagents_ray.serve.observers.commands import TRACKED_S, CommandBoard
 from vlagents_ray.serve.observers.live import (
     ENCODING_SHARE,
     RATE,
-    ROWS,
     SHOWN_OPS,
     VALUES,
     Answer,
-    Executed,
     KeptObservation,
     LiveObserver,
 )
@@ -112,19 +110,15 @@ class ReplicaView:
         It may take milliseconds, so it does not belong on an event loop or the policy's thread.
         """
         engine, live = self._engine, self.live
-        live.renew(viewer=True)
+        live.renew()
         answers = live.answers(since)
         snapshot = Snapshot(answers[-1].number if answers else since, {})
         last = {one.session: one for one in answers if one.op in SHOWN_OPS}
-        executed: dict[str, list[Executed]] = {}
-        for one in answers:
-            if one.executed is not None:
-                executed.setdefault(one.session, []).append(one.executed)
         ids = engine.sessions.ids()
         live.forget_others(ids)
         self.commands.forget_others(ids)
         held = sorted(engine.sessions.all(), key=lambda one: one.id)[:_SESSIONS]
-        sessions = {one.id: _session(one, last.get(one.id), executed.get(one.id, [])) for one in held}
+        sessions = {one.id: _session(one, last.get(one.id)) for one in held}
         begun = time.thread_time()
         self._pictured = {name: self._pictured.get(name, 0) for name in sessions}
         for name in sorted(sessions, key=self._pictured.__getitem__):  # longest without first
@@ -173,8 +167,8 @@ class ReplicaView:
         return self._slow
 
 
-def _session(session: Session[LoadedModel], last: Answer | None, executed: list[Executed]) -> dict[str, Any]:
-    """Return a session as a viewer needs it, with its last answer and what it executed, if there is something new."""
+def _session(session: Session[LoadedModel], last: Answer | None) -> dict[str, Any]:
+    """Return a session as a viewer needs it, with its last answer if that is new."""
     weights = session.weights
     described = {
         "id": session.id,
@@ -183,14 +177,8 @@ def _session(session: Session[LoadedModel], last: Answer | None, executed: list[
         "instruction": session.instruction[:_INSTRUCTION],
         "silent_s": round(time.monotonic() - session.used, 2),
         "version": None if weights is None else weights.number,
-        "follows": session.follows,
         "pictures": {},
     }
-    if executed:
-        numbers: dict[str, Any] = plain_values(executed[-1].numbers)
-        steps = [step for one in executed for step in one.steps.tolist()]
-        rows = [row for one in executed for row in _numbers(one.rows)]
-        described["played"] = numbers | {"steps": steps[-ROWS:], "rows": rows[-ROWS:]}
     return described if last is None else described | {"rank": last.rank, "last": _act(last)}
 
 
@@ -212,8 +200,6 @@ def _act(answer: Answer) -> dict[str, Any]:
     if answer.action is not None:
         found |= {"rows": answer.rows, "action": _numbers(answer.action), "done": answer.done}
         found["info"] = plain_values(answer.info)
-        if answer.executed is not None:
-            found["at"] = answer.executed.numbers.get("step")
     return found
 
 

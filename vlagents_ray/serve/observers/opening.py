@@ -1,4 +1,4 @@
-"""Opens the observers of a replica by their keys in its settings: `live`, `viewers`, `shadow` and `record`."""
+"""Opens the observers of a replica by their keys in its settings: `live` and `record`."""
 
 from __future__ import annotations
 
@@ -13,9 +13,7 @@ from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.observer import Observer
 from vlagents_ray.serve.observers.live_view import ReplicaView
 from vlagents_ray.serve.observers.recording import SessionRecorder, open_recorder
-from vlagents_ray.serve.observers.shadow import Ask, ShadowSender
 from vlagents_ray.serve.observers.spans import RequestSpans
-from vlagents_ray.serve.observers.viewers import SessionViewers
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +21,6 @@ class ReplicaObservers:
     """The open observers of one replica, until `close`."""
 
     view: ReplicaView  # what viewers see; the live observer is active only while something reads it
-    shadow: ShadowSender | None
     recorder: SessionRecorder | None
     _opened: ExitStack
 
@@ -38,15 +35,13 @@ def open_observers(
     replica: str,
     node: str,
     metadata: Callable[[], Mapping[str, Any]],
-    ask_candidate: Ask | None = None,
 ) -> ReplicaObservers:
     """Observe the requests of an engine from now on.
 
-    `replica` is Ray's name of the replica, which no other has or will have. Viewers see the name of its `node`. With a
-    shadow, `ask_candidate` sends to the candidate.
+    `replica` is Ray's name of the replica, which no other has or will have. Viewers see the name of its `node`.
 
     Raises:
-        ConfigError: A folder cannot be written to, or a viewer is not there.
+        ConfigError: A folder cannot be written to.
         MissingDependency: An extra is not installed.
     """
     observers, name = engine.observers, replica.rpartition("#")[2]
@@ -60,14 +55,9 @@ def open_observers(
         view = ReplicaView(engine, observers, name, node, metadata, args.live)
         view.open()
         opened.callback(view.close)
-        if targets := args.viewers.targets():
-            opened.callback(SessionViewers(engine.sessions, view.live, targets).close)
         if (tracer := tracing.tracer()) is not None:
             observe(RequestSpans(tracer, name))
-        shadow = recorder = None
-        if args.shadow is not None and ask_candidate is not None:
-            is_open = engine.sessions.__contains__
-            observe(shadow := ShadowSender(ask_candidate, args.shadow.share, args.shadow.queue, is_open))
+        recorder = None
         if args.record is not None:
             observe(recorder := open_recorder(engine.sessions, args.record, replica, metadata))
-        return ReplicaObservers(view, shadow, recorder, opened.pop_all())
+        return ReplicaObservers(view, recorder, opened.pop_all())

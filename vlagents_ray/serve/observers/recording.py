@@ -8,15 +8,18 @@ full, frames are dropped and counted; no answer waits for them.
 from __future__ import annotations
 
 import logging
+import os
 import random
 import re
 import tempfile
 import threading
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any
 
 from vlagents_ray.errors import ConfigError, PolicyFailed, UnknownSession
@@ -29,7 +32,6 @@ from vlagents_ray.serve.engine.metrics_buffer import STAGES
 from vlagents_ray.serve.engine.observer import Observer
 from vlagents_ray.serve.models.loaded_model import LoadedModel
 from vlagents_ray.serve.observers.episodes import EpisodeWriter, RecordedAct, RecordingEnded
-from vlagents_ray.serve.observers.worker import Worker, be_nice
 from vlagents_ray.serve.periodic import each_half_second
 from vlagents_ray.serve.requests import PendingRequest
 from vlagents_ray.serve.sessions import SessionTable
@@ -39,7 +41,43 @@ logger = logging.getLogger(__name__)
 NO_VERSION = -1  # of an answer whose policy names no version of its weights
 _HELD_BYTES = 256 * 2**20  # most bytes of observations that wait to be written
 _OTHER_BYTES = 16 * 2**10  # counted for an act beside its pictures and the bytes in its `info`
+_NICE = 5  # the threads run after the policy's
 _CLOSING_S = 30.0  # time that the threads get to write what waits
+
+
+class Worker:
+    """A thread that makes calls one after the other, after the policy's thread; its user bounds those that wait."""
+
+    def __init__(self, name: str) -> None:
+        """Start the thread of that name."""
+        self._calls: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    def put(self, call: Callable[[], None]) -> None:
+        """Call `call` on the thread; an error is logged, and ends nothing."""
+        self._calls.put(call)
+
+    def close(self, timeout_s: float) -> None:
+        """End after the calls that wait, and wait for that."""
+        self._calls.put(None)
+        self._thread.join(timeout_s)
+
+    def _run(self) -> None:
+        with suppress(OSError):
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
+        while self._made(self._calls.get()):
+            pass
+
+    def _made(self, call: Callable[[], None] | None) -> bool:
+        """Make a call, to which nothing refers afterwards; False at the end."""
+        if call is None:
+            return False
+        try:
+            call()
+        except Exception:
+            logger.exception("%s: a request is left out", self._thread.name)
+        return True
 
 
 @dataclass(slots=True, eq=False)
@@ -100,8 +138,6 @@ class SessionRecorder(Observer):
         self._missing: set[str] = set()  # sessions in `_first` that were not here when they were looked up
         self._first: dict[str, int | None] = {}  # step at the reset of each session; None if it is not recorded
         self._copier, self._worker = Worker("record-copy"), Worker("record-write")
-        for worker in (self._copier, self._worker):
-            worker.put(be_nice)
         each_half_second.add(self._look)
 
     @property

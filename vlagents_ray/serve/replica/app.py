@@ -9,11 +9,9 @@ from typing import Any
 from ray import serve
 from ray.serve import Application
 
-from vlagents_ray.serve.config.deployment import GATEWAY, POLICY, SHADOW, ServerArgs, ShadowArgs, candidate_of
-from vlagents_ray.serve.config.dialects import DialectArgs
+from vlagents_ray.serve.config.deployment import GATEWAY, POLICY, ServerArgs
 from vlagents_ray.serve.dialects.gateway import Gateway
 from vlagents_ray.serve.python_env.probe import with_process
-from vlagents_ray.serve.replica.candidate import CandidateReplica
 from vlagents_ray.serve.replica.replica import PolicyReplica
 
 _FAILURES = 3  # number of consecutive failed health checks after which Serve replaces a replica
@@ -21,15 +19,13 @@ _LEAST_ANSWER_S = 5.0  # minimum time limit of a health check, for a busy machin
 _HEAD = "node:__internal_head__"  # a resource that Ray assigns to the head node of any cluster
 # A replica gets neither these settings nor the dialects of the gateway, and does not restart when they change.
 _OUTSIDE: Any = {"replicas": True, "autoscaling": True, "resources": True}
-# Of deployments for which no Serve request waits: of a shadow, and of the gateway, whose clients use its own ports.
-_ALONE: Any = {"num_replicas": 1, "graceful_shutdown_timeout_s": 10, "graceful_shutdown_wait_loop_s": 0.1}
 
 
 def build(args: ServerArgs) -> Application:
     """Build the Serve application of one policy; raises `ConfigError` if its environment cannot run it."""
     args = args.model_copy(update={"environment": with_process(args.environment)})
     options: dict[str, Any] = {
-        **_options(args, POLICY),
+        **_options(args),
         # A WebSocket session counts as a request as long as it lasts, so the limit must allow all sessions and two
         # batches. It is no protection against overload, since requests wait in the batch queue.
         "max_ongoing_requests": args.sessions.limit + 2 * args.batch.max_size,
@@ -52,20 +48,13 @@ def build(args: ServerArgs) -> Application:
         policy = serve.deployment(**options)(replica)
     gateways = args.dialects.gateways()
     settings = args.model_dump(mode="json", exclude=_OUTSIDE | {"dialects": set(gateways)})
-    parts: dict[str, Any] = {}
-    if gateways:
-        parts["gateway"] = _gateway(args)
-    if args.shadow is not None:
-        candidate = candidate_of(args.shadow)
-        settings["shadow"]["policy"] = candidate.policy
-        parts["candidate"] = _shadow(candidate, args.shadow)
-    return policy.bind(settings, **parts)
+    return policy.bind(settings, _gateway(args) if gateways else None)
 
 
-def _options(args: ServerArgs, name: str) -> dict[str, Any]:
-    """Return Serve's options that hold for a deployment of any policy."""
+def _options(args: ServerArgs) -> dict[str, Any]:
+    """Return Serve's options that do not depend on the number of replicas."""
     return {
-        "name": name,
+        "name": POLICY,
         "health_check_period_s": 1 if args.environment.process == "child" else 5,  # Serve wants three failures
         # A replica that does not reply is frozen, or its policy holds the interpreter's lock: then only these checks
         # limit the time of a call. Together they take the limit of a call; Serve's default is 95 s for any policy.
@@ -83,19 +72,14 @@ def _options(args: ServerArgs, name: str) -> dict[str, Any]:
     }
 
 
-def _shadow(candidate: ServerArgs, shadow: ShadowArgs) -> Application:
-    """Build the deployment of the candidate: one replica, which only the live policy's replicas call."""
-    args = candidate.model_copy(update={"environment": with_process(candidate.environment), "dialects": DialectArgs()})
-    options = _options(args, SHADOW) | _ALONE
-    settings = args.model_dump(mode="json", exclude=_OUTSIDE)
-    return serve.deployment(**options)(CandidateReplica).bind(settings, shadow.record, shadow.record_mb)
-
-
 def _gateway(args: ServerArgs) -> Application:
     """Build the process of the dialects that have their own port; it runs on the head node, where clients connect."""
     options: dict[str, Any] = {
-        **_ALONE,
         "name": GATEWAY,
+        "num_replicas": 1,
+        # No Serve request waits for it: its clients use its own ports.
+        "graceful_shutdown_timeout_s": 10,
+        "graceful_shutdown_wait_loop_s": 0.1,
         "health_check_period_s": 5,
         "ray_actor_options": {"num_cpus": 0, "resources": {_HEAD: 0.001}},
     }

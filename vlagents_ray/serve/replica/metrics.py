@@ -15,19 +15,13 @@
 | `vlagents_uncompiled` | gauge | batch sizes that run without compilation, although the policy's `compile` is set |
 | `vlagents_out_of_memory` | counter | forward passes that did not fit into memory; not those in a child process |
 | `vlagents_hung_calls` | counter | op; calls of the policy that took longer than `limits` allow |
-| `vlagents_shadow_dropped` | counter | observations that the candidate of a shadow did not get |
-| `vlagents_shadow_observations` | counter | outcome ("compared", "failed"); observations that the candidate got |
-| `vlagents_shadow_difference` | histogram | rows ("all", "first"); absolute difference of two actions, mean of joints |
-| `vlagents_shadow_joint_difference` | gauge | joint; mean absolute difference, of the last second with comparisons |
-| `vlagents_shadow_latency_ms` | histogram | waiting and inference of the candidate |
 | `vlagents_recorded_frames` | counter | outcome ("saved", "lost"); acts of sessions that `record` names |
 | `vlagents_recording` | gauge | 1 while sessions are recorded, 0 once that has ended or if `record` is not set |
 | `vlagents_keys_unreadable_s` | gauge | time since which the file of API keys cannot be read; 0 if it can |
 
 All series have the tags `application`, `deployment`, `replica` and `policy`. Transport is `shm`, `plasma`, `websocket`,
 `http` or `handle`, class is `robot` or `simulation`. Counters are exact; a histogram takes a random sample of up to 100
-values per second for each kind of request and for the batches. The candidate of a shadow exports the series
-`vlagents_shadow_*` but the first, with the deployment `Shadow` and the candidate as the policy.
+values per second for each kind of request and for the batches.
 """
 
 from __future__ import annotations
@@ -45,8 +39,7 @@ from ray.util.metrics import Counter, Gauge, Histogram
 from vlagents_ray.serve.access.api_keys import Keys
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.metrics_buffer import STAGES, Collected
-from vlagents_ray.serve.observers.comparison import Comparer
-from vlagents_ray.serve.observers.opening import ReplicaObservers
+from vlagents_ray.serve.observers.recording import SessionRecorder
 from vlagents_ray.serve.periodic import Periodic
 from vlagents_ray.serve.queue.batch_queue import LoadMeter
 
@@ -57,7 +50,6 @@ _SLICE_S = 50e-6
 _PAUSE_S = 300e-6
 _MS = [0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0, 2000.0, 5000.0, 10_000.0]
 _SIZES = [1.0, 2.0, 4.0, 8.0, 12.0, 16.0, 24.0, 32.0, 48.0, 64.0, 128.0, 256.0]
-_DIFFERENCES = [1e-6, 1e-5, 1e-4, 3e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0]  # units of the action
 _TRANSPORTS = ("shm", "plasma", "websocket", "http", "handle")
 
 T = TypeVar("T")
@@ -71,11 +63,11 @@ class Exporter:
         engine: Engine,
         tags: dict[str, str],
         keys: Keys | None = None,
-        observers: ReplicaObservers | None = None,
+        recorder: SessionRecorder | None = None,
     ) -> None:
         """Create the series, with these tags: application, deployment, replica, policy.
 
-        How long the file of `keys` was unreadable, and numbers of the `observers`, are exported if there are any.
+        How long the file of `keys` was unreadable, and numbers of the `recorder`, are exported if there are any.
         """
         make = partial(_series, tags)
         self._engine = engine
@@ -95,11 +87,10 @@ class Exporter:
         self._out_of_memory = make(Counter, "out_of_memory", "Forward passes that did not fit into memory.")
         self._uncompiled = make(Gauge, "uncompiled", "Batch sizes that run without the compilation that is set.")
         self._unreadable = make(Gauge, "keys_unreadable_s", "Time in which the key file could not be read.")
-        self._dropped = make(Counter, "shadow_dropped", "Observations that the candidate did not get.")
         self._recorded = make(Counter, "recorded_frames", "Acts of recorded sessions.", "outcome")
         self._recording = make(Gauge, "recording", "Whether sessions are recorded.")
-        self._keys, self._observers = keys, observers
-        self._counted = Counts[str]()  # what was exported of the observers' numbers
+        self._keys, self._recorder = keys, recorder
+        self._frames = Counts[str]()  # what was exported of the recorder's numbers
         self._meter = LoadMeter(engine.queue)
         self._periodic = Periodic(PERIOD_S)
 
@@ -130,20 +121,13 @@ class Exporter:
         self._version.set(self._engine.weights.number)
         self._uncompiled.set(len(self._engine.models.uncompiled))
         self._unreadable.set(0.0 if self._keys is None else self._keys.unreadable_s)
-        shadow = None if self._observers is None else self._observers.shadow
-        if shadow is not None:
-            self._increase(self._dropped, "dropped", shadow.dropped)
-        recorder = None if self._observers is None else self._observers.recorder
+        recorder = self._recorder
         self._recording.set(float(recorder is not None and recorder.ended is None))
-        if recorder is not None:
-            self._increase(self._recorded, "saved", recorder.saved, {"outcome": "saved"})
-            self._increase(self._recorded, "lost", recorder.lost, {"outcome": "lost"})
-
-    def _increase(self, counter: Any, name: str, total: int, tags: dict[str, str] | None = None) -> None:
-        """Bring a counter to `total`."""
-        if new := total - self._counted[name]:
-            counter.inc(new, tags)
-            self._counted[name] = total
+        frames = {} if recorder is None else {"saved": recorder.saved, "lost": recorder.lost}
+        for outcome, total in frames.items():
+            if new := total - self._frames[outcome]:
+                self._recorded.inc(new, {"outcome": outcome})
+                self._frames[outcome] = total
 
     def _export_collected(self, collected: Collected) -> None:
         for (op, transport, kind, code), sample in collected.requests.items():
@@ -164,45 +148,6 @@ class Exporter:
             self._out_of_memory.inc(collected.out_of_memory)
         if collected.padding:
             self._padding.inc(collected.padding)
-
-
-class ShadowExporter:
-    """Exports the comparisons of a candidate to Ray once a second, until `close`."""
-
-    def __init__(self, comparer: Comparer, tags: dict[str, str]) -> None:
-        """Create the series with these tags: application, deployment, replica, policy."""
-        make = partial(_series, tags)
-        self._comparer = comparer
-        self._observations = make(Counter, "shadow_observations", "Observations that the candidate got.", "outcome")
-        self._difference = make(
-            Histogram, "shadow_difference", "Difference of two actions.", "rows", boundaries=_DIFFERENCES
-        )
-        self._joints = make(Gauge, "shadow_joint_difference", "Mean absolute difference.", "joint")
-        self._latency = make(Histogram, "shadow_latency_ms", "Time of the candidate for an act.", boundaries=_MS)
-        self._periodic = Periodic(PERIOD_S)
-
-    def start(self) -> None:
-        """Start to export."""
-        self._periodic.add(self.export)
-
-    def close(self) -> None:
-        """Export what remains, and end."""
-        self._periodic.remove(self.export)
-        self.export()
-
-    def export(self) -> None:
-        """Export the comparisons since the last call."""
-        compared = self._comparer.collect()
-        for outcome, count in compared.outcomes.items():
-            self._observations.inc(count, {"outcome": outcome})
-        for rows, sample in compared.differences.items():
-            for value in sample.values:
-                self._difference.observe(value, {"rows": rows})
-        for took_ms in compared.latencies_ms.values:
-            self._latency.observe(took_ms)
-        if compared.joints is not None:
-            for joint, total in enumerate(compared.joints):
-                self._joints.set(float(total) / compared.outcomes["compared"], {"joint": str(joint)})
 
 
 def _series(tags: Mapping[str, str], kind: Any, name: str, text: str, *own: str, **options: Any) -> Any:

@@ -8,7 +8,7 @@ import importlib.metadata
 import logging
 import os
 from collections import Counter
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from typing import Any
@@ -19,11 +19,13 @@ from ray.serve.exceptions import RayServeException
 from starlette.types import ASGIApp
 
 from vlagents_ray.client.transports.serve_handle import ClientApi
-from vlagents_ray.errors import PolicyUnavailable, UnknownSession
+from vlagents_ray.errors import PolicyFailed, PolicyUnavailable, UnknownSession, VLAgentsError
+from vlagents_ray.policies.base.accelerator import VISIBLE
 from vlagents_ray.policies.base.program import loaded_code
-from vlagents_ray.protocol.messages import PROTOCOL_VERSION, SERVERS_MACHINE, boot_id
+from vlagents_ray.protocol.frames import Decoded, decode_requests
+from vlagents_ray.protocol.messages import PROTOCOL_VERSION, SERVERS_MACHINE, Limits, boot_id
 from vlagents_ray.ray_tools.git_state import code_of
-from vlagents_ray.ray_tools.private import compress_no_websockets, http_options, replica_is_ending
+from vlagents_ray.ray_tools.private import compress_no_websockets, gpus_here, http_options, replica_is_ending
 from vlagents_ray.registry import names
 from vlagents_ray.serve.access.api_keys import NoKey, require_access, warn_of_plain_http
 from vlagents_ray.serve.access.audit import write_audit
@@ -37,21 +39,22 @@ from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.endpoints.unix_messages import Admit
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.endpoints.weights import weights_routes
+from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.sender import Sender
 from vlagents_ray.serve.models.checkpoints import resolved
 from vlagents_ray.serve.observers.live_page import live_routes
 from vlagents_ray.serve.observers.live_view import Fleet, Snapshot
 from vlagents_ray.serve.observers.opening import open_observers
 from vlagents_ray.serve.ports import EVERYWHERE, HOST, LOOPBACK
+from vlagents_ray.serve.python_env.child_agent import make_agent, version_of
 from vlagents_ray.serve.queue.batch_queue import LoadMeter
-from vlagents_ray.serve.replica.candidate import CandidateLink
-from vlagents_ray.serve.replica.engine_replica import ReplicaEngine
 from vlagents_ray.serve.replica.metrics import Exporter, tags_of
 from vlagents_ray.serve.scaling.autoscaling import SESSIONS, UTILISATION, WAITING
 from vlagents_ray.serve.scaling.rebalancer import ClientLocation, Rebalancer, ReplicaLoad
 from vlagents_ray.serve.scaling.session_migration import PEER_METHODS, SessionMigrator
-from vlagents_ray.serve.scaling.sibling_replicas import ReplicaViews, SiblingApi, SiblingReplicas
-from vlagents_ray.serve.scaling.weight_push import OwnWeights, Values, WeightPusher, WeightsReplica
-from vlagents_ray.serve.weights import HeldVersion, NewestVersion, PushOptions, PushResult
+from vlagents_ray.serve.scaling.sibling_replicas import SiblingApi, SiblingReplicas
+from vlagents_ray.serve.scaling.weight_push import WEIGHT_METHODS, ThisReplica, Values, WeightPusher, WeightsReplica
+from vlagents_ray.serve.weights import NewestVersion, PushOptions, PushResult, WeightUpdates
 from vlagents_ray.weights.safetensors import ValueSpec
 
 logger = logging.getLogger(__name__)
@@ -67,16 +70,16 @@ class PolicyReplica(ClientApi, SiblingApi):
     """One replica of the policy, with all the ways in that clients use.
 
     Ray calls its methods by name: Serve those of a deployment, clients inside the cluster those of `ClientApi`, and
-    other replicas those of `SiblingApi` and `WeightsReplica`. Until the first replica runs, Serve's proxies reply for
+    other replicas those of `SiblingApi`. Until the first replica runs, Serve's proxies reply for
     the application: see `vlagents_ray.serve.scaling.router` and `vlagents_ray.serve.launch.haproxy`.
     """
 
     _opened = False  # whether there is something to close
 
     async def __init__(  # type: ignore[misc]  # Serve awaits it
-        self, args: dict[str, Any], gateway: Any = None, candidate: Any = None
+        self, args: dict[str, Any], gateway: Any = None
     ) -> None:
-        """Make the replica with the settings `args`; handles make the other two a part of the application."""
+        """Make the replica with the settings `args`; the handle makes the gateway a part of the application."""
         self._args = settings = ServerArgs(**args)
         self._gateway = gateway
         self._gateways: dict[str, Any] = {}
@@ -96,20 +99,20 @@ class PolicyReplica(ClientApi, SiblingApi):
         # The engine, and what it shares with the other replicas.
         self._peers = SiblingReplicas()
         self._migrator = SessionMigrator(self._peers.others, asyncio.get_running_loop())
-        self._policy = ReplicaEngine.from_args(settings, partial(require_fit, settings.dialects), self._migrator)
-        self._engine, self._limits = self._policy.engine, self._policy.limits
+        self._limits = settings.limits.limits()
+        self._engine = _engine(settings, self._limits, self._migrator)
+        self._configured = False
         self._migrator.start(self._engine)
         self._rebalancer = Rebalancer(self._engine, self._peers, self._load_of)
-        self._weights = OwnWeights(self._peers.own_name, self._engine.weights)
+        self._weights = ThisReplica(self._peers.own_name, self._engine.weights)
         self._pusher = WeightPusher(self._weights, self._peers.others)
 
         # What is seen of it.
         node = ray.get_runtime_context().get_node_id()[:8]
-        ask = None if candidate is None else CandidateLink(candidate)
-        self._observers = open_observers(self._engine, settings, self._peers.own_name, node, self.metadata, ask)
-        self._fleet = Fleet(self._observers.view, ReplicaViews([self._app], but=self._peers.own_name))
+        self._observers = open_observers(self._engine, settings, self._peers.own_name, node, self.metadata)
+        self._fleet = Fleet(self._observers.view, self._peers)
         self._meter = LoadMeter(self._engine.queue)
-        self._metrics = Exporter(self._engine, tags_of(settings.policy), self._keys, self._observers)
+        self._metrics = Exporter(self._engine, tags_of(settings.policy), self._keys, self._observers.recorder)
         self._metrics.start()
 
         # The ways in.
@@ -126,18 +129,38 @@ class PolicyReplica(ClientApi, SiblingApi):
     async def reconfigure(self, settings: dict[str, Any] | None, rank: Any) -> None:
         """Apply the file's `user_config`; called by Serve before the replica is ready, and when the settings change.
 
-        An error of the first call makes the start of the replica fail. `rank` is not used, but Serve calls a method
-        with this parameter also without a `user_config`.
+        The first call loads the policy, so that Serve reports RUNNING only when it can act, and `serve status` has the
+        reason why it cannot. Later calls return at once and raise nothing, as an error would end the replica: the
+        metadata and the log show the result of the swap.
+
+        Args:
+            settings: The policy's settings that replace those in `args`.
+            rank: Not used, but without this parameter Serve calls no `reconfigure` if there is no `user_config`.
         """
-        if not self._policy.configure(settings):
+        config = {**self._args.config, **(settings or {})}
+        if self._configured:
+            logger.info("new settings, to be loaded beside the present ones: %s", config)
+        self._engine.models.configure(config)
+        if self._configured:
             return
-        await self._policy.load()
+        self._configured = True
+        await self._load_policy()
         await self._catch_up()  # takes the others' versions before this replica is ready
         self._rebalancer.start()
         works = [self._watch_shutdown(), self._keep_catching_up()]
         if self._gateway is not None:
             works.append(self._poll_gateways())
         self._tasks = [asyncio.ensure_future(work) for work in works]
+
+    async def _load_policy(self) -> None:
+        try:
+            await asyncio.to_thread(self._engine.start)
+        except PolicyFailed as error:
+            if not isinstance(error.__cause__, VLAgentsError):
+                raise
+            logger.exception("the policy did not load")
+            # Errors of this package say what to do: `serve status` would show the tracebacks of both before it.
+            raise PolicyFailed(str(error)) from None
 
     async def close(self) -> None:
         """Close everything: first what gives or takes work, then the engine, then what observes it, the ways in last.
@@ -162,7 +185,7 @@ class PolicyReplica(ClientApi, SiblingApi):
 
     async def check_health(self) -> None:
         """Raise if the policy died or hangs; Serve calls this once the policy has loaded, and replaces the replica."""
-        await self._policy.check_health()
+        await asyncio.to_thread(self._engine.check_health)
 
     async def refusal(self) -> str | None:
         """Return the full reason why the policy cannot act yet, for the process that starts the server; else None."""
@@ -213,7 +236,7 @@ class PolicyReplica(ClientApi, SiblingApi):
 
     def metadata(self) -> dict[str, Any]:
         """Return the document of `GET /v1/metadata` and `RemoteAgent.metadata`."""
-        contract, models, shadow = self._engine.contract, self._engine.models, self._args.shadow
+        contract, models = self._engine.contract, self._engine.models
         return {
             "policy": self._args.policy,
             "checkpoint": resolved(models.config),
@@ -231,7 +254,6 @@ class PolicyReplica(ClientApi, SiblingApi):
             "dialects": describe(self._args.dialects) | self._gateways,
             "local": None if self._local is None else asdict(self._local.address),
             "stream": None if self._stream is None else asdict(self._stream.address),
-            "shadow": None if shadow is None else shadow.model_dump(include={"policy", "share"}),
         }
 
     # Clients inside the cluster: `ClientApi`.
@@ -252,7 +274,7 @@ class PolicyReplica(ClientApi, SiblingApi):
 
     async def call(self, session_id: str, frame: Any) -> bytes:
         """Execute a frame of requests from inside the cluster, a buffer that is read in place from plasma."""
-        return await self._policy.call(session_id, frame)
+        return await answer_frame(self._engine, self._limits, session_id, frame)
 
     async def lease(self, length: int) -> tuple[bytes, int]:
         """Lease a plasma channel for frames of `length` bytes to a client that got the address from `attach`."""
@@ -315,7 +337,7 @@ class PolicyReplica(ClientApi, SiblingApi):
         except UnknownSession:
             return None
 
-    # New weights: from learners, and from the replica that coordinates a push (`WeightsReplica`).
+    # New weights: from learners, and from the replica that coordinates a push.
 
     async def push_weights(self, values: Values, options: PushOptions) -> PushResult:
         """Let all replicas act with new weights; called by a learner."""
@@ -335,28 +357,14 @@ class PolicyReplica(ClientApi, SiblingApi):
     async def versions_of_weights(self) -> list[int]:
         """Return the newest version of each replica that can be reached; called by a learner."""
         replicas: list[WeightsReplica] = [self._weights, *await self._peers.others()]
-        found = await asyncio.gather(*(replica.newest_weights() for replica in replicas), return_exceptions=True)
+        found = await asyncio.gather(
+            *(replica.weights(WeightUpdates.newest) for replica in replicas), return_exceptions=True
+        )
         return [newest.number for newest in found if isinstance(newest, NewestVersion)]
 
-    async def newest_weights(self) -> NewestVersion:
-        """Return the newest version that acts here."""
-        return await self._weights.newest_weights()
-
-    async def stage_weights(self, number: int, values: Values, options: PushOptions) -> str:
-        """Check and hold a version."""
-        return await self._weights.stage_weights(number, values, options)
-
-    async def commit_weights(self, number: int, options: PushOptions) -> None:
-        """Act with the staged version."""
-        await self._weights.commit_weights(number, options)
-
-    async def drop_weights(self, number: int) -> None:
-        """Drop the staged version."""
-        await self._weights.drop_weights(number)
-
-    async def held_weights(self) -> list[HeldVersion]:
-        """Return the pushed versions that new episodes act with."""
-        return await self._weights.held_weights()
+    async def weights(self, method: str, *args: Any) -> Any:
+        """Call one of `WEIGHT_METHODS` for another replica, which coordinates a push or has missed one."""
+        return await self._weights.weights(WEIGHT_METHODS[method], *args)
 
     # What the replica does by itself.
 
@@ -395,6 +403,57 @@ class PolicyReplica(ClientApi, SiblingApi):
                 self._gateways = {}
                 logger.info("the gateway does not say where it listens: %s", error)
             await asyncio.sleep(_GATEWAY_POLL_S)
+
+
+def _engine(args: ServerArgs, limits: Limits, migrator: SessionMigrator) -> Engine:
+    """Make the engine, without loading the policy."""
+    if VISIBLE not in args.environment.env_vars:
+        hide_gpus(ray.get_runtime_context().get_accelerator_ids().get("GPU", []))
+    return Engine(
+        args.checkpoints.of(partial(make_agent, args), args.config),
+        max_batch_size=args.batch.max_size,
+        patience=args.batch.patience,
+        batch_sizes=args.batch.sizes or (),
+        session_limit=args.sessions.limit,
+        session_idle_s=args.sessions.idle_s,
+        version=version_of(args),
+        check=partial(require_fit, args.dialects),
+        limits=args.limits.call_limits(),
+        reply_bytes=limits.reply_bytes,
+        in_flight_bytes=limits.in_flight_bytes,
+        finder=migrator,
+    )
+
+
+def hide_gpus(given: Sequence[str]) -> None:
+    """Hide the node's GPUs from this process and its children, unless Ray has given it some.
+
+    Ray itself does not hide them from a replica with `num_gpus: 0`, which would take memory of the first one,
+    unreserved. It must be called before anything uses CUDA.
+    """
+    if given:
+        return
+    if found := gpus_here():
+        logger.warning(
+            "this node has %g GPUs, which are hidden from the policy, as its resources say num_gpus: 0; with "
+            "resources: {num_gpus: 1} it gets one",
+            found,
+        )
+    os.environ[VISIBLE] = ""
+
+
+async def answer_frame(engine: Engine, limits: Limits, session_id: str, frame: Any) -> bytes:
+    """Execute a frame of requests from inside the cluster, and return the frame of the replies."""
+    sender = Sender(engine, "handle", session_id, caller=NoKey.INSIDE, connected=False)
+    message, decoded = sender.message(), Decoded([], {})
+    try:
+        admission = sender.admission(limits)  # the frame is in plasma
+        decoded = await admission.decoded(partial(decode_requests, memoryview(frame)))
+        message.decoded(decoded)
+        await sender.ask(message, decoded, admission)
+    except VLAgentsError as error:
+        message.refuse(error)
+    return message.frame()
 
 
 def _plain_host() -> str:

@@ -1,4 +1,4 @@
-"""The other replicas of the same Serve application, called as actors."""
+"""Replicas of Serve applications in this Ray cluster, called as actors."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import asyncio
 import logging
 import time
 from collections.abc import Awaitable, Callable, Collection, Iterator
-from functools import partial
 from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar
 
 import ray
@@ -18,8 +17,7 @@ from vlagents_ray.serve.config.deployment import POLICY
 from vlagents_ray.serve.observers.live_view import OtherReplicas, Snapshot, SnapshotReader
 from vlagents_ray.serve.scaling.rebalancer import ReplicaLoad
 from vlagents_ray.serve.scaling.session_migration import HeldSessions, Peer, PeerEnded, PeerUnreachable
-from vlagents_ray.serve.scaling.weight_push import Values, WeightsReplica
-from vlagents_ray.serve.weights import HeldVersion, NewestVersion, PushOptions
+from vlagents_ray.serve.weights import WeightUpdates
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -51,6 +49,10 @@ class SiblingApi(Protocol):
         """Call the method of that name in `PEER_METHODS`, for moving sessions, and return its result."""
         ...
 
+    async def weights(self, method: str, *args: Any) -> Any:
+        """Call the method of that name in `WEIGHT_METHODS`, for pushes of weights, and return its result."""
+        ...
+
     async def live(self, since: int, shown: Collection[str]) -> Snapshot:
         """Return what happened since a snapshot, with pictures of the sessions `shown`."""
         ...
@@ -61,7 +63,7 @@ class SiblingApi(Protocol):
 
 
 class _Sibling(Peer):
-    """Another replica, for moving sessions and for pushes of weights (`WeightsReplica`)."""
+    """Another replica: for moving sessions, for pushes of weights (`WeightsReplica`), and for the live page."""
 
     def __init__(self, name: str, actor: Any) -> None:
         self.name = name
@@ -76,20 +78,16 @@ class _Sibling(Peer):
             raise PeerUnreachable(str(error)) from error
         return found
 
-    async def newest_weights(self) -> NewestVersion:
-        return await self._call(_ANSWER_S, WeightsReplica.newest_weights)
+    async def weights(self, method: Callable[..., T], *args: Any) -> T:
+        transfers = method in (WeightUpdates.stage, WeightUpdates.held)
+        found: T = await self._call(_TRANSFER_S if transfers else _ANSWER_S, SiblingApi.weights, method.__name__, *args)
+        return found
 
-    async def stage_weights(self, number: int, values: Values, options: PushOptions) -> str:
-        return await self._call(_TRANSFER_S, WeightsReplica.stage_weights, number, values, options)
+    async def live(self, since: int, shown: Collection[str]) -> Snapshot:
+        return await self._call(_VIEW_ANSWER_S, SiblingApi.live, since, shown)
 
-    async def commit_weights(self, number: int, options: PushOptions) -> None:
-        await self._call(_ANSWER_S, WeightsReplica.commit_weights, number, options)
-
-    async def drop_weights(self, number: int) -> None:
-        await self._call(_ANSWER_S, WeightsReplica.drop_weights, number)
-
-    async def held_weights(self) -> list[HeldVersion]:
-        return await self._call(_TRANSFER_S, WeightsReplica.held_weights)
+    async def press(self, session: str, do: str, by: str) -> dict[str, Any] | None:
+        return await self._call(_PRESS_S, SiblingApi.press, session, do, by)
 
     async def _call(
         self,
@@ -109,19 +107,63 @@ class _Sibling(Peer):
         return found
 
 
-class SiblingReplicas:
-    """Calls the other replicas of the application; each call looks them up again, since their set changes."""
+class ReplicasInCluster(OtherReplicas):
+    """The replicas of applications; each call looks them up again, since their set changes."""
+
+    def __init__(self, apps: Collection[str], but: str = "") -> None:
+        """Call the replicas of `apps`, apart from the replica whose full name is `but`."""
+        self._apps = apps
+        self._but = but
+        self._views: dict[str, SnapshotReader] = {}  # found last
+        self._found = float("-inf")
+
+    async def others(self) -> list[_Sibling]:
+        """Return all of them."""
+        return await asyncio.to_thread(lambda: [_Sibling(name, actor) for name, actor in self._actors()])
+
+    async def views(self) -> dict[str, SnapshotReader]:
+        """Return the reader of the snapshots of each, by name."""
+        if time.monotonic() - self._found > _VIEW_S:
+            self._found = time.monotonic()
+            self._views = {one.name: one.live for one in await self.others()}
+        return self._views
+
+    async def press(self, session: str, do: str, by: str) -> dict[str, Any] | None:
+        """Give a command to a session of one of them, see `CommandBoard.press`; None if none has the session.
+
+        Raises:
+            VLAgentsError: The replica that has the session refused the command.
+        """
+        for answer in asyncio.as_completed([one.press(session, do, by) for one in await self.others()]):
+            try:
+                pressed = await answer
+            except (PeerEnded, PeerUnreachable) as error:
+                logger.info("another replica does not answer: %s", error)
+                continue
+            if pressed is not None:
+                return pressed
+        return None
+
+    def _actors(self) -> Iterator[tuple[str, Any]]:
+        """Yield the name and the actor of each."""
+        prefixes = tuple(f"SERVE_REPLICA::{app}#{POLICY}#" for app in self._apps)
+        for entry in ray.util.list_named_actors(all_namespaces=True):
+            name = entry["name"]
+            if entry["namespace"] == _NAMESPACE and name.startswith(prefixes) and name != self._but:
+                try:
+                    yield name, ray.get_actor(name, namespace=_NAMESPACE)
+                except ValueError:  # the replica has ended meanwhile
+                    continue
+
+
+class SiblingReplicas(ReplicasInCluster):
+    """The other replicas of this replica's application."""
 
     def __init__(self) -> None:
         context = serve.get_replica_context()
-        self.app = context.app_name
-        self._deployment = context.deployment
         self.own_name = context.replica_id.to_full_id_str()
+        super().__init__([context.app_name], but=self.own_name)
         self._silent: dict[str, float] = {}  # time until which a silent replica is not asked, by its name
-
-    async def others(self) -> list[_Sibling]:
-        """Return all other replicas."""
-        return await asyncio.to_thread(lambda: [_Sibling(name, actor) for name, actor in self._actors()])
 
     def loads(self) -> list[ReplicaLoad]:
         """Return the loads of the replicas that answer within 0.3 s."""
@@ -148,20 +190,6 @@ class SiblingReplicas:
         """Wait for the other replica's answer to the client; None if it does not answer within 0.3 s."""
         return _result(reference, _QUICK_S)
 
-    def _actors(self) -> Iterator[tuple[str, Any]]:
-        return ((name, one) for name, one in replica_actors(self.app, self._deployment) if name != self.own_name)
-
-
-def replica_actors(app: str, deployment: str) -> Iterator[tuple[str, Any]]:
-    """Find the replicas of an application's deployment in this cluster; yield the name and the actor of each."""
-    for entry in ray.util.list_named_actors(all_namespaces=True):
-        name = entry["name"]
-        if entry["namespace"] == _NAMESPACE and name.startswith(f"SERVE_REPLICA::{app}#{deployment}#"):
-            try:
-                yield name, ray.get_actor(name, namespace=_NAMESPACE)
-            except ValueError:  # the replica has ended meanwhile
-                continue
-
 
 def _result(reference: Any, timeout_s: float = _ANSWER_S) -> Any:
     try:
@@ -169,55 +197,3 @@ def _result(reference: Any, timeout_s: float = _ANSWER_S) -> Any:
     except (ray.exceptions.RayError, TimeoutError) as error:
         logger.info("another replica does not answer: %s", error)
         return None
-
-
-class ReplicaViews(OtherReplicas):
-    """Reads the snapshots of the replicas of applications in the Ray cluster that this process is connected to."""
-
-    def __init__(self, apps: Collection[str], but: str = "") -> None:
-        """Read those of the replicas of `apps`, apart from the replica whose full name is `but`."""
-        self._apps = apps
-        self._but = but
-        self._views: dict[str, SnapshotReader] = {}  # found last
-        self._found = float("-inf")
-
-    async def views(self) -> dict[str, SnapshotReader]:
-        """Return the reader of the snapshots of each, by name."""
-        if time.monotonic() - self._found > _VIEW_S:
-            self._found = time.monotonic()
-            actors = await asyncio.to_thread(self._look_up)
-            self._views = {name: partial(_view, actor) for name, actor in actors.items()}
-        return self._views
-
-    async def press(self, session: str, do: str, by: str) -> dict[str, Any] | None:
-        """Give a command to a session of one of them, see `CommandBoard.press`; None if none has the session.
-
-        Raises:
-            VLAgentsError: The replica that has the session refused the command.
-        """
-        actors = await asyncio.to_thread(self._look_up)
-        asked = [
-            asyncio.wait_for(call_replica(actor, SiblingApi.press, session, do, by), _PRESS_S)
-            for actor in actors.values()
-        ]
-        for answer in asyncio.as_completed(asked):
-            try:
-                pressed: dict[str, Any] | None = await answer
-            except (ray.exceptions.RayError, TimeoutError, asyncio.TimeoutError) as error:
-                cause = getattr(error, "cause", None)  # what the replica itself raised
-                if isinstance(cause, VLAgentsError):
-                    raise cause from error
-                logger.info("another replica does not answer: %s", error)
-                continue
-            if pressed is not None:
-                return pressed
-        return None
-
-    def _look_up(self) -> dict[str, Any]:
-        actors = [found for app in self._apps for found in replica_actors(app, POLICY)]
-        return {name: actor for name, actor in actors if name != self._but}
-
-
-async def _view(actor: Any, since: int, shown: Collection[str]) -> Snapshot:
-    snapshot: Snapshot = await asyncio.wait_for(call_replica(actor, SiblingApi.live, since, shown), _VIEW_ANSWER_S)
-    return snapshot

@@ -16,8 +16,8 @@ from typing import Any, Protocol, TypeVar
 
 from vlagents_ray.errors import InvalidInput, InvalidWeights, PolicyUnavailable, VLAgentsError
 from vlagents_ray.serve.scaling.session_migration import PeerEnded, PeerUnreachable
-from vlagents_ray.serve.weights import HeldVersion, NewestVersion, PushOptions, PushResult, WeightUpdates
-from vlagents_ray.weights.shared_values import NotShared, SharedValues, opened
+from vlagents_ray.serve.weights import NewestVersion, PushOptions, PushResult, WeightUpdates
+from vlagents_ray.weights.shared_values import NotShared, SharedValues
 
 T = TypeVar("T")
 
@@ -31,36 +31,33 @@ _MOST_AHEAD = 10**9  # of a version that a learner numbers, such as by its step 
 _ATTEMPTS = 3  # at the commit of a replica that cannot be reached
 
 
+WEIGHT_METHODS: dict[str, Callable[..., Any]] = {
+    method.__name__: method
+    for method in (
+        WeightUpdates.newest,
+        WeightUpdates.stage,
+        WeightUpdates.commit,
+        WeightUpdates.drop,
+        WeightUpdates.held,
+    )
+}
+"""The methods that a replica may call at another one, by name."""
+
+
 class WeightsReplica(Protocol):
-    """A replica as a push sees it. Its methods raise `PeerEnded` and `PeerUnreachable` beside their own errors."""
+    """A replica as a push sees it."""
 
     @property
     def name(self) -> str:
         """Name of the replica, for messages."""
         ...
 
-    async def newest_weights(self) -> NewestVersion:
-        """Return the newest version that acts."""
-        ...
-
-    async def stage_weights(self, number: int, values: Values, options: PushOptions) -> str:
-        """Check and hold a version, and return the fingerprint of what is held."""
-        ...
-
-    async def commit_weights(self, number: int, options: PushOptions) -> None:
-        """Act with the staged version."""
-        ...
-
-    async def drop_weights(self, number: int) -> None:
-        """Drop the staged version."""
-        ...
-
-    async def held_weights(self) -> list[HeldVersion]:
-        """Return the pushed versions that new episodes act with, for a replica that lacks them."""
+    async def weights(self, method: Callable[..., T], *args: Any) -> T:
+        """Call a method of the replica's `WeightUpdates`; also raises `PeerEnded` and `PeerUnreachable`."""
         ...
 
 
-class OwnWeights(WeightsReplica):
+class ThisReplica(WeightsReplica):
     """This replica among those of a push."""
 
     def __init__(self, name: str, updates: WeightUpdates) -> None:
@@ -72,38 +69,16 @@ class OwnWeights(WeightsReplica):
     def name(self) -> str:
         return self._name
 
-    def pushed(self, took_ms: float) -> None:
-        """Note the duration of a push that this replica coordinated."""
-        self._updates.pushed(took_ms)
-
-    async def newest_weights(self) -> NewestVersion:
-        return self._updates.newest
-
-    async def stage_weights(self, number: int, values: Values, options: PushOptions) -> str:
-        """Check and hold a version on another thread, since that takes long, and return its fingerprint."""
-        if isinstance(values, SharedValues):
-            return await asyncio.to_thread(self._stage_shared, number, values, options)
-        named = values if isinstance(values, Mapping) else await values[0]
-        return await asyncio.to_thread(self._updates.stage, number, named, options)
-
-    def _stage_shared(self, number: int, values: SharedValues, options: PushOptions) -> str:
-        with opened(values) as named:
-            return self._updates.stage(number, named, options)
-
-    async def commit_weights(self, number: int, options: PushOptions) -> None:
-        self._updates.commit(number, options)
-
-    async def drop_weights(self, number: int) -> None:
-        self._updates.drop(number)
-
-    async def held_weights(self) -> list[HeldVersion]:
-        return await asyncio.to_thread(self._updates.held)
+    async def weights(self, method: Callable[..., T], *args: Any) -> T:
+        """Call the method on another thread, since it may take long."""
+        given = [await one[0] if isinstance(one, list) else one for one in args]
+        return await asyncio.to_thread(method, self._updates, *given)
 
 
 class WeightPusher:
     """Pushes new weights to all replicas, on the event loop of one of them."""
 
-    def __init__(self, own: OwnWeights, others: Callable[[], Awaitable[Sequence[WeightsReplica]]]) -> None:
+    def __init__(self, own: WeightsReplica, others: Callable[[], Awaitable[Sequence[WeightsReplica]]]) -> None:
         """Push to the `own` replica and to the `others`, which are looked up for each push."""
         self._own = own
         self._others = others
@@ -128,7 +103,10 @@ class WeightPusher:
         """
         begun = time.perf_counter()
         async with self._pushing:
-            newest = {self._own: await self._own.newest_weights(), **await self._loaded(await self._others())}
+            newest = {
+                self._own: await self._own.weights(WeightUpdates.newest),
+                **await self._loaded(await self._others()),
+            }
             if len({one.model for one in newest.values()}) > 1:
                 raise PolicyUnavailable("weights: the replicas are changing their checkpoint; push again in a while")
             last = max(one.number for one in newest.values())
@@ -145,7 +123,7 @@ class WeightPusher:
             staged: dict[WeightsReplica, str] = {}
 
             async def stage(replica: WeightsReplica) -> None:
-                staged[replica] = await replica.stage_weights(number, values, options)
+                staged[replica] = await replica.weights(WeightUpdates.stage, number, values, options)
 
             try:
                 await self._all(newest, stage)
@@ -155,10 +133,12 @@ class WeightPusher:
                     )
             except BaseException:
                 # Where staging failed, another push may have staged a version of the same number.
-                await asyncio.gather(*(one.drop_weights(number) for one in staged), return_exceptions=True)
+                await asyncio.gather(
+                    *(one.weights(WeightUpdates.drop, number) for one in staged), return_exceptions=True
+                )
                 raise
             done = await asyncio.gather(*(self._commit(replica, number, options) for replica in staged))
-            self._own.pushed(1e3 * (time.perf_counter() - begun))
+            await self._own.weights(WeightUpdates.pushed, 1e3 * (time.perf_counter() - begun))
             acting = sorted(replica.name for replica, acts in zip(staged, done, strict=True) if acts)
             return PushResult(number, staged[self._own], tuple(acting))
 
@@ -168,30 +148,30 @@ class WeightPusher:
         A replica calls this before it is ready, and regularly, since it may have missed a commit.
         """
         async with self._pushing:
-            own = best = await self._own.newest_weights()
+            own = best = await self._own.weights(WeightUpdates.newest)
             source = None
             for replica in await self._others():
                 try:
-                    newest = await replica.newest_weights()
+                    newest = await replica.weights(WeightUpdates.newest)
                 except (PeerEnded, PeerUnreachable, VLAgentsError):  # it knows no better than this one
                     continue
                 if newest.number > best.number and newest.model == own.model:
                     best, source = newest, replica
             if source is None:
                 return own.number
-            for version in await source.held_weights():
+            for version in await source.weights(WeightUpdates.held):
                 if version.number > own.number:
                     options = PushOptions(allow_same=True, pin=version.pinned)
-                    await self._own.stage_weights(version.number, version.values, options)
-                    await self._own.commit_weights(version.number, options)
+                    await self._own.weights(WeightUpdates.stage, version.number, version.values, options)
+                    await self._own.weights(WeightUpdates.commit, version.number, options)
             logger.info("took version %d of the weights from %s", best.number, source.name)
-            return (await self._own.newest_weights()).number
+            return (await self._own.weights(WeightUpdates.newest)).number
 
     async def _commit(self, replica: WeightsReplica, number: int, options: PushOptions) -> bool:
         """Commit at one replica, and return whether it acts with the version; otherwise it will catch up."""
         for _ in range(_ATTEMPTS):
             try:
-                await replica.commit_weights(number, options)
+                await replica.weights(WeightUpdates.commit, number, options)
             except PeerEnded:
                 return False
             except PeerUnreachable as error:
@@ -206,7 +186,7 @@ class WeightPusher:
         A replica does not answer while it loads. One that has answered before has loaded, and cannot be reached.
         """
         found: dict[WeightsReplica, NewestVersion] = {}
-        answers = await asyncio.gather(*(one.newest_weights() for one in replicas), return_exceptions=True)
+        answers = await asyncio.gather(*(one.weights(WeightUpdates.newest) for one in replicas), return_exceptions=True)
         for replica, answer in zip(replicas, answers, strict=True):
             if isinstance(answer, NewestVersion):
                 found[replica] = answer

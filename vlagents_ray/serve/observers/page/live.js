@@ -4,8 +4,6 @@
 const KEPT_S = 10; // times and rates are of the last seconds
 const POINTS = 120; // of a sparkline
 const LINES = 8; // most lines in one plot
-const EXECUTED = 300; // actions that a card keeps
-const PLANS = 12; // chunks that a card keeps
 const STAGES = ["decode", "queue", "inference", "encode"];
 const COLOURS = ["--c0", "--c1", "--c2", "--c3", "--c4", "--c5"];
 const SVG = "http://www.w3.org/2000/svg";
@@ -204,10 +202,9 @@ function svgElement() {
   return svg;
 }
 
-function polyline(points, colour, kind = "") {
+function polyline(points, colour) {
   const line = document.createElementNS(SVG, "polyline");
   line.setAttribute("points", points.join(" "));
-  line.setAttribute("class", kind);
   line.style.stroke = `var(${colour})`;
   return line;
 }
@@ -226,16 +223,11 @@ class Card {
     this.cameras = element("div", { className: "cameras" });
     this.drawn = element("div", { className: "plots" });
     this.told = element("dl");
-    this.plans = []; // the last chunks: the step of their first row, and their rows
-    this.executed = new Map(); // action by step
-    this.joint = element("select", { onchange: () => this.compare() });
-    this.compared = element("figure", { className: "compared", hidden: true }, svgElement(),
-      element("figcaption", {}, element("label", {}, "Planned and executed, joint ", this.joint), element("span")));
     const unique = `${cards.size}-${Date.now()}`;
     const name = element("p", { id: `name-${unique}`, className: "name" }, id);
     this.outcome = element("p", { className: "note", role: "status" });
     this.operated = this.buttons();
-    this.numbers = element("details", {}, element("summary", {}, "Numbers"), this.drawn, this.compared, this.told);
+    this.numbers = element("details", {}, element("summary", {}, "Numbers"), this.drawn, this.told);
     this.root = element("article", {}, element("div", { className: "title" }, this.instruction, this.badge), name, this.error, this.cameras, this.operated, this.numbers);
     this.instruction.id = `session-${unique}`;
     this.root.setAttribute("aria-labelledby", `session-${unique} name-${unique}`);
@@ -262,13 +254,10 @@ class Card {
       this.plot(`state: ${part}`, rows);
     }
     this.operated.hidden = !mayOperate || this.rank !== "robot";
-    this.follows.textContent = said.follows ? "Pin version" : "Follow versions";
     this.save.hidden = !ring;
     this.save.textContent = `Save last ${ring} s`;
-    this.follows.value = said.follows ? "pin" : "follow";
     this.commands(said.commands);
     if (said.last) this.act(said.last);
-    if (said.played) this.played(said.played);
     this.root.classList.toggle("silent", said.silent_s > 5);
     this.tell({ step: said.step, "weights version": said.version, "last request": `${said.silent_s.toFixed(1)} s ago` });
   }
@@ -276,7 +265,6 @@ class Card {
   act(act) {
     this.root.classList.toggle("failed", Boolean(act.error));
     this.error.textContent = act.error ? `${act.error}: ${act.detail}` : "";
-    if (act.action && act.at != null) this.plans = [...this.plans, { at: act.at, rows: act.action }].slice(-PLANS);
     if (act.action) this.plot(act.rows > 1 ? `plan: ${act.rows} rows` : "action", this.planned(act));
     const ms = act.ms;
     if (ms.inference_ms !== undefined) {
@@ -290,11 +278,10 @@ class Card {
   buttons() {
     const button = (text, command, className = "") => element("button", { type: "button", className, value: command,
       ariaLabel: `${text}: ${this.id}`, onclick: (event) => this.press(event.currentTarget.value) }, text);
-    this.follows = button("Pin version", "pin", "quiet");
     this.save = button("Save", "save", "quiet");
     return element("div", { className: "operate", hidden: true },
       element("div", { className: "row" }, button("Stop", "stop", "stop"), button("Pause", "pause"), button("Success", "success", "quiet"), button("Failure", "failure", "quiet")),
-      element("div", { className: "row" }, this.follows, this.save), this.outcome);
+      element("div", { className: "row" }, this.save), this.outcome);
   }
 
   async press(command) {
@@ -322,41 +309,6 @@ class Card {
     if (!last || state === this.last) return;
     this.last = state;
     this.say(OUTCOMES[last.state](last), ["refused", "ignored", "too late"].includes(last.state));
-  }
-
-  // What the robot executed, as its chunk player states it with each request.
-  played(said) {
-    if (said.step < this.step) { this.executed.clear(); this.plans = []; } // another player
-    this.step = said.step;
-    said.steps.forEach((step, i) => { this.executed.delete(step); this.executed.set(step, said.rows[i]); });
-    while (this.executed.size > EXECUTED) this.executed.delete(this.executed.keys().next().value);
-    const spells = said.safe_spells ? `${said.safe_ticks} ticks in ${said.safe_spells} ${said.safe_spells === 1 ? "spell" : "spells"}` : "none";
-    this.tell({ "age when executed": said.age_ms == null ? null : `${said.age_ms.toFixed(0)} ms`, "safe action now": said.safe || null,
-      "safe actions": spells, "answers too late": said.late, reconnects: said.reconnects });
-    this.compare();
-  }
-
-  // One joint of the last chunks (dashed) and of the actions that were executed (solid), by step.
-  compare() {
-    const { plans, executed } = this;
-    if (!plans.length || !executed.size) return;
-    const plan = plans[plans.length - 1];
-    this.compared.hidden = false;
-    const joints = plan.rows[0].length;
-    if (this.joint.length !== joints) this.joint.replaceChildren(...plan.rows[0].map((_, i) => element("option", { value: i }, `${i + 1} of ${joints}`)));
-    const joint = Number(this.joint.value), first = plan.at - 2 * plan.rows.length;
-    const lines = [
-      ...plans.map((one) => one.rows.map((row, i) => [one.at + i, row[joint]])),
-      [...executed].sort((a, b) => a[0] - b[0]).map(([step, row]) => [step, row[joint]]),
-    ].map((line) => line.filter(([step, value]) => step >= first && value != null));
-    const values = lines.flat().map(([, value]) => value), steps = lines.flat().map(([step]) => step);
-    if (!values.length) return;
-    const low = Math.min(...values), range = Math.max(...values) - low || 1, from = Math.min(...steps), length = Math.max(1, Math.max(...steps) - from);
-    const [svg, caption] = this.compared.children;
-    svg.replaceChildren(...lines.map((line, i) => polyline(line.map(([step, value]) => `${(100 * (step - from)) / length},${95 - (90 * (value - low)) / range}`), COLOURS[i < plans.length ? 1 : 0], i < plans.length ? "planned" : "executed")));
-    const told = `${number(low)} to ${number(Math.max(...values))}; dashed: planned, solid: executed, up to step ${this.step}`;
-    caption.lastChild.textContent = told;
-    svg.setAttribute("aria-label", `Joint ${joint + 1}, ${told}`);
   }
 
   // A chunk is drawn as it is; single actions as the last of them.
