@@ -53,10 +53,6 @@ class View:
         if self._closed == self._open:
             raise ConfigError(f"{name}: gripper_range is {mapped.gripper_range}, want two different numbers")
 
-    @property
-    def renders(self) -> bool:
-        return any(pick.text == RENDER for pick in self._cameras.values())
-
     def observe(self, nested: Any, render: Callable[[], Any]) -> Obs:
         """Return an observation of the environment as ours; `render` gives the picture of its own renderer."""
         cameras, recorded = {}, {}
@@ -79,10 +75,6 @@ class View:
             action = self._low + (action + 1) / 2 * (self._high - self._low)
         clipped: np.ndarray = np.clip(action, self._low, self._high).astype(self._dtype)
         return clipped
-
-    def idle(self) -> np.ndarray:
-        still: np.ndarray = np.clip(np.zeros_like(self._low), self._low, self._high).astype(self._dtype)
-        return still
 
     def succeeded(self, info: Mapping[str, Any], terminated: bool) -> bool:
         success = self._options.success
