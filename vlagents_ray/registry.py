@@ -258,7 +258,6 @@ _EXTRAS = {
     "trackio": "trackio",
     "tensorboard": "tensorboard",
     "rerun": "rerun",
-    "foxglove": "foxglove",
 }
 
 # import name -> how to come by a package that no extra and no file of requirements/ installs

@@ -59,7 +59,6 @@ class EvalOptions:
     video: Annotated[str | None, typer.Option(help="none, failures (default) or all.")] = None
     record: Annotated[str | None, typer.Option(help="Trajectories: none (default), failures or all.")] = None
     rerun: Annotated[str | None, typer.Option(metavar="DIR", help="Write .rrd files for Rerun; or 'live'.")] = None
-    foxglove: Annotated[str | None, typer.Option(metavar="DIR", help="Write .mcap files for Foxglove.")] = None
     track: Annotated[str, typer.Option(help="wandb, trackio, tensorboard, with commas between them.")] = ""
     resume: Annotated[bool, typer.Option(help="Go on with the results in --out.")] = False
     accept_changes: Annotated[
@@ -139,7 +138,7 @@ def evaluate_command(options: EvalOptions) -> None:
     """Evaluate policies: episodes in parallel, success rates with confidence intervals, videos.
 
     A file holds policies, their checkpoints, suites of environments, seeds; --out, --workers, --video, --record,
-    --rerun, --foxglove, --track, --retries and --resume win over it.
+    --rerun, --track, --retries and --resume win over it.
 
     Exit status: 0 when every episode has its result; 75 when --end-at left some over, 130 if interrupted (resume both
     with --resume); 2 for invalid settings; 3 when an error of the policy ended every episode of a cell; 1 for any other

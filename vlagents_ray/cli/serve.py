@@ -19,7 +19,6 @@ from vlagents_ray.cli.options import Address, Set, command_of, parse_settings
 from vlagents_ray.cli.ray_session import RESTART, exit_if_ray_is_lost, quiet_ray
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.ports import EVERYWHERE, LOOPBACK
-from vlagents_ray.viewers.targets import is_live
 
 if TYPE_CHECKING:
     from ray.serve.schema import ServeDeploySchema
@@ -45,7 +44,6 @@ class ServeOptions:
         int | None, typer.Option(min=1, max=65535, help="Also accept clients of the package vlagents, at this port.")
     ] = None
     rerun: Annotated[str | None, typer.Option(metavar="DIR", help="Write .rrd files for Rerun.")] = None
-    foxglove: Annotated[str | None, typer.Option(metavar="DIR", help="Write .mcap files for Foxglove.")] = None
     address: Address = None
     keys: Annotated[
         Path | None, typer.Option(help="File of the API keys; default: VLAGENTS_RAY_KEYS_FILE or VLAGENTS_RAY_KEYS.")
@@ -63,10 +61,8 @@ class ServeOptions:
             ConfigError: An option cannot be parsed, or --serve-set has settings of the policy.
         """
         args = parse_settings(self.serve_set, "--serve-set")
-        for name, target in (("rerun", self.rerun), ("foxglove", self.foxglove)):
-            if target is not None:
-                where = target if is_live(name, target) else str(Path(target).resolve())
-                args["viewers"] = {**args.get("viewers", {}), name: where}
+        if self.rerun is not None:
+            args["rerun"] = self.rerun
         if "config" in args:
             raise ConfigError("--serve-set config: the policy's own settings go into --set")
         config = parse_settings(self.settings, "--set")

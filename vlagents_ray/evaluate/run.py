@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from vlagents_ray.errors import ConfigError, StorageFailed, from_code
-from vlagents_ray.evaluate.artifacts.recorder import Artifacts, save, save_views
+from vlagents_ray.evaluate.artifacts.recorder import Artifacts, save, save_view
 from vlagents_ray.evaluate.artifacts.storage import driver_code, policy_code, save_diffs, storing, versions
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.episode.records import EpisodeResult, WorkerInfo
@@ -261,7 +261,8 @@ class _Run:
     def _record(self, job: Job, result: EpisodeResult, kept: Artifacts) -> None:
         # Files first: a crash in between repeats the episode, and they are overwritten.
         videos, trajectory = save(self._config.out, job.cell, result, kept)
-        save_views(self._config, job.cell, result, kept.views)
+        if self._config.rerun and kept.rerun is not None:
+            save_view(self._config.rerun, job.cell, result, kept.rerun)
         self._store.record(result, job.attempt, videos, trajectory)
         self._progress.episode(job.cell, result)
         self._left[job.key.settings] -= 1

@@ -91,7 +91,7 @@ def test_tasks_are_those_of_the_plan_and_patterns_match_them(tmp_path: Path) -> 
         planned_cells(plan(tmp_path, policies=pushed))
 
 
-@pytest.mark.parametrize("telling", [{"track": ["wandb"]}, {"rerun": "viewed"}, {"foxglove": "viewed"}])
+@pytest.mark.parametrize("telling", [{"track": ["wandb"]}, {"rerun": "viewed"}])
 def test_what_would_show_rates_or_policies_before_the_end_is_refused(tmp_path: Path, telling: dict[str, Any]) -> None:
     with pytest.raises(ConfigError, match=f"{next(iter(telling))}.*before the end"):
         planned_cells(plan(tmp_path, **telling))

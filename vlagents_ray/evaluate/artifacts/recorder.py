@@ -23,8 +23,7 @@ from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.evaluate.plan.config import EpisodeChoice, EvalConfig
 from vlagents_ray.evaluate.plan.jobs import Job
 from vlagents_ray.interface import Act, Obs
-from vlagents_ray.viewers.targets import SUFFIXES, is_live, open_target
-from vlagents_ray.viewers.viewer import EpisodeViewer, ViewerFrame, numbers_of
+from vlagents_ray.viewers import EpisodeViewer, ViewerFrame, is_live, numbers_of, open_viewer
 
 log = logging.getLogger(__name__)
 
@@ -36,7 +35,7 @@ class Artifacts:
     footage: Footage = field(default_factory=Footage)
     trajectory: bytes | None = None  # a `Trajectory` as .npz
     transitions: Any = None  # a pyarrow.RecordBatch, for a learner
-    views: dict[str, bytes] = field(default_factory=dict)  # the viewers' files, by the name of the viewer
+    rerun: bytes | None = None  # the file of Rerun
     not_repeatable: str | None = None  # why images are missing that were to be rendered in a second pass
 
 
@@ -72,9 +71,9 @@ class Recording(EpisodeRecorder):
         self._wants_video, self._wants_trajectory = config.video, config.record
         self._video = VideoRecorder(fps, seen=config.record != "none")
         self._trajectory, self._played = TrajectoryRecorder(), PlayedEpisode()
-        self._views = EpisodeViews(config, fps)
-        self._is_viewed = bool(config.rerun or config.foxglove)
-        self._observers: list[EpisodeObserver] = [self._views]
+        self._view = EpisodeView(config.rerun, fps)
+        self._is_viewed = bool(config.rerun)
+        self._observers: list[EpisodeObserver] = [self._view]
         self._observers += [self._played] if self.wants_images == "failures" else []
         self._observers += [self._trajectory] if self._wants_trajectory != "none" else []
 
@@ -84,7 +83,7 @@ class Recording(EpisodeRecorder):
         return "all" if "all" in wanted or self._is_viewed else "failures" if "failures" in wanted else "none"
 
     def begin(self, job: Job) -> None:
-        self._views.begin(job)
+        self._view.begin(job)
 
     def add_observation(self, obs: Obs) -> None:
         self._show(obs)
@@ -101,9 +100,9 @@ class Recording(EpisodeRecorder):
 
     def finish(self, result: EpisodeResult, second_pass: SecondPass) -> Artifacts:
         video, trajectory = _wanted(self._wants_video, result), _wanted(self._wants_trajectory, result)
-        views = self._views.finish()
+        rerun = self._view.finish()
         if not video and not trajectory:
-            return Artifacts(views=views)
+            return Artifacts(rerun=rerun)
         if self._played.lacks_images:
             self._video.close()
             if (reason := second_pass(self._played, self._show)) is not None:
@@ -112,7 +111,7 @@ class Recording(EpisodeRecorder):
         return Artifacts(
             Footage(footage.shown if video else {}, footage.seen if trajectory else {}),
             self._trajectory.finish().to_bytes() if trajectory else None,
-            views=views,
+            rerun=rerun,
         )
 
     def _show(self, obs: Obs) -> None:
@@ -123,7 +122,7 @@ class Recording(EpisodeRecorder):
 
     def __exit__(self, *exc: object) -> None:
         self._video.close()
-        self._views.close()
+        self._view.close()
 
 
 def save(out: Path, cell: EvalCase, result: EpisodeResult, kept: Artifacts) -> tuple[list[str], str | None]:
@@ -136,11 +135,11 @@ def _wanted(which: EpisodeChoice, result: EpisodeResult) -> bool:
     return which == "all" or (which == "failures" and not result.success_once)
 
 
-class EpisodeViews(EpisodeObserver):
-    """Shows one episode in the viewers that the settings name. Use as a context manager, which closes them."""
+class EpisodeView(EpisodeObserver):
+    """Shows one episode in Rerun, if the settings have a target."""
 
-    def __init__(self, config: EvalConfig, hz: float | None) -> None:
-        """Open the viewers; `hz` is the control rate of the env."""
+    def __init__(self, target: str | None, hz: float | None) -> None:
+        """Open the viewer; `hz` is the control rate of the env."""
         self._period_s = 1 / (hz or DEFAULT_FPS)
         self._begun = time.time()
         self._seen: list[ViewerFrame] = []  # observations whose action is not executed yet, at most two
@@ -148,79 +147,67 @@ class EpisodeViews(EpisodeObserver):
         self._rows: np.ndarray | None = None  # of the newest chunk, (H, D)
         self._row = 0  # of that chunk, for the next action
         self._numbers: dict[str, float] = {}
-        self._folders: dict[str, Path] = {}  # of files, by the name of the viewer
-        self._viewers: list[EpisodeViewer] = []
+        self._folder: Path | None = None  # of the file
+        self._viewer: EpisodeViewer | None = None
         self._shown = ExitStack()
-        targets = _targets(config)
         with ExitStack() as stack:
-            for name in targets:
-                if not is_live(name, targets[name]):
-                    self._folders[name] = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-            stack.enter_context(self._shown)  # closed before its folders are removed
-            for name, target in targets.items():
-                opened = open_target(name, str(self._folders.get(name, target)))
-                self._viewers.append(self._shown.enter_context(EpisodeViewer(opened)))
+            if target and not is_live(target):
+                self._folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+            stack.enter_context(self._shown)  # closed before its folder is removed
+            if target:
+                self._viewer = self._shown.enter_context(open_viewer(str(self._folder or target)))
             self._opened = stack.pop_all()
 
     def begin(self, job: Job) -> None:
         name = "_".join([*(part.replace("/", "_") for part in job.cell.name if part), stem(job.key)])
-        for viewer in self._viewers:
-            self._shown.enter_context(viewer.episode(name))
+        if self._viewer is not None:
+            self._shown.enter_context(self._viewer.episode(name))
 
     def add_observation(self, obs: Obs) -> None:
-        if self._viewers:
+        if self._viewer is not None:
             self._seen.append(ViewerFrame.of(obs, self._ticks, time=self._begun + self._ticks * self._period_s))
             self._ticks += 1
 
     def add_act(self, act: Act, ticks_waited: int = 0) -> None:
-        if self._viewers:
+        if self._viewer is not None:
             self._rows, self._row, self._numbers = np.array(act.rows()), 0, numbers_of(act.info)
 
     def add_action(self, action: np.ndarray, reward: float, success: bool) -> None:
-        if not self._viewers:
+        if self._viewer is None:
             return
         rows, row = self._rows, self._row
-        self._show(
+        shown = replace(
+            self._seen.pop(0),
             executed=np.array(action),
             planned=None if rows is None or row >= len(rows) else rows[row],
             chunk=rows if row == 0 else None,
             numbers={**self._numbers, "reward": float(reward), "success": float(success)},
         )
+        self._viewer.add(shown)
         self._row, self._numbers = row + 1, {}
 
-    def finish(self) -> dict[str, bytes]:
-        """Show the last observation, and return the files by the name of the viewer."""
-        while self._seen:
-            self._show()
-        self._shown.close()
-        for viewer in self._viewers:
-            if viewer.dropped or viewer.error is not None:
-                log.warning("%s", viewer.report())
-        files = {name: file.read_bytes() for name, folder in self._folders.items() for file in folder.iterdir()}
+    def finish(self) -> bytes | None:
+        """Show the last observation, and return the file, if there is one."""
+        if self._viewer is not None:
+            for frame in self._seen:
+                self._viewer.add(frame)
+            self._seen.clear()
+            self._shown.close()
+            if self._viewer.dropped or self._viewer.error is not None:
+                log.warning("%s", self._viewer.report())
+        files = [] if self._folder is None else [file.read_bytes() for file in self._folder.iterdir()]
         self.close()
-        return files
+        return files[0] if files else None
 
     def close(self) -> None:
-        """Close the viewers, and remove what is left of their files."""
+        """Close the viewer, and remove what is left of its file."""
         self._opened.close()
 
-    def _show(self, **what: Any) -> None:
-        frame = replace(self._seen.pop(0), **what)
-        for viewer in self._viewers:
-            viewer.add(frame)
 
-
-def save_views(config: EvalConfig, cell: EvalCase, result: EpisodeResult, files: dict[str, bytes]) -> None:
-    """Write the files of an episode as `FOLDER/POLICY/SUITE/ENV/epNNNN_seedS_OUTCOME.rrd`, or `.mcap`."""
-    for name, target in _targets(config).items():
-        if name in files:
-            folder = episode_folder(Path(target), ".", cell)
-            path = folder / f"{stem(result.key)}_{outcome(result)}{SUFFIXES[name]}"
-            for old in folder.glob(f"{stem(result.key)}_*{SUFFIXES[name]}"):  # of an earlier attempt
-                old.unlink()
-            with whole(path) as part:
-                part.write_bytes(files[name])
-
-
-def _targets(config: EvalConfig) -> dict[str, str]:
-    return {name: target for name, target in (("rerun", config.rerun), ("foxglove", config.foxglove)) if target}
+def save_view(folder: str, cell: EvalCase, result: EpisodeResult, file: bytes) -> None:
+    """Write the file of an episode as `FOLDER/POLICY/SUITE/ENV/epNNNN_seedS_OUTCOME.rrd`."""
+    below = episode_folder(Path(folder), ".", cell)
+    for old in below.glob(f"{stem(result.key)}_*.rrd"):  # of an earlier attempt
+        old.unlink()
+    with whole(below / f"{stem(result.key)}_{outcome(result)}.rrd") as part:
+        part.write_bytes(file)

@@ -25,7 +25,6 @@ from typing_extensions import Self
 
 from vlagents_ray.client.transports.select import TransportName
 from vlagents_ray.ray_tools.runtime_env import require_no_secrets
-from vlagents_ray.viewers.targets import require_no_server
 
 EpisodeChoice = Literal["none", "failures", "all"]
 Tracker = Literal["wandb", "trackio", "tensorboard"]
@@ -238,9 +237,7 @@ class EvalConfig(_PlanModel):
     workers: PositiveInt = 1  # environments rolled out in parallel
     video: EpisodeChoice = "failures"  # of which episodes there are videos
     record: EpisodeChoice = "none"  # and of which trajectories: states, actions, rewards, and what the policy saw
-    # Viewers that show every episode: a folder for their files, or for Rerun "live" or "rerun+http://HOST:PORT/proxy".
-    rerun: str | None = None
-    foxglove: str | None = None
+    rerun: str | None = None  # a folder of `.rrd` files of every episode; "live" or "rerun+http://HOST:PORT/proxy"
     resume: bool = False
     accept_changes: bool = False  # resume although files of policy or environment changed; the report says so
     worker: WorkerConfig = WorkerConfig()
@@ -257,11 +254,6 @@ class EvalConfig(_PlanModel):
     policy_timeout_s: PositiveFloat = 60.0  # one reset or act of the policy
     connect_timeout_s: PositiveFloat = 120.0  # reaching the policy, a restart of its server included
     place_timeout_s: PositiveFloat = 120.0  # until the cluster has resources for a worker
-
-    @field_validator("foxglove")
-    @classmethod
-    def _no_server(cls, foxglove: str | None) -> str | None:
-        return require_no_server(foxglove)
 
     @field_validator("policies")
     @classmethod

@@ -117,7 +117,7 @@ def planned_cells(config: EvalConfig) -> list[EvalCase]:
         raise ConfigError("robot: got no robot, want `robot: {tasks: …}` in the plan and the class of one (--robot)")
     if any(policy.pushed_weights is not None for policy in config.policies):
         raise ConfigError("pushed_weights: got some with a robot, want checkpoints; leave them out")
-    if telling := [name for name in ("track", "rerun", "foxglove") if getattr(config, name)]:
+    if telling := [name for name in ("track", "rerun") if getattr(config, name)]:
         raise ConfigError(f"{telling}: got them with a robot, want none: rates and times tell policies before the end")
     return cells(config)
 

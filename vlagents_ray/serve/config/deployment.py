@@ -22,13 +22,16 @@ from vlagents_ray.serve.config.dialects import DialectArgs
 from vlagents_ray.serve.models.checkpoints import Checkpoints
 from vlagents_ray.serve.queue.call_limits import CallLimits
 from vlagents_ray.settings import wrong_settings
-from vlagents_ray.viewers.targets import is_live, require_no_server
+from vlagents_ray.viewers import is_live
 
 POLICY, GATEWAY, SHADOW = "Policy", "Gateway", "Shadow"  # the deployments of an application
 _PYTHON = re.compile(r"^# python: (3\.\d+)\s*$", re.MULTILINE)
 
 # Links are not followed: the interpreter of a virtual environment links to that of its creator.
 AbsolutePath = Annotated[str, AfterValidator(lambda path: os.path.abspath(os.path.expanduser(path)))]
+RerunTarget = Annotated[
+    str, AfterValidator(lambda target: target if is_live(target) else os.path.abspath(os.path.expanduser(target)))
+]
 
 
 class _DeploymentModel(BaseModel):
@@ -65,31 +68,6 @@ class ShadowArgs(_DeploymentModel):
         "one from the working directory",
     )
     record_mb: int = Field(default=1000, ge=1, description="most MB of these files; the oldest ones are deleted")
-
-
-class ViewerArgs(_DeploymentModel):
-    """Where the episodes of all sessions are shown; unset: nowhere."""
-
-    rerun: str | None = Field(
-        default=None, description="an absolute folder for `.rrd` files, or the address of a viewer of Rerun"
-    )
-    foxglove: str | None = Field(default=None, description="an absolute folder for `.mcap` files")
-
-    @field_validator("foxglove")
-    @classmethod
-    def _no_server(cls, foxglove: str | None) -> str | None:
-        return require_no_server(foxglove)
-
-    @field_validator("rerun", "foxglove")
-    @classmethod
-    def _absolute(cls, target: str | None) -> str | None:
-        if target is not None and not is_live("rerun", target) and not Path(target).is_absolute():
-            raise ValueError(f"got {target!r}, want an absolute folder: replicas run in another one than this command")
-        return target
-
-    def targets(self) -> dict[str, str]:
-        """Return the target of each viewer that has one."""
-        return {name: target for name, target in self.model_dump().items() if target is not None}
 
 
 def python_wanted_by(requirements: Path) -> str | None:
@@ -430,7 +408,11 @@ class ServerArgs(_DeploymentModel):
     shadow: ShadowArgs | None = Field(
         default=None, description="a candidate that acts on live observations; its actions are never executed"
     )
-    viewers: ViewerArgs = Field(default=ViewerArgs(), description="recordings of all sessions for Rerun and Foxglove")
+    rerun: RerunTarget | None = Field(
+        default=None,
+        description="recordings of all sessions: a folder on the replicas' machines for `.rrd` files (a relative path "
+        "is one from the working directory), or the address of a viewer of Rerun",
+    )
 
     @model_validator(mode="after")
     def _one_scaling(self) -> ServerArgs:

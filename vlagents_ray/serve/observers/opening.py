@@ -1,4 +1,4 @@
-"""Opens the observers of a replica by their keys in its settings: `live`, `viewers`, `shadow` and `record`."""
+"""Opens the observers of a replica by their keys in its settings: `live`, `rerun`, `shadow` and `record`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vlagents_ray.serve.observers.live_view import ReplicaView
 from vlagents_ray.serve.observers.recording import SessionRecorder, open_recorder
 from vlagents_ray.serve.observers.shadow import Ask, ShadowSender
 from vlagents_ray.serve.observers.spans import RequestSpans
-from vlagents_ray.serve.observers.viewers import SessionViewers
+from vlagents_ray.serve.observers.viewer import SessionViewer
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,8 +60,8 @@ def open_observers(
         view = ReplicaView(engine, observers, name, node, metadata, args.live)
         view.open()
         opened.callback(view.close)
-        if targets := args.viewers.targets():
-            opened.callback(SessionViewers(engine.sessions, view.live, targets).close)
+        if args.rerun is not None:
+            opened.callback(SessionViewer(engine.sessions, view.live, args.rerun).close)
         if (tracer := tracing.tracer()) is not None:
             observe(RequestSpans(tracer, name))
         shadow = recorder = None

@@ -1,4 +1,4 @@
-"""Recordings of a server's sessions for viewers."""
+"""Recordings of a server's sessions for Rerun."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ import pytest
 from eval_fakes import wait_for
 from live_server import LiveServer, live_server
 from observed import observe
-from viewer_files import read_mcap, read_rrd
+from rerun_files import read_rrd
 
 from vlagents_ray import Obs, RemoteAgent
 from vlagents_ray.errors import UnknownSession
 from vlagents_ray.images.jpeg_png import decode
 from vlagents_ray.interface import Act, Agent
 from vlagents_ray.protocol.messages import Reply, Request
-from vlagents_ray.serve.observers.viewers import SessionViewers
+from vlagents_ray.serve.observers.viewer import SessionViewer
 
 ROWS = 3
 
@@ -39,28 +39,25 @@ def obs(value: int) -> Obs:
 
 
 @contextmanager
-def recorded(server: LiveServer, **targets: str) -> Iterator[None]:
-    viewers = SessionViewers(server.engine.sessions, server.view.live, targets)
+def recorded(server: LiveServer, folder: Path) -> Iterator[None]:
+    viewer = SessionViewer(server.engine.sessions, server.view.live, str(folder))
     try:
         wait_for(lambda: server.engine.observers.any)
         yield
     finally:
-        viewers.close()
+        viewer.close()
 
 
 @pytest.mark.library("rerun")
-@pytest.mark.library("foxglove")
-@pytest.mark.library("mcap")
 def test_each_reset_of_a_session_begins_a_file_with_every_answer(tmp_path: Path) -> None:
-    targets = {"rerun": str(tmp_path), "foxglove": str(tmp_path)}
     with (
         live_server(Counting()) as server,
-        recorded(server, **targets),
+        recorded(server, tmp_path),
         RemoteAgent(server.url, transport="http", codec="jpeg") as agent,
     ):
         for number, instruction in enumerate(("stack", "sort"), 1):
             agent.reset(obs(80), instruction)
-            wait_for(lambda number=number: len(list(tmp_path.glob("*.mcap"))) == number)
+            wait_for(lambda number=number: len(list(tmp_path.glob("*.rrd"))) == number)
             for _ in range(5):
                 agent.act(obs(80))
     first, second = sorted(tmp_path.glob("*.rrd"))
@@ -71,8 +68,6 @@ def test_each_reset_of_a_session_begins_a_file_with_every_answer(tmp_path: Path)
         assert shown["action/chunk"] == chunks
         assert shown["action/planned"] == {tick: rows[0] for tick, rows in chunks.items()}
         assert set(shown["timing/inference_ms"]) >= set(range(5))
-        messages = read_mcap(file.with_suffix(".mcap"))
-        assert messages["/chunk"] == [{"tick": tick, "rows": rows} for tick, rows in chunks.items()]
     shown = read_rrd(first)
     assert {tuple(values) for values in shown["state/joints"].values()} == {(80.0, 80.0, 80.0)}
     pictures = list(shown["cameras/front"].values())
@@ -80,12 +75,12 @@ def test_each_reset_of_a_session_begins_a_file_with_every_answer(tmp_path: Path)
     assert {round(float(decode(data).mean()), -1) for data in pictures} == {80}
 
 
-@pytest.mark.library("foxglove")
+@pytest.mark.library("rerun")
 def test_a_folder_that_cannot_be_written_to_costs_the_recording_and_no_answer(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     folder = tmp_path / "gone"
-    with live_server(Counting()) as server, recorded(server, foxglove=str(folder)), caplog.at_level(logging.WARNING):
+    with live_server(Counting()) as server, recorded(server, folder), caplog.at_level(logging.WARNING):
         folder.rmdir()
         with RemoteAgent(server.url, transport="http") as agent:
             agent.reset(obs(0), "stack")
@@ -95,9 +90,9 @@ def test_a_folder_that_cannot_be_written_to_costs_the_recording_and_no_answer(
     assert caplog.text.count("is not recorded") == 1
 
 
-@pytest.mark.library("foxglove")
+@pytest.mark.library("rerun")
 def test_a_session_that_is_not_there_has_no_file(tmp_path: Path) -> None:
-    with live_server(Counting()) as server, recorded(server, foxglove=str(tmp_path)):
+    with live_server(Counting()) as server, recorded(server, tmp_path):
         refused = Reply(error=UnknownSession("send a reset first"))
         observe(server.view.live, "nobody", Request("act", obs(0)), refused)
     assert list(tmp_path.iterdir()) == []

@@ -1,4 +1,4 @@
-"""Shows the episodes of a replica's sessions in viewers, from what the live observer keeps."""
+"""Shows the episodes of a replica's sessions in Rerun, from what the live observer keeps."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import logging
 import threading
 import time
 from collections import defaultdict
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 from vlagents_ray.naming import plain
@@ -14,8 +13,7 @@ from vlagents_ray.serve.models.loaded_model import LoadedModel
 from vlagents_ray.serve.observers.live import SHOWN_OPS, Answer, KeptObservation, LiveObserver
 from vlagents_ray.serve.observers.worker import be_nice
 from vlagents_ray.serve.sessions import SessionTable
-from vlagents_ray.viewers.targets import open_target
-from vlagents_ray.viewers.viewer import ViewerEpisode, ViewerFrame, dated_name
+from vlagents_ray.viewers import RerunEpisode, RerunRecordings, ViewerFrame, dated_name
 
 logger = logging.getLogger(__name__)
 
@@ -27,7 +25,7 @@ _NAME = 8  # characters of a session's id in the name of a file: a list of the f
 
 @dataclass(slots=True)
 class _SessionEpisode:
-    writers: list[ViewerEpisode]
+    writer: RerunEpisode | None  # None after an error
     shown: int  # number of the last observation that was shown
     acts: int = 0
 
@@ -51,7 +49,7 @@ class _SessionEpisode:
         return frame
 
 
-class SessionViewers:
+class SessionViewer:
     """Writes an episode for each `reset` of a session, until the next one or the session's end.
 
     One thread reads the live observer twenty times a second, and writes every answer with its times and its chunk (as
@@ -59,20 +57,15 @@ class SessionViewers:
     takes at most a tenth of a core; where that is too little, older answers are left out.
     """
 
-    def __init__(self, sessions: SessionTable[LoadedModel], live: LiveObserver, targets: Mapping[str, str]) -> None:
-        """Begin to show the sessions at `targets`: the folder or the address, by the name of the viewer.
-
-        Raises:
-            ConfigError: A target is the address of something else, or nothing listens there.
-            MissingDependency: A viewer's extra is not installed.
-        """
+    def __init__(self, sessions: SessionTable[LoadedModel], live: LiveObserver, target: str) -> None:
+        """Begin to show the sessions at `target`, a folder or an address; raises the errors of `RerunRecordings`."""
         self._sessions = sessions
         self._live = live
-        self._formats = [open_target(name, target) for name, target in targets.items()]
+        self._recordings = RerunRecordings(target)
         self._episodes: dict[str, _SessionEpisode] = {}  # by session
         self._since = 0  # number of the last answer that was read
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="vlagents-ray-viewers", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="vlagents-ray-viewer", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
@@ -106,28 +99,30 @@ class SessionViewers:
             self._end(name)
             episode = self._episodes[name] = _SessionEpisode(self._begun(name, instruction), shown)
         frame = episode.frame(answer, kept)
-        for writer in list(episode.writers):
-            try:
-                writer.write(frame)
-            except Exception as error:  # noqa: BLE001 - the server goes on without this episode
-                logger.warning("session %s: the rest of its episode is not recorded: %s", name, error)
-                episode.writers.remove(writer)
+        if episode.writer is None:
+            return
+        try:
+            episode.writer.write(frame)
+        except Exception as error:  # noqa: BLE001 - the server goes on without this episode
+            logger.warning("session %s: the rest of its episode is not recorded: %s", name, error)
+            episode.writer = None
 
-    def _begun(self, name: str, instruction: str | None) -> list[ViewerEpisode]:
+    def _begun(self, name: str, instruction: str | None) -> RerunEpisode | None:
         file = f"{dated_name()}_{plain(name)[:_NAME]}"
         try:
-            return [one.begin(file, instruction or "") for one in self._formats]
+            return self._recordings.begin(file, instruction or "")
         except Exception as error:  # noqa: BLE001 - likewise
             logger.warning("session %s: its episode is not recorded: %s", name, error)
-            return []
+            return None
 
     def _end(self, name: str) -> None:
         episode = self._episodes.pop(name, None)
-        for writer in () if episode is None else episode.writers:
-            try:
-                writer.close()
-            except Exception as error:  # noqa: BLE001 - likewise
-                logger.warning("session %s: the recording of its episode is not whole: %s", name, error)
+        if episode is None or episode.writer is None:
+            return
+        try:
+            episode.writer.close()
+        except Exception as error:  # noqa: BLE001 - likewise
+            logger.warning("session %s: the recording of its episode is not whole: %s", name, error)
 
     def _run(self) -> None:
         be_nice()
@@ -139,5 +134,3 @@ class SessionViewers:
         self._poll()
         for name in list(self._episodes):
             self._end(name)
-        for one in self._formats:
-            one.close()
