@@ -141,7 +141,6 @@ def _run(options: argparse.Namespace) -> LoopReport:
         watchdog = Watchdog(stop, silent_s if topics is None else {**topics.silent_s, **silent_s})
         if topics is not None:
             require_match(contract, topics.contract)
-            options.instruction = options.instruction or topics.first_instruction(say)
             topics.watchdog = watchdog
         stack.enter_context(_restarting(watchdog, say))
         if options.baseline > 0:
