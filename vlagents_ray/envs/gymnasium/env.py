@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.util
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,7 +15,7 @@ from vlagents_ray.contract import Contract
 from vlagents_ray.envs.base import EvalEnv, require_known
 from vlagents_ray.envs.graphics import prepare_rendering
 from vlagents_ray.envs.gymnasium.view import SUCCESS_KEYS, Mapped, View, plain
-from vlagents_ray.envs.simulator import BenchmarkProtocol, record_size_of
+from vlagents_ray.envs.simulator import BenchmarkProtocol
 from vlagents_ray.errors import ConfigError, EnvFailed, MissingDependency, NotReset, UnknownEnv, VLAgentsError
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.registry import require
@@ -111,7 +111,6 @@ class Gymnasium(EvalEnv):
         height: int | None = None,
         max_steps: int | None = None,
         remake: bool = False,
-        record_size: Sequence[int] | None = None,
     ) -> None:
         """Make the environment, and check one observation of it.
 
@@ -131,7 +130,6 @@ class Gymnasium(EvalEnv):
             height: The height to which every image is stretched, pixels.
             max_steps: The step limit, instead of the registered one.
             remake: Whether each reset makes the simulator again, for one whose own reset keeps some state.
-            record_size: Height and width of further copies of the images, for recordings only.
 
         Raises:
             UnknownEnv: There is no such id.
@@ -165,7 +163,6 @@ class Gymnasium(EvalEnv):
                 success=success,
                 unit_actions=unit_actions,
                 size=(height, width),
-                record_size=record_size_of(record_size, self._name),
             )
             self._view = View(self._name, self._env, mapped)
             first, _ = self._call("reset", seed=0)
@@ -300,11 +297,10 @@ class PushT(Gymnasium):
         width: int | None = None,
         height: int | None = None,
         max_steps: int | None = None,
-        record_size: Sequence[int] | None = None,
     ) -> None:
         """Make the environment; images are stretched to `width` and `height`, pixels."""
         self.require_task(task)
-        super().__init__(_ID, **_TASKS[task], width=width, height=height, max_steps=max_steps, record_size=record_size)
+        super().__init__(_ID, **_TASKS[task], width=width, height=height, max_steps=max_steps)
 
     @classmethod
     def tasks(cls) -> list[str]:
