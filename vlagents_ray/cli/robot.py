@@ -314,8 +314,6 @@ def command_parser() -> tuple[argparse.ArgumentParser, list[argparse.Action], li
     simulated("--set", **settings, help="a setting of the policy, repeatable")
     simulated("--episodes", type=rows, default=10, metavar="N", help="how many (%(default)s)")
     simulated("--seed", type=int, default=0, help="of the first episode; the others count on (%(default)s)")
-    simulated("--ask-for-help", type=_number(), metavar="U", help="pause where the policy's uncertainty is above this")
-    simulated("--samples", type=_number(int, least=2), metavar="N", help="to compute the uncertainty from")
     return parser, of_robot, of_env
 
 

@@ -118,8 +118,6 @@ def drive(options: argparse.Namespace) -> int:
     """Play what the options of `vlagents-ray robot --env` say, and return the command's exit status."""
     try:
         with errors():
-            if options.ask_for_help is not None and options.leader != "keyboard":
-                raise ConfigError("--ask-for-help: got it without a way to answer, want --leader keyboard")
             run = RobotRun(options)
             try:
                 run.play(range(options.seed, options.seed + options.episodes))
@@ -234,7 +232,7 @@ class RobotRun:
         policy.initialize()
         require_match(inner.contract, contract)
         given = self.options
-        settings = PlayerSettings(given.mode, given.execute, ask_for_help=given.ask_for_help, samples=given.samples)
+        settings = PlayerSettings(given.mode, given.execute)
         return ChunkPlayer(policy, settings, check=Guard(contract, max_step=given.max_step), override=leader)
 
     def _pause(self) -> None:
