@@ -68,7 +68,7 @@ def driver(link: str, kind: str, watch: Stopwatch) -> Iterator[tuple[str, Publis
         return
     node = Ros2("driver")
     node.advertise(IMAGE, kind)
-    node.subscribe(COMMANDS, "std_msgs/msg/Float64MultiArray", watch.arrived, sensor=False)
+    node.subscribe(COMMANDS, "std_msgs/msg/Float64MultiArray", watch.arrived)
     node.open()
     try:
         yield link, node.publish
@@ -88,7 +88,7 @@ def image(number: int, compressed: bool) -> dict[str, Any]:
     return {"header": header, **said, "data": pixels.tobytes()}
 
 
-def measure(link: str, *, compressed: bool, compression: str, images: int) -> list[float]:
+def measure(link: str, *, compressed: bool, images: int) -> list[float]:
     """Return the milliseconds from an image until its action came."""
     watch = Stopwatch()
     kind = f"sensor_msgs/msg/{'CompressedImage' if compressed else 'Image'}"
@@ -98,9 +98,7 @@ def measure(link: str, *, compressed: bool, compression: str, images: int) -> li
         stack.callback(over.set)
         action = {"topic": COMMANDS, "type": "std_msgs/msg/Float64MultiArray", "numbers": 1, "stop": "nothing"}
         stated = {"link": address, "cameras": {"front": {"topic": IMAGE, "type": kind}}, "actions": [action]}
-        settings = settings_from(
-            {**stated, "compression": compression, "max_age_s": 60.0, "silent_s": 60.0}, "benchmark"
-        )
+        settings = settings_from({**stated, "max_age_s": 60.0, "silent_s": 60.0}, "benchmark")
         begin = threading.Thread(target=_publish_until, args=(publish, compressed, over))
         begin.start()
         robot = stack.enter_context(RosRobot(settings))
@@ -147,18 +145,15 @@ def main() -> None:
     parser.add_argument("--link", default="double", help="double, ros2, or the address of a rosbridge beside ROS 2")
     parser.add_argument("--images", type=int, default=300)
     options = parser.parse_args()
-    print(f"{'link':<24}{'images':<12}{'as':<8}{'n':>5}{'p10 ms':>9}{'p50 ms':>9}{'p99 ms':>9}{'lost':>6}")  # noqa: T201
+    print(f"{'link':<24}{'images':<12}{'n':>5}{'p10 ms':>9}{'p50 ms':>9}{'p99 ms':>9}{'lost':>6}")  # noqa: T201
     for compressed in (False, True):
-        for compression in ("cbor",) if options.link == "ros2" else ("cbor", "none"):
-            took = measure(options.link, compressed=compressed, compression=compression, images=options.images)
-            name = "JPEG" if compressed else "rgb8"
-            way = "-" if options.link == "ros2" else compression
-            p10, p50, p99 = np.percentile(took, [10, 50, 99])
-            lost = options.images - len(took)
-            print(  # noqa: T201
-                f"{options.link:<24}{name:<12}{way:<8}{len(took):>5}{p10:>9.2f}{p50:>9.2f}{p99:>9.2f}{lost:>6}",
-                flush=True,
-            )
+        took = measure(options.link, compressed=compressed, images=options.images)
+        name = "JPEG" if compressed else "rgb8"
+        p10, p50, p99 = np.percentile(took, [10, 50, 99])
+        lost = options.images - len(took)
+        print(  # noqa: T201
+            f"{options.link:<24}{name:<12}{len(took):>5}{p10:>9.2f}{p50:>9.2f}{p99:>9.2f}{lost:>6}", flush=True
+        )
 
 
 if __name__ == "__main__":

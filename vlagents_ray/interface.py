@@ -37,7 +37,6 @@ if TYPE_CHECKING:
 # that `Obs.info` names.
 GOAL_IMAGE = "goal_image"  # (H, W, 3) uint8 RGB, for goal-conditioned policies
 DEPTH = "depth"  # {camera: (H, W) float32, metres; or uint16, millimetres}
-HIGH_RES = "high_res"  # {camera: (H, W, 3) uint8 RGB}, for recordings only; never sent to the policy
 SAMPLES = "samples"  # in an observation: the number of samples of its action distribution to return, N
 # In the Act: {"mean", "std": shaped as the action; "samples": (N, *action)} float32, and for each name of WANT what the
 # act says of every sample, with N as the first dimension.

@@ -208,17 +208,10 @@ ENVS: dict[str, Adapter] = {
     ),
     "gymnasium": Adapter(
         "vlagents_ray.envs.gymnasium:Gymnasium",
-        "Gymnasium-Robotics, any other, any VectorEnv",
+        "Gymnasium-Robotics, any other",
         needs=("gymnasium_robotics", "mujoco"),
         extra="robotics",
         tasks="/<id>",
-    ),
-    "hub": Adapter(
-        "vlagents_ray.envs.gymnasium.hub:EnvHub",
-        "LeRobot's EnvHub",
-        extra="hub",
-        tasks="/<user>/<repository>@<commit>",
-        page="gymnasium#environments-of-the-hub",
     ),
     "tabletop": Adapter(
         "vlagents_ray.envs.tabletop:Tabletop",
@@ -265,7 +258,6 @@ _EXTRAS = {
     "trackio": "trackio",
     "tensorboard": "tensorboard",
     "rerun": "rerun",
-    "foxglove": "foxglove",
 }
 
 # import name -> how to come by a package that no extra and no file of requirements/ installs
@@ -371,7 +363,7 @@ def env_task(name: str) -> str | None:
 
 
 def _is_class(name: str) -> bool:
-    """Whether an env's name is "module:Class"; a task may hold a colon, too, as in "hub/USER/REPO@COMMIT:FILE"."""
+    """Whether an env's name is "module:Class"; a task may hold a colon, too, as in "gymnasium/MODULE:ID"."""
     return ":" in name and name.partition("/")[0] not in ENVS
 
 

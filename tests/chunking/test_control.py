@@ -15,9 +15,9 @@ from scripted_leader import ScriptedLeader
 
 from vlagents_ray import Act, ActionSpec, Agent, ConfigError, Contract, Obs, PolicyFailed
 from vlagents_ray.chunking.control import Control
-from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings, uncertainty
+from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.errors import InvalidAction, InvalidObservation
-from vlagents_ray.interface import DELAY, EXECUTED, INTERVENTION, LEFTOVER, SAFE, SAMPLES, WANTED
+from vlagents_ray.interface import DELAY, EXECUTED, INTERVENTION, LEFTOVER, SAFE, WANTED
 from vlagents_ray.robot import Guard
 
 HORIZON = 5
@@ -453,46 +453,6 @@ def test_a_leader_needs_a_safe_action_that_is_no_guess() -> None:
 
     with ChunkPlayer(Unstated(), override=ScriptedLeader(row(0))) as player, pytest.raises(ConfigError, match="safe"):
         player.reset(Obs(), "stack")
-
-
-def test_an_uncertain_chunk_pauses_before_any_of_it_is_executed(make: Any) -> None:
-    agent = Near()
-    arm, leader = make(agent, ask_for_help=0.5, samples=8)
-    agent.info = {"uncertainty": 0.4}
-    for _ in range(HORIZON):
-        assert SAFE not in arm.tick().info
-    agent.info = {"uncertainty": [0.1, 0.7]}
-    at = arm.pose.copy()
-    act = arm.tick()
-    assert act.info[SAFE] == "asks for help: its uncertainty is 0.7, above 0.5"
-    assert act.action == pytest.approx(at)
-    arm.tick()
-    assert arm.player.control.state == "paused"
-    leader.held = True
-    arm.tick()
-    leader.held = False
-    for _ in range(2 * HORIZON):  # a human has looked at it: it may go on
-        assert SAFE not in arm.tick().info
-    agent.info = {"uncertainty": 0.1}
-    for _ in range(HORIZON):
-        arm.tick()
-    agent.info = {"uncertainty": 0.8}
-    assert "asks for help" in arm.tick().info[SAFE]
-    assert all(info[SAMPLES] == 8 for info in agent.asked)
-
-
-def test_uncertainty_is_what_the_policy_states_or_the_spread_of_its_samples() -> None:
-    assert uncertainty({}) is None
-    assert uncertainty({"distribution": {"std": np.array([[0.1, 0.3]])}}) == pytest.approx(0.2)
-    assert uncertainty({"uncertainty": 2, "distribution": {"std": np.zeros(1)}}) == 2
-
-
-def test_help_cannot_be_asked_for_by_a_policy_that_states_no_uncertainty(make: Any) -> None:
-    arm, _ = make(Near(), ask_for_help=0.5)
-    with pytest.raises(ConfigError, match="samples"):
-        arm.tick()
-    with pytest.raises(ConfigError, match="ask_for_help"):
-        ChunkPlayer(Near(), PlayerSettings(ask_for_help=float("nan")))
 
 
 def lines_of(function: Any) -> list[int]:

@@ -154,7 +154,6 @@ def test_a_policy_of_this_process_is_loaded_once(monkeypatch: pytest.MonkeyPatch
         ([], "want one of them"),
         (["--leader", "pedals"], "keyboard"),
         (["--leader", "keyboard"], "no terminal"),
-        (["scripted", "--ask-for-help", "0.5"], "--leader keyboard"),
         (["scripted", "--mode", "often"], "open_loop"),
         (["http://127.0.0.1:9", "--set", "a=1"], "has its settings already"),
     ],

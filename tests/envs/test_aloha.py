@@ -10,7 +10,7 @@ from vlagents_ray.contract import CameraSpec
 from vlagents_ray.envs.aloha import Aloha
 from vlagents_ray.envs.base import known_contract, make_env
 from vlagents_ray.errors import ConfigError, ContractMismatch, EnvFailed, InvalidObservation, NotReset, UnknownEnv
-from vlagents_ray.interface import HIGH_RES, Act, Obs
+from vlagents_ray.interface import Act, Obs
 from vlagents_ray.policies.experts import expert_for
 from vlagents_ray.testing import check_env
 
@@ -69,13 +69,13 @@ def test_images_are_left_out_where_nobody_looks_which_changes_nothing_else() -> 
 
 
 def test_the_contract_is_known_before_the_simulator_is_made() -> None:
-    with Aloha("insertion", width=40, height=32, cameras=("top", "angle"), record_size=(64, 80)) as env:
+    with Aloha("insertion", width=40, height=32, cameras=("top", "angle")) as env:
         assert (
             known_contract("aloha/insertion", {"width": 40, "height": 32, "cameras": ["top", "angle"]}) == env.contract
         )
         assert env.contract.cameras == {"top": CameraSpec(32, 40), "angle": CameraSpec(32, 40)}
         obs, _ = env.reset(seed=0)
-        assert obs.info[HIGH_RES]["angle"].shape == (64, 80, 3)
+        assert obs.cameras["angle"].shape == (32, 40, 3)
         assert env.instruction == "insert the peg into the socket"
         assert env.describe()["protocol"]["deviations"] == []
         env.close()
@@ -100,7 +100,6 @@ def test_a_deviation_from_the_protocol_is_recorded() -> None:
     [
         ({"width": 0}, ConfigError, "width is 0"),
         ({"cameras": ("wrist",)}, ConfigError, r"no camera \['wrist'\].*top"),
-        ({"record_size": (96,)}, ConfigError, "record_size"),
         ({"task": "insert"}, UnknownEnv, "did you mean 'insertion'"),
     ],
 )

@@ -13,7 +13,6 @@ from vlagents_ray.envs import make_env
 from vlagents_ray.envs.gymnasium import Gymnasium
 from vlagents_ray.envs.gymnasium.view import Pick, as_image, plain
 from vlagents_ray.errors import ConfigError, EnvFailed, InvalidAction, MissingDependency, NotReset, UnknownEnv
-from vlagents_ray.interface import HIGH_RES
 from vlagents_ray.testing import ContractViolation, check_env
 
 pytestmark = pytest.mark.sim
@@ -286,16 +285,10 @@ def test_an_image_is_a_copy() -> None:
     assert image.max() == 0
 
 
-def test_pictures_for_the_record_have_a_size_of_their_own() -> None:
-    with Gymnasium(
-        "gym_pusht/PushT-v0", kwargs={"obs_type": "pixels_agent_pos"}, width=32, height=32, record_size=(96, 96)
-    ) as env:
+def test_images_are_stretched_and_there_is_no_more_info_than_the_envs() -> None:
+    with Gymnasium("gym_pusht/PushT-v0", kwargs={"obs_type": "pixels_agent_pos"}) as large:
+        whole = large.reset(seed=0)[0].cameras["front"]
+    with Gymnasium("gym_pusht/PushT-v0", kwargs={"obs_type": "pixels_agent_pos"}, width=32, height=32) as env:
         obs, _ = env.reset(seed=0)
-        view = obs.info[HIGH_RES]["front"]
-        assert view.shape == (96, 96, 3)
-        np.testing.assert_array_equal(as_image(view, "front", (32, 32)), obs.cameras["front"])
-        assert HIGH_RES in env.step(Act(np.full(2, 100.0, np.float32)))[0].info
-    with Gymnasium("Pendulum-v1") as plain_env:
-        assert plain_env.reset(seed=0)[0].info == {}
-    with pytest.raises(ConfigError, match="record_size is"):
-        Gymnasium("Pendulum-v1", record_size=(96,))
+        np.testing.assert_array_equal(as_image(whole, "front", (32, 32)), obs.cameras["front"])
+        assert obs.info == {}

@@ -10,7 +10,7 @@ from vlagents_ray.envs.base import SequentialBatch, make_batch
 from vlagents_ray.envs.maniskill import ManiSkill
 from vlagents_ray.envs.maniskill.env import ManiSkillBatch
 from vlagents_ray.errors import ConfigError, NotReset
-from vlagents_ray.interface import HIGH_RES, Act
+from vlagents_ray.interface import Act
 from vlagents_ray.policies.experts import expert_for
 
 pytestmark = pytest.mark.vulkan
@@ -78,23 +78,6 @@ def test_results_say_which_protocol_was_followed_and_what_was_not() -> None:
     assert deviations[1] == "max_steps is 7, the task's own is 50"
 
 
-def test_views_for_the_record_have_a_size_of_their_own() -> None:
-    with (
-        ManiSkill("StackCube-v1", width=96, height=64) as large,
-        ManiSkill("StackCube-v1", width=32, height=32, record_size=(64, 96)) as env,
-    ):
-        for seed in SEEDS:  # the second scene has cameras of its own
-            seen, expected = env.reset(seed=seed)[0], large.reset(seed=seed)[0]
-            assert set(seen.info[HIGH_RES]) == set(seen.cameras) == {"base_camera", "hand_camera"}
-            for name, view in seen.info[HIGH_RES].items():
-                assert seen.cameras[name].shape == (32, 32, 3)
-                np.testing.assert_array_equal(view, expected.cameras[name])
-        hand = seen.info[HIGH_RES]["hand_camera"]
-        for _ in range(3):
-            seen, *_ = env.step(Act(np.array([0, 0.5, 0, 0, 0, 0, 1], np.float32)))
-        assert np.abs(seen.info[HIGH_RES]["hand_camera"].astype(int) - hand).max() > 20  # it moves with the hand
-
-
 def test_a_batch_of_one_plays_what_a_single_environment_plays() -> None:
     """All that the CPU can show of it: physics there has one environment."""
     actions = np.random.default_rng(0).uniform(-1, 1, (5, 7)).astype(np.float32)
@@ -122,8 +105,6 @@ def test_a_batch_of_one_plays_what_a_single_environment_plays() -> None:
 def test_several_environments_share_a_simulator_only_on_a_gpu() -> None:
     with pytest.raises(ConfigError, match="want physx_cuda"):
         ManiSkillBatch("PushCube-v1", num_envs=2, sim_backend="physx_cpu")
-    with pytest.raises(ConfigError, match="record_size"):
-        ManiSkillBatch("PushCube-v1", num_envs=1, record_size=(64, 64))
     with make_batch("maniskill/PushCube-v1", 2, **SMALL) as batch:
         assert isinstance(batch, SequentialBatch)
         assert len(batch.reset(seeds=SEEDS)) == 2

@@ -14,7 +14,7 @@ from vlagents_ray.contract import CameraSpec
 from vlagents_ray.envs.base import known_contract
 from vlagents_ray.envs.metaworld import PROTOCOL, MetaWorld
 from vlagents_ray.errors import ConfigError, EnvFailed, InvalidAction, NotReset, UnknownEnv
-from vlagents_ray.interface import HIGH_RES, Act
+from vlagents_ray.interface import Act
 from vlagents_ray.testing import check_env
 from vlagents_ray.validation import check_observation
 
@@ -209,14 +209,3 @@ def test_a_closed_env_says_so() -> None:
     env.close()
     with pytest.raises(EnvFailed, match="closed"):
         env.reset(seed=0)
-
-
-def test_views_for_the_record_have_a_size_of_their_own(reach: MetaWorld) -> None:
-    with MetaWorld("reach-v3", width=48, height=32, record_size=(128, 96)) as env:
-        obs, _ = env.reset(seed=1)
-        np.testing.assert_array_equal(obs.cameras["corner2"], reach.reset(seed=1)[0].cameras["corner2"])
-        view = obs.info[HIGH_RES]["corner2"]
-        assert (view.shape, view.dtype) == ((128, 96, 3), np.uint8)
-        assert np.abs(view[:64].mean(axis=(0, 1)) - obs.cameras["corner2"][:16].mean(axis=(0, 1))).max() < 40  # upright
-    with pytest.raises(ConfigError, match="want \\(height, width\\)"):
-        MetaWorld("reach-v3", record_size=(0, 96))

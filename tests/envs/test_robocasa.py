@@ -44,7 +44,6 @@ def test_the_contract_is_known_before_the_simulator_is_made() -> None:
         ("robocasa/OpenDrawer", {"action_order": "any"}, ConfigError, "action_order"),
         ("robocasa/OpenDrawer", {"object_registries": ["aigen"]}, ConfigError, "object_registries"),
         ("robocasa/OpenDrawer", {"object_registries": []}, ConfigError, "object_registries"),
-        ("robocasa/OpenDrawer", {"record_size": (96,)}, ConfigError, "record_size"),
     ],
 )
 def test_a_wrong_option_is_named(name: str, options: dict[str, object], error: type[Exception], message: str) -> None:

@@ -47,7 +47,6 @@ def test_the_contract_is_known_before_the_simulator_is_made() -> None:
     [
         ("robosuite/Lifts", {}, UnknownEnv, "did you mean 'Lift'"),
         ("robosuite/Lift", {"width": 0}, ConfigError, "width is 0"),
-        ("robosuite/Lift", {"record_size": (96,)}, ConfigError, "record_size"),
     ],
 )
 def test_a_wrong_option_is_named(name: str, options: dict[str, object], error: type[Exception], message: str) -> None:

@@ -12,7 +12,7 @@ from vlagents_ray.contract import CameraSpec
 from vlagents_ray.envs import make_env
 from vlagents_ray.envs.simpler import Simpler
 from vlagents_ray.errors import ConfigError, EnvFailed, NotReset, UnknownEnv
-from vlagents_ray.interface import HIGH_RES, Act, Obs
+from vlagents_ray.interface import Act, Obs
 from vlagents_ray.policies.experts import expert_for
 from vlagents_ray.testing import check_env
 from vlagents_ray.validation import check_observation
@@ -166,16 +166,6 @@ def test_two_twins_in_one_process_keep_their_own_pictures(carrot: Simpler) -> No
         np.testing.assert_array_equal(begin(carrot, 2).cameras[CAMERA], alone)
         np.testing.assert_array_equal(begin(sink, 0).cameras[CAMERA], in_sink)
     np.testing.assert_array_equal(begin(carrot, 2).cameras[CAMERA], alone)
-
-
-def test_the_view_for_the_record_shows_the_same_in_another_size(carrot: Simpler) -> None:
-    with Simpler(CARROT, record_size=(120, 160)) as env:
-        obs = begin(env, 4)
-    np.testing.assert_array_equal(obs.cameras[CAMERA], begin(carrot, 4).cameras[CAMERA])
-    [(name, view)] = obs.info[HIGH_RES].items()
-    assert (name, view.shape, view.dtype) == (CAMERA, (120, 160, 3), np.uint8)
-    small = obs.cameras[CAMERA].reshape(120, 4, 160, 4, 3).mean(axis=(1, 3))
-    assert np.abs(view - small).mean() < 6
 
 
 def test_what_deviates_from_the_protocol_is_said() -> None:

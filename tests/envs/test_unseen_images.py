@@ -24,21 +24,21 @@ def test_the_tabletop() -> None:
 @pytest.mark.sim
 @pytest.mark.integration
 def test_metaworld() -> None:
-    played("metaworld/drawer-open-v3", **SMALL, record_size=(40, 40))
+    played("metaworld/drawer-open-v3", **SMALL)
 
 
 @pytest.mark.vulkan
 @pytest.mark.parametrize("task", ["PickCube-v1", "StackCube-v1", "PushT-v1"])
 def test_maniskill(task: str) -> None:
     """PickCube hides its goal from cameras, StackCube has two of them, PushT draws its reward as a picture."""
-    played(f"maniskill/{task}", **SMALL, record_size=(40, 40))
+    played(f"maniskill/{task}", **SMALL)
 
 
 @pytest.mark.vulkan
 @pytest.mark.assets("simpler")
 def test_simpler() -> None:
     """Its state is made of poses, and its picture of an image and a segmentation."""
-    played("simpler/PutCarrotOnPlateInScene-v1", record_size=(48, 64))
+    played("simpler/PutCarrotOnPlateInScene-v1")
 
 
 @pytest.mark.vulkan

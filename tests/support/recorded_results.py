@@ -97,4 +97,4 @@ def _video() -> dict[str, bytes]:
     with VideoRecorder(10.0) as recorder:
         for shade in range(0, 250, 50):
             recorder.add(Obs(cameras={"front": np.full((32, 48, 3), shade, np.uint8)}))
-        return recorder.finish().shown
+        return recorder.finish()

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-CAMERA, JOINTS, COMMANDS, BEAT, TOLD = "/camera/image_raw", "/joint_states", "/arm/commands", "/alive", "/instruction"
+CAMERA, JOINTS, COMMANDS, BEAT = "/camera/image_raw", "/joint_states", "/arm/commands", "/alive"
 NAMES = ["shoulder", "elbow"]
 SIDE = 32
 HZ = 30.0
@@ -46,7 +46,6 @@ class RosArm(threading.Thread):
         self.joints = [0.0, 0.0]
         self.poses: list[list[float]] = []  # all that it has been in
         self.broken: set[str] = set()  # topics that it does not publish on
-        self.told: str | None = None  # an instruction, which is published again and again
         self.images = 0
         self._publish, self._commands = publish, commands
         self._over = threading.Event()
@@ -67,8 +66,6 @@ class RosArm(threading.Thread):
             for topic, message in ((JOINTS, self._state()), (CAMERA, self._image())):
                 if topic not in self.broken:
                     self._publish(topic, message)
-            if self.told is not None:
-                self._publish(TOLD, {"data": self.told})
 
     def _state(self) -> dict[str, Any]:
         # In another order than the policy's, with a joint that it does not know.

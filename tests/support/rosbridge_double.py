@@ -10,7 +10,6 @@ import base64
 import contextlib
 import json
 import math
-import struct
 import threading
 import time
 from collections import defaultdict
@@ -21,8 +20,6 @@ from typing import Any
 import numpy as np
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import Server, ServerConnection, serve
-
-_TYPED = {np.dtype("<f8"): 86, np.dtype("<f4"): 85, np.dtype("<u2"): 69}
 
 
 @dataclass
@@ -42,7 +39,7 @@ class RosbridgeDouble:
     subscribed: dict[str, str] = field(default_factory=dict)
     subscriptions: list[str] = field(default_factory=list)  # in their order, with those that were made again
     noticed: Callable[[dict[str, Any]], None] = lambda _: None  # gets each message that a client publishes
-    _asked: dict[ServerConnection, dict[str, str]] = field(default_factory=lambda: defaultdict(dict))
+    _asked: dict[ServerConnection, set[str]] = field(default_factory=lambda: defaultdict(set))
     _server: Server | None = None
     _thread: threading.Thread | None = None
 
@@ -59,7 +56,7 @@ class RosbridgeDouble:
         for socket, asked in list(self._asked.items()):
             if topic in asked:
                 with contextlib.suppress(ConnectionClosed, OSError):
-                    socket.send(encoded({"op": "publish", "topic": topic, "msg": message}, asked[topic]))
+                    socket.send(json.dumps(_plain({"op": "publish", "topic": topic, "msg": message})))
 
     def open(self) -> None:
         """Listen, at the same port as before if it was open before."""
@@ -89,14 +86,14 @@ class RosbridgeDouble:
         finally:
             self._asked.pop(socket, None)
 
-    def _do(self, message: dict[str, Any], asked: dict[str, str], socket: ServerConnection) -> None:
+    def _do(self, message: dict[str, Any], asked: set[str], socket: ServerConnection) -> None:
         match message["op"]:
             case "subscribe":
                 self.subscribed[message["topic"]] = message["type"]
                 self.subscriptions.append(message["topic"])
-                asked[message["topic"]] = message.get("compression", "none")
+                asked.add(message["topic"])
             case "unsubscribe":
-                asked.pop(message["topic"], None)
+                asked.discard(message["topic"])
             case "advertise":
                 self.advertised[message["topic"]] = message["type"]
             case "publish":
@@ -119,11 +116,6 @@ def rosbridge_double() -> Iterator[RosbridgeDouble]:
         double.close()
 
 
-def encoded(message: dict[str, Any], compression: str) -> str | bytes:
-    """A message as a client asked for it."""
-    return cbor(message) if compression == "cbor" else json.dumps(_plain(message))
-
-
 def _plain(value: Any) -> Any:
     """JSON's values of a message: bytes in base64, numbers that are not finite as null."""
     if isinstance(value, dict):
@@ -133,29 +125,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, (list, np.ndarray)):
         return [_plain(one) for one in (value.tolist() if isinstance(value, np.ndarray) else value)]
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def cbor(value: Any) -> bytes:
-    """A value in CBOR (RFC 8949), with typed arrays for numpy's."""
-    if value is None or isinstance(value, bool):
-        return bytes([{False: 0xF4, True: 0xF5, None: 0xF6}[value]])
-    if isinstance(value, int):
-        return _head(0, value) if value >= 0 else _head(1, -1 - value)
-    if isinstance(value, float):
-        return b"\xfb" + struct.pack(">d", value)
-    if isinstance(value, str):
-        return _head(3, len(value.encode())) + value.encode()
-    if isinstance(value, (bytes, bytearray)):
-        return _head(2, len(value)) + bytes(value)
-    if isinstance(value, np.ndarray):
-        return _head(6, _TYPED[value.dtype]) + cbor(value.tobytes())
-    if isinstance(value, list):
-        return _head(4, len(value)) + b"".join(map(cbor, value))
-    return _head(5, len(value)) + b"".join(cbor(name) + cbor(one) for name, one in value.items())
-
-
-def _head(kind: int, count: int) -> bytes:
-    if count < 24:
-        return bytes([kind << 5 | count])
-    low = next(low for low in range(4) if count < 1 << (8 << low))
-    return bytes([kind << 5 | 24 + low]) + count.to_bytes(1 << low, "big")

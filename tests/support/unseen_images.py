@@ -12,7 +12,7 @@ from vlagents_ray.envs.base import SequentialBatch
 from vlagents_ray.evaluate.episode.episode import options_of_reset
 from vlagents_ray.evaluate.episode.second_pass import PlayedEpisode
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
-from vlagents_ray.interface import HIGH_RES, Act, Agent, Obs
+from vlagents_ray.interface import Act, Agent, Obs
 
 _CHUNK = 3
 _KEY = EpisodeKey("env", episode=0, seed=3, settings="")
@@ -71,7 +71,6 @@ def _played(env: EvalEnv, *, images: bool) -> _Played:
 
     def record(obs: Obs) -> None:
         played.told.append(_values(obs))
-        assert obs.cameras or HIGH_RES not in obs.info
         played.rendered.append(bool(obs.cameras))
         played.images.append(_images(obs))
         played.episode.add_observation(obs)
@@ -94,14 +93,12 @@ def _played(env: EvalEnv, *, images: bool) -> _Played:
 
 
 def _images(obs: Obs) -> list[Any]:
-    """Those that the policy gets, and the views for people."""
-    return [_plain(dict(sorted(images.items()))) for images in (obs.cameras, obs.info.get(HIGH_RES, {}))]
+    return [_plain(dict(sorted(obs.cameras.items())))]
 
 
 def _values(obs: Obs) -> list[Any]:
     """Everything but the images."""
-    info = {name: value for name, value in obs.info.items() if name != HIGH_RES}
-    return [(name, part.tobytes()) for name, part in sorted(obs.state.items())] + [obs.gripper, _plain(info)]
+    return [(name, part.tobytes()) for name, part in sorted(obs.state.items())] + [obs.gripper, _plain(dict(obs.info))]
 
 
 def _plain(value: Any) -> Any:

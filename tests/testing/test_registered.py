@@ -13,7 +13,7 @@ from vlagents_ray.testing import check_agent, check_env
 
 # Registered names whose own test modules run the suites, because they need a simulator or a setting.
 CHECKED_ELSEWHERE = {
-    "libero", "maniskill", "metaworld", "rcs", "duobench", "robosuite", "robocasa", "calvin", "simpler", "aloha", "hub",
+    "libero", "maniskill", "metaworld", "rcs", "duobench", "robosuite", "robocasa", "calvin", "simpler", "aloha",
     "replay", "upstream",
 }  # fmt: skip
 ENV_NAMES = {

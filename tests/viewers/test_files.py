@@ -1,4 +1,4 @@
-"""The files of viewers open with their own readers, and hold what was sent."""
+"""A recording of Rerun opens with its own reader, and holds what was sent."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from eval_fakes import wait_for
-from viewer_files import read_mcap, read_rrd
+from rerun_files import read_rrd
 
 from vlagents_ray import ConfigError
 from vlagents_ray.errors import MissingDependency
 from vlagents_ray.images.jpeg_png import decode, encode_jpeg
 from vlagents_ray.serve.ports import free_port
-from vlagents_ray.viewers import ViewerFrame, open_viewers
+from vlagents_ray.viewers import ViewerFrame, open_viewer
 
 TICKS = 6
 JPEG = encode_jpeg(np.full((8, 8, 3), 200, np.uint8))
@@ -40,17 +40,12 @@ def frame(tick: int) -> ViewerFrame:
     )
 
 
-def write(**targets: str) -> None:
-    for viewer in open_viewers(**targets):
-        with viewer, viewer.episode("ep0", "stack the cups"):
-            for tick in range(TICKS):
-                viewer.add(frame(tick))
-        assert (viewer.episodes, viewer.dropped, viewer.error) == (1, 0, None)
-
-
 @pytest.mark.library("rerun")
 def test_a_recording_of_rerun_holds_what_was_sent(tmp_path: Path) -> None:
-    write(rerun_target=str(tmp_path / "seen"))
+    with open_viewer(str(tmp_path / "seen")) as viewer, viewer.episode("ep0", "stack the cups"):
+        for tick in range(TICKS):
+            viewer.add(frame(tick))
+    assert (viewer.episodes, viewer.dropped, viewer.error) == (1, 0, None)
     found = read_rrd(tmp_path / "seen/ep0.rrd")
     ticks = range(TICKS)
     assert found["instruction"] == {None: "stack the cups"}
@@ -67,72 +62,23 @@ def test_a_recording_of_rerun_holds_what_was_sent(tmp_path: Path) -> None:
     assert [round(float(decode(pictures[tick]).mean()), -1) for tick in ticks] == [40 * tick for tick in ticks]
 
 
-@pytest.mark.library("foxglove")
-@pytest.mark.library("mcap")
-def test_an_mcap_file_holds_what_was_sent(tmp_path: Path) -> None:
-    write(foxglove_target=str(tmp_path / "seen"))
-    found = read_mcap(tmp_path / "seen/ep0.mcap")
-    ticks = range(TICKS)
-    assert found["/state"] == [{"tick": tick, "joints": [tick, -tick], "gripper": [0.5]} for tick in ticks]
-    assert found["/action"] == [{"tick": tick, "executed": [tick, 1, 2], "planned": [tick, 1, 3]} for tick in ticks]
-    assert found["/chunk"] == [{"tick": tick, "rows": frame(tick).chunk.tolist()} for tick in (0, 4)]
-    assert found["/timing"] == [{"tick": tick, "round_trip_ms": 3.5, "safe": 0} for tick in ticks]
-    assert [b"deadline_exceeded" in message["raw"] for message in found["/log"]] == [True]
-    assert [JPEG in message["raw"] for message in found["/cameras/front"]] == [True] * TICKS
-    assert len(found["/cameras/left/wrist"]) == TICKS
-
-
-@pytest.mark.library("foxglove")
-@pytest.mark.library("mcap")
-def test_an_mcap_file_has_the_schemas_and_times_that_foxglove_reads(tmp_path: Path) -> None:
-    from mcap.reader import make_reader
-
-    write(foxglove_target=str(tmp_path))
-    with (tmp_path / "ep0.mcap").open("rb") as file:
-        reader = make_reader(file)
-        summary = reader.get_summary()
-        assert summary is not None
-        [said] = reader.iter_metadata()
-        assert said.metadata == {"name": "ep0", "instruction": "stack the cups"}
-        names = {channel.topic: summary.schemas[channel.schema_id].name for channel in summary.channels.values()}
-        at = [message.log_time for _, _, message in reader.iter_messages("/state")]
-    assert (names["/cameras/front"], names["/log"]) == ("foxglove.CompressedImage", "foxglove.Log")
-    assert at == [round((1e9 + tick / 50) * 1e9) for tick in range(TICKS)]
-
-
-@pytest.mark.library("foxglove")
-def test_foxglove_may_connect_to_what_runs() -> None:
-    port = free_port()
-    [viewer] = open_viewers(None, f"ws://127.0.0.1:{port}")
-    with viewer, viewer.episode("ep0"):
-        socket.create_connection(("127.0.0.1", port), 30).close()
-        with pytest.raises(ConfigError, match=f"cannot listen at ws://127.0.0.1:{port}"):
-            open_viewers(None, f"ws://127.0.0.1:{port}")
-        viewer.add(frame(0))
-    assert (viewer.episodes, viewer.error) == (1, None)
-
-
 @pytest.mark.library("rerun")
 def test_a_live_viewer_of_rerun_has_to_run() -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))  # and does not listen
         with pytest.raises(ConfigError, match=r"no viewer listens at rerun\+http.*start it with `rerun`"):
-            open_viewers(f"rerun+http://127.0.0.1:{taken.getsockname()[1]}/proxy")
+            open_viewer(f"rerun+http://127.0.0.1:{taken.getsockname()[1]}/proxy")
 
 
-@pytest.mark.parametrize(("viewer", "target"), [("rerun", "ws://127.0.0.1:1"), ("foxglove", "rerun+http://host/proxy")])
-def test_the_address_of_something_else_is_refused(viewer: str, target: str) -> None:
-    with pytest.raises(ConfigError, match=f"{viewer}: got '{target.replace('+', '.')}', want a folder, 'live', or"):
-        open_viewers(**{f"{viewer}_target": target})
+def test_the_address_of_something_else_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"rerun: got 'ws://127.0.0.1:1', want a folder, 'live', or"):
+        open_viewer("ws://127.0.0.1:1")
 
 
-@pytest.mark.parametrize("name", ["rerun", "foxglove"])
-def test_a_viewer_that_is_not_installed_names_its_extra(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, name, None)
-    with pytest.raises(MissingDependency, match=rf"pip install 'vlagents-ray\[{name}\]'"):
-        open_viewers(**{f"{name}_target": str(tmp_path)})
+def test_a_viewer_that_is_not_installed_names_its_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    with pytest.raises(MissingDependency, match=r"pip install 'vlagents-ray\[rerun\]'"):
+        open_viewer(str(tmp_path))
 
 
 _VIEWER = """
@@ -163,7 +109,7 @@ def rerun_viewer() -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
 @pytest.mark.library("rerun")
 def test_a_viewer_of_rerun_gets_what_runs(rerun_viewer: tuple[str, subprocess.Popen[bytes]]) -> None:
     address, _ = rerun_viewer
-    [viewer] = open_viewers(address)
+    viewer = open_viewer(address)
     with viewer, viewer.episode("ep0", "stack the cups"):
         for tick in range(TICKS):
             viewer.add(frame(tick))
@@ -175,7 +121,7 @@ def test_a_viewer_of_rerun_that_stands_still_holds_up_nothing(
     rerun_viewer: tuple[str, subprocess.Popen[bytes]],
 ) -> None:
     address, process = rerun_viewer
-    [viewer] = open_viewers(address)
+    viewer = open_viewer(address)
     with viewer.episode("ep0", "stack the cups"):
         process.send_signal(signal.SIGSTOP)
         for tick in range(TICKS):

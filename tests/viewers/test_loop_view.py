@@ -6,14 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from viewer_files import read_mcap, read_rrd
+from rerun_files import read_rrd
 
 from vlagents_ray import Act, ActionSpec, Agent, Contract, Obs
 from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.robot import run_loop
 from vlagents_ray.robot.simulated import SimulatedRobot
-from vlagents_ray.viewers import EpisodeViewer, ViewerFrame, open_viewers
-from vlagents_ray.viewers.viewer import LoopView
+from vlagents_ray.viewers import EpisodeViewer, LoopView, ViewerFrame, open_viewer
 
 HZ, ROWS, CHUNKS = 100.0, 4, 3
 
@@ -34,7 +33,7 @@ class Counting(Agent):
 class Kept:
     """A target that keeps its frames."""
 
-    name, target, closing_s = "kept", "here", None
+    target, closing_s = "here", None
 
     def __init__(self) -> None:
         self.frames: list[ViewerFrame] = []
@@ -49,17 +48,17 @@ class Kept:
         pass
 
 
-def run(viewers: list[EpisodeViewer]) -> None:
+def run(viewer: EpisodeViewer) -> None:
     agent = Counting()
     player = ChunkPlayer(agent, PlayerSettings(mode="open_loop"))
     robot = SimulatedRobot(agent.contract)
-    run_loop(robot, player, hz=HZ, instruction="count", viewers=viewers, until=lambda: agent.asked > CHUNKS)
+    run_loop(robot, player, hz=HZ, instruction="count", viewer=viewer, until=lambda: agent.asked > CHUNKS)
 
 
 def test_each_tick_is_shown_with_what_was_planned_and_executed() -> None:
     target = Kept()
     with EpisodeViewer(target) as viewer:
-        run([viewer])
+        run(viewer)
     frames = target.frames
     assert len(frames) == CHUNKS * ROWS + 1
     executed = [float(frame.executed[0]) for frame in frames]
@@ -86,7 +85,7 @@ def test_an_action_without_a_plan_is_shown_too() -> None:
             def act(self, obs: Obs) -> Act:
                 return Act(np.zeros(2, np.float32))
 
-        run_loop(SimulatedRobot(one), Single(), hz=HZ, seconds=1, viewers=[viewer])
+        run_loop(SimulatedRobot(one), Single(), hz=HZ, seconds=1, viewer=viewer)
     assert {frame.planned is None for frame in target.frames} == {True}
     assert {tuple(frame.executed) for frame in target.frames} == {(0.0, 0.0)}
 
@@ -100,7 +99,7 @@ def test_spells_without_the_policy_are_shown_with_their_reason_once() -> None:
         Act(np.ones(2, np.float32)),
     ]
     with EpisodeViewer(target) as viewer:
-        view = LoopView([viewer])
+        view = LoopView(viewer)
         with view.episode("count"):
             for tick, act in enumerate(acts):
                 stop = "no signal from the server" if tick == 3 else ""
@@ -114,17 +113,11 @@ def test_spells_without_the_policy_are_shown_with_their_reason_once() -> None:
 
 
 @pytest.mark.library("rerun")
-@pytest.mark.library("foxglove")
-@pytest.mark.library("mcap")
-def test_both_viewers_get_the_run(tmp_path: Path) -> None:
-    viewers = open_viewers(str(tmp_path), str(tmp_path))
-    run(viewers)
-    for viewer in viewers:
-        viewer.close()
-    [rrd], [mcap] = tmp_path.glob("*.rrd"), tmp_path.glob("*.mcap")
-    shown = read_rrd(rrd)
+def test_a_run_becomes_a_recording(tmp_path: Path) -> None:
+    with open_viewer(str(tmp_path)) as viewer:
+        run(viewer)
+    [file] = tmp_path.glob("*.rrd")
+    shown = read_rrd(file)
     assert shown["instruction"] == {None: "count"}
     executed = [values[0] for _, values in sorted(shown["action/executed"].items())]
     assert executed == list(range(len(executed)))
-    assert [message["executed"][0] for message in read_mcap(mcap)["/action"]] == executed
-    assert rrd.stem == mcap.stem

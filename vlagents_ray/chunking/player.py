@@ -6,7 +6,7 @@ import queue
 import threading
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, get_args
 
@@ -46,11 +46,9 @@ from vlagents_ray.errors import ConfigError, InvalidAction, InvalidInput, NotRes
 from vlagents_ray.interface import (
     CAUSE,
     DEADLINE,
-    DISTRIBUTION,
     INTERVENTION,
     OF_THE_LOOP,
     SAFE,
-    SAMPLES,
     SILENT,
     WANTED,
     Act,
@@ -60,7 +58,6 @@ from vlagents_ray.interface import (
 )
 from vlagents_ray.validation import check_action
 
-UNCERTAINTY = "uncertainty"  # in the info of an Act, if the policy states it: a number, or one for each row
 _CLOSE_S = 2.0
 
 
@@ -154,8 +151,6 @@ class PlayerSettings:
     sensor which was read first; without it, from the call of `act` (see `CaptureClock`)."""
     safe: Safe = "auto"  # the action in place of a missing one (see `SafeAction`)
     grippers: Sequence[int] | None = None  # the columns of the action that are grippers (see `SafeAction`)
-    ask_for_help: float | None = None  # the uncertainty above which the robot pauses (see `uncertainty`)
-    samples: int | None = None  # to ask for, from whose spread a policy's uncertainty is computed
 
     def __post_init__(self) -> None:
         if self.mode not in get_args(Mode):
@@ -165,8 +160,6 @@ class PlayerSettings:
                 raise ConfigError(f"{name}: got {value}, want at least 1, or None")
         if self.max_age_s is not None and not self.max_age_s > 0:
             raise ConfigError(f"max_age_s: got {self.max_age_s}, want above 0, or None")
-        if self.ask_for_help is not None and not self.ask_for_help >= 0:
-            raise ConfigError(f"ask_for_help: got {self.ask_for_help}, want 0 or above, or None")
         if self.mode != "async" and (self.merge != "newest" or self.real_time_chunking):
             raise ConfigError(f"merge and real_time_chunking: got them with mode {self.mode!r}, want mode='async'")
         if self.mode == "async" and self.deadline_s is None:
@@ -232,8 +225,6 @@ class ChunkPlayer(Agent):
         self._captured = CaptureClock()
         self._delays: deque[int] = deque(maxlen=DELAYS)
         self._motion = Motion(self.check)
-        self._judged: Mapping[str, Any] | None = None  # the info of the last chunk whose uncertainty was looked at
-        self._helped = False  # since the last certain chunk, a human has looked at the scene
 
     @property
     def contract(self) -> Contract | None:
@@ -305,7 +296,6 @@ class ChunkPlayer(Agent):
         self._execution.tick()
         if self.control.update():
             self._begin_again(RELEASED)
-            self._helped = True
         led = self.control.state == "human"
         try:
             self._ask(obs, tick, begun)
@@ -343,11 +333,7 @@ class ChunkPlayer(Agent):
         """Choose the safe action; raises `ConfigError` if it does not fit the policy's actions."""
         self._contract = self._agent.contract
         spec = ActionSpec() if self._contract is None else self._contract.action
-        wanted = (
-            self.settings.deadline_s is not None
-            or self.control.leader is not None
-            or self.settings.ask_for_help is not None
-        )
+        wanted = self.settings.deadline_s is not None or self.control.leader is not None
         safe = SafeAction(self.settings.safe, spec, self.settings.grippers) if wanted else None
         self._motion = Motion(self.check, self._contract, safe)
 
@@ -418,13 +404,10 @@ class ChunkPlayer(Agent):
 
     def _extras(self) -> dict[str, Any]:
         extras = self._execution.report()
-        if self.settings.samples is not None:
-            extras[SAMPLES] = self.settings.samples
         if self.settings.timeout_s is not None:
             extras[DEADLINE] = self.settings.timeout_s * 1e3
-        if (
-            self.settings.real_time_chunking and self.control.state != "human"
-        ):  # who executes other actions than those of the plan
+        # A human executes other actions than those of the plan.
+        if self.settings.real_time_chunking and self.control.state != "human":
             extras |= self._plan.continuation(self._delays)
         return extras
 
@@ -448,9 +431,6 @@ class ChunkPlayer(Agent):
         held = self.control.held
         step = None if held is not None else self._next()
         why = held or (STALE if self._is_old(self._captured(obs)) else self._trouble)
-        if step is not None and self._needs_help(step.chunk.info):
-            step, held = None, self.control.held
-            why = held or why
         if step is not None:
             try:
                 action = self._motion.move(step.action, obs)
@@ -469,28 +449,6 @@ class ChunkPlayer(Agent):
                 self._execution.note_in_place(action)
         return Act(action, info={SAFE: why.reason, CAUSE: why.cause, SILENT: self._silent_s()})
 
-    def _needs_help(self, info: Mapping[str, Any]) -> bool:
-        """Pause if a chunk is too uncertain, and return whether it is.
-
-        After a pause the policy may continue once with an uncertain chunk: help is asked for again when there was a
-        certain one in between.
-        """
-        if self.settings.ask_for_help is None or info is self._judged:
-            return False
-        self._judged = info
-        value = uncertainty(info)
-        if value is None:
-            raise ConfigError(
-                "ask_for_help: the policy states no uncertainty; ask it for samples (samples=8), or add "
-                f"act.info[{UNCERTAINTY!r}] to its answers"
-            )
-        if value <= self.settings.ask_for_help:
-            self._helped = False
-        elif not self._helped:
-            self.control.pause(f"asks for help: its uncertainty is {value:.3g}, above {self.settings.ask_for_help:.3g}")
-            return True
-        return False
-
     def _begin_again(self, why: Held) -> None:
         """Let the next action be of the answer to a new observation."""
         self._plan.drop()
@@ -499,17 +457,3 @@ class ChunkPlayer(Agent):
 
     def _silent_s(self) -> float:
         return 0.0 if self._waiting_since is None else time.monotonic() - self._waiting_since
-
-
-def uncertainty(info: Mapping[str, Any]) -> float | None:
-    """Return how uncertain a policy is of a chunk, by the info of its `Act`; raises `InvalidAction` for another value.
-
-    It is `info["uncertainty"]` if the policy states it; else the mean standard deviation of its samples, in the units
-    of the action; None if there are none.
-    """
-    try:
-        if UNCERTAINTY in info:
-            return float(np.max(info[UNCERTAINTY]))
-        return float(np.mean(info[DISTRIBUTION]["std"])) if DISTRIBUTION in info else None
-    except (TypeError, ValueError, KeyError) as error:
-        raise InvalidAction(f'uncertainty: got {error}, want a number, or samples with their "std"') from error

@@ -29,7 +29,7 @@ from vlagents_ray.robot.ros import RosRobot, read_settings
 from vlagents_ray.robot.safety import Guard, Watchdog, measured_state
 from vlagents_ray.robot.simulated import SimulatedRobot
 from vlagents_ray.robot.teleoperation import HELP, AxesLeader, Keyboard, SpaceMouse, Terminal
-from vlagents_ray.viewers.targets import open_viewers
+from vlagents_ray.viewers import open_viewer
 
 MOSTLY_SAFE = 3  # exit status
 WAIT_S = 1.0  # deadline of a tick in the modes that wait for an answer; half of the default of --silent-s
@@ -130,7 +130,7 @@ def _run(options: argparse.Namespace) -> LoopReport:
         recorder = None
         if options.record:
             recorder = stack.enter_context(Recorder(options.record, hz, interventions=leader is not None))
-        viewers = [stack.enter_context(viewer) for viewer in open_viewers(options.rerun, options.foxglove)]
+        viewer = None if options.rerun is None else stack.enter_context(open_viewer(options.rerun))
         hangs_s = max(0.2, 5 / hz) + deadline_s
 
         def stop(reason: str) -> None:
@@ -141,7 +141,6 @@ def _run(options: argparse.Namespace) -> LoopReport:
         watchdog = Watchdog(stop, silent_s if topics is None else {**topics.silent_s, **silent_s})
         if topics is not None:
             require_match(contract, topics.contract)
-            options.instruction = options.instruction or topics.first_instruction(say)
             topics.watchdog = watchdog
         stack.enter_context(_restarting(watchdog, say))
         if options.baseline > 0:
@@ -156,7 +155,7 @@ def _run(options: argparse.Namespace) -> LoopReport:
             watchdog=watchdog,
             restart=options.restart,
             recorder=recorder,
-            viewers=viewers,
+            viewer=viewer,
             real_time=options.real_time,
             commands=commands,
         )
@@ -168,7 +167,7 @@ def _run(options: argparse.Namespace) -> LoopReport:
         _say_outcome(report, say, led=leader is not None)
     if recorder is not None:  # closed, so everything is written
         say(f"recorded: {recorder.episodes} episodes in {options.record}, {recorder.dropped} frames dropped")
-    for viewer in viewers:
+    if viewer is not None:
         say(viewer.report())
     return report
 
@@ -304,7 +303,6 @@ def command_parser() -> tuple[argparse.ArgumentParser, list[argparse.Action], li
     real("--transport", choices=("auto", "shm", "websocket", "http"), default="auto", help="(%(default)s)")
     add("--record", metavar="DIR", help="record a LeRobotDataset v3.0 there; needs the extra 'record'")
     add("--rerun", metavar="DIR", help="write a .rrd file there for Rerun, or 'live': show the run in its viewer")
-    add("--foxglove", metavar="DIR", help="write an .mcap file there for Foxglove, or 'live': let it connect")
     buttons = "obey the buttons of the server's live page: pause, stop, success, failure"
     real("--operate", action="store_true", help=buttons)
     real("--real-time", action="store_true", help="ask for SCHED_FIFO in place of a nice value")
@@ -316,8 +314,6 @@ def command_parser() -> tuple[argparse.ArgumentParser, list[argparse.Action], li
     simulated("--set", **settings, help="a setting of the policy, repeatable")
     simulated("--episodes", type=rows, default=10, metavar="N", help="how many (%(default)s)")
     simulated("--seed", type=int, default=0, help="of the first episode; the others count on (%(default)s)")
-    simulated("--ask-for-help", type=_number(), metavar="U", help="pause where the policy's uncertainty is above this")
-    simulated("--samples", type=_number(int, least=2), metavar="N", help="to compute the uncertainty from")
     return parser, of_robot, of_env
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any
 
 import typer
@@ -24,8 +24,7 @@ from vlagents_ray.robot.episode import Label
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.simulated import EnvRobot
 from vlagents_ray.robot.teleoperation import HELP, AxesDevice, AxesLeader, Keyboard, SpaceMouse, TeleoperatedAgent
-from vlagents_ray.viewers.targets import open_viewers
-from vlagents_ray.viewers.viewer import EpisodeViewer
+from vlagents_ray.viewers import EpisodeViewer, open_viewer
 
 DEVICES = ("keyboard", "spacemouse")
 KEYS = "p pauses and continues; y success, n failure, x discard end the episode; q quits"
@@ -68,8 +67,6 @@ def drive(options: argparse.Namespace) -> int:
     """Play what the options of `vlagents-ray robot --env` say, and return the command's exit status."""
     try:
         with errors():
-            if options.ask_for_help is not None and options.leader != "keyboard":
-                raise ConfigError("--ask-for-help: got it without a way to answer, want --leader keyboard")
             run = RobotRun(options)
             try:
                 run.play(range(options.seed, options.seed + options.episodes))
@@ -92,7 +89,7 @@ class RobotRun:
         self.over = False  # the human wants no further episode
         self.recorder: Recorder | None = None
         self._control: Control | None = None
-        self._viewers: Sequence[EpisodeViewer] = ()
+        self._viewer: EpisodeViewer | None = None
         self._said: str | None = None  # what moves the robot, as printed
 
     def play(self, seeds: Iterable[int]) -> None:
@@ -113,8 +110,8 @@ class RobotRun:
                 self.recorder = stack.enter_context(opened)
             if self.options.leader == "keyboard":
                 out.print(f"{HELP}\n{KEYS}")
-            opened_viewers = open_viewers(self.options.rerun, self.options.foxglove)
-            self._viewers = [stack.enter_context(viewer) for viewer in opened_viewers]
+            if self.options.rerun is not None:
+                self._viewer = stack.enter_context(open_viewer(self.options.rerun))
             for seed in seeds:
                 if self.over:
                     break
@@ -122,8 +119,8 @@ class RobotRun:
         if (recorder := self.recorder) is not None:  # closed, so everything is written
             kept = f"{recorder.episodes} episodes in {self.options.record}"
             out.print(f"recorded: {kept}, {recorder.dropped} frames dropped")
-        for viewer in self._viewers:
-            out.print(viewer.report())
+        if self._viewer is not None:
+            out.print(self._viewer.report())
 
     def _play(self, env: EvalEnv, agent: Agent, seed: int, hz: float) -> None:
         self.verdict, recorder = None, self.recorder
@@ -149,7 +146,7 @@ class RobotRun:
             reset_options=options,
             guard=guard,
             recorder=recorder,
-            viewers=self._viewers,
+            viewer=self._viewer,
             until=ended,
         )
         out.print(
@@ -185,7 +182,7 @@ class RobotRun:
         policy.initialize()
         require_match(inner.contract, contract)
         given = self.options
-        settings = PlayerSettings(given.mode, given.execute, ask_for_help=given.ask_for_help, samples=given.samples)
+        settings = PlayerSettings(given.mode, given.execute)
         return ChunkPlayer(policy, settings, check=Guard(contract, max_step=given.max_step), override=leader)
 
     def _pause(self) -> None:

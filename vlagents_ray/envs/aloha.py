@@ -69,7 +69,6 @@ class Aloha(SimulatorEnv):
         instruction: str | None = None,
         max_steps: int = PROTOCOL.max_steps,
         ends_on_success: bool = True,
-        record_size: Sequence[int] | None = None,
     ) -> None:
         """Make the environment; raises the errors of `make_env`. Other options are those of most `SimulatorEnv`s.
 
@@ -78,7 +77,7 @@ class Aloha(SimulatorEnv):
             cameras: MuJoCo's names: "top", "angle", "front_close", "left_wrist", "right_wrist", ….
         """
         self.require_task(task)
-        super().__init__(f"aloha/{task}", record_size=record_size, width=width, height=height, max_steps=max_steps)
+        super().__init__(f"aloha/{task}", width=width, height=height, max_steps=max_steps)
         self.max_steps, self._ends_on_success = max_steps, ends_on_success
         self._instruction = instruction or _TASKS[task]
         self._contract = self.known_contract({"cameras": cameras, "width": width, "height": height})
@@ -89,9 +88,7 @@ class Aloha(SimulatorEnv):
             self._env._env.task.get_observation = self._env._env.task.get_qpos
             self._env._format_raw_obs = np.array
             self._physics = self._env._env.physics
-            self._cameras = MujocoCameras(
-                self._name, self._physics.model.ptr, cameras, (height, width), self._record_size
-            )
+            self._cameras = MujocoCameras(self._name, self._physics.model.ptr, cameras, (height, width))
             self._resources.callback(self._cameras.close)
 
     @classmethod
@@ -127,6 +124,6 @@ class Aloha(SimulatorEnv):
         return self._observe(qpos, look=self.looked_at), float(reward), *self._solved(bool(reward == _SOLVED))
 
     def _observe(self, qpos: np.ndarray, *, look: bool = True) -> Obs:
-        images, views = self._cameras.render(self._physics.data.ptr) if look else ({}, {})
+        images = self._cameras.render(self._physics.data.ptr) if look else {}
         state = {name: qpos[part].astype(np.float32) for name, part in _STATE.items()}
-        return Obs(images, state=state, info={"sim_state": self._physics.data.qpos[16:].copy(), **views})
+        return Obs(images, state=state, info={"sim_state": self._physics.data.qpos[16:].copy()})

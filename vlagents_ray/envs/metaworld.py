@@ -65,7 +65,6 @@ class MetaWorld(SimulatorEnv):
         goals_seed: int | None = None,
         ends_on_success: bool = True,
         camera_positions: Mapping[str, Sequence[float]] | None = None,
-        record_size: Sequence[int] | None = None,
     ) -> None:
         """Make the environment; raises the errors of `make_env`. Other options are those of most `SimulatorEnv`s.
 
@@ -79,7 +78,7 @@ class MetaWorld(SimulatorEnv):
         """
         if max_steps > PROTOCOL.max_steps:
             raise ConfigError(f"metaworld: max_steps is {max_steps}, want at most {PROTOCOL.max_steps}: there it stops")
-        super().__init__(f"metaworld/{task}", record_size=record_size, width=width, height=height, max_steps=max_steps)
+        super().__init__(f"metaworld/{task}", width=width, height=height, max_steps=max_steps)
         self.require_task(task)
         self.max_steps, self._ends_on_success = max_steps, ends_on_success
         self._instruction = instruction or task.removesuffix("-v3").replace("-", " ")
@@ -101,9 +100,7 @@ class MetaWorld(SimulatorEnv):
             require_cameras(self._name, moved, camera_names(env.model))
             for name, position in moved.items():
                 env.model.camera(name).pos = position
-            self._cameras = MujocoCameras(
-                self._name, env.model, cameras, (height, width), self._record_size, upside_down=_UPSIDE_DOWN
-            )
+            self._cameras = MujocoCameras(self._name, env.model, cameras, (height, width), upside_down=_UPSIDE_DOWN)
             self._resources.callback(self._cameras.close)
         stated = self.known_contract({"cameras": cameras, "width": width, "height": height})
         self._contract = replace(stated, control_hz=1.0 / self._env.dt)
@@ -159,10 +156,9 @@ class MetaWorld(SimulatorEnv):
         return self._observe(raw, look=self.looked_at), float(reward), *self._solved(bool(info["success"]))
 
     def _observe(self, raw: np.ndarray, *, look: bool = True) -> Obs:
-        images, views = self._cameras.render(self._env.data) if look else ({}, {})
         return Obs(
-            cameras=images,
+            cameras=self._cameras.render(self._env.data) if look else {},
             gripper=float(raw[3]),  # the fingers' distance over 0.1 m, clipped to [0, 1] by Meta-World
             state={"xyz": raw[:3].astype(np.float32)},
-            info={"sim_state": raw, **views},
+            info={"sim_state": raw},
         )

@@ -21,7 +21,7 @@ from vlagents_ray.envs.base import require_known
 from vlagents_ray.envs.gymnasium.view import plain
 from vlagents_ray.envs.simulator import BenchmarkProtocol, SimulatorEnv, Size, require_cameras
 from vlagents_ray.errors import ConfigError, MissingDependency, UnknownEnv
-from vlagents_ray.interface import HIGH_RES, Obs
+from vlagents_ray.interface import Obs
 from vlagents_ray.registry import require
 
 ControlMode = Literal["joints", "xyzrpy", "tquat"]
@@ -94,8 +94,6 @@ DUOBENCH_TASKS = {
 }
 
 
-RECORD = "record/"  # before a camera's name: its view for the record
-
 # Where this one is not, `import rcs` and `import duobench` download all assets (rcs-core 0.7.3, rcs/__init__.py).
 _REQUIRED = Path("assets/scenes/empty_world/scene.xml")
 
@@ -165,7 +163,6 @@ def configure(
     binary_gripper: bool,
     size: Size,
     cameras: Sequence[str] | None,
-    record_size: Size | None,
 ) -> None:
     """Set up a scene's configuration for an evaluation; sizes are (height, width) in pixels.
 
@@ -188,10 +185,7 @@ def configure(
     have = config.camera_cfgs or {}
     require_cameras(env, cameras or (), have)
     chosen = {name: have[name] for name in (have if cameras is None else cameras)}
-    views = {name: _sized(camera, size) for name, camera in chosen.items()}
-    if record_size is not None:
-        views |= {RECORD + name: _sized(camera, record_size) for name, camera in chosen.items()}
-    config.camera_cfgs = views or None
+    config.camera_cfgs = {name: _sized(camera, size) for name, camera in chosen.items()} or None
     if config.camera_adds is not None:
         config.camera_adds = {name: added for name, added in config.camera_adds.items() if name in chosen}
 
@@ -241,7 +235,6 @@ class Rcs(SimulatorEnv):
         width: int = 224,
         height: int = 224,
         cameras: Sequence[str] | None = None,
-        record_size: Sequence[int] | None = None,
         instruction: str | None = None,
         max_steps: int | None = None,
     ) -> None:
@@ -262,7 +255,7 @@ class Rcs(SimulatorEnv):
         limit = protocol.max_steps if max_steps is None and protocol is not None else max_steps
         if limit is None:
             raise ConfigError(f"{self.suite}/{task} has no step limit of its own; set max_steps")
-        super().__init__(f"{self.suite}/{task}", record_size=record_size, width=width, height=height, max_steps=limit)
+        super().__init__(f"{self.suite}/{task}", width=width, height=height, max_steps=limit)
         self.max_steps = limit
         self._mode = control_mode or self._task.control_mode
         self._given_instruction = instruction
@@ -279,7 +272,6 @@ class Rcs(SimulatorEnv):
             binary_gripper=binary_gripper,
             size=(height, width),
             cameras=cameras,
-            record_size=self._record_size,
         )
         with self._making():
             self._env = maker.create_env(config)
@@ -288,7 +280,7 @@ class Rcs(SimulatorEnv):
             self._loose = _loose_joints(self._sim.model)
             self._arms = Arms(self._env.action_space, self._env.observation_space, self._mode)
         self._contract = Contract(
-            cameras={name: CameraSpec(height, width) for name in config.camera_cfgs or () if not _for_the_record(name)},
+            cameras=dict.fromkeys(config.camera_cfgs or (), CameraSpec(height, width)),
             state=self._arms.state,
             gripper=self._arms.has_gripper,
             instruction=True,
@@ -349,19 +341,12 @@ class Rcs(SimulatorEnv):
 
     def _observe(self, raw: Mapping[str, Any]) -> Obs:
         state, gripper = self._arms.read(raw)
-        images = {name: frame["rgb"]["data"] for name, frame in raw.get("frames", {}).items()}
-        info: dict[str, Any] = {"objects": {name: np.array(self._sim.data.joint(name).qpos) for name in self._loose}}
-        if self._record_size is not None:
-            info[HIGH_RES] = {
-                name.removeprefix(RECORD): np.ascontiguousarray(image)
-                for name, image in images.items()
-                if _for_the_record(name)
-            }
+        frames = raw.get("frames", {})
         return Obs(
-            cameras={name: np.ascontiguousarray(image) for name, image in images.items() if not _for_the_record(name)},
+            cameras={name: np.ascontiguousarray(frame["rgb"]["data"]) for name, frame in frames.items()},
             gripper=gripper,
             state=state,
-            info=info,
+            info={"objects": {name: np.array(self._sim.data.joint(name).qpos) for name in self._loose}},
         )
 
 
@@ -380,10 +365,6 @@ class DuoBench(Rcs):
 def _loose_joints(model: Any) -> list[str]:
     free = int(require("mujoco").mjtJoint.mjJNT_FREE)
     return [model.joint(i).name for i in range(model.njnt) if model.jnt_type[i] == free]
-
-
-def _for_the_record(camera: str) -> bool:
-    return camera.startswith(RECORD)
 
 
 class Arms:

@@ -163,7 +163,6 @@ class RoboCasa(RobosuiteEnv):
         object_registries: Sequence[str] = REGISTRIES,
         max_steps: int | None = None,
         ends_on_success: bool = True,
-        record_size: Sequence[int] | None = None,
     ) -> None:
         """Make the environment; raises the errors of `make_env`. Other options are those of most `SimulatorEnv`s.
 
@@ -176,7 +175,7 @@ class RoboCasa(RobosuiteEnv):
             object_registries: The sets of objects that are drawn from; the protocol has both.
         """
         self.require_task(task)
-        super().__init__(f"robocasa/{task}", record_size=record_size, width=width, height=height, max_steps=max_steps)
+        super().__init__(f"robocasa/{task}", width=width, height=height, max_steps=max_steps)
         for option, chosen, known in (
             ("split", [split], SPLITS),
             ("action_order", [action_order], ACTION_ORDERS),

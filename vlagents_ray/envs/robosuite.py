@@ -23,7 +23,7 @@ from vlagents_ray.envs.graphics import EGL_DEVICE, GPUS
 from vlagents_ray.envs.render_probe import EGL_CURE
 from vlagents_ray.envs.simulator import BenchmarkProtocol, SimulatorEnv, Size
 from vlagents_ray.errors import ConfigError, EnvFailed
-from vlagents_ray.interface import HIGH_RES, Obs
+from vlagents_ray.interface import Obs
 from vlagents_ray.registry import require
 
 _OPEN_M = 0.04  # a finger's travel from closed to open
@@ -39,7 +39,7 @@ class RobosuiteEnv(SimulatorEnv):
     """What robosuite calls parts of the contract's state, of those that it calls otherwise."""
 
     def _use(self, simulator: Any) -> None:
-        self._env, self._renderer = simulator, CameraRenderer(simulator, self._record_size)
+        self._env, self._renderer = simulator, CameraRenderer(simulator)
         self._resources.callback(simulator.close)
         self._resources.callback(self._renderer.make_current)
 
@@ -75,14 +75,11 @@ class RobosuiteEnv(SimulatorEnv):
     def _observe(self, raw: Mapping[str, Any], *, look: bool = True) -> Obs:
         contract = self.contract
         cameras = list(contract.cameras or {}) if look else []
-        info: dict[str, Any] = {"sim_state": self._sim_state(raw)}
-        if look and self._renderer.views:
-            info[HIGH_RES] = {name: _upright(self._renderer.views[name]) for name in cameras}
         return Obs(
             cameras={name: _upright(raw[f"{name}_image"]) for name in cameras},
             gripper=gripper_opening(raw) if contract.gripper else None,
             state={name: np.asarray(raw[self._raw.get(name, name)], np.float32) for name in contract.state or {}},
-            info=info,
+            info={"sim_state": self._sim_state(raw)},
         )
 
 
@@ -99,15 +96,12 @@ class CameraRenderer:
     """Renders the cameras while it is `open`; otherwise they show black and cost nothing.
 
     robosuite renders each camera for every observation, 14 times from the beginning of a reset to the policy's
-    first observation. It samples a step's observation, images included, after the first 2 ms of the step's 50;
-    the views for recordings are of the same moment.
+    first observation. It samples a step's observation, images included, after the first 2 ms of the step's 50.
     """
 
-    def __init__(self, domain: Any, record_size: Size | None) -> None:
+    def __init__(self, domain: Any) -> None:
         self.open = True
-        self.views: dict[str, np.ndarray] = {}
         self._domain = domain
-        self._record_size = record_size
         self._own = domain._create_camera_sensors
         domain._create_camera_sensors = self._sensors  # called again in each reset
 
@@ -119,18 +113,14 @@ class CameraRenderer:
 
     def _sensors(self, cam_name: str, cam_w: int, cam_h: int, **rest: Any) -> tuple[list[Any], list[str]]:
         [own], names = self._own(cam_name, cam_w=cam_w, cam_h=cam_h, **rest)
-        return [self._switched(own, cam_name, (cam_h, cam_w))], names
+        return [self._switched(own, (cam_h, cam_w))], names
 
-    def _switched(self, own: Callable[[Any], np.ndarray], camera: str, size: tuple[int, int]) -> Callable[[Any], Any]:
+    def _switched(self, own: Callable[[Any], np.ndarray], size: Size) -> Callable[[Any], Any]:
         @functools.wraps(own)  # keeps robosuite's attributes
         def look(cache: Any) -> np.ndarray:
             if not self.open:
                 return np.zeros((*size, 3), np.uint8)
             self.make_current()
-            if self._record_size is not None:
-                height, width = self._record_size
-                view = self._domain.sim.render(camera_name=camera, height=height, width=width)
-                self.views = self.views | {camera: view}
             return own(cache)
 
         return look
@@ -263,7 +253,6 @@ class Robosuite(RobosuiteEnv):
         instruction: str | None = None,
         max_steps: int | None = None,
         ends_on_success: bool = True,
-        record_size: Sequence[int] | None = None,
     ) -> None:
         """Make the environment; raises the errors of `make_env`. Other options are those of most `SimulatorEnv`s.
 
@@ -272,7 +261,7 @@ class Robosuite(RobosuiteEnv):
             cameras: MuJoCo's names; None are robomimic's for the task.
         """
         self.require_task(task)
-        super().__init__(f"robosuite/{task}", record_size=record_size, width=width, height=height, max_steps=max_steps)
+        super().__init__(f"robosuite/{task}", width=width, height=height, max_steps=max_steps)
         self._task = TASKS[task]
         self._protocol, self._ends_on_success = self._task.protocol, ends_on_success
         self.max_steps = max_steps or self._task.protocol.max_steps

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 import os
 import sys
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -88,7 +87,6 @@ class Simpler(SimulatorEnv):
         sim_backend: str = "physx_cpu",
         render_backend: str = "auto",
         shader: str = PROTOCOL.shader,
-        record_size: Sequence[int] | None = None,
     ) -> None:
         """Make the environment; raises the errors of `make_env`. Other options are those of most `SimulatorEnv`s.
 
@@ -102,7 +100,7 @@ class Simpler(SimulatorEnv):
             shader: ManiSkill's name; that of the protocol is "default".
         """
         self.require_task(task)
-        super().__init__(f"simpler/{task}", record_size=record_size)
+        super().__init__(f"simpler/{task}")
         _find_assets(assets)
         own_limit = registered_limit(task)
         self.max_steps = step_limit(self._name, max_steps, own_limit)
@@ -116,7 +114,6 @@ class Simpler(SimulatorEnv):
             self._name,
             task,
             obs_mode=PROTOCOL.obs_mode,
-            record_size=self._record_size,
             sim_backend=sim_backend,
             render_backend=render_backend,
             control_mode=PROTOCOL.control_mode,

@@ -17,7 +17,7 @@ from vlagents_ray.envs.base import EvalEnv, Options, one_row, require_known
 from vlagents_ray.envs.graphics import prepare_rendering
 from vlagents_ray.envs.render_probe import failing, without, without_egl
 from vlagents_ray.errors import ConfigError, EnvFailed, NotReset
-from vlagents_ray.interface import HIGH_RES, Act, Obs
+from vlagents_ray.interface import Act, Obs
 from vlagents_ray.registry import require
 
 Size = tuple[int, int]  # height, width in pixels
@@ -56,8 +56,7 @@ class SimulatorEnv(EvalEnv):
 
     Most constructors have these options, of which None is the task's or the protocol's own value: `width` and `height`
     of each image, pixels; `instruction`, the task in words; `max_steps`, the step limit; `ends_on_success`, whether
-    success ends the episode (without that, success at the end can be measured, too); `record_size`, height and width
-    of further views by the same cameras, for recordings only.
+    success ends the episode (without that, success at the end can be measured, too).
     """
 
     suite: ClassVar[str]
@@ -73,13 +72,12 @@ class SimulatorEnv(EvalEnv):
     _env: Any = None  # the simulator; None before it is made and after `close`
     _steps: int | None = None  # of the episode; None before the first reset
 
-    def __init__(self, name: str, *, record_size: Sequence[int] | None = None, **sizes: int | None) -> None:
+    def __init__(self, name: str, **sizes: int | None) -> None:
         """Check the options, of which `sizes` are at least 1 or None; set what drivers read when they are loaded."""
         self._name = name
         for option, value in sizes.items():
             if value is not None and value < 1:
                 raise ConfigError(f"{name}: {option} is {value}, want at least 1")
-        self._record_size = record_size_of(record_size, name)
         self._resources = ExitStack()  # what `close` calls, the last first
         prepare_rendering()
 
@@ -192,42 +190,28 @@ class SimulatorEnv(EvalEnv):
 
 
 class MujocoCameras:
-    """Cameras of a MuJoCo model, each rendered in the size of the policy and in that of recordings."""
+    """Cameras of a MuJoCo model."""
 
     def __init__(
-        self,
-        env: str,
-        model: Any,
-        cameras: Sequence[str],
-        size: Size,
-        record_size: Size | None,
-        *,
-        upside_down: Collection[str] = (),
+        self, env: str, model: Any, cameras: Sequence[str], size: Size, *, upside_down: Collection[str] = ()
     ) -> None:
-        """Make the renderers, for which the model's frame buffer grows; images of `upside_down` cameras are turned."""
+        """Make the renderer, for which the model's frame buffer grows; images of `upside_down` cameras are turned."""
         require_cameras(env, cameras, camera_names(model))
         self._cameras, self._upside_down = list(cameras), upside_down
         buffer = model.vis.global_
-        self._renderers: dict[str, Any] = {}
-        for use, wanted in (("", size), (HIGH_RES, record_size)):
-            if wanted is not None:
-                buffer.offheight, buffer.offwidth = max(buffer.offheight, wanted[0]), max(buffer.offwidth, wanted[1])
-                self._renderers[use] = require("mujoco").Renderer(model, *wanted)
+        buffer.offheight, buffer.offwidth = max(buffer.offheight, size[0]), max(buffer.offwidth, size[1])
+        self._renderer: Any = require("mujoco").Renderer(model, *size)
 
-    def render(self, data: Any) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Render a `mujoco.MjData`: the images by camera, (H, W, 3) uint8, and `Obs.info` with those for recordings."""
-        views = {
-            use: {name: self._image(one, data, name) for name in self._cameras} for use, one in self._renderers.items()
-        }
-        return views.pop(""), views
+    def render(self, data: Any) -> dict[str, np.ndarray]:
+        """Render a `mujoco.MjData`: the images by camera, (H, W, 3) uint8."""
+        return {name: self._image(data, name) for name in self._cameras}
 
     def close(self) -> None:
-        for renderer in self._renderers.values():
-            renderer.close()
+        self._renderer.close()
 
-    def _image(self, renderer: Any, data: Any, camera: str) -> np.ndarray:
-        renderer.update_scene(data, camera=camera)
-        image: np.ndarray = renderer.render()
+    def _image(self, data: Any, camera: str) -> np.ndarray:
+        self._renderer.update_scene(data, camera=camera)
+        image: np.ndarray = self._renderer.render()
         return np.ascontiguousarray(image[::-1, ::-1]) if camera in self._upside_down else image
 
 
@@ -240,12 +224,3 @@ def require_cameras(env: str, names: Collection[str], have: Collection[str]) -> 
     unknown = sorted(set(names) - set(have))
     if unknown:
         raise ConfigError(f"{env} has no camera {unknown}: want some of {sorted(have)}")
-
-
-def record_size_of(size: Sequence[int] | None, env: str) -> Size | None:
-    """Return the option `record_size` (height, width), px, as a tuple, or None; raises `ConfigError`."""
-    if size is None:
-        return None
-    if len(size) != 2 or min(size) < 1:
-        raise ConfigError(f"{env}: record_size is {size}, want (height, width), each at least 1")
-    return size[0], size[1]

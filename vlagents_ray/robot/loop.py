@@ -24,7 +24,7 @@ from vlagents_ray.interface import CAPTURED, CAUSE, INTERVENTION, SAFE, SILENT, 
 from vlagents_ray.robot.pacing import KEPT_TICKS, Pacer, jitter, undisturbed
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.safety import Guard, Watchdog
-from vlagents_ray.viewers.viewer import EpisodeViewer, LoopView
+from vlagents_ray.viewers import EpisodeViewer, LoopView
 
 Restart = Literal["manual", "auto"]
 logger = logging.getLogger(__name__)
@@ -139,7 +139,7 @@ def run_loop(
     watchdog: Watchdog | None = None,
     restart: Restart | None = None,
     recorder: Recorder | None = None,
-    viewers: Sequence[EpisodeViewer] = (),
+    viewer: EpisodeViewer | None = None,
     real_time: bool = False,
     until: Callable[[], bool] = lambda: False,
     commands: CommandInbox | None = None,
@@ -171,7 +171,7 @@ def run_loop(
             command still needs the call. The default is "auto" for a simulated robot and "manual" for any other.
         recorder: Records the run as one episode, also if it ends by an exception. A player with `override` wants one
             with `interventions=True`.
-        viewers: Show the run as one episode (see `vlagents_ray.viewers`).
+        viewer: Shows the run as one episode (see `vlagents_ray.viewers`).
         real_time: Run the thread with SCHED_FIFO (see `vlagents_ray.robot.pacing.undisturbed`).
         until: Ends the loop when it returns True; called before each tick, and after the last one.
         commands: The commands of the live page, from `RemoteAgent(url, commands=...)`: pause, stop, mark.
@@ -198,7 +198,7 @@ def run_loop(
     report = LoopReport(hz)
     stops = len(control.stops)
     agent.initialize()
-    run = _Run(robot, agent, control, _guard(agent, guard), watchdog, recorder, commands, LoopView(viewers), report)
+    run = _Run(robot, agent, control, _guard(agent, guard), watchdog, recorder, commands, LoopView(viewer), report)
     with contextlib.ExitStack() as stack:
         control.begin(auto=restart == "auto")
         try:

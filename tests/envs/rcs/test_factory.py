@@ -61,5 +61,5 @@ def test_tasks_are_known_without_the_packages() -> None:
     assert len(DuoBench.tasks()) == 11
     with pytest.raises(UnknownEnv, match="transfer_cube"):
         make_env("duobench/juggle")
-    with pytest.raises(ConfigError, match="record_size"):
-        make_env("rcs/pick", record_size=(0, 64))
+    with pytest.raises(ConfigError, match="height is 0"):
+        make_env("rcs/pick", height=0)

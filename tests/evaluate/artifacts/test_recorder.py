@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import os
 from collections.abc import Callable
 from dataclasses import replace
@@ -21,7 +20,7 @@ from vlagents_ray.evaluate.artifacts.recorder import Recording
 from vlagents_ray.evaluate.artifacts.trajectory import NO_VERSION, Trajectory, TrajectoryRecorder, videos_of
 from vlagents_ray.evaluate.artifacts.video import VideoRecorder
 from vlagents_ray.evaluate.episode.second_pass import PlayedEpisode
-from vlagents_ray.interface import HIGH_RES, Act, Agent, Obs
+from vlagents_ray.interface import Act, Agent, Obs
 
 Config = Callable[..., EvalConfig]
 CAMERA = {"camera": [32, 32]}
@@ -68,14 +67,6 @@ def test_a_video_that_is_also_the_trajectorys_is_there_once(config: Config) -> N
     assert os.path.samefile(*paths)
 
 
-def test_a_trajectory_has_what_the_policy_saw_and_a_video_the_view_for_people(config: Config) -> None:
-    obs = Obs({"front": np.zeros((32, 32, 3), np.uint8)}, info={HIGH_RES: {"front": np.zeros((64, 64, 3), np.uint8)}})
-    with VideoRecorder(seen=True) as recorder:
-        recorder.add(obs)
-        footage = recorder.finish()
-    assert (height(footage.shown["front"]), height(footage.seen["front"])) == (64, 32)
-
-
 class Pushed(ToZero):
     """Answers with chunks of two rows, each of a further version of the weights."""
 
@@ -110,11 +101,6 @@ def test_what_is_executed_until_an_answer_comes_is_of_the_weights_before_it(conf
         update={"suites": [suite.model_copy(update={"clock": late, "episodes": 1})]}
     )
     assert versions(settings, Pushed) == [NO_VERSION, 1, 1, 1, 2, 2, 2, 3, 3, 3]
-
-
-def height(video: bytes) -> int:
-    with av.open(io.BytesIO(video)) as container:
-        return container.streams.video[0].height
 
 
 def test_nothing_is_encoded_or_collected_unless_it_is_asked_for(

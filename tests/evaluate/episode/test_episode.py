@@ -25,7 +25,7 @@ from vlagents_ray.errors import (
     VLAgentsError,
 )
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
-from vlagents_ray.interface import HIGH_RES, Act, Agent, Obs
+from vlagents_ray.interface import Act, Agent, Obs
 
 KEY = EpisodeKey("script", 3, 11, "0")
 
@@ -360,15 +360,6 @@ def test_a_contract_that_cannot_be_made_is_an_env_failure() -> None:
 
     with pytest.raises(EnvFailed, match="no robot"):
         run_episode(Broken(), Chunks(ROW), KEY)
-
-
-def test_views_for_the_record_are_recorded_and_never_reach_the_policy() -> None:
-    obs = Obs(info={HIGH_RES: {"front": np.zeros((8, 8, 3), np.uint8)}, "note": "kept"})
-    agent, recorded = Chunks(*[ROW] * 6), list[Obs]()
-    run_episode(Script(obs=obs), agent, KEY, record=recorded.append)
-    assert all(seen.info == {"note": "kept"} for seen in agent.seen)
-    assert len(recorded) == 7
-    assert all(HIGH_RES in one.info for one in recorded)
 
 
 def test_every_call_is_announced_to_the_watch() -> None:

@@ -26,5 +26,5 @@ def bowl(folder: str) -> Iterator[Libero]:
 
 @pytest.fixture(scope="package")
 def soup(folder: str) -> Iterator[Libero]:
-    with Libero("libero_object/0", width=32, height=32, record_size=(48, 64), assets=folder) as env:
+    with Libero("libero_object/0", width=32, height=32, assets=folder) as env:
         yield env

@@ -9,7 +9,7 @@ import pytest
 from libero_episodes import STILL, begin, play, world
 
 from vlagents_ray.envs.libero import Libero
-from vlagents_ray.interface import HIGH_RES, Act
+from vlagents_ray.interface import Act
 
 pytestmark = pytest.mark.assets("libero")
 
@@ -117,15 +117,3 @@ def test_a_command_moves_the_hand_along_its_axis(soup: Libero) -> None:
         moved = obs.state["xyz_axis_angle"][:3] - start
         assert 0.03 < moved[axis] < 0.25  # 0.05 m a unit commanded, with a lag
         assert np.abs(np.delete(moved, axis)).max() < 0.03
-
-
-def test_views_for_the_record_show_the_same_moment_in_their_own_size(soup: Libero, bowl: Libero) -> None:
-    begin(soup)
-    obs, *_ = soup.step(Act(np.array([1, 0, 0, 0, 0, 0, -1], np.float32)))
-    assert {name: image.shape for name, image in obs.cameras.items()} == dict.fromkeys(("front", "wrist"), (32, 32, 3))
-    views = obs.info[HIGH_RES]
-    assert {name: image.shape for name, image in views.items()} == dict.fromkeys(("front", "wrist"), (48, 64, 3))
-    small = obs.cameras["front"].reshape(4, 8, 4, 8, 3).mean(axis=(1, 3))
-    large = views["front"][:, 8:56].reshape(4, 12, 4, 12, 3).mean(axis=(1, 3))  # the same height, a wider angle
-    assert np.abs(small - large).max() < 25
-    assert HIGH_RES not in begin(bowl).info

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from in_process_episode import Always, play
 
-from vlagents_ray.contract import CameraSpec
 from vlagents_ray.envs.rcs import Rcs
 from vlagents_ray.errors import ConfigError, EnvFailed, InvalidAction, MissingDependency, NotReset, UnknownEnv
-from vlagents_ray.interface import HIGH_RES, Act, Obs
+from vlagents_ray.interface import Act, Obs
 from vlagents_ray.testing import check_env
 
 pytestmark = pytest.mark.assets("rcs")
@@ -34,7 +33,7 @@ def led(env: Rcs, command: Sequence[float], steps: int = 40) -> Obs:
 
 
 def test_it_keeps_the_promises_of_an_env() -> None:
-    check_env(Rcs("pick", cameras=["wrist"], width=40, height=32, record_size=(48, 64), max_steps=8))
+    check_env(Rcs("pick", cameras=["wrist"], width=40, height=32, max_steps=8))
 
 
 def test_the_expert_picks_the_cuboid_up_and_that_ends_the_episode(pick: Rcs) -> None:
@@ -102,18 +101,6 @@ def test_the_image_shows_the_cuboid_where_mujoco_projects_it() -> None:
             focal = 60 / math.tan(math.radians(env._sim.model.camera("bird_eye").fovy[0]) / 2)
             assert columns.mean() == pytest.approx(80 + focal * x / -z, abs=2)
             assert rows.mean() == pytest.approx(60 - focal * y / -z, abs=2)
-
-
-def test_views_for_the_record_are_apart_from_what_the_policy_sees() -> None:
-    with Rcs("pick", width=40, height=32, cameras=["wrist"], record_size=(64, 80)) as env:
-        obs, _ = env.reset(seed=0)
-        assert env.contract.cameras == {"wrist": CameraSpec(32, 40)}
-        assert {name: image.shape for name, image in obs.cameras.items()} == {"wrist": (32, 40, 3)}
-        assert {name: image.shape for name, image in obs.info[HIGH_RES].items()} == {"wrist": (64, 80, 3)}
-        smaller = obs.info[HIGH_RES]["wrist"].reshape(32, 2, 40, 2, 3).mean(axis=(1, 3))
-        assert np.abs(smaller - obs.cameras["wrist"]).mean() < 8
-    with Rcs("pick", width=40, height=32) as env:
-        assert HIGH_RES not in env.reset(seed=0)[0].info
 
 
 def test_a_description_names_versions_robot_and_protocol(pick: Rcs) -> None:

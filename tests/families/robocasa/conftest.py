@@ -24,5 +24,5 @@ def kitchen(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 @pytest.fixture(scope="package")
 def drive(kitchen: Path) -> Iterator[RoboCasa]:
-    with RoboCasa("NavigateKitchen", width=32, height=24, record_size=(40, 48)) as env:
+    with RoboCasa("NavigateKitchen", width=32, height=24) as env:
         yield env

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import ros_arm
 from eval_fakes import wait_for
-from ros_arm import BEAT, CAMERA, COMMANDS, JOINTS, TOLD, RosArm
+from ros_arm import BEAT, CAMERA, COMMANDS, JOINTS, RosArm
 
 os.environ.setdefault("ROS_DOMAIN_ID", "87")
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
@@ -26,7 +26,7 @@ from geometry_msgs.msg import Twist
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
 from sensor_msgs.msg import Image, JointState
-from std_msgs.msg import Bool, Float64MultiArray, String
+from std_msgs.msg import Bool, Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
 from vlagents_ray import Act, ActionSpec, Agent, CameraSpec, ChunkPlayer, Contract, Obs, StateSpec
@@ -57,7 +57,6 @@ class Driver:
         self._publishers = {
             CAMERA: self.node.create_publisher(Image, CAMERA, qos_profile_sensor_data),
             JOINTS: self.node.create_publisher(JointState, JOINTS, 10),  # reliable
-            TOLD: self.node.create_publisher(String, TOLD, 10),
         }
         self._executor = SingleThreadedExecutor(context=self._context)
         self._thread = threading.Thread(target=self._spin)
@@ -80,9 +79,8 @@ class Driver:
         self.node.destroy_node()
 
     def publish(self, topic: str, message: dict[str, Any]) -> None:
-        made = {CAMERA: self._image, JOINTS: self._state, TOLD: lambda said: String(data=said["data"])}[topic](message)
-        if topic != TOLD:
-            made.header.stamp = self.node.get_clock().now().to_msg()
+        made = {CAMERA: self._image, JOINTS: self._state}[topic](message)
+        made.header.stamp = self.node.get_clock().now().to_msg()
         self._publishers[topic].publish(made)
 
     def commands(self) -> list[dict[str, Any]]:
@@ -124,10 +122,9 @@ def driver() -> Iterator[Driver]:
 
 @each_link
 def test_an_arm_is_driven_held_and_stopped_by_topics_of_ros(driver: Driver, link: str) -> None:
-    settings = settings_from(ros_arm.settings(link, instruction={"topic": TOLD}, max_age_s=0.5), "arm.yaml")
+    settings = settings_from(ros_arm.settings(link, max_age_s=0.5), "arm.yaml")
     over = threading.Event()
     with RosArm(driver.publish, driver.commands) as arm, RosRobot(settings) as robot:
-        wait_for(lambda: driver.publish(TOLD, {"data": "fold"}) or robot.instruction == "fold")
         guard = Guard(Ahead.contract, max_step=MAX_STEP, measure=measured_state("joints"))
         watchdog = robot.watchdog = Watchdog(lambda _: robot.stop(), robot.silent_s)
         with ChunkPlayer(Ahead(), check=guard) as player:

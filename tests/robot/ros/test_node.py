@@ -16,7 +16,7 @@ import ros_arm
 import yaml
 from asgi_server import served
 from eval_fakes import wait_for
-from ros_arm import BEAT, CAMERA, COMMANDS, JOINTS, NAMES, SIDE, TOLD, RosArm, header
+from ros_arm import BEAT, CAMERA, COMMANDS, JOINTS, NAMES, SIDE, RosArm, header
 from rosbridge_double import RosbridgeDouble, rosbridge_double
 
 import vlagents_ray.cli.robot as command
@@ -149,11 +149,11 @@ def test_the_command_drives_an_arm_from_its_topics_and_stops_it_where_it_is(
 ) -> None:
     agent = Ahead(last=15)
     with policy_server(agent) as url, rosbridge_double() as double:
-        (tmp_path / "arm.yaml").write_text(yaml.safe_dump(ros_arm.settings(double.url, instruction={"topic": TOLD})))
+        (tmp_path / "arm.yaml").write_text(yaml.safe_dump(ros_arm.settings(double.url)))
         with RosArm(double.publish, lambda: double.on(COMMANDS)) as arm:
-            arm.told = "stack the cups"
             options = f"--ros {tmp_path / 'arm.yaml'} --hz 30 --mode open_loop --restart auto --baseline 0".split()
-            status = command.main([url, *options, "--measure", "joints", "--max-step", str(MAX_STEP)])
+            said = ["--instruction", "stack the cups", "--measure", "joints", "--max-step", str(MAX_STEP)]
+            status = command.main([url, *options, *said])
     assert status != 2, capsys.readouterr().out  # a busy machine may be late at a tick
     assert list(agent.instructions) == ["stack the cups"]
     obs = agent.seen[0]
@@ -257,7 +257,7 @@ class Wire:
         self.takes: dict[str, Callable[[Any], None]] = {}
         self.published: list[tuple[str, dict[str, Any]]] = []
 
-    def subscribe(self, topic: str, kind: str, take: Callable[[Any], None], *, sensor: bool) -> None:
+    def subscribe(self, topic: str, kind: str, take: Callable[[Any], None]) -> None:
         self.takes[topic] = take
 
     def advertise(self, topic: str, kind: str) -> None: ...
@@ -333,54 +333,6 @@ def test_a_killed_server_stops_the_arm(tmp_path: Path, capsys: pytest.CaptureFix
     said = capsys.readouterr().out
     assert "stopped by the watchdog: server: silent for" in said
     assert status in ([1], [3])
-
-
-def test_the_first_instruction_is_waited_for_and_a_later_one_neither_ends_nor_begins_an_episode(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    with rosbridge_double() as double, RosArm(double.publish, lambda: double.on(COMMANDS)) as arm:
-        settings = settings_from(ros_arm.settings(double.url, instruction={"topic": TOLD}), "arm.yaml")
-        agent, said = Ahead(), []
-
-        def say(line: str) -> None:
-            said.append(line)
-            arm.told = "fold"
-
-        with RosRobot(settings) as robot, ChunkPlayer(agent, check=Guard(agent.contract)) as player:
-            assert robot.first_instruction(say) == "fold"
-            assert said == [f"waiting for an instruction on {TOLD}"]
-            heard_at = []
-
-            def over() -> bool:
-                if agent.acts > 10:
-                    arm.told = "unfold"
-                if robot.instruction == "unfold":
-                    heard_at.append(agent.acts)
-                return len(heard_at) > 20
-
-            report = run_loop(robot, player, hz=50, instruction=robot.instruction, until=over)
-            assert robot.instruction == "unfold"  # for the next call of `run_loop`
-    assert agent.acts > heard_at[0] + 5, "the policy goes on under the first instruction"
-    assert list(agent.instructions) == ["fold"]
-    assert report.safe_ticks == 0
-    assert "instruction: got 'unfold', which counts from the next episode on" in caplog.messages
-
-
-@pytest.mark.parametrize("held", ["pause", "stop"])
-def test_a_new_instruction_moves_no_arm_that_stands(held: str) -> None:
-    wire, agent = Wire(), Ahead()
-    settings = settings_from(ros_arm.settings("ws://arm", instruction={"topic": TOLD}), "arm.yaml")
-    with RosRobot(settings, wire) as robot, ChunkPlayer(agent, check=Guard(agent.contract)) as player:
-        getattr(player.control, held)("by the operator")
-        wire.takes[TOLD]({"data": "unfold"})
-        for _ in range(2):  # the second one is the episode of the new instruction
-            report = run_loop(robot, player, hz=100, seconds=0.1, instruction=robot.instruction)
-            assert all(one == [0.0, 0.0] for one in wire.commands), "where the arm stands"
-            assert report.paused + report.safe.get("stopped", 0) >= 5
-        player.control.resume()
-        assert player.control.restart()
-        run_loop(robot, player, hz=100, seconds=0.1, instruction=robot.instruction)
-        assert any(one != [0.0, 0.0] for one in wire.commands)
 
 
 @pytest.mark.parametrize(

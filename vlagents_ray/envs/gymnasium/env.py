@@ -5,23 +5,20 @@ from __future__ import annotations
 import importlib.util
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from vlagents_ray.contract import Contract
-from vlagents_ray.envs.base import BatchEnv, EvalEnv, require_known
+from vlagents_ray.envs.base import EvalEnv, require_known
 from vlagents_ray.envs.graphics import prepare_rendering
-from vlagents_ray.envs.gymnasium.vector import GymnasiumBatch, VectorRows
 from vlagents_ray.envs.gymnasium.view import SUCCESS_KEYS, Mapped, View, plain
-from vlagents_ray.envs.simulator import BenchmarkProtocol, record_size_of
+from vlagents_ray.envs.simulator import BenchmarkProtocol
 from vlagents_ray.errors import ConfigError, EnvFailed, MissingDependency, NotReset, UnknownEnv, VLAgentsError
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.registry import require
-
-VECTORIZATIONS = ("sync", "async", "vector_entry_point")
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,76 +85,6 @@ _FETCH = BenchmarkProtocol(
 )
 
 
-def make(
-    name: str,
-    task: str,
-    *,
-    module: str | None,
-    kwargs: Mapping[str, Any],
-    vectorization: str | None,
-    rows: int,
-    max_steps: int | None,
-) -> Any:
-    """Make a `gymnasium.Env`, or `VectorRows`, by its id; see `Gymnasium` for the options and errors."""
-    if vectorization not in (None, *VECTORIZATIONS):
-        raise ConfigError(f"{name}: vectorization is {vectorization!r}, want one of {list(VECTORIZATIONS)}")
-    # pygame, which several environments draw with, prints a greeting on import otherwise
-    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
-    gymnasium = require("gymnasium")
-    spec = _registered(task, module)
-    if vectorization is None and spec is not None and spec.entry_point is None:
-        vectorization = "vector_entry_point"
-    try:
-        if vectorization is None:
-            arguments = {"render_mode": "rgb_array", "disable_env_checker": True, **kwargs}
-            return gymnasium.make(task, max_episode_steps=max_steps, **arguments)
-        arguments = _vector_arguments(gymnasium, spec, vectorization, max_steps) | dict(kwargs)
-        vector = gymnasium.make_vec(task, num_envs=rows, vectorization_mode=vectorization, **arguments)
-    except gymnasium.error.DependencyNotInstalled as error:
-        raise MissingDependency(f"{name}: {error}") from error
-    except gymnasium.error.UnregisteredEnv as error:
-        raise UnknownEnv(f"{name}: {error}; set `module` to what registers it") from error
-    except gymnasium.error.Error as error:
-        raise ConfigError(f"{name}: {error}") from error
-    except TypeError as error:
-        raise ConfigError(f"{name}: {error}; check `kwargs`, got {dict(kwargs)}") from error
-    return VectorRows(name, vector)
-
-
-def only_vectors(task: str, module: str | None) -> bool:
-    """Whether an id is registered with a VectorEnv's entry point alone."""
-    spec = _registered(task, module)
-    return spec is not None and spec.entry_point is None
-
-
-def _registered(task: str, module: str | None) -> Any:
-    """Import what registers an id, and return its spec; None if it has none under exactly this id."""
-    registry = require("gymnasium").registry
-    if module is None and "/" in task and task not in registry:
-        module = task.partition("/")[0]
-    if module is not None:
-        require(module)
-    return registry.get(task)
-
-
-def _vector_arguments(gymnasium: Any, spec: Any, vectorization: str, max_steps: int | None) -> dict[str, Any]:
-    arguments: dict[str, Any] = {"max_episode_steps": max_steps} if max_steps is not None else {}
-    if vectorization != "vector_entry_point":
-        mode = gymnasium.vector.AutoresetMode.DISABLED  # one row can begin an episode while the others go on
-        return arguments | {
-            "render_mode": "rgb_array",
-            "disable_env_checker": True,
-            "vector_kwargs": {"autoreset_mode": mode},
-        }
-    entry = getattr(spec, "vector_entry_point", None)
-    if isinstance(entry, str):
-        entry = gymnasium.envs.registration.load_env_creator(entry)
-    if spec is not None and spec.max_episode_steps is None:
-        arguments = {}  # its entry point need not take a limit
-    renders = "rgb_array" in (getattr(entry, "metadata", None) or {}).get("render_modes", ())
-    return arguments | ({"render_mode": "rgb_array"} if renders else {})
-
-
 class Gymnasium(EvalEnv):
     """A Gymnasium environment with a continuous action vector, Box (D,).
 
@@ -166,19 +93,12 @@ class Gymnasium(EvalEnv):
     only the returns say something.
     """
 
-    suite: str = "gymnasium"
-    """The registered name, for messages."""
-
-    rows: int = 1
-    """How many rows the VectorEnv has, if it is one; those of more than one are for a `GymnasiumBatch`."""
-
     def __init__(
         self,
         task: str | None = None,
         *,
         module: str | None = None,
         kwargs: Mapping[str, Any] | None = None,
-        vectorization: str | None = None,
         cameras: Mapping[str, str] | None = None,
         state: Mapping[str, str] | None = None,
         gripper: str | None = None,
@@ -191,7 +111,6 @@ class Gymnasium(EvalEnv):
         height: int | None = None,
         max_steps: int | None = None,
         remake: bool = False,
-        record_size: Sequence[int] | None = None,
     ) -> None:
         """Make the environment, and check one observation of it.
 
@@ -199,8 +118,6 @@ class Gymnasium(EvalEnv):
             task: The Gymnasium id.
             module: The module that registers the id; by default the id's namespace.
             kwargs: Arguments of `gymnasium.make`; `render_mode` is "rgb_array" by default.
-            vectorization: How `gymnasium.make_vec` makes a VectorEnv: "sync", "async" (a process for each row), or
-                "vector_entry_point"; None makes none, unless the id is registered with a vector entry point alone.
             cameras: name -> path of an (H, W, 3) uint8 image in the observation, or "render".
             state: name -> path of a vector, optionally with a range: "robot/qpos[0:7]"; see `Pick`.
             gripper: The path of a number in the observation.
@@ -213,7 +130,6 @@ class Gymnasium(EvalEnv):
             height: The height to which every image is stretched, pixels.
             max_steps: The step limit, instead of the registered one.
             remake: Whether each reset makes the simulator again, for one whose own reset keeps some state.
-            record_size: Height and width of further copies of the images, for recordings only.
 
         Raises:
             UnknownEnv: There is no such id.
@@ -225,9 +141,8 @@ class Gymnasium(EvalEnv):
             raise UnknownEnv("gymnasium: got no id, want one, as in 'gymnasium/Pendulum-v1'")
         prepare_rendering()
         defaults = known(task)
-        self._id, self._name = task, f"{self.suite}/{task}"
+        self._id, self._name = task, f"gymnasium/{task}"
         self._module = module if module is not None else defaults.module
-        self._vectorization = vectorization
         self._kwargs = {**defaults.kwargs, **(kwargs or {})}
         self._protocol = defaults.protocol
         self._success = success
@@ -237,7 +152,7 @@ class Gymnasium(EvalEnv):
         self._steps = 0
         self._env = self._make(max_steps)
         try:
-            self._instruction = instruction if instruction is not None else defaults.instruction or self._stated_task()
+            self._instruction = instruction if instruction is not None else defaults.instruction
             self.max_steps = self._step_limit(max_steps)
             self._action_space = str(self._env.action_space)
             mapped = Mapped(
@@ -248,10 +163,8 @@ class Gymnasium(EvalEnv):
                 success=success,
                 unit_actions=unit_actions,
                 size=(height, width),
-                record_size=record_size_of(record_size, self._name),
             )
             self._view = View(self._name, self._env, mapped)
-            self._check_vectorized()
             first, _ = self._call("reset", seed=0)
             self._contract = self._view.contract(
                 self._observe(first),
@@ -286,7 +199,6 @@ class Gymnasium(EvalEnv):
             "kwargs": plain(self._kwargs),
             "action_space": self._action_space,
             "unit_actions": self._unit_actions,
-            **({"autoreset": self._env.autoreset} if isinstance(self._env, VectorRows) else {}),
             "success": self._success or f"info: {' or '.join(SUCCESS_KEYS)}",
             "protocol": self._protocol.describe(**played) if self._protocol is not None else played,
         }
@@ -319,65 +231,30 @@ class Gymnasium(EvalEnv):
             env, self._env = self._env, None
             env.close()
 
-    @classmethod
-    def batched(cls, num_envs: int, **options: Any) -> BatchEnv | None:
-        """Make the rows of one VectorEnv, if these options make one."""
-        if not cls._makes_vectors(options):
-            return None
-        several: type[Gymnasium] = type(cls.__name__, (cls,), {"rows": num_envs})
-        return several(**options)._as_batch()
-
-    @classmethod
-    def _makes_vectors(cls, options: Mapping[str, Any]) -> bool:
-        task, module = options.get("task"), options.get("module")
-        return options.get("vectorization") is not None or (task is not None and only_vectors(task, module))
-
     def _make(self, max_steps: int | None) -> Any:
-        return make(
-            self._name,
-            self._id,
-            module=self._module,
-            kwargs=self._kwargs,
-            vectorization=self._vectorization,
-            rows=self.rows,
-            max_steps=max_steps,
-        )
-
-    def _as_batch(self) -> GymnasiumBatch:
-        return GymnasiumBatch(
-            self._name,
-            self._env,
-            self._view,
-            self._contract,
-            max_steps=self.max_steps,
-            instruction=self._instruction,
-            described=self.describe(),
-        )
-
-    def _check_vectorized(self) -> None:
-        if not isinstance(self._env, VectorRows):
-            return
-        if self._remake:
-            raise ConfigError(f"{self._name}: remake is for environments that are no VectorEnv; leave it out")
-        if self._view.renders and self._env.autoreset == "SAME_STEP":
-            raise ConfigError(
-                f"{self._name}: its VectorEnv resets a row in the step that ends an episode (SAME_STEP), so that the "
-                f"last picture of its renderer is the next episode's; choose `cameras` in the observation, or another "
-                f"autoreset mode"
-            )
-
-    def _stated_task(self) -> str:
-        """Return the task in words that the rows of a VectorEnv state as those of LeRobot do; "" if there is none."""
-        if not isinstance(self._env, VectorRows):
-            return ""
-        words = self._env.stated("task_description") or self._env.stated("task")
-        return words if isinstance(words, str) else ""
+        # pygame, which several environments draw with, prints a greeting on import otherwise
+        os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+        gymnasium = require("gymnasium")
+        module = self._module
+        if module is None and "/" in self._id and self._id not in gymnasium.registry:
+            module = self._id.partition("/")[0]
+        if module is not None:
+            require(module)
+        arguments = {"render_mode": "rgb_array", "disable_env_checker": True, **self._kwargs}
+        try:
+            return gymnasium.make(self._id, max_episode_steps=max_steps, **arguments)
+        except gymnasium.error.DependencyNotInstalled as error:
+            raise MissingDependency(f"{self._name}: {error}") from error
+        except gymnasium.error.UnregisteredEnv as error:
+            raise UnknownEnv(f"{self._name}: {error}; set `module` to what registers it") from error
+        except gymnasium.error.Error as error:
+            raise ConfigError(f"{self._name}: {error}") from error
+        except TypeError as error:
+            raise ConfigError(f"{self._name}: {error}; check `kwargs`, got {self._kwargs}") from error
 
     def _step_limit(self, wanted: int | None) -> int:
         spec = self._env.spec
         limit = wanted or (spec.max_episode_steps if spec is not None else None)
-        if limit is None and isinstance(self._env, VectorRows):
-            limit = self._env.stated("_max_episode_steps")  # as LeRobot's environments have it
         if limit is None or limit < 1:
             raise ConfigError(f"{self._name}: its step limit is {limit}; set `max_steps` to 1 or more")
         return int(limit)
@@ -420,11 +297,10 @@ class PushT(Gymnasium):
         width: int | None = None,
         height: int | None = None,
         max_steps: int | None = None,
-        record_size: Sequence[int] | None = None,
     ) -> None:
         """Make the environment; images are stretched to `width` and `height`, pixels."""
         self.require_task(task)
-        super().__init__(_ID, **_TASKS[task], width=width, height=height, max_steps=max_steps, record_size=record_size)
+        super().__init__(_ID, **_TASKS[task], width=width, height=height, max_steps=max_steps)
 
     @classmethod
     def tasks(cls) -> list[str]:

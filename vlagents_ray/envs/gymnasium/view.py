@@ -11,9 +11,8 @@ import numpy as np
 
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.envs.base import one_row
-from vlagents_ray.envs.simulator import Size
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.interface import HIGH_RES, Act, Obs
+from vlagents_ray.interface import Act, Obs
 from vlagents_ray.registry import require
 
 TERMINATED = "terminated"
@@ -33,7 +32,6 @@ class Mapped:
     success: str | None
     unit_actions: bool
     size: tuple[int | None, int | None]  # height, width
-    record_size: Size | None
 
 
 class View:
@@ -53,24 +51,18 @@ class View:
         if self._closed == self._open:
             raise ConfigError(f"{name}: gripper_range is {mapped.gripper_range}, want two different numbers")
 
-    @property
-    def renders(self) -> bool:
-        return any(pick.text == RENDER for pick in self._cameras.values())
-
     def observe(self, nested: Any, render: Callable[[], Any]) -> Obs:
         """Return an observation of the environment as ours; `render` gives the picture of its own renderer."""
-        cameras, recorded = {}, {}
-        for name, pick in self._cameras.items():
-            picture = render() if pick.text == RENDER else pick.value(nested)
-            cameras[name] = as_image(picture, name, self._options.size)
-            if self._options.record_size is not None:
-                recorded[name] = as_image(picture, name, self._options.record_size)
+        cameras = {
+            name: as_image(render() if pick.text == RENDER else pick.value(nested), name, self._options.size)
+            for name, pick in self._cameras.items()
+        }
         gripper = None
         if self._gripper is not None:
             share = (self._gripper.number(nested) - self._closed) / (self._open - self._closed)
             gripper = min(max(share, 0.0), 1.0)
         state = {name: pick.vector(nested) for name, pick in self._state.items()}
-        return Obs(cameras, gripper, state, {HIGH_RES: recorded} if recorded else {})
+        return Obs(cameras, gripper, state)
 
     def command(self, act: Act, contract: Contract) -> np.ndarray:
         """Return the action that the environment gets, (D,); raises `InvalidAction` if the policy's is not valid."""
@@ -79,10 +71,6 @@ class View:
             action = self._low + (action + 1) / 2 * (self._high - self._low)
         clipped: np.ndarray = np.clip(action, self._low, self._high).astype(self._dtype)
         return clipped
-
-    def idle(self) -> np.ndarray:
-        still: np.ndarray = np.clip(np.zeros_like(self._low), self._low, self._high).astype(self._dtype)
-        return still
 
     def succeeded(self, info: Mapping[str, Any], terminated: bool) -> bool:
         success = self._options.success

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ from vlagents_ray.envs.libero.tasks import (
 from vlagents_ray.envs.robosuite import CameraRenderer, gripper_opening, seeded
 from vlagents_ray.envs.simulator import SimulatorEnv
 from vlagents_ray.errors import ConfigError, EnvFailed
-from vlagents_ray.interface import HIGH_RES, Obs
+from vlagents_ray.interface import Obs
 from vlagents_ray.registry import require
 
 
@@ -56,7 +56,6 @@ class Libero(SimulatorEnv):
         *,
         width: int = 256,
         height: int = 256,
-        record_size: Sequence[int] | None = None,
         max_steps: int | None = None,
         settling_steps: int | None = None,
         simulator_seed: int | None = None,
@@ -81,7 +80,7 @@ class Libero(SimulatorEnv):
             files: The folder with `bddl_files` and `init_files` of suites that vary LIBERO's, such as LIBERO-PRO's;
                 None is what LIBERO_FILES names.
         """
-        super().__init__(f"libero/{task}", record_size=record_size, width=width, height=height, max_steps=max_steps)
+        super().__init__(f"libero/{task}", width=width, height=height, max_steps=max_steps)
         if (settling_steps or 0) < 0:
             raise ConfigError(f"libero/{task}: settling_steps is {settling_steps}, want 0 or more")
         self._task = find_task(task, files)
@@ -104,7 +103,7 @@ class Libero(SimulatorEnv):
         self._contract = _contract_of(self._rules)
         with self._making():
             self._states = read_states(self._task.states)
-            self._env = LiberoSimulation(self._task, self._rules, self._assets, self._record_size)
+            self._env = LiberoSimulation(self._task, self._rules, self._assets)
             self._resources.callback(self._env.close)
         self.init_states = len(self._states)
 
@@ -153,9 +152,6 @@ class Libero(SimulatorEnv):
 
     def _observe(self, seen: SimulatorObs, *, look: bool = True) -> Obs:
         cameras = self._rules.cameras if look else {}
-        info: dict[str, Any] = {"sim_state": {"positions": self._env.positions(), "goal": self._env.goal}}
-        if seen.views and look:
-            info[HIGH_RES] = {name: _turned(seen.views[own]) for name, own in cameras.items()}
         raw = seen.raw
         state = {
             "xyz_axis_angle": np.concatenate([raw["robot0_eef_pos"], axis_angle(raw["robot0_eef_quat"])]),
@@ -166,7 +162,7 @@ class Libero(SimulatorEnv):
             cameras={name: _turned(raw[f"{own}_image"]) for name, own in cameras.items()},
             gripper=gripper_opening(raw),
             state={name: part.astype(np.float32) for name, part in state.items()},
-            info=info,
+            info={"sim_state": {"positions": self._env.positions(), "goal": self._env.goal}},
         )
 
 
@@ -233,16 +229,13 @@ class SimulatorObs:
     """The simulator's observation after a step."""
 
     raw: Mapping[str, Any]  # robosuite's observation
-    views: Mapping[str, np.ndarray]  # MuJoCo's camera -> (H, W, 3) uint8, upside down, in the size for the record
     success: bool
 
 
 class LiberoSimulation:
     """Steps the simulator by the protocol, and renders only images that are used."""
 
-    def __init__(
-        self, task: LiberoTask, protocol: LiberoProtocol, assets: Path, record_size: tuple[int, int] | None
-    ) -> None:
+    def __init__(self, task: LiberoTask, protocol: LiberoProtocol, assets: Path) -> None:
         self._package: Any = require("libero.libero")
         self._assets = assets
         self._protocol = protocol
@@ -256,7 +249,7 @@ class LiberoSimulation:
             camera_widths=protocol.image_size[1],
             horizon=protocol.settling_steps + protocol.max_steps + 1,  # robosuite's own limit stays out of the way
         )
-        self._cameras = CameraRenderer(self._env.env, record_size)
+        self._cameras = CameraRenderer(self._env.env)
 
     def begin(self, state: np.ndarray) -> SimulatorObs:
         """Seed, reset, set the initial `state`, (D,) float64, and let the objects settle."""
@@ -273,13 +266,13 @@ class LiberoSimulation:
                 self._cameras.open = i == settling - 1
                 raw, _, success, _ = self._env.step(list(self._protocol.settling_action))
         self._cameras.open = True
-        return SimulatorObs(raw, self._cameras.views, bool(success))
+        return SimulatorObs(raw, bool(success))
 
     def step(self, action: np.ndarray, *, look: bool = True) -> SimulatorObs:
         """Execute an action, (7,) float64, clipped to [-1, 1] by the controller; without `look` nothing is rendered."""
         self._cameras.open = look
         raw, _, success, _ = self._env.step(action)
-        return SimulatorObs(raw, self._cameras.views, bool(success))
+        return SimulatorObs(raw, bool(success))
 
     @property
     def goal(self) -> list[list[str]]:

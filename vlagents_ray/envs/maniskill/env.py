@@ -68,7 +68,6 @@ class ManiSkill(SimulatorEnv):
         shader: str | None = None,
         reward_mode: str | None = None,
         reconfigure: bool = True,
-        record_size: Sequence[int] | None = None,
     ) -> None:
         """Make the environment; raises the errors of `make_env`. Other options are those of most `SimulatorEnv`s.
 
@@ -84,7 +83,7 @@ class ManiSkill(SimulatorEnv):
             reconfigure: Rebuild the scene for each episode. Without it some tasks' dynamics
                 (PlugCharger, PushT) depend on the episode before; it saves about 15 ms a reset.
         """
-        super().__init__(f"maniskill/{task}", record_size=record_size)
+        super().__init__(f"maniskill/{task}")
         self._own_limit = registered_limit(task)
         self.max_steps = step_limit(self._name, max_steps, self._own_limit)
         self._given_instruction = instruction
@@ -95,7 +94,6 @@ class ManiSkill(SimulatorEnv):
             height=height,
             shader=shader,
             cameras=cameras,
-            record_size=self._record_size,
             sim_backend=sim_backend,
             render_backend=render_backend,
             control_mode=control_mode,
@@ -166,15 +164,12 @@ class ManiSkillBatch(BatchEnv):
         max_steps: int | None = None,
         sim_backend: str = "physx_cuda",
         reconfigure: bool = True,
-        record_size: Sequence[int] | None = None,
         **options: Any,
     ) -> None:
         """Make the environments with the options of `ManiSkill`, whose errors this raises.
 
-        `sim_backend` "physx_cpu" simulates a single environment, and `record_size` must be None.
+        `sim_backend` "physx_cpu" simulates a single environment.
         """
-        if record_size is not None:
-            raise ConfigError(f"maniskill/{task}: record_size is for single environments; leave it out")
         if sim_backend not in ON_GPU and num_envs > 1:
             raise ConfigError(
                 f"maniskill/{task}: {sim_backend} simulates one environment, not {num_envs}; want physx_cuda"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import functools
 import gc
 import io
@@ -12,7 +11,7 @@ import math
 import re
 import sys
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from typing import Any
@@ -22,9 +21,9 @@ import numpy as np
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.envs.graphics import Renderer, prepare_rendering, vulkan_renderer
 from vlagents_ray.envs.render_probe import failing, vulkan_cure, vulkan_device
-from vlagents_ray.envs.simulator import Size, require_cameras
+from vlagents_ray.envs.simulator import require_cameras
 from vlagents_ray.errors import ConfigError, EnvFailed, UnknownEnv
-from vlagents_ray.interface import HIGH_RES, Obs
+from vlagents_ray.interface import Obs
 from vlagents_ray.registry import require
 
 DEFAULT_CONTROL_MODE = "pd_ee_delta_pose"
@@ -320,7 +319,6 @@ class Simulator:
         obs_mode: str,
         num_envs: int = 1,
         cameras: Sequence[str] | None = None,
-        record_size: Size | None = None,
         sim_backend: str,
         render_backend: str = "auto",
         control_mode: str | None = None,
@@ -331,7 +329,6 @@ class Simulator:
         self.name = name
         self._task = task
         self._asked_for = render_backend != "auto"
-        self._record: RecordCameras | None = None
         self.env: Any = make_bare(
             task,
             control_mode,
@@ -349,8 +346,6 @@ class Simulator:
         except BaseException:
             self.close()
             raise
-        if record_size is not None:
-            self._record = RecordCameras(record_size, self.cameras)
 
     @property
     def action(self) -> ActionSpec:
@@ -416,8 +411,6 @@ class Simulator:
         for i, (state, gripper) in enumerate(self._robot.read(env.agent)):
             extra = {} if states is None else {"sim_state": states[i]}
             seen.append(Obs({name: rows[i] for name, rows in images.items()}, gripper, state, extra))
-        if self._record is not None and rendered is not None:
-            seen[0].info[HIGH_RES] = self._record.views(env)
         success = [bool(value) for value in info["success"]]
         return Moment(seen, success, [0.0] * len(seen))
 
@@ -449,7 +442,7 @@ class Simulator:
         return self.env
 
     def close(self) -> None:
-        env, self.env, self._record = self.env, None, None
+        env, self.env = self.env, None
         if env is not None:
             env.close()
 
@@ -475,46 +468,3 @@ class Simulator:
             yield
         finally:
             env._obs_mode = own
-
-
-class RecordCameras:
-    """Cameras at the places of the task's cameras, created again with each scene."""
-
-    def __init__(self, size: Size, names: Iterable[str]) -> None:
-        self._height, self._width = size
-        self._names = list(names)
-        self._scene: Any = None
-        self._cameras: dict[str, Any] = {}
-
-    def views(self, env: Any) -> dict[str, np.ndarray]:
-        """Return the current images of a single environment's cameras, (height, width, 3) uint8 RGB each."""
-        if env.scene is not self._scene:
-            self._cameras = {name: self._beside(env, name) for name in self._names}
-            self._scene = env.scene
-        env.scene.update_render(update_sensors=True, update_human_render_cameras=False)
-        return {name: self._view(env, name) for name in self._names}
-
-    def _beside(self, env: Any, name: str) -> Any:
-        own = env._sensor_configs[name]
-        intrinsic = None
-        if own.intrinsic is not None:  # in pixels; a field of view needs no scaling
-            scale = np.array([self._width / own.width, self._height / own.height, 1.0])
-            intrinsic = np.asarray(own.intrinsic) * scale[:, np.newaxis]
-        config = dataclasses.replace(
-            own, uid=f"{name}_record", width=self._width, height=self._height, intrinsic=intrinsic
-        )
-        robot = env.agent.robot if name in env._agent_sensor_configs else None
-        return require("mani_skill.sensors.camera").Camera(config, env.scene, articulation=robot)
-
-    def _view(self, env: Any, name: str) -> np.ndarray:
-        camera = self._cameras[name]
-        camera.capture()
-        overlay = (getattr(env, "_rgb_overlay_images", None) or {}).get(name)
-        seen = camera.get_obs(depth=False, position=False, segmentation=overlay is not None)
-        rgb = seen["rgb"]
-        if overlay is not None:  # a digital twin, whose background is a photograph
-            pil = require("PIL.Image")
-            photograph = pil.fromarray(overlay.cpu().numpy().astype(np.uint8)).resize((self._width, self._height))
-            background = require("torch").tensor(np.array(photograph), device=rgb.device)
-            rgb = env._green_sceen_rgb(rgb, seen["segmentation"], background)
-        return np.ascontiguousarray(rgb[0].cpu().numpy().astype(np.uint8))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -56,7 +56,7 @@ class Recording(EpisodeRecorder):
 
     def __init__(self, config: EvalConfig, fps: float | None) -> None:
         self._wants_video, self._wants_trajectory = config.video, config.record
-        self._video = VideoRecorder(fps, seen=config.record != "none")
+        self._video = VideoRecorder(fps)
         self._trajectory, self._played = TrajectoryRecorder(), PlayedEpisode()
         self._observers: list[EpisodeObserver] = [self._played] if self.wants_images == "failures" else []
         self._observers += [self._trajectory] if self._wants_trajectory != "none" else []
@@ -87,17 +87,15 @@ class Recording(EpisodeRecorder):
             self._video.close()
             if (reason := second_pass(self._played, self._show)) is not None:
                 return Artifacts(not_repeatable=reason)
-        footage = self._video.finish()
+        videos = self._video.finish()
         return Artifacts(
-            Footage(footage.shown if video else {}, footage.seen if trajectory else {}),
+            Footage(videos if video else {}, videos if trajectory else {}),
             self._trajectory.finish().to_bytes() if trajectory else None,
         )
 
     def _show(self, obs: Obs) -> None:
-        if self._wants_video != "none":
+        if self._wants_video != "none" or self._wants_trajectory != "none":
             self._video.add(obs)
-        elif self._wants_trajectory != "none":
-            self._video.add(replace(obs, info={}))  # without the views for people
 
     def __exit__(self, *exc: object) -> None:
         self._video.close()

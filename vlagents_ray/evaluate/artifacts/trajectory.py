@@ -134,8 +134,8 @@ def save_trajectory(
 ) -> str | None:
     """Write `out/trajectories/POLICY/SUITE/ENV/epNNNN_seedS.npz` and `_CAMERA.mp4`; returns the first's path in `out`.
 
-    `videos` are the paths at which `footage.shown` was saved, in its order: a file that is the same is not there
-    twice. The .npz comes last: where it is, the rest is. What an earlier attempt at the episode left is removed.
+    `videos` are the paths at which `footage.shown` was saved, in its order: the same file is not there twice. The .npz
+    comes last: where it is, the rest is. What an earlier attempt at the episode left is removed.
     """
     saved = dict(zip(footage.shown, videos, strict=True))
     folder = episode_folder(out, TRAJECTORIES, cell)
@@ -145,7 +145,7 @@ def save_trajectory(
     path = folder / f"{stem(result.key)}.npz"
     seen = videos_of(path, footage.seen)
     for camera, video in footage.seen.items():
-        if footage.shown.get(camera) == video:
+        if camera in footage.shown:
             link_or_copy(out / saved[camera], seen[camera])
         else:
             with whole(seen[camera]) as part:

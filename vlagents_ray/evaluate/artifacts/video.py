@@ -12,14 +12,12 @@ import io
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
-
 from vlagents_ray.errors import EnvFailed, InvalidObservation
 from vlagents_ray.evaluate.artifacts.storage import VIDEOS, episode_folder, outcome, remove_old, stem, whole
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.images.mp4 import Mp4
-from vlagents_ray.interface import HIGH_RES, Obs
+from vlagents_ray.interface import Obs
 from vlagents_ray.naming import distinct
 
 DEFAULT_FPS = 20.0  # for an env whose contract has no control rate
@@ -29,39 +27,36 @@ DEFAULT_FPS = 20.0  # for an env whose contract has no control rate
 class Footage:
     """MP4 files by camera, each with a frame for every observation; {} if they are not recorded."""
 
-    shown: dict[str, bytes] = field(default_factory=dict)  # for people: high-resolution views where an env has them
-    seen: dict[str, bytes] = field(default_factory=dict)  # what the policy saw
+    shown: dict[str, bytes] = field(default_factory=dict)  # for people
+    seen: dict[str, bytes] = field(default_factory=dict)  # for the trajectory
 
 
 class VideoRecorder:
     """Videos of one episode, one a camera. Use as a context manager: leaving it frees the encoders."""
 
-    def __init__(self, fps: float | None = None, *, seen: bool = False) -> None:
-        """`seen`: of a camera with a high-resolution view keep, beside that, what the policy saw."""
+    def __init__(self, fps: float | None = None) -> None:
         self._fps = fps or DEFAULT_FPS
-        self._seen = seen
-        self._tracks: dict[tuple[str, bool], tuple[io.BytesIO, Mp4]] = {}  # by camera, and whether it is that view
+        self._tracks: dict[str, tuple[io.BytesIO, Mp4]] = {}  # by camera
 
     def add(self, obs: Obs) -> None:
-        """Append every camera's image, (H, W, 3) uint8 RGB; a high-resolution view replaces its camera's."""
-        views: dict[str, np.ndarray] = obs.info.get(HIGH_RES, {})
+        """Append every camera's image, (H, W, 3) uint8 RGB."""
         for name, image in obs.cameras.items():
-            if self._seen or name not in views:
-                self._append((name, False), image)
-        for name, image in views.items():
-            self._append((name, True), image)
+            if name not in self._tracks:
+                file = io.BytesIO()
+                self._tracks[name] = file, Mp4(file, image.shape, self._fps)
+            try:
+                self._tracks[name][1].add(image)
+            except InvalidObservation as error:
+                raise EnvFailed(f"camera {name!r}: {error}") from error
 
-    def finish(self) -> Footage:
-        """Finish the videos; the recorder is empty afterwards."""
-        videos: dict[tuple[str, bool], bytes] = {}
+    def finish(self) -> dict[str, bytes]:
+        """Finish the videos, by camera; the recorder is empty afterwards."""
+        videos: dict[str, bytes] = {}
         while self._tracks:
-            key, (file, track) = self._tracks.popitem()
+            name, (file, track) = self._tracks.popitem()
             track.finish()
-            videos[key] = file.getvalue()
-        # In this order a high-resolution view takes the place of its camera's.
-        shown = {name: videos[name, high] for name, high in sorted(videos)}
-        seen = {name: data for (name, high), data in sorted(videos.items()) if not high} if self._seen else {}
-        return Footage(shown, seen)
+            videos[name] = file.getvalue()
+        return dict(sorted(videos.items()))
 
     def close(self) -> None:
         while self._tracks:
@@ -72,15 +67,6 @@ class VideoRecorder:
 
     def __exit__(self, *exc: object) -> None:
         self.close()
-
-    def _append(self, key: tuple[str, bool], image: np.ndarray) -> None:
-        if key not in self._tracks:
-            file = io.BytesIO()
-            self._tracks[key] = file, Mp4(file, image.shape, self._fps)
-        try:
-            self._tracks[key][1].add(image)
-        except InvalidObservation as error:
-            raise EnvFailed(f"camera {key[0]!r}: {error}") from error
 
 
 def save_videos(out: Path, cell: EvalCase, result: EpisodeResult, videos: dict[str, bytes]) -> list[str]:

@@ -31,7 +31,7 @@ from vlagents_ray.evaluate.episode.records import EpisodeObserver, EpisodeResult
 from vlagents_ray.evaluate.episode.stats import EpisodeStats
 from vlagents_ray.evaluate.plan.config import ClockConfig
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
-from vlagents_ray.interface import HIGH_RES, Act, Agent, Obs
+from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.validation import check_action
 
 Phase = Literal["idle", "connect", "make", "env reset", "policy reset", "policy act", "env step"]
@@ -306,7 +306,4 @@ def options_of_reset(env: Environment, episode: int, options: Mapping[str, Any] 
 
 
 def _for_policy(obs: Obs, info: Mapping[str, Any]) -> Obs:
-    """Return the observation with `info`, and without the views that are for the record only."""
-    if HIGH_RES not in obs.info and not info:
-        return obs
-    return replace(obs, info={name: value for name, value in obs.info.items() if name != HIGH_RES} | dict(info))
+    return replace(obs, info={**obs.info, **info}) if info else obs

@@ -1,4 +1,4 @@
-"""ROS 2 messages to numbers, images and words, and actions to messages; nothing here needs ROS.
+"""ROS 2 messages to numbers and images, and actions to messages; nothing here needs ROS.
 
 A message that comes in is a mapping, as rosbridge sends it, or an object with the same fields, as rclpy gives it. One
 that goes out is a mapping of its fields. The fields and their units are those of ROS 2's packages `sensor_msgs`,
@@ -147,14 +147,6 @@ def numbers(message: Any) -> np.ndarray:
     return _finite("data", _numbers("data", [data] if isinstance(data, (int, float)) else data))
 
 
-def text(message: Any) -> str:
-    """Return the words of a `std_msgs/msg/String`."""
-    data = field(message, "data")
-    if not isinstance(data, str):
-        raise MalformedMessage(f"data: got {type(data).__name__}, want a string; is the topic's type right?")
-    return data
-
-
 def float64_multi_array(row: np.ndarray) -> dict[str, Any]:
     """Return a `std_msgs/msg/Float64MultiArray` of numbers, (D,)."""
     return {"layout": {"dim": [], "data_offset": 0}, "data": row.astype(np.float64).tolist()}
@@ -200,7 +192,7 @@ def _whole(name: str, value: Any) -> int:
 
 
 def _bytes(name: str, value: Any) -> bytes | memoryview:
-    """Return an array of uint8: rclpy gives an array, CBOR bytes, JSON base64 or, from some servers, a list."""
+    """Return an array of uint8: rclpy gives an array, rosbridge base64 or, from some servers, a list."""
     try:
         if isinstance(value, str):
             return base64.b64decode(value, validate=True)

@@ -50,7 +50,7 @@ class Link(Protocol):
     @property
     def connections(self) -> int: ...
 
-    def subscribe(self, topic: str, kind: str, take: Callable[[Any], None], *, sensor: bool) -> None: ...
+    def subscribe(self, topic: str, kind: str, take: Callable[[Any], None]) -> None: ...
 
     def advertise(self, topic: str, kind: str) -> None: ...
 
@@ -152,17 +152,15 @@ class RosRobot:
         self.holds: str | None = None
         self.watchdog: Watchdog | None = None
         """The watchdog of the control loop, with `silent_s` among its sources."""
-        self.instruction: str | None = None
-        """The newest instruction on its topic, for the next episode: a message neither ends nor begins one."""
-        self._link: Link = link or (Ros2() if settings.link == ROS2 else Rosbridge(settings.link, settings.compression))
+        self._link: Link = link or (Ros2() if settings.link == ROS2 else Rosbridge(settings.link))
         by_stamp = settings.clock == "stamp"
         self._readers = {id(reading): TopicReader(reading, by_stamp) for reading in settings.sensors}
         self._beat_at = -math.inf
         self._connections = 0
         self._lost_at = -math.inf  # s of `time.monotonic`
         self._stop_unsent = False
-        for topic, kind, sensor in self._topics():
-            self._link.subscribe(topic, kind, self._taker(topic), sensor=sensor)
+        for topic, kind in {reading.topic: reading.type for reading in settings.sensors}.items():
+            self._link.subscribe(topic, kind, self._taker(topic))
         for command in settings.actions:
             self._link.advertise(command.topic, command.type)
         if settings.heartbeat is not None:
@@ -203,15 +201,6 @@ class RosRobot:
             gripper=self.settings.gripper is not None,
             action=ActionSpec(dim=self.settings.dim),
         )
-
-    def first_instruction(self, say: Callable[[str], None]) -> str | None:
-        """Wait for the first instruction on its topic, if there is one; what is waited for is printed with `say`."""
-        told = self.settings.instruction
-        if told is not None and self.instruction is None:
-            say(f"waiting for an instruction on {told.topic}")
-        while told is not None and self.instruction is None:
-            time.sleep(_POLL_S)
-        return self.instruction
 
     def observe(self) -> Obs:
         """Return the newest message of each topic; also publishes the heartbeat."""
@@ -300,15 +289,7 @@ class RosRobot:
     def _value(self, reading: InputTopic) -> Any:
         return self._readers[id(reading)].value
 
-    def _topics(self) -> list[tuple[str, str, bool]]:
-        sensors = {one.topic: (one.topic, one.type, True) for one in self.settings.sensors}
-        told = self.settings.instruction
-        return [*sensors.values(), *([(told.topic, told.type, False)] if told else [])]
-
     def _taker(self, topic: str) -> Callable[[Any], None]:
-        told = self.settings.instruction
-        if told is not None and told.topic == topic:
-            return self._take_instruction
         readers = [self._readers[id(one)] for one in self.settings.sensors if one.topic == topic]
 
         def take(message: Any) -> None:
@@ -316,16 +297,6 @@ class RosRobot:
                 reader.take(message)
 
         return take
-
-    def _take_instruction(self, message: Any) -> None:
-        try:
-            text = messages.text(message)
-        except VLAgentsError as error:
-            logger.warning("instruction: left out: %s", error)
-            return
-        if self.instruction not in (None, text):  # the same one may be published again and again
-            logger.warning("instruction: got %r, which counts from the next episode on", text)
-        self.instruction = text
 
     def _wait_for_messages(self) -> None:
         deadline = time.monotonic() + self.settings.ready_s

@@ -28,17 +28,15 @@ class Ros2:
         self._executor: Any = None
         self._thread: threading.Thread | None = None
 
-    def subscribe(self, topic: str, kind: str, take: Callable[[Any], None], *, sensor: bool) -> None:
+    def subscribe(self, topic: str, kind: str, take: Callable[[Any], None]) -> None:
         """Have messages of a topic given to `take`, on the link's thread; before `open`.
 
-        Of a sensor the newest message is wanted and a lost one is not sent again; such a subscription also matches a
-        reliable publisher.
+        The newest message is wanted and a lost one is not sent again; such a subscription also matches a reliable
+        publisher.
         """
         qos = require("rclpy.qos")
-        reliability = qos.ReliabilityPolicy.BEST_EFFORT if sensor else qos.ReliabilityPolicy.RELIABLE
-        self._node.create_subscription(
-            message_class(kind), topic, take, qos.QoSProfile(depth=1, reliability=reliability)
-        )
+        newest = qos.QoSProfile(depth=1, reliability=qos.ReliabilityPolicy.BEST_EFFORT)
+        self._node.create_subscription(message_class(kind), topic, take, newest)
 
     def advertise(self, topic: str, kind: str) -> None:
         """Say that messages of this type will be published; before `open`."""

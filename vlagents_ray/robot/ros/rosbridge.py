@@ -15,7 +15,6 @@ from collections.abc import Callable
 from socket import SHUT_RDWR, SO_SNDTIMEO, SOL_SOCKET
 from typing import Any
 
-import numpy as np
 from websockets.exceptions import ConnectionClosed, WebSocketException
 from websockets.sync.client import ClientConnection, connect
 
@@ -35,16 +34,15 @@ class Rosbridge:
 
     Args:
         url: The server, "ws://arm-pc:9090".
-        compression: What messages are asked for in: "cbor", whose images need no base64, or "none" (JSON).
     """
 
     name = "rosbridge"
 
-    def __init__(self, url: str, compression: str = "cbor") -> None:
-        self._url, self._compression = url, compression
+    def __init__(self, url: str) -> None:
+        self._url = url
         self._take: dict[str, Callable[[Any], None]] = {}
         self._types: dict[str, str] = {}
-        # By a sensor's topic: when its last message came, or it was subscribed to, s of `time.monotonic`.
+        # By topic: when its last message came, or it was subscribed to, s of `time.monotonic`.
         self._heard: dict[str, float] = {}
         self._outlets: dict[str, str] = {}
         self._socket: ClientConnection | None = None
@@ -53,15 +51,14 @@ class Rosbridge:
         self._thread: threading.Thread | None = None
         self.connections = 0  # since `open`
 
-    def subscribe(self, topic: str, kind: str, take: Callable[[Any], None], *, sensor: bool) -> None:
+    def subscribe(self, topic: str, kind: str, take: Callable[[Any], None]) -> None:
         """Have messages of a topic given to `take`, on the link's thread; before `open`.
 
-        A sensor's topic is subscribed to again while it is silent: the server chooses the quality of service by the
+        The topic is subscribed to again while it is silent: the server chooses the quality of service by the
         publishers that it knows at that moment, and gets nothing from one with best effort that it found later.
         """
         self._take[topic], self._types[topic] = take, kind
-        if sensor:
-            self._heard[topic] = 0.0
+        self._heard[topic] = 0.0
 
     def advertise(self, topic: str, kind: str) -> None:
         """Say that messages of this type will be published; before `open`."""
@@ -133,11 +130,10 @@ class Rosbridge:
                 self._lose(socket)
 
     def _ask_for(self, topic: str, socket: ClientConnection) -> None:
-        request = {"op": "subscribe", "topic": topic, "type": self._types[topic], "compression": self._compression}
         # The newest message alone, as it replaces what a slow link has not carried yet.
-        socket.send(json.dumps({**request, "queue_length": 1}))
-        if topic in self._heard:
-            self._heard[topic] = time.monotonic()
+        request = {"op": "subscribe", "topic": topic, "type": self._types[topic], "queue_length": 1}
+        socket.send(json.dumps(request))
+        self._heard[topic] = time.monotonic()
 
     def _ask_silent_again(self, socket: ClientConnection) -> None:
         for topic, at in self._heard.items():
@@ -183,118 +179,19 @@ class Rosbridge:
             return
         if came.get("op") == "publish":
             topic = str(came.get("topic"))
-            if topic in self._heard:
-                self._heard[topic] = time.monotonic()
             if (take := self._take.get(topic)) is not None:
+                self._heard[topic] = time.monotonic()
                 take(came.get("msg"))
         elif came.get("op") == "status":
             logger.warning("%s: %s: %s", self._url, came.get("level"), came.get("msg"))
 
 
 def decoded(frame: str | bytes) -> dict[str, Any]:
-    """Decode a message of the protocol: JSON if it is a text, CBOR if it is bytes; raises `MalformedMessage`."""
-    if isinstance(frame, bytes):
-        message = decode_cbor(frame)
-    else:
-        try:
-            message = json.loads(frame)
-        except (ValueError, RecursionError) as error:
-            raise MalformedMessage(f"rosbridge: got {frame[:40]!r}, want JSON ({error})") from error
+    """Decode a message of the protocol, which is JSON; raises `MalformedMessage`."""
+    try:
+        message = json.loads(frame)
+    except (ValueError, RecursionError) as error:
+        raise MalformedMessage(f"rosbridge: got {frame[:40]!r}, want JSON ({error})") from error
     if not isinstance(message, dict) or not isinstance(message.get("op"), str):
         raise MalformedMessage(f"rosbridge: got {shown(message)}, want an object with `op`")
     return message
-
-
-# CBOR (RFC 8949) with typed arrays (RFC 8746), as far as rosbridge uses it: no indefinite lengths. The robot's install
-# has no package for it. Nothing that the bytes declare is allocated before they have shown to be as long.
-
-_DEPTH = 16
-_SIMPLE: dict[int, Any] = {20: False, 21: True, 22: None, 23: None}
-_FLOATS = {25: struct.Struct(">e"), 26: struct.Struct(">f"), 27: struct.Struct(">d")}
-# Typed arrays: the tag's bits say kind, byte order and size.
-_TYPED = {
-    64: "u1", 65: ">u2", 66: ">u4", 67: ">u8", 68: "u1", 69: "<u2", 70: "<u4", 71: "<u8",
-    72: "i1", 73: ">i2", 74: ">i4", 75: ">i8", 77: "<i2", 78: "<i4", 79: "<i8",
-    80: ">f2", 81: ">f4", 82: ">f8", 84: "<f2", 85: "<f4", 86: "<f8",
-}  # fmt: skip
-
-
-def decode_cbor(data: bytes | memoryview) -> Any:
-    """Decode one CBOR item: byte strings become views of `data`, typed arrays numpy arrays, (D,).
-
-    Raises:
-        MalformedMessage: The data are truncated, continue after the item, nest too deep, or use what is not supported.
-    """
-    reader = _CborReader(memoryview(data))
-    found = reader.item(_DEPTH)
-    if reader.left:
-        raise MalformedMessage(f"CBOR: got {reader.left} bytes after the item, want none")
-    return found
-
-
-class _CborReader:
-    def __init__(self, view: memoryview) -> None:
-        self._view, self._at = view, 0
-
-    @property
-    def left(self) -> int:
-        return len(self._view) - self._at
-
-    def item(self, depth: int) -> Any:
-        if depth == 0:
-            raise MalformedMessage(f"CBOR: got more than {_DEPTH} levels, want a message of ROS")
-        head = self._take(1)[0]
-        kind, low = head >> 5, head & 31
-        if kind == 7:
-            return self._simple(low)
-        count = self._count(low)
-        if kind <= 1:
-            return count if kind == 0 else -1 - count
-        if kind <= 3:
-            return self._take(count) if kind == 2 else self._text(count)
-        if kind == 6:
-            return self._tagged(count, self.item(depth - 1))
-        if count * (kind - 3) > self.left:  # each item takes a byte or more, and a mapping has two an entry
-            raise MalformedMessage(f"CBOR: got {self.left} bytes for {count * (kind - 3)} items")
-        if kind == 4:
-            return [self.item(depth - 1) for _ in range(count)]
-        return {self._name(self.item(depth - 1)): self.item(depth - 1) for _ in range(count)}
-
-    def _take(self, count: int) -> memoryview:
-        if count > self.left:
-            raise MalformedMessage(f"CBOR: got {self.left} bytes, want {count} or more; the message is truncated")
-        self._at += count
-        return self._view[self._at - count : self._at]
-
-    def _count(self, low: int) -> int:
-        if low < 24:
-            return low
-        if low > 27:
-            raise MalformedMessage(f"CBOR: got the additional information {low}, want 0 to 27: no indefinite lengths")
-        return int.from_bytes(self._take(1 << (low - 24)), "big")
-
-    def _text(self, count: int) -> str:
-        try:
-            return str(self._take(count), "utf-8")
-        except UnicodeDecodeError as error:
-            raise MalformedMessage(f"CBOR: got a text that is not UTF-8 ({error})") from error
-
-    def _name(self, key: Any) -> str:
-        if not isinstance(key, str):
-            raise MalformedMessage(f"CBOR: got the key {shown(key)}, want a field's name")
-        return key
-
-    def _tagged(self, tag: int, value: Any) -> Any:
-        if tag not in _TYPED:
-            return value
-        kind = np.dtype(_TYPED[tag])
-        if not isinstance(value, memoryview) or len(value) % kind.itemsize:
-            raise MalformedMessage(f"CBOR: got a typed array of {kind} that is not as many bytes")
-        return np.frombuffer(value, kind)
-
-    def _simple(self, low: int) -> Any:
-        if low in _FLOATS:
-            return _FLOATS[low].unpack(self._take(_FLOATS[low].size))[0]
-        if low not in _SIMPLE:
-            raise MalformedMessage(f"CBOR: got the simple value {low}, want false, true, null or a float")
-        return _SIMPLE[low]

@@ -14,7 +14,7 @@ from vlagents_ray.settings import require_arguments
 
 ROS2 = "ros2"
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
-JOINT_STATE, STRING, BOOL = "sensor_msgs/msg/JointState", "std_msgs/msg/String", "std_msgs/msg/Bool"
+JOINT_STATE, BOOL = "sensor_msgs/msg/JointState", "std_msgs/msg/Bool"
 POSES = ("geometry_msgs/msg/Pose", "geometry_msgs/msg/PoseStamped")
 NUMBERS = tuple(f"std_msgs/msg/{name}" for name in ("Float64MultiArray", "Float32MultiArray", "Float64", "Float32"))
 ARRAY, TWIST_TYPE, TRAJECTORY = NUMBERS[0], "geometry_msgs/msg/Twist", "trajectory_msgs/msg/JointTrajectory"
@@ -74,13 +74,11 @@ class RosSettings:
     cameras: Mapping[str, InputTopic] = field(default_factory=dict)
     state: Mapping[str, InputTopic] = field(default_factory=dict)
     gripper: InputTopic | None = None
-    instruction: InputTopic | None = None
     heartbeat: HeartbeatTopic | None = None
     max_age_s: float = 0.3
     silent_s: float = 1.0
     clock: str = "stamp"  # whether a message's age counts from its header's time stamp, or from its arrival ("arrival")
     ready_s: float = 10.0  # how long the first message of each topic is waited for
-    compression: str = "cbor"  # of a rosbridge: "cbor" or "none"
 
     @property
     def sensors(self) -> list[InputTopic]:
@@ -122,9 +120,8 @@ def settings_from(stated: Any, where: str) -> RosSettings:
     for part, kind in (("cameras", IMAGE), ("state", JOINT_STATE)):
         named = _mapping(top.get(part) or {}, f"{where}: {part}")
         top[part] = {str(name): _reading(one, f"{where}: {part}.{name}", kind) for name, one in named.items()}
-    for part, kind in (("gripper", JOINT_STATE), ("instruction", STRING)):
-        if top.get(part) is not None:
-            top[part] = _reading(top[part], f"{where}: {part}", kind)
+    if top.get("gripper") is not None:
+        top["gripper"] = _reading(top["gripper"], f"{where}: gripper", JOINT_STATE)
     if top.get("heartbeat") is not None:
         top["heartbeat"] = _made(HeartbeatTopic, top["heartbeat"], f"{where}: heartbeat")
     actions = top.get("actions") or []
@@ -140,8 +137,7 @@ def _check(settings: RosSettings, where: str) -> None:
     readings = [
         *((f"cameras.{name}", one, (IMAGE, COMPRESSED)) for name, one in settings.cameras.items()),
         *((f"state.{name}", one, (JOINT_STATE, *POSES, *NUMBERS)) for name, one in settings.state.items()),
-        *((name, one, (JOINT_STATE, *NUMBERS)) for name, one in (("gripper", settings.gripper),) if one is not None),
-        *((name, one, (STRING,)) for name, one in (("instruction", settings.instruction),) if one is not None),
+        *([("gripper", gripper, (JOINT_STATE, *NUMBERS))] if (gripper := settings.gripper) is not None else []),
     ]
     for name, reading, types in readings:
         _one_of(f"{where}: {name}: type", reading.type, types)
@@ -157,7 +153,6 @@ def _check(settings: RosSettings, where: str) -> None:
         raise ConfigError(f"{where}: got no camera, state or gripper, want one, by whose age the robot is stopped")
     if not settings.actions:
         raise ConfigError(f"{where}: actions: got none, want the topics that command the robot")
-    gripper = settings.gripper
     if gripper is not None and (gripper.open is None or gripper.closed is None or gripper.open == gripper.closed):
         raise ConfigError(f"{where}: gripper: got no two numbers, want `open` and `closed` as the topic gives them")
     for i, command in enumerate(settings.actions):
@@ -169,7 +164,6 @@ def _check(settings: RosSettings, where: str) -> None:
         if limit is not None and not limit > 0:
             raise ConfigError(f"{where}: {name}: got {limit}, want above 0")
     _one_of(f"{where}: clock", settings.clock, ("stamp", "arrival"))
-    _one_of(f"{where}: compression", settings.compression, ("cbor", "none"))
     if settings.link != ROS2 and not settings.link.startswith(("ws://", "wss://")):
         raise ConfigError(f"{where}: link: got {settings.link!r}, want 'ros2', or a rosbridge as 'ws://arm-pc:9090'")
 

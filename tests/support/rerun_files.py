@@ -1,8 +1,7 @@
-"""What the files of viewers hold, read by their own readers."""
+"""What a file of Rerun holds, read by its own reader."""
 
 from __future__ import annotations
 
-import json
 from collections import defaultdict
 from pathlib import Path
 from typing import Any
@@ -41,15 +40,3 @@ def _plain(kind: str, value: Any) -> Any:
     numbers = next(iter(buffer.values())) if isinstance(buffer, dict) else buffer
     rows, columns = value[0]["shape"]
     return [numbers[i * columns : (i + 1) * columns] for i in range(rows)]
-
-
-def read_mcap(path: Path) -> dict[str, list[dict[str, Any]]]:
-    """What an MCAP file says: topic -> its messages in order; those that are not JSON as `{"raw": bytes}`."""
-    from mcap.reader import make_reader
-
-    found: dict[str, list[dict[str, Any]]] = defaultdict(list)
-    with path.open("rb") as file:
-        for _, channel, message in make_reader(file, validate_crcs=True).iter_messages():
-            known = channel.message_encoding == "json"
-            found[channel.topic].append(json.loads(message.data) if known else {"raw": message.data})
-    return dict(found)

@@ -1,4 +1,7 @@
-"""Viewers of episodes: what they show, and the thread that shows it, which drops what comes too fast."""
+"""Episodes for Rerun (https://rerun.io): `.rrd` files, or a viewer that runs; the extra "rerun".
+
+A thread writes them, and drops what comes too fast: what is shown is never delayed by it.
+"""
 
 from __future__ import annotations
 
@@ -6,22 +9,33 @@ import contextlib
 import logging
 import os
 import queue
+import socket
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Protocol
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
+from uuid import uuid4
 
 import numpy as np
 
+from vlagents_ray.errors import ConfigError
 from vlagents_ray.images.jpeg_png import encode_jpeg
 from vlagents_ray.interface import AGE, CAPTURED, INTERVENTION, PLANNED, SAFE, SILENT, WANTED, Act, Obs
+from vlagents_ray.registry import require
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
+__all__ = ["EpisodeViewer", "RerunRecordings", "ViewerFrame", "is_live", "open_viewer"]
 
 logger = logging.getLogger(__name__)
+APPLICATION = "vlagents_ray"
+LIVE = "rerun+http://127.0.0.1:9876/proxy"  # where `rerun`, the viewer, listens by default
+_PORT = 9876
+CLOSING_S = 2.0  # within which a live viewer takes what is left
 FRAMES = 100  # in the queue: 2 s at 50 Hz, 180 MB with two cameras of 640x480
 _NICE = 5  # the writing thread runs after the loop's
 
@@ -75,28 +89,104 @@ def note_of(info: Mapping[str, Any]) -> str:
     return str(info.get(SAFE, ""))
 
 
-class ViewerEpisode(Protocol):
-    """Writes one episode."""
+class RerunRecordings:
+    """Writes a recording of each episode, on the timelines `tick` and `time`.
+
+    Cameras are `cameras/NAME`, parts of the state `state/NAME`, the actions `action/executed`, `action/planned` and
+    `action/chunk`, times and other numbers `timing/NAME`, and notes `log`.
+    """
+
+    def __init__(self, target: str) -> None:
+        """Write `TARGET/EPISODE.rrd`, or send to the viewer at an address; see `open_viewer`."""
+        if "://" in target and not is_live(target):
+            raise ConfigError(f"rerun: got {target!r}, want a folder, 'live', or an address such as {LIVE}")
+        self.target = LIVE if target == "live" else target
+        self._rerun = require("rerun")
+        self._folder = None if is_live(target) else Path(target)
+        self.closing_s = CLOSING_S if self._folder is None else None
+        """How long the end waits for what is left to be written; None: until it is."""
+        if self._folder is None:
+            _require_viewer(self.target)
+            self._rerun.unregister_shutdown()  # it would wait for a viewer that is gone, without an end
+        else:
+            self._folder.mkdir(parents=True, exist_ok=True)
+
+    def begin(self, name: str, instruction: str) -> RerunEpisode:
+        recording = self._rerun.RecordingStream(APPLICATION, recording_id=uuid4())
+        if self._folder is None:
+            recording.connect_grpc(self.target)
+        else:
+            recording.save(self._folder / f"{name}.rrd")
+        recording.send_recording_name(name)
+        return RerunEpisode(self._rerun, recording, instruction, live=self._folder is None)
+
+
+class RerunEpisode:
+    """The recording of one episode."""
+
+    def __init__(self, rerun: Any, recording: Any, instruction: str, *, live: bool) -> None:
+        self._rerun = rerun
+        self._recording = recording
+        self._live = live
+        if instruction:
+            recording.log("instruction", rerun.TextDocument(instruction), static=True)
 
     def write(self, frame: ViewerFrame) -> None:
-        """Write a frame."""
+        rerun, recording = self._rerun, self._recording
+        recording.set_time("tick", sequence=frame.tick)
+        recording.set_time("time", timestamp=frame.time)
+        for name, data in frame.images().items():
+            kind = "image/jpeg" if data[:3] == b"\xff\xd8\xff" else "image/png"
+            recording.log(["cameras", name], rerun.EncodedImage(contents=data, media_type=kind))
+        for name, part in frame.state.items():
+            recording.log(["state", name], rerun.Scalars(part))
+        for name, action in (("executed", frame.executed), ("planned", frame.planned)):
+            if action is not None:
+                recording.log(["action", name], rerun.Scalars(action))
+        if frame.chunk is not None:
+            chunk = np.asarray(frame.chunk, np.float32)
+            recording.log(["action", "chunk"], rerun.Tensor(chunk, dim_names=("row", "dimension")))
+        for name, value in frame.numbers.items():
+            recording.log(["timing", name], rerun.Scalars(value))
+        if frame.note:
+            recording.log("log", rerun.TextLog(frame.note, level="WARN"))
 
     def close(self) -> None:
-        """Finish the episode."""
+        if self._live:
+            self._recording.flush(timeout_sec=CLOSING_S)
+        self._recording.disconnect()
 
 
-class EpisodeFormat(Protocol):
-    """Where episodes are written to, and how."""
+def _require_viewer(address: str) -> None:
+    """Raise `ConfigError` if nothing listens at the address: the SDK would retry without an end."""
+    where = urlsplit(address)
+    try:
+        with socket.create_connection((where.hostname or "", where.port or _PORT), CLOSING_S):
+            pass
+    except OSError as error:
+        raise ConfigError(f"rerun: no viewer listens at {address}: {error}; start it with `rerun`") from error
 
-    name: str  # of the viewer
-    target: str  # the folder or the address
-    closing_s: float | None  # how long the end waits for what is left to be written; None: until it is
 
-    def begin(self, name: str, instruction: str) -> ViewerEpisode:
-        """Begin an episode; `name` is also that of its file."""
+def open_viewer(target: str) -> EpisodeViewer:
+    """Open a viewer.
 
-    def close(self) -> None:
-        """Free what the episodes shared, such as a server."""
+    Args:
+        target: A folder for `.rrd` files; the address of a viewer, "rerun+http://HOST:PORT/proxy"; or "live", the
+            viewer on this machine.
+
+    Returns:
+        The viewer, which the caller closes.
+
+    Raises:
+        ConfigError: The target is another address, or nothing listens there.
+        MissingDependency: The extra "rerun" is not installed.
+    """
+    return EpisodeViewer(RerunRecordings(target))
+
+
+def is_live(target: str) -> bool:
+    """Whether a target is a connection, not a folder."""
+    return target == "live" or target.startswith("rerun+")
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +198,7 @@ class _Beginning:
 class EpisodeViewer:
     """Shows episodes on its own thread.
 
-        with EpisodeViewer(RerunRecordings("recordings")) as viewer:
+        with open_viewer("recordings") as viewer:
             with viewer.episode("stack_0", "stack the cups"):
                 viewer.add(ViewerFrame.of(obs, tick=0, executed=action))
 
@@ -121,17 +211,17 @@ class EpisodeViewer:
         frames: The largest number of frames in the queue.
     """
 
-    def __init__(self, target: EpisodeFormat, *, frames: int = FRAMES) -> None:
+    def __init__(self, target: RerunRecordings, *, frames: int = FRAMES) -> None:
         self.dropped = 0  # frames
         self.episodes = 0  # written without an error
         self.error: Exception | None = None  # the first one
-        self._format = target
+        self._recordings = target
         self._frames = frames
         self._queue: queue.SimpleQueue[ViewerFrame | _Beginning | None] = queue.SimpleQueue()
         self._put = 0  # frames added, counted by the caller's thread
         self._got = 0  # frames written, counted by the writing thread
         self._closed = False
-        self._thread = threading.Thread(target=self._run, name=f"vlagents-ray-{target.name}", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="vlagents-ray-rerun", daemon=True)
         self._thread.start()
 
     @property
@@ -166,15 +256,13 @@ class EpisodeViewer:
         if not self._closed:
             self._closed = True
             self._queue.put(None)
-            self._thread.join(self._format.closing_s)
+            self._thread.join(self._recordings.closing_s)
             if self._thread.is_alive():
-                self.error = self.error or TimeoutError(f"nothing at {self._format.target} takes what is left")
-                return
-            self._format.close()
+                self.error = self.error or TimeoutError(f"nothing at {self._recordings.target} takes what is left")
 
     def report(self) -> str:
         """Return a line that says what was shown."""
-        line = f"{self._format.name}: {self.episodes} episodes in {self._format.target}, {self.dropped} frames dropped"
+        line = f"rerun: {self.episodes} episodes in {self._recordings.target}, {self.dropped} frames dropped"
         return line if self.error is None else f"{line}; stopped by {type(self.error).__name__}: {self.error}"
 
     def __enter__(self) -> Self:
@@ -192,12 +280,12 @@ class EpisodeViewer:
     def _show(self, beginning: _Beginning) -> None:
         frames = self._until_the_end()
         try:
-            with contextlib.closing(self._format.begin(beginning.name, beginning.instruction)) as writer:
+            with contextlib.closing(self._recordings.begin(beginning.name, beginning.instruction)) as writer:
                 for frame in frames:
                     writer.write(frame)
             self.episodes += 1
         except Exception as error:  # noqa: BLE001 - what is shown goes on without the viewer
-            logger.warning("%s: episode %s is not shown: %s", self._format.name, beginning.name, error)
+            logger.warning("rerun: episode %s is not shown: %s", beginning.name, error)
             self.error = self.error or error
         for _ in frames:
             pass
@@ -210,28 +298,25 @@ class EpisodeViewer:
 
 
 class LoopView:
-    """Shows one run in each of some viewers; without one, it costs nothing."""
+    """Shows one run in a viewer; without one, it costs nothing."""
 
-    def __init__(self, viewers: Sequence[EpisodeViewer]) -> None:
-        """Show a run in `viewers`."""
-        self._viewers = viewers
+    def __init__(self, viewer: EpisodeViewer | None) -> None:
+        """Show a run in `viewer`."""
+        self._viewer = viewer
         self._chunk: np.ndarray | None = None  # the last one that was shown
         self._note = ""
 
-    @contextlib.contextmanager
-    def episode(self, instruction: str) -> Iterator[None]:
+    def episode(self, instruction: str) -> contextlib.AbstractContextManager[None]:
         """Show what is added within the context as one episode."""
-        name = dated_name()
-        with contextlib.ExitStack() as stack:
-            for viewer in self._viewers:
-                stack.enter_context(viewer.episode(name, instruction))
-            yield
+        return contextlib.nullcontext() if self._viewer is None else self._viewer.episode(dated_name(), instruction)
 
     def add(self, obs: Obs, act: Act, executed: np.ndarray | None, tick: int, work_s: float, stop: str = "") -> None:
         """Show a tick; never waits."""
-        if not any(viewer.has_room for viewer in self._viewers):
-            for viewer in self._viewers:
-                viewer.dropped += 1
+        viewer = self._viewer
+        if viewer is None:
+            return
+        if not viewer.has_room:
+            viewer.dropped += 1
             return
         info = act.info
         rows, note = info.get(PLANNED), stop or note_of(info)
@@ -246,8 +331,7 @@ class LoopView:
             note=note if note != self._note else "",
         )
         self._chunk, self._note = self._chunk if rows is None else rows, note
-        for viewer in self._viewers:
-            viewer.add(frame)
+        viewer.add(frame)
 
 
 def dated_name(when: float | None = None) -> str:
