@@ -103,7 +103,7 @@ POLICIES: dict[str, Adapter] = {
     ),
     "upstream": Adapter(
         "vlagents_ray.policies.upstream:Upstream",
-        "any model behind a server of openpi, RoboArena, GR00T, LeRobot, OpenVLA, vla-eval, XPolicyLab or vlagents",
+        "any model behind a server of openpi, RoboArena, GR00T, OpenVLA, vla-eval or vlagents",
         wants="that server",
     ),
     "noop": Adapter("vlagents_ray.policies.noop:Noop"),
