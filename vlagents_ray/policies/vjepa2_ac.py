@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -36,7 +36,6 @@ from vlagents_ray.registry import require
 class VJepa2AcConfig(ModelConfig):
     """Settings of V-JEPA 2-AC, beside those of all models: its checkpoint, and the search for plans."""
 
-    deterministic: Literal[False] = Field(default=False, description="not for this family")
     encoder: str | None = Field(
         default=None,
         description="folder or hub id (org/name@COMMIT) of a `VJEPA2Model` instead of the encoder in the checkpoint",
