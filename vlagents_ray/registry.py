@@ -108,7 +108,6 @@ POLICIES: dict[str, Adapter] = {
     ),
     "noop": Adapter("vlagents_ray.policies.noop:Noop"),
     "random": Adapter("vlagents_ray.policies.random:Random"),
-    "replay": Adapter("vlagents_ray.policies.replay:Replay"),
     "scripted": Adapter("vlagents_ray.policies.scripted:Scripted"),
 }
 
