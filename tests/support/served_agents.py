@@ -16,6 +16,7 @@ import numpy as np
 import psutil
 from eval_fakes import ToZero, wait_for
 from process_resources import unpooled_threads
+from shared_cpu_memory import SharedCpuMemory
 
 from vlagents_ray import Act, Agent, Obs
 from vlagents_ray.contract import ActionSpec, Contract, StateSpec
@@ -58,6 +59,25 @@ class Trainable(Agent):
 
     def act(self, obs: Obs) -> Act:
         return Act(self.tree["gain"][:2].copy())
+
+
+class OnOneGpu(Agent):
+    """A torch policy that has a GPU in common with its learner; or, on the CPU, memory in the place of that GPU's."""
+
+    trainable = "layer"
+
+    def __init__(self, device: str = "cpu") -> None:
+        self.device = device
+
+    def initialize(self) -> None:
+        import torch
+
+        if self.device == "cpu":
+            SharedCpuMemory().install()
+        self.layer = torch.nn.Linear(500, 400, device=self.device).requires_grad_(False)
+
+    def act(self, obs: Obs) -> Act:
+        return Act(np.array(self.layer.weight[:2, 0].cpu()))
 
 
 class Remembering(Agent):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import logging
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -27,7 +28,10 @@ from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.scaling.weight_push import OwnWeights, Values, WeightPusher, WeightsReplica
 from vlagents_ray.serve.weights import PushMode, PushOptions, PushResult
 from vlagents_ray.weights.safetensors import MESSAGE_BYTES, header_of, parts_of
+from vlagents_ray.weights.shared_values import NotShared, gpu_of, shared
 from vlagents_ray.weights.trainable import is_array, portable
+
+logger = logging.getLogger(__name__)
 
 _ANSWER_S = 10.0  # time limit for the question which versions act
 _PUSH_S = 600.0  # time limit for a push, which includes the transfer to all nodes
@@ -159,8 +163,9 @@ class EngineTarget(WeightsTarget):
 class AppTarget(WeightsTarget):
     """An application of the Ray cluster that this process is in.
 
-    The values are put into Ray's object store once. All replicas of this node read them there, without a copy where the
-    policy is on the CPU; Ray transfers them to other nodes once each.
+    If the learner and all replicas have their weights on the same GPU, the replicas copy them from where they are.
+    Otherwise the values are put into Ray's object store once. All replicas of this node read them there, without a copy
+    where the policy is on the CPU; Ray transfers them to other nodes once each.
     """
 
     def __init__(self, app: str) -> None:
@@ -174,7 +179,15 @@ class AppTarget(WeightsTarget):
     def push(self, named: Mapping[str, Any], options: PushOptions) -> int:
         import ray
 
-        values: Values = [ray.put(_portable(named))]
+        if gpu_of(named):
+            try:
+                with shared(named) as values:
+                    return self._push(values, options)
+            except NotShared as error:
+                logger.info("serve://%s: the weights go through Ray's object store: %s", self._app, error)
+        return self._push([ray.put(_portable(named))], options)
+
+    def _push(self, values: Values, options: PushOptions) -> int:
         result: PushResult = self._call("push_weights", values, options, timeout_s=_PUSH_S)
         return result.version
 

@@ -30,6 +30,7 @@ from vlagents_ray.errors import (
 from vlagents_ray.interface import POLICY, Agent
 from vlagents_ray.policies.compilation import CAPTURES
 from vlagents_ray.weights.safetensors import ValueSpec, read_header
+from vlagents_ray.weights.shared_values import gpu_of
 from vlagents_ray.weights.trainable import fingerprint, fitted, is_copied, own_copy, portable, require_fit
 
 DIGITS = 16  # of a checkpoint's digest in place of a fingerprint, hexadecimal
@@ -95,12 +96,13 @@ class ModelWeights:
             values: dict[str, Any] | None = agent.parameters()
         except NotTrainable as error:
             self._refusal: NotTrainable | None = error
-            first, self._in_place = WeightsVersion(0, digest, None), False
+            first, self._in_place, self.gpu = WeightsVersion(0, digest, None), False, ""
         else:
             self._refusal = None
             # An agent of its own ways may copy as well, so that references to old values do not last.
             self._in_place = type(agent).load_parameters is not Agent.load_parameters or is_copied(values or {})
             first = WeightsVersion(0, fingerprint(values or {}), None if self._in_place else values)
+            self.gpu = gpu_of(values or {})
         self.newest = self.pinned = first
         self._staged: WeightsVersion | None = None
         self._timer: threading.Timer | None = None
@@ -334,6 +336,7 @@ class NewestVersion:
 
     number: int
     model: tuple[str, str]  # equal in replicas that loaded the same checkpoint with the same settings
+    gpu: str = ""  # UUID of the GPU on which its weights are; empty if it is none, or more than one
 
 
 @dataclass(frozen=True, slots=True)
@@ -398,7 +401,7 @@ class WeightUpdates:
         """The newest version; raises `PolicyUnavailable` while the policy loads."""
         own = self._own()
         own.settle()
-        return NewestVersion(own.newest.number, own.model)
+        return NewestVersion(own.newest.number, own.model, own.gpu)
 
     @property
     def number(self) -> int:

@@ -23,6 +23,7 @@ from vlagents_ray.policies.loading import report_device
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.weights import ModelWeights
+from vlagents_ray.weights.shared_values import _GpuMemory
 
 pytestmark = pytest.mark.torch
 
@@ -181,6 +182,15 @@ def test_a_push_waits_for_the_end_of_a_capture(cuda: FakeCuda) -> None:
     pushed = {"w": np.zeros(2, np.float32)}
     assert captured_beside(cuda, lambda: on_a_thread(lambda: weights.stage(1, pushed))) == weights._staged.fingerprint  # type: ignore[union-attr]
     weights.drop(1)
+
+
+def test_memory_for_another_process_is_finished_without_a_wait_for_the_device(cuda: FakeCuda) -> None:
+    def function(x: Any) -> Any:
+        if cuda.capture is not None:
+            assert on_a_thread(lambda: _GpuMemory().finish(x.device)).get(timeout=10) is None
+        return x.tanh()
+
+    CudaGraph(function, [numbers(cuda)])
 
 
 def test_a_capture_that_waits_for_a_push_delays_no_act_and_is_not_starved_by_acts(cuda: FakeCuda) -> None:

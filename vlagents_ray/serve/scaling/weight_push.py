@@ -17,11 +17,13 @@ from typing import Any, Protocol, TypeVar
 from vlagents_ray.errors import InvalidInput, InvalidWeights, PolicyUnavailable, VLAgentsError
 from vlagents_ray.serve.scaling.session_migration import PeerEnded, PeerUnreachable
 from vlagents_ray.serve.weights import HeldVersion, NewestVersion, PushOptions, PushResult, WeightUpdates
+from vlagents_ray.weights.shared_values import NotShared, SharedValues, opened
 
 T = TypeVar("T")
 
-Values = Mapping[str, Any] | list[Awaitable[Mapping[str, Any]]]
-"""Values by name; or a list of one reference to them in Ray's object store, which each replica reads in place."""
+Values = Mapping[str, Any] | list[Awaitable[Mapping[str, Any]]] | SharedValues
+"""Values by name; a list of one reference to them in Ray's object store, which each replica reads in place; or handles
+of a learner's memory on the GPU of all replicas."""
 
 logger = logging.getLogger(__name__)
 
@@ -79,8 +81,14 @@ class OwnWeights(WeightsReplica):
 
     async def stage_weights(self, number: int, values: Values, options: PushOptions) -> str:
         """Check and hold a version on another thread, since that takes long, and return its fingerprint."""
+        if isinstance(values, SharedValues):
+            return await asyncio.to_thread(self._stage_shared, number, values, options)
         named = values if isinstance(values, Mapping) else await values[0]
         return await asyncio.to_thread(self._updates.stage, number, named, options)
+
+    def _stage_shared(self, number: int, values: SharedValues, options: PushOptions) -> str:
+        with opened(values) as named:
+            return self._updates.stage(number, named, options)
 
     async def commit_weights(self, number: int, options: PushOptions) -> None:
         self._updates.commit(number, options)
@@ -106,7 +114,7 @@ class WeightPusher:
         """Let all replicas act with new weights.
 
         Args:
-            values: The values: numpy arrays, as `vlagents_ray.weights.trainable.portable` returns them.
+            values: The values: numpy arrays, as `vlagents_ray.weights.trainable.portable` returns them, or on a GPU.
             options: When sessions change, and what is allowed.
 
         Returns:
@@ -116,6 +124,7 @@ class WeightPusher:
             VLAgentsError: A replica refused the version. None acts with it.
             InvalidInput: The number of the version is not above that of the newest one.
             PolicyUnavailable: A replica cannot be reached. None acts with the version.
+            NotShared: The values are on a GPU on which a replica has none. None acts with the version.
         """
         begun = time.perf_counter()
         async with self._pushing:
@@ -131,6 +140,8 @@ class WeightPusher:
                     f"version: got {number}, want at most {_MOST_AHEAD} above {last}, the newest that acts: versions "
                     f"never go back, so that a number beyond would end all numbered pushes"
                 )
+            if isinstance(values, SharedValues):
+                _require_gpu(values.gpu, newest)
             staged: dict[WeightsReplica, str] = {}
 
             async def stage(replica: WeightsReplica) -> None:
@@ -223,6 +234,15 @@ class WeightPusher:
             else:
                 found[replica] = result
         return found
+
+
+def _require_gpu(gpu: str, replicas: Mapping[WeightsReplica, NewestVersion]) -> None:
+    for replica, newest in replicas.items():
+        if newest.gpu != gpu:
+            raise NotShared(
+                f"replica {replica.name} has its weights on {f'GPU {newest.gpu}' if newest.gpu else 'no single GPU'}, "
+                f"the learner on GPU {gpu}"
+            )
 
 
 def _unreachable(replica: WeightsReplica) -> PolicyUnavailable:

@@ -1,0 +1,183 @@
+"""A learner and a replica in two processes that use one GPU, or memory of the CPU in its place."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from replica_process import ReplicaProcess, model
+from shared_cpu_memory import GPU, SharedCpuMemory
+
+from vlagents_ray.errors import InvalidWeights, UnchangedWeights
+from vlagents_ray.learn.publisher import AppTarget
+from vlagents_ray.serve.scaling.weight_push import WeightPusher
+from vlagents_ray.serve.weights import PushOptions
+from vlagents_ray.weights import shared_values
+from vlagents_ray.weights.shared_values import NotShared, SharedValues, opened, shared
+from vlagents_ray.weights.trainable import portable
+
+pytestmark = pytest.mark.torch
+
+PIN = PushOptions(pin=True)  # otherwise a replica also holds the weights that it loaded
+
+
+class Application(AppTarget):
+    """One of which the only replica is a process of the test, without Ray."""
+
+    def __init__(self, replica: Any) -> None:
+        self._app = "Policy"
+        self._pusher = WeightPusher(replica, self._others)
+        self.sent: list[Any] = []
+
+    async def _others(self) -> list[Any]:
+        return []
+
+    def _call(self, method: str, *args: Any, timeout_s: float) -> Any:
+        self.sent.append(args[0])
+        return asyncio.run(getattr(self._pusher, method.removesuffix("_weights"))(*args))
+
+
+@pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
+def device(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+@pytest.fixture
+def memory(device: str, monkeypatch: pytest.MonkeyPatch) -> SharedCpuMemory | None:
+    """In place of a GPU's."""
+    if device != "cpu":
+        return None
+    monkeypatch.setattr(shared_values, "_MEMORY", found := SharedCpuMemory())
+    return found
+
+
+@pytest.fixture
+def replica(device: str, memory: SharedCpuMemory | None) -> Iterator[ReplicaProcess]:
+    with ReplicaProcess(device, gpu=GPU if memory else "") as found:
+        yield found
+
+
+def changed(learner: Any) -> dict[str, np.ndarray]:
+    """Take a step, and return copies of the values after it."""
+    with torch.no_grad():
+        for value in learner.parameters():
+            value.add_(1)
+    return {name: portable(value).copy() for name, value in learner.state_dict().items()}
+
+
+def test_a_replica_acts_with_what_was_pushed_whatever_the_learner_does_next(
+    replica: ReplicaProcess, device: str
+) -> None:
+    app, learner = Application(replica), model(device)
+    for version in range(1, 5):
+        pushed = changed(learner)
+        assert app.push(learner.state_dict(), PIN) == version
+        changed(learner)  # before the replica acts
+        np.testing.assert_equal(replica.ask("values"), pushed)
+    assert all(isinstance(values, SharedValues) for values in app.sent)
+
+
+def test_nobody_holds_more_memory_after_pushes_than_before(
+    replica: ReplicaProcess, device: str, memory: SharedCpuMemory | None
+) -> None:
+    app, learner = Application(replica), model(device)
+
+    def push() -> tuple[Any, int]:
+        changed(learner)
+        app.push(learner.state_dict(), PIN)
+        replica.ask("values")
+        return replica.ask("memory"), torch.cuda.memory_allocated() if device == "cuda" else 0
+
+    before = replica.ask("memory")
+    first = push()
+    assert first[0] == before  # the weights stand there once, and nothing of the learner's is open
+    assert [push() for _ in range(5)] == [first] * 5
+    if memory is not None:
+        assert memory.handles == 0
+    else:
+        del learner
+        assert torch.cuda.memory_allocated() < first[1]  # nothing keeps what was handed over
+
+
+def test_the_learner_keeps_its_memory_until_the_replica_has_answered(
+    replica: ReplicaProcess, device: str, memory: SharedCpuMemory | None
+) -> None:
+    if memory is None:
+        pytest.skip("handles of CUDA are not counted")
+    held: list[int] = []
+
+    class Watched(ReplicaProcess):
+        def __init__(self) -> None:
+            self._pipe, self._process = replica._pipe, replica._process
+
+        async def stage_weights(self, *args: Any) -> Any:
+            held.append(memory.handles)
+            answer = self.ask("stage_weights", *args)
+            held.append(memory.handles)
+            return answer
+
+    learner = model(device)
+    changed(learner)
+    Application(Watched()).push(learner.state_dict(), PIN)
+    assert held[0] == held[1] > 0
+    assert memory.handles == 0
+
+
+def test_what_does_not_fit_is_refused_as_ever_and_nothing_stays_open(
+    replica: ReplicaProcess, device: str, memory: SharedCpuMemory | None
+) -> None:
+    app, learner, before = Application(replica), model(device), replica.ask("memory")
+    values = learner.state_dict()
+    with pytest.raises(UnchangedWeights):
+        app.push(values, PIN)
+    changed(learner)
+    for wrong, message in (
+        ({**values, "part": torch.full((4,), torch.nan, device=device)}, "'part': got NaN"),
+        ({**values, "part": values["layer.bias"]}, r"'part': got shape \(32,\), want \(4,\)"),
+        ({**values, "part": values["part"].long()}, "'part': got int64, want float32"),
+        ({**values, "more": values["part"]}, "'more': unknown"),
+        ({"part": values["part"]}, "'rough': missing"),
+        ({**values, "part": "text"}, "'part': got str, want an array"),
+    ):
+        with pytest.raises(InvalidWeights, match=message):
+            app.push(wrong, PIN)
+    assert replica.ask("memory") == before
+    assert replica.ask("newest_weights").number == 0
+    assert app.push(values, PIN) == 1
+    assert all(isinstance(sent, SharedValues) for sent in app.sent)
+
+
+def test_without_a_gpu_in_common_the_object_store_is_used_and_the_log_says_why(
+    replica: ReplicaProcess, device: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    if device != "cpu":
+        pytest.skip("one GPU is enough")
+
+    async def found(values: Any) -> Any:
+        return values
+
+    monkeypatch.setattr("ray.put", found)
+    caplog.set_level(logging.INFO)
+    app, learner = Application(replica), model(device)
+    monkeypatch.setattr(shared_values, "_MEMORY", another := SharedCpuMemory("GPU-another"))
+    pushed = changed(learner)
+    assert app.push(learner.state_dict(), PIN) == 1
+    np.testing.assert_equal(replica.ask("values"), pushed)
+    assert [type(sent) for sent in app.sent] == [SharedValues, list]
+    assert f"replica replica has its weights on GPU {GPU}, the learner on GPU GPU-another" in caplog.text
+    assert another.handles == 0
+
+
+def test_memory_that_cannot_be_opened_is_said_to_be_so(device: str, memory: SharedCpuMemory | None) -> None:
+    if memory is None:
+        pytest.skip("one GPU is enough")
+    with shared(model(device).state_dict()) as values:
+        memory.uuid = "GPU-another"
+        message = f"the learner's memory on GPU {GPU} cannot be opened: this process does not use that GPU"
+        with pytest.raises(NotShared, match=message), opened(values):
+            pass

@@ -1,0 +1,135 @@
+"""A replica of a torch policy in a process of its own, which a push in this process reaches."""
+
+from __future__ import annotations
+
+import asyncio
+import multiprocessing
+import threading
+from types import TracebackType
+from typing import Any, ClassVar
+
+import numpy as np
+from shared_cpu_memory import SharedCpuMemory, files_of_torch
+
+from vlagents_ray.errors import VLAgentsError
+from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.serve.scaling.weight_push import OwnWeights
+from vlagents_ray.serve.weights import ModelWeights, WeightUpdates
+from vlagents_ray.weights.trainable import portable
+
+
+def model(device: str) -> Any:
+    """Values of many kinds: tied, transposed, of one element, of two precisions, whole numbers, on the CPU."""
+    import torch
+
+    torch.manual_seed(0)
+    found = torch.nn.Module()
+    found.layer = torch.nn.Linear(64, 32, device=device)
+    found.tied = found.layer.weight
+    found.turned = torch.nn.Parameter(torch.randn(8, 4, device=device).T)
+    found.part = torch.nn.Parameter(torch.randn(16, device=device)[3:7])
+    found.rough = torch.nn.Parameter(torch.randn(5, device=device, dtype=torch.bfloat16))
+    found.register_buffer("steps", torch.tensor(7, device=device))
+    found.register_buffer("mean", torch.randn(3))
+    found.register_buffer("empty", torch.zeros(0, device=device))
+    return found
+
+
+class Served(Agent):
+    """Replaces its weights where they are, as on a GPU."""
+
+    trainable: ClassVar[str | None] = "model"
+
+    def __init__(self, device: str) -> None:
+        self.device = device
+
+    def initialize(self) -> None:
+        self.model = model(self.device)
+
+    def load_parameters(self, named: Any) -> None:
+        for name, value in self.parameters().items():
+            value.copy_(named[name])
+
+    def act(self, obs: Obs) -> Act:
+        raise NotImplementedError
+
+
+class _Replica:
+    """What runs in the other process."""
+
+    def __init__(self, device: str, gpu: str) -> None:
+        if gpu:
+            SharedCpuMemory(gpu).install()
+        self.agent = Served(device)
+        self.agent.initialize()
+        self.left_open: set[str] = set()
+        self.weights = ModelWeights(self.agent, threading.Lock())
+        self.own = OwnWeights("replica", WeightUpdates(lambda: self.weights, list))
+
+    def values(self) -> dict[str, np.ndarray]:
+        """Act with the newest version, and return its values."""
+        self.weights.use(self.weights.newest)
+        return {name: portable(value) for name, value in self.agent.parameters().items()}
+
+    def memory(self) -> tuple[int, set[str]]:
+        """Bytes of GPU memory in use, and the files of shared memory that were open at any answer."""
+        import torch
+
+        return torch.cuda.memory_allocated() if torch.cuda.is_available() else 0, self.left_open
+
+
+def _serve(pipe: Any, device: str, gpu: str) -> None:
+    replica = _Replica(device, gpu)
+    while (asked := pipe.recv()) is not None:
+        method, args = asked
+        try:
+            found = getattr(replica, method, None) or getattr(replica.own, method)
+            answer = found(*args)
+            answer = asyncio.run(answer) if asyncio.iscoroutine(answer) else answer
+        except VLAgentsError as error:
+            answer = error  # which holds all local variables of its frames
+        replica.left_open |= files_of_torch()
+        pipe.send(answer)
+
+
+class ReplicaProcess:
+    """The replica as a push sees it: `vlagents_ray.serve.scaling.weight_push.OwnWeights`."""
+
+    name = "replica"
+
+    def __init__(self, device: str, gpu: str = "") -> None:
+        """Start it; with a `gpu`, memory of the CPU takes the place of that GPU's."""
+        context = multiprocessing.get_context("spawn")
+        self._pipe, other = context.Pipe()
+        self._process = context.Process(target=_serve, args=(other, device, gpu), daemon=True)
+        self._process.start()
+
+    def ask(self, method: str, *args: Any) -> Any:
+        """The result of a method in the other process."""
+        self._pipe.send((method, args))
+        answer = self._pipe.recv()
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+    def pushed(self, took_ms: float) -> None:
+        self.ask("pushed", took_ms)
+
+    async def newest_weights(self) -> Any:
+        return self.ask("newest_weights")
+
+    async def stage_weights(self, number: int, values: Any, options: Any) -> Any:
+        return self.ask("stage_weights", number, await values[0] if isinstance(values, list) else values, options)
+
+    async def commit_weights(self, *args: Any) -> None:
+        self.ask("commit_weights", *args)
+
+    async def drop_weights(self, *args: Any) -> None:
+        self.ask("drop_weights", *args)
+
+    def __enter__(self) -> ReplicaProcess:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self._pipe.send(None)
+        self._process.join(60)
