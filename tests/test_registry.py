@@ -67,8 +67,8 @@ def test_a_missing_simulator_is_cured_by_its_extra() -> None:
 
 
 @pytest.mark.usefixtures("nothing_installed")
-def test_a_package_that_no_requirements_file_installs_has_its_own_cure() -> None:
-    assert "source the setup file of ROS 2" in cure("rclpy")
+def test_a_package_that_no_requirements_file_installs_is_cured_by_pip() -> None:
+    assert "`pip install torchao` in the policy's environment" in cure("torchao.quantization")
 
 
 def required() -> Iterator[str]:

@@ -262,6 +262,7 @@ _EXTRAS = {
 _ELSEWHERE = {
     "rclpy": "source the setup file of ROS 2 (`. /opt/ros/jazzy/setup.bash`) and start its Python, or reach ROS "
     "through a rosbridge, `link: ws://arm-pc:9090`",
+    "torchao": "run `pip install torchao` in the policy's environment; its requirements file leaves it out",
 }
 # packages that those of the families bring along
 _BROUGHT = {"torchvision": "torch", "tokenizers": "transformers", "safetensors": "transformers"} | {

@@ -57,12 +57,13 @@ def test_a_type_whose_actions_differ_is_refused_and_one_whose_process_ends_is_le
     assert crashed == "dtype: float16: ended with exit status 7"
 
 
-def test_a_type_whose_actions_are_near_enough_passes() -> None:
-    measured = tuner(dtypes=["bfloat16"], off=5.0, compile=True, tolerance=10.0)
+@pytest.mark.parametrize("name", ["bfloat16", "int8"])
+def test_a_type_whose_actions_are_near_enough_passes(name: str) -> None:
+    measured = tuner(dtypes=[name], off=5.0, compile=True, tolerance=10.0)
     [(changes, off)] = {
         (tuple(one.variant.changes.items()), one.difference) for one in measured.measure() if one.variant.changes
     }
-    assert changes == (("dtype", "bfloat16"),)
+    assert changes == (("quantization" if name == "int8" else "dtype", name),)
     assert off > 0.01
     assert measured.left_out == []
 

@@ -20,10 +20,11 @@ class TunableConfig(BaseModel, extra="forbid"):
 
     compile: bool = False
     dtype: Literal["auto", "float32", "bfloat16", "float16"] = "auto"
+    quantization: Literal["int8", "float8"] | None = None
     batch_sizes: list[int] | None = None
     eager_ms: float = 60.0  # of a batch that is not compiled
     row_ms: float = 0.0  # of each of its rows
-    off: float = 0.0  # of all numbers, in bfloat16
+    off: float = 0.0  # of all numbers, in bfloat16 or quantized
     most_rows: int | None = None  # larger batches have no memory
     compiles: bool = True
 
@@ -54,7 +55,7 @@ class Tunable(Agent):
         if self.config.most_rows is not None and len(obs) > self.config.most_rows:
             raise MemoryError(f"{len(obs)} rows")
         time.sleep(0 if self.config.compile else (self.config.eager_ms + self.config.row_ms * len(obs)) / 1000)
-        off = self.config.off if self.config.dtype == "bfloat16" else 0.0
+        off = self.config.off if self.config.dtype == "bfloat16" or self.config.quantization else 0.0
         return [
             Act(np.tile(one.state["joints"] + session.seed + one.cameras["front"].mean() + off, (3, 1)))  # type: ignore[attr-defined]
             for one, session in zip(obs, sessions, strict=True)

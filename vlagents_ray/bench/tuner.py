@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from vlagents_ray.bench.tuning_process import FRAMES, ProcessSettings, save_obse
 from vlagents_ray.errors import ConfigError, VLAgentsError
 from vlagents_ray.evaluate.artifacts.trajectory import Trajectory, videos_of
 from vlagents_ray.interface import Obs
+from vlagents_ray.policies.compilation import Quantization
 from vlagents_ray.registry import require
 from vlagents_ray.serve.config.deployment import ServerArgs
 
@@ -141,7 +142,8 @@ class Tuner:
         """Return the variants beside the file's own settings; a compiled one has these sizes, unless the file has."""
         has = ready["settings"]
         wanted = ready["dtypes"] if self._plan.dtypes is None else self._plan.dtypes
-        dtypes = [{"dtype": one} for one in wanted if has.get("dtype", one) != one]
+        named = [{"quantization" if one in get_args(Quantization) else "dtype": one} for one in wanted]
+        dtypes = [change for change in named if change.keys() <= has.keys() and not change.items() <= has.items()]
         compiled: list[dict[str, Any]] = []
         if has.get("compile") is False:
             compiled = [{"compile": True} | ({"batch_sizes": list(sizes)} if has.get("batch_sizes", 0) is None else {})]

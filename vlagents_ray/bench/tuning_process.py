@@ -27,7 +27,7 @@ from vlagents_ray.validation import check_observation
 
 _CAMERA, _STATE, _GRIPPER = "camera", "state", "gripper"  # keys: NUMBER/camera/NAME, NUMBER/state/NAME, NUMBER/gripper
 FRAMES = 8  # episodes whose first actions are compared
-_TUNED = ("compile", "dtype", "batch_sizes")  # settings of a policy
+_TUNED = ("compile", "dtype", "quantization", "batch_sizes")  # settings of a policy
 
 
 @dataclass(frozen=True, slots=True)

@@ -319,7 +319,7 @@ def _layer(
     if not all(one.dtype.kind in "fV" for one in raw):  # V: bfloat16, which numpy does not have
         raise ConfigError(
             f"{folder / WEIGHTS}: {name}: got A {raw[0].dtype} and B {raw[1].dtype}, want real numbers; save the "
-            f"adapter in float32 or bfloat16"
+            f"adapter without quantization"
         )
     # scaled before they are rounded to the type of the weights
     down, up = (converted(one, weight.new_empty(0, dtype=float32)) for one in raw)

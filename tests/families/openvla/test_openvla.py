@@ -111,6 +111,13 @@ def test_it_acts_with_pushed_weights(loaded: Callable[..., Any]) -> None:
     check_pushed_weights(policy, lambda: begun(policy, 0).act(seen(0)).action)
 
 
+@pytest.mark.library("torchao")
+def test_quantized_it_acts_from_weights_of_8_bits(loaded: Callable[..., Any]) -> None:
+    quantized = loaded("openvla", quantization="int8")
+    assert begun(quantized, 0).act(seen(0)).action.shape == (1, 7)
+    assert type(quantized.model.base.network.language_model.lm_head.weight).__name__ == "Int8Tensor"
+
+
 def test_samples_are_drawn_from_the_distribution_whose_moments_are_stated(policy: OpenVLA) -> None:
     act = begun(policy, 0).act(seen(0, **{SAMPLES: 1000}))
     assert np.array_equal(act.action, begun(policy, 0).act(seen(0)).action)

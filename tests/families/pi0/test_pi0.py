@@ -15,7 +15,7 @@ from safetensors.torch import load_file, save_file
 
 from tests.families.pi0 import tiny
 from vlagents_ray import Obs
-from vlagents_ray.errors import ConfigError, InvalidObservation, MissingCamera
+from vlagents_ray.errors import ConfigError, InvalidObservation, MissingCamera, NotTrainable
 from vlagents_ray.interface import DELAY, DISTRIBUTION, LEFTOVER, SAMPLES
 from vlagents_ray.policies.pi0 import Pi0
 from vlagents_ray.testing import check_agent
@@ -252,3 +252,18 @@ def test_it_acts_with_pushed_weights(folder: Path) -> None:
     policy = Pi0.from_config({"checkpoint": str(folder)})
     policy.initialize()
     check_pushed_weights(policy, lambda: begun(policy, 0).act(seen(0)).action)
+
+
+@pytest.mark.library("torchao")
+@pytest.mark.parametrize(("kind", "error"), [("int8", 0.02), ("float8", 0.1)])
+def test_quantized_it_acts_nearly_alike_from_less_memory(loaded: Pi0, folder: Path, kind: str, error: float) -> None:
+    quantized = Pi0.from_config({"checkpoint": str(folder), "quantization": kind})
+    quantized.initialize()
+    whole = begun(loaded, 0).act(seen(0)).action
+    off = np.abs(begun(quantized, 0).act(seen(0)).action - whole).max() / np.abs(whole).max()
+    assert 0 < off < error
+    layers = [layer for layer in quantized.model.network.modules() if isinstance(layer, torch.nn.Linear)]
+    assert layers
+    assert all(type(layer.weight).__name__.lower().startswith(kind) for layer in layers)
+    with pytest.raises(NotTrainable, match="quantization"):
+        quantized.parameters()

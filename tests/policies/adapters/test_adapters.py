@@ -149,9 +149,10 @@ def test_a_learner_cannot_replace_the_base_of_adapters(tmp_path: Path) -> None:
         loaded(tmp_path, adapters=paths(tmp_path, "stack")).parameters()
 
 
-def test_what_needs_one_set_of_weights_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="adapters and compile: got both, want one"):
-        Small.from_config({"checkpoint": "any", "adapters": {"stack": "any"}, "compile": True})
+@pytest.mark.parametrize("setting", [{"compile": True}, {"quantization": "int8"}])
+def test_what_needs_one_set_of_weights_is_refused(tmp_path: Path, setting: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError, match=f"adapters and {next(iter(setting))}: got both, want one"):
+        Small.from_config({"checkpoint": "any", "adapters": {"stack": "any"}, **setting})
 
 
 def test_a_family_without_adapters_says_so(tmp_path: Path) -> None:

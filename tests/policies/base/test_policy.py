@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import copy
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -12,7 +14,7 @@ import pytest
 
 from vlagents_ray import Obs
 from vlagents_ray.contract import ActionSpec, Contract, StateSpec
-from vlagents_ray.errors import InvalidAction, InvalidObservation, MissingState, NotReset
+from vlagents_ray.errors import ConfigError, InvalidAction, InvalidObservation, MissingState, NotReset, NotTrainable
 from vlagents_ray.interface import BEHAVIOUR, DELAY, DISTRIBUTION, LEFTOVER, SAMPLES, WANT, Act
 from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row, shared_frames
 from vlagents_ray.policies.base.model_inputs import state_specs, state_vector
@@ -122,6 +124,46 @@ class CountsViews(Wobble):
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
         firsts, _ = shared_frames(rows)
         return [Prediction(np.full((HORIZON, DIM), len(firsts), np.float32)) for _ in rows]
+
+
+def test_a_policy_that_names_no_network_cannot_be_quantized() -> None:
+    with pytest.raises(ConfigError, match=r"quantization: .* does not offer it"):
+        loaded(quantization="int8")
+
+
+def test_the_named_network_is_quantized_once_loaded_and_no_weights_can_be_pushed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    torchao = ModuleType("torchao.quantization")
+    torchao.Float8WeightOnlyConfig = lambda: "float8"
+    torchao.quantize_ = lambda network, config: network.update(weights=config)
+    monkeypatch.setitem(sys.modules, "torchao", ModuleType("torchao"))
+    monkeypatch.setitem(sys.modules, "torchao.quantization", torchao)
+
+    class Quantizable(Wobble):
+        network = trainable = "model"
+
+        def load(self) -> dict[str, Any]:
+            return {"weights": "whole"}
+
+    policy = Quantizable.from_config({"checkpoint": "none", "quantization": "float8"})
+    policy.initialize()
+    assert policy.model == {"weights": "float8"}
+    with pytest.raises(NotTrainable, match="quantization 'float8': weights of 8 bits"):
+        policy.parameters()
+
+
+def test_what_torchao_cannot_quantize_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(network: Any, config: Any) -> None:
+        raise NotImplementedError("no such kernel")
+
+    torchao = ModuleType("torchao.quantization")
+    torchao.Int8WeightOnlyConfig, torchao.quantize_ = object, fail
+    monkeypatch.setitem(sys.modules, "torchao", ModuleType("torchao"))
+    monkeypatch.setitem(sys.modules, "torchao.quantization", torchao)
+    monkeypatch.setattr(Wobble, "network", "model")
+    with pytest.raises(ConfigError, match=r"cannot use it here \(NotImplementedError: no such kernel\)"):
+        loaded(quantization="int8")
 
 
 def test_padding_has_no_observations_of_its_own() -> None:

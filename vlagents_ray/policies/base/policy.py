@@ -33,7 +33,7 @@ from vlagents_ray.policies.base.model_inputs import (
     wanted_behaviour,
     wanted_samples,
 )
-from vlagents_ray.policies.compilation import Compilation
+from vlagents_ray.policies.compilation import Compilation, quantize, require_whole
 from vlagents_ray.policies.loading import COMPILED_SIZES, LoadingReport, current_report, report_progress
 from vlagents_ray.validation import check_action
 
@@ -75,7 +75,7 @@ class ModelPolicy(Agent, abc.ABC):
     """
 
     shared: ClassVar[tuple[str, ...]] = ("config", "model", "compilation", "adapters", "report")
-    network: ClassVar[str | None] = None  # the attribute whose layers `adapters` change
+    network: ClassVar[str | None] = None  # the attribute whose linear layers `quantization` may keep in 8 bits
     adaptable: ClassVar[bool] = False  # whether `predict` runs `network` within `self.adapters.rows`
 
     def __init__(self, config: Any) -> None:
@@ -142,6 +142,8 @@ class ModelPolicy(Agent, abc.ABC):
             if self.config.compile:
                 self.config = self.config.with_sizes(self.report.batch_sizes)
             self.model = self._load_with_adapters() if self.config.adapters else self.load()
+        if self.config.quantization:
+            quantize(self, self.config.quantization)
         sizes = self.config.batch_sizes or []
         if not sizes and any(device["kind"] != "cpu" for device in self.report.devices):
             sizes = sorted({1, self.config.rows})
@@ -202,6 +204,7 @@ class ModelPolicy(Agent, abc.ABC):
         self.model, self.adapters, self.compilation = None, Adapters(), Compilation(self.config.compile)
 
     def _trainable(self) -> Any:
+        require_whole(self.config.quantization)
         require_base_alone(self.config.adapters)
         return super()._trainable()
 
