@@ -123,7 +123,7 @@ docs: $(VENV)-docs/.installed
 extras locks: $(TOOLS)/.installed
 	$(TOOLS)/bin/python tests/support/resolved.py $@ $(ONLY)
 
-# The same wheels again from the same commit. LeRobot's plug-in is a distribution of its own.
+# The same wheels again from the same commit. Each folder of plugins/ is a distribution of its own.
 PUBLISHING := build==1.6.1 twine==7.0.0 check-wheel-contents==0.6.3
 dist: export SOURCE_DATE_EPOCH := $(shell git log -1 --format=%ct 2>/dev/null || date +%s)
 dist:
@@ -131,7 +131,7 @@ dist:
 	rm -rf dist build/publishing build/plugins && '$(PYTHON)' -m venv build/publishing
 	build/publishing/bin/pip install --quiet $(PUBLISHING)
 	build/publishing/bin/python -m build --outdir dist
-	build/publishing/bin/python -m build --outdir build/plugins plugins/lerobot_policy_vlagents
+	for folder in plugins/*/; do build/publishing/bin/python -m build --outdir build/plugins "$$folder"; done
 	build/publishing/bin/twine check --strict dist/* build/plugins/*
 	for wheel in dist/*.whl build/plugins/*.whl; do build/publishing/bin/check-wheel-contents "$$wheel"; done
 

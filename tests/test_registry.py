@@ -13,7 +13,7 @@ import tomllib
 
 import vlagents_ray
 from vlagents_ray import registry
-from vlagents_ray.errors import MissingDependency, UnknownEnv, UnknownPolicy, UnknownWrapper
+from vlagents_ray.errors import MissingDependency, UnknownEnv, UnknownPolicy
 
 ROOT = Path(vlagents_ray.__file__).parents[1]
 FAMILIES = ["diffusion_policy", "gr00t", "hf", "lerobot", "octo", "openpi", "openvla"]
@@ -88,7 +88,7 @@ def test_every_optional_package_has_a_cure() -> None:
 def test_the_extras_and_files_that_cures_name_exist() -> None:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     assert set(registry._EXTRAS.values()) <= extras.keys()
-    adapters = (registry.POLICIES | registry.WRAPPERS | registry.ENVS).values()
+    adapters = (registry.POLICIES | registry.ENVS).values()
     assert {one.extra for one in adapters if one.extra} <= extras.keys()
     assert {one.requirements[0] for _, one in registry.families()} == set(FAMILIES)
     for file in {file for one in adapters for file in one.requirements}:
@@ -109,7 +109,5 @@ def test_a_cure_names_each_file_that_lists_the_package(package: str) -> None:
 def test_an_unknown_name_raises_the_error_of_its_kind() -> None:
     with pytest.raises(UnknownPolicy, match=r"'scriptd' is not registered.*did you mean 'scripted'"):
         registry.policy_class("scriptd")
-    with pytest.raises(UnknownWrapper, match=r"'aro' is not registered.*did you mean 'arro'"):
-        registry.wrapper_class("aro")
     with pytest.raises(UnknownEnv, match=r"'tabletopp' is not registered.*did you mean 'tabletop'"):
         registry.env_class("tabletopp/reach")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import tables
 
-from vlagents_ray.registry import DIALECTS, ENVS, POLICIES, WRAPPERS
+from vlagents_ray.registry import DIALECTS, ENVS, POLICIES
 
 
 @pytest.mark.parametrize("file", [*tables.TABLES, "mkdocs.yml"])
@@ -15,9 +15,9 @@ def test_the_tables_are_up_to_date(file: str) -> None:
 
 
 def test_each_adapter_has_a_page_and_each_page_an_adapter() -> None:
-    for folder, adapters in (("policies", POLICIES | WRAPPERS), ("benchmarks", ENVS)):
-        named = {tables.page_of(name, one) for name, one in adapters.items() if one.about} - {""}
-        assert {page.stem for page in (tables.ROOT / "docs" / folder).glob("*.md")} - {"index"} == named
+    for folder, adapters, more in (("policies", POLICIES, tables.PLUGINS), ("benchmarks", ENVS, ())):
+        named = {tables.page_of(name, one) for name, one in adapters.items() if one.about} | {*more}
+        assert {page.stem for page in (tables.ROOT / "docs" / folder).glob("*.md")} - {"index"} == named - {""}
 
 
 def test_each_dialect_is_shown_among_the_clients_of_other_systems() -> None:

@@ -2,7 +2,8 @@
 
 A name stands for `"module:Class"`, imported only when it is used. Third parties add names through the entry-point
 groups `vlagents_ray.policies`, `vlagents_ray.wrappers`, `vlagents_ray.envs` and `vlagents_ray.dialects`; a
-`"module:Class"` written out in a deployment file works without registration.
+`"module:Class"` written out in a deployment file works without registration. Wrappers, which change the observations of
+any policy, are all registered that way.
 
 The tables of README and docs/ are made from this file: `python tests/support/tables.py`.
 """
@@ -23,7 +24,7 @@ from vlagents_ray.naming import did_you_mean
 
 @dataclass(frozen=True, slots=True)
 class Adapter:
-    """A policy, wrapper or environment of this package, and the packages that it needs."""
+    """A policy or environment of this package, and the packages that it needs."""
 
     target: str  # "module:Class"
     about: str = ""  # its models or tasks, for the tables of README and docs/; empty: it is not in them
@@ -102,23 +103,12 @@ POLICIES: dict[str, Adapter] = {
     ),
     "upstream": Adapter(
         "vlagents_ray.policies.upstream:Upstream",
-        "any model behind a server of openpi, RoboArena, GR00T, LeRobot, OpenVLA, vla-eval, XPolicyLab or vlagents",
+        "any model behind a server of openpi, RoboArena, GR00T, OpenVLA, vla-eval or vlagents",
         wants="that server",
     ),
     "noop": Adapter("vlagents_ray.policies.noop:Noop"),
     "random": Adapter("vlagents_ray.policies.random:Random"),
-    "replay": Adapter("vlagents_ray.policies.replay:Replay"),
     "scripted": Adapter("vlagents_ray.policies.scripted:Scripted"),
-}
-
-# Wrappers change the observations of any policy; a deployment file lists them under `wrappers`.
-WRAPPERS: dict[str, Adapter] = {
-    "arro": Adapter(
-        "vlagents_ray.policies.arro:Arro",
-        "a wrapper of any policy, which then sees only its gripper and the objects of its task",
-        needs=("transformers", "torch"),
-        requirements=("hf",),
-    ),
 }
 
 # The key is the part of an env's name before the first slash; the rest of the name is the task.
@@ -275,8 +265,8 @@ _BROUGHT = {"torchvision": "torch", "tokenizers": "transformers", "safetensors":
 
 
 def families() -> Iterator[tuple[str, Adapter]]:
-    """Yield the policies and wrappers that need packages, with their names."""
-    for name, one in (POLICIES | WRAPPERS).items():
+    """Yield the policies that need packages, with their names."""
+    for name, one in POLICIES.items():
         if one.needs:
             yield name, one
 
@@ -326,8 +316,8 @@ def _install(package: str, extra: str | None = None) -> str:
 
 def names(kind: str) -> dict[str, str]:
     """All registered names of `kind` ("policies", "wrappers", "envs" or "dialects") with their "module:Class"."""
-    adapters = {"policies": POLICIES, "wrappers": WRAPPERS, "envs": ENVS}
-    own = DIALECTS if kind == "dialects" else {name: one.target for name, one in adapters[kind].items()}
+    adapters = {"policies": POLICIES, "envs": ENVS}.get(kind, {})
+    own = DIALECTS if kind == "dialects" else {name: one.target for name, one in adapters.items()}
     found = {point.name: point.value for point in entry_points(group=f"vlagents_ray.{kind}")}
     return found | own
 

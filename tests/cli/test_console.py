@@ -16,7 +16,7 @@ from vlagents_ray.cli import console, listing
 from vlagents_ray.cli.console import PlainConsole, table
 from vlagents_ray.cli.main import envs, policies
 from vlagents_ray.envs.tabletop import Tabletop
-from vlagents_ray.registry import POLICIES, WRAPPERS
+from vlagents_ray.registry import POLICIES
 
 CLI = Path(console.__file__).parent
 CURE = "pip install 'vlagents-ray[libero]' [/] \\[red] and /a/very/long/path/" + "of-an-interpreter/" * 8 + "bin/python"
@@ -85,8 +85,8 @@ def test_a_listing_is_as_wide_as_a_terminal_and_has_a_line_for_each_elsewhere(sh
     if console.out.is_terminal:
         assert max(map(len, rows)) <= 80
     else:
-        assert len(rows) == 1 + len(POLICIES) + len(WRAPPERS)
-        assert {row.split()[0] for row in rows[1:]} == POLICIES.keys() | WRAPPERS.keys()
+        assert len(rows) == 1 + len(POLICIES)
+        assert {row.split()[0] for row in rows[1:]} == POLICIES.keys()
     assert "…" not in shown.getvalue()
 
 
@@ -99,7 +99,7 @@ def test_what_installs_the_rest_is_said_once_for_all_that_want_it(
     policies()
     rest = shown.getvalue().partition("\n\n")[2].splitlines()
     assert rest[0] == "for the rest, whose Python a deployment names as `environment`:"
-    assert "  vlagents-ray env make requirements/hf.txt  # pi0, vjepa2_ac, arro" in rest
+    assert "  vlagents-ray env make requirements/hf.txt  # pi0, vjepa2_ac" in rest
     assert "  vlagents-ray env make requirements/openvla.txt  # openvla, openvla_oft" in rest
     assert "  export VJEPA2_SRC=FOLDER  # a checkout, for vjepa2_ac" in rest
     assert not any("OPENVLA" in line for line in rest)
@@ -117,8 +117,6 @@ def test_of_one_policy_all_is_said(shown: io.StringIO, monkeypatch: pytest.Monke
     policies("openpi")
     assert "requirements/openpi.txt`" in shown.getvalue()
     assert "OPENPI_SRC=FOLDER of a checkout" in shown.getvalue()
-    policies("arro")
-    assert "arro: ARRO (arXiv" in shown.getvalue()
     with pytest.raises(typer.Exit) as ended:
         policies("opnpi")
     assert ended.value.exit_code == 2
@@ -128,10 +126,9 @@ def test_of_one_policy_all_is_said(shown: io.StringIO, monkeypatch: pytest.Monke
 def test_a_listing_is_json_for_programs(shown: io.StringIO) -> None:
     policies(as_json=True)
     found = {one["name"]: one for one in json.loads(shown.getvalue())}
-    assert found.keys() == POLICIES.keys() | WRAPPERS.keys()
+    assert found.keys() == POLICIES.keys()
     assert (found["noop"]["kind"], found["noop"]["missing"]) == ("policy", None)
     assert found["noop"]["details"][0] == "action_dim=7"
-    assert found["arro"]["kind"] == "wrapper"
 
 
 def test_an_environment_that_has_a_family_is_ready_for_it(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from experts.aloha import AlohaExpert
 from in_process_episode import Always, play
 
 from vlagents_ray.contract import CameraSpec
@@ -11,7 +12,6 @@ from vlagents_ray.envs.aloha import Aloha
 from vlagents_ray.envs.base import known_contract, make_env
 from vlagents_ray.errors import ConfigError, ContractMismatch, EnvFailed, InvalidObservation, NotReset, UnknownEnv
 from vlagents_ray.interface import Act, Obs
-from vlagents_ray.policies.experts import expert_for
 from vlagents_ray.testing import check_env
 
 gym_aloha = pytest.importorskip("gym_aloha.env")
@@ -30,7 +30,7 @@ def test_it_keeps_the_promises_of_an_env() -> None:
 def test_the_expert_solves_the_task_and_staying_put_does_not(task: str) -> None:
     with Aloha(task, cameras=()) as env:  # rendering would take most of the time
         for seed in (0, 1000):
-            solved = play(env, f"aloha/{task}", seed=seed)
+            solved = play(env, f"aloha/{task}", "experts.aloha:AlohaExpert", seed=seed)
             assert (solved.success_once, solved.ending) == (True, "terminated")
             assert solved.steps <= 400
         idle = play(env, f"aloha/{task}", Always(*FIRST, *FIRST), seed=0)
@@ -109,10 +109,10 @@ def test_a_wrong_option_is_named(options: dict[str, object], error: type[Excepti
 
 
 def test_the_expert_says_what_it_wants() -> None:
-    expert = expert_for("aloha/insertion")
+    expert = AlohaExpert("aloha/insertion")
     with pytest.raises(InvalidObservation, match=r"want \(14,\)"):
         expert.reset(Obs(info={"sim_state": np.zeros(7)}), "")
     with pytest.raises(NotReset):
         expert.act(Obs())
     with pytest.raises(ContractMismatch, match="aloha/transfer_cube"):
-        expert_for("aloha/pour")
+        AlohaExpert("aloha/pour")

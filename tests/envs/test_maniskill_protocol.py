@@ -11,7 +11,7 @@ from vlagents_ray.envs.maniskill import ManiSkill
 from vlagents_ray.envs.maniskill.env import ManiSkillBatch
 from vlagents_ray.errors import ConfigError, NotReset
 from vlagents_ray.interface import Act
-from vlagents_ray.policies.experts import expert_for
+from vlagents_ray.policies.experts import expert_class
 
 pytestmark = pytest.mark.vulkan
 
@@ -24,7 +24,7 @@ def test_success_and_return_are_those_of_maniskills_own_wrapper(task: str) -> No
     """The set-up of its guide for CPU simulation, given the actions that our env was."""
     with ManiSkill(task, **SMALL) as env:
         obs, _ = env.reset(seed=5)
-        expert = expert_for(f"maniskill/{task}")
+        expert = expert_class(f"maniskill/{task}")(f"maniskill/{task}")
         expert.reset(obs, env.instruction)
         actions, rewards, solved, over = [], [], [], False
         while not over:

@@ -8,12 +8,12 @@ from collections.abc import Iterator
 import gymnasium
 import numpy as np
 import pytest
+from experts.pusht import PushTExpert
 from in_process_episode import Always, play
 
 from vlagents_ray.envs import EvalEnv, make_env
 from vlagents_ray.errors import InvalidObservation
 from vlagents_ray.interface import Act, Obs
-from vlagents_ray.policies.experts import expert_for
 
 pytest.importorskip("gym_pusht")  # registers the environment
 pytestmark = pytest.mark.sim
@@ -79,7 +79,7 @@ def test_each_seed_begins_elsewhere_and_always_there(pusht: EvalEnv) -> None:
 def test_the_expert_solves_random_beginnings_and_holding_still_does_not() -> None:
     with make_env("pusht/keypoints") as env:  # the expert does not look at the image
         for seed in (14, 48):  # those soon solved
-            solved = play(env, "pusht/keypoints", seed=seed)
+            solved = play(env, "pusht/keypoints", "experts.pusht:PushTExpert", seed=seed)
             assert (solved.success_once, solved.ending) == (True, "terminated")
         first, _ = env.reset(seed=3)
         still = play(env, "pusht/keypoints", Always(*first.state["agent_pos"]), seed=3)
@@ -88,16 +88,16 @@ def test_the_expert_solves_random_beginnings_and_holding_still_does_not() -> Non
 
 def test_a_block_that_is_not_where_the_expert_expected_it_makes_it_plan_again(pusht: EvalEnv) -> None:
     (before, _), (elsewhere, _) = pusht.reset(seed=0), pusht.reset(seed=1)
-    interrupted, fresh = expert_for("pusht"), expert_for("pusht")
+    interrupted, fresh = PushTExpert("pusht"), PushTExpert("pusht")
     interrupted.act(before)
     assert np.array_equal(interrupted.act(elsewhere).action, fresh.act(elsewhere).action)
 
 
 def test_with_a_block_out_of_reach_the_expert_holds_still() -> None:
     seen = Obs(info={"sim_state": np.array([100.0, 200.0, 0.0, 0.0, 900.0, 900.0, 0.0])})
-    assert expert_for("pusht").act(seen).action.tolist() == [100.0, 200.0]
+    assert PushTExpert("pusht").act(seen).action.tolist() == [100.0, 200.0]
 
 
 def test_without_the_simulators_state_the_expert_says_what_it_wants() -> None:
     with pytest.raises(InvalidObservation, match=r"sim_state.*NoneType.*\(7,\).*pusht/keypoints"):
-        expert_for("pusht/keypoints").reset(Obs(), "")
+        PushTExpert("pusht/keypoints").reset(Obs(), "")

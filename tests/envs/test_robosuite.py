@@ -6,13 +6,13 @@ import math
 
 import numpy as np
 import pytest
+from experts.osc_pose import RobosuiteExpert
 
 from vlagents_ray.contract import CameraSpec
 from vlagents_ray.envs.base import known_contract, make_env
 from vlagents_ray.envs.robosuite import TASKS, Robosuite
 from vlagents_ray.errors import ConfigError, ContractMismatch, InvalidObservation, MissingState, NotReset, UnknownEnv
 from vlagents_ray.interface import Obs
-from vlagents_ray.policies.experts import expert_for
 
 
 def test_the_protocols_are_robomimics() -> None:
@@ -66,7 +66,7 @@ def seen(hand: tuple[float, float, float], yaw: float = 0.0) -> Obs:
 
 
 def test_the_expert_goes_over_the_handle_turns_across_it_and_opens_the_hand() -> None:
-    expert = expert_for("robosuite/NutAssemblySquare")
+    expert = RobosuiteExpert("robosuite/NutAssemblySquare")
     yaw = math.pi / 4
     over = (0.1 + 0.054 * math.cos(yaw), 0.2 + 0.054 * math.sin(yaw), 0.83 + 0.12)
     start = seen((over[0], over[1] - 0.02, over[2]), yaw)
@@ -77,7 +77,7 @@ def test_the_expert_goes_over_the_handle_turns_across_it_and_opens_the_hand() ->
 
 
 def test_the_expert_says_what_it_wants() -> None:
-    expert = expert_for("robosuite/PickPlaceCan")
+    expert = RobosuiteExpert("robosuite/PickPlaceCan")
     with pytest.raises(NotReset):
         expert.act(Obs())
     with pytest.raises(MissingState, match="robot0_eef_pos"):
@@ -85,7 +85,7 @@ def test_the_expert_says_what_it_wants() -> None:
     with pytest.raises(InvalidObservation, match=r"want 'Can_quat', \(4,\)"):
         expert.reset(seen((0, 0, 1)), "")
     with pytest.raises(ContractMismatch, match="robosuite/Lift"):
-        expert_for("robosuite/ToolHang")
+        RobosuiteExpert("robosuite/ToolHang")
 
 
 def test_a_missing_robosuite_is_named_with_its_cure(monkeypatch: pytest.MonkeyPatch) -> None:

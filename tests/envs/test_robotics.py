@@ -6,12 +6,12 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from experts.robotics import FetchReach
 from in_process_episode import Always, play
 
 from vlagents_ray.envs import EvalEnv, make_env
 from vlagents_ray.errors import MissingState
 from vlagents_ray.interface import Obs
-from vlagents_ray.policies.experts import expert_for
 from vlagents_ray.testing import check_env
 
 pytestmark = [pytest.mark.sim, pytest.mark.integration]
@@ -41,7 +41,7 @@ def test_the_parts_of_the_goal_observation_are_parts_of_the_state(reach: EvalEnv
 
 def test_moving_to_the_target_is_a_success(reach: EvalEnv) -> None:
     for seed in range(3):
-        result = play(reach, NAME, seed=seed)
+        result = play(reach, NAME, "experts.robotics:FetchReach", seed=seed)
         assert (result.success_at_end, result.ending, result.steps) == (True, "truncated", 50)
         assert result.episode_return > -10.0  # sparse: -1 in each step away from it
 
@@ -63,6 +63,6 @@ def test_each_task_has_its_instruction_and_the_protocol(task: str) -> None:
 
 
 def test_the_expert_says_that_it_wants_goals() -> None:
-    expert = expert_for(NAME)
+    expert = FetchReach(NAME)
     with pytest.raises(MissingState, match="desired_goal"):
         expert.reset(Obs(state={"joints": np.zeros(7, np.float32)}), "reach")

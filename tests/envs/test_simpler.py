@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from experts.simpler import SimplerExpert
 
 from vlagents_ray.contract import CameraSpec
 from vlagents_ray.envs import make_env
 from vlagents_ray.envs.simpler import Simpler
 from vlagents_ray.errors import ConfigError, EnvFailed, NotReset, UnknownEnv
 from vlagents_ray.interface import Act, Obs
-from vlagents_ray.policies.experts import expert_for
 from vlagents_ray.testing import check_env
 from vlagents_ray.validation import check_observation
 
@@ -148,7 +148,7 @@ def test_rotations_are_radians_about_the_bases_axes(carrot: Simpler) -> None:
 
 @pytest.mark.slow
 def test_the_expert_succeeds_and_doing_nothing_does_not(carrot: Simpler) -> None:
-    expert = expert_for(f"simpler/{CARROT}")
+    expert = SimplerExpert(f"simpler/{CARROT}")
     for solved in (True, False):
         obs, over = begin(carrot, 3), False
         expert.reset(obs, carrot.instruction)

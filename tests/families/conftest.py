@@ -11,11 +11,12 @@ from pathlib import Path
 import pytest
 from verified import VerifyingTests
 
-from vlagents_ray.registry import ENVS, POLICIES, WRAPPERS
+from vlagents_ray.registry import ENVS, POLICIES
 
 # folder -> the packages without which its tests cannot be imported; the authors' source may come from a checkout
-_NEEDS = {name: one.needs[bool(one.checkouts) :] for name, one in (POLICIES | WRAPPERS | ENVS).items()} | {
-    "ros": ("rclpy",)
+_NEEDS = {name: one.needs[bool(one.checkouts) :] for name, one in (POLICIES | ENVS).items()} | {
+    "arro": ("transformers", "torch"),
+    "ros": ("rclpy",),
 }
 
 _FOLDERS = {test.parent.name for test in Path(__file__).parent.glob("*/test_*.py")}

@@ -25,8 +25,7 @@ what varies by nature, which `masks` replaces by zeros: times in ms and timestam
 32 hexadecimal digits), the headers Date and Server, the CPU core, and which memory files are free again. A length
 around such a value is made to fit. How many digits or bytes a time has is compared, and so is the batch's size. Steps
 begin at 10**15, since the server gets a wall clock that stands still. Bytes within ZeroMQ's and gRPC's own framing,
-API keys (tests/serve/test_access_matrix.py), the metadata of a replica under Ray, and xpolicylab, which no server of
-ours speaks, are not recorded.
+API keys (tests/serve/test_access_matrix.py) and the metadata of a replica under Ray are not recorded.
 
 A difference is printed by step, field by field:
 

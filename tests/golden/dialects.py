@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from golden import png
 
+from tests.golden import lerobot_requests
 from tests.golden.masks import masked
 from tests.golden.scenarios import Send, asks, gets, http, scenario
 from tests.golden.traces import Step, Trace
@@ -128,25 +129,21 @@ def gateways() -> Iterator[Trace]:
         dialects={"gr00t": {}},
     )
 
-    robot = lerobot.PolicyInstructions("act", "me/act", ("shoulder.pos", "gripper.pos"), ("front",), 10)
-
     def call(method: str, *messages: bytes) -> tuple[bytes, ...]:
         return (lerobot.method(method).encode(), *(messages or (b"",)))
 
-    def setup(pickle: bytes) -> tuple[bytes, ...]:
-        return call("SendPolicyInstructions", lerobot.write_data(pickle))
+    def setup(message: bytes) -> tuple[bytes, ...]:
+        return call("SendPolicyInstructions", message)
 
     def saw(step: int, task: str = "pick") -> tuple[bytes, ...]:
-        theirs = {"observation.state": JOINTS, "observation.images.front": PIXELS, "task": task}
-        pickle = lerobot.write_observation(theirs, robot, 1000.0 + step, step)
-        return call("SendObservations", *lerobot.write_observation_parts(pickle))
+        return call("SendObservations", *lerobot_requests.observation(JOINTS, PIXELS, task, step))
 
     act = call("GetActions")
     yield from scenario(
         "lerobot: calls",
         ("lerobot",),
-        asks(act, call("Ready"), saw(0), setup(lerobot.write_instructions(robot)), saw(0), act, saw(1), act),
-        asks(saw(2, "place it"), act, saw(3, "fail"), act, setup(b"\x80\x04cos\nsystem\n.")),
+        asks(act, call("Ready"), saw(0), setup(lerobot_requests.instructions()), saw(0), act, saw(1), act),
+        asks(saw(2, "place it"), act, saw(3, "fail"), act, setup(lerobot.write_data(b"\x80\x04cos\nsystem\n."))),
         asks(call("SendObservations", b"\x08\x03\x12\x04junk"), call("SendObservations", b"\x08\x09")),
         dialects={"lerobot": {}},
     )

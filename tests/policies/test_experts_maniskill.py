@@ -8,7 +8,7 @@ import pytest
 from vlagents_ray.envs.maniskill import ManiSkill
 from vlagents_ray.errors import InvalidObservation
 from vlagents_ray.interface import Obs
-from vlagents_ray.policies.experts import expert_for
+from vlagents_ray.policies.experts import expert_class
 
 pytestmark = pytest.mark.sim
 
@@ -23,7 +23,7 @@ def test_the_expert_solves_the_task_and_the_cube_stays(task: str) -> None:
     with ManiSkill(task, width=16, height=16) as env:  # experts do not look at the image
         for seed in range(EPISODES):
             obs, _ = env.reset(seed=seed)
-            expert = expert_for(name)
+            expert = expert_class(name)(name)
             expert.reset(obs, env.instruction)
             successes = []
             truncated = terminated = False
@@ -38,7 +38,7 @@ def test_the_expert_solves_the_task_and_the_cube_stays(task: str) -> None:
 @pytest.mark.parametrize("task", ["PushCube-v1", "PickCube-v1"])
 @pytest.mark.parametrize("state", [None, np.zeros(7, np.float32)])
 def test_without_the_simulators_state_the_expert_says_what_it_wants(task: str, state: np.ndarray | None) -> None:
-    expert = expert_for(f"maniskill/{task}")
+    expert = expert_class(f"maniskill/{task}")(f"maniskill/{task}")
     info = {} if state is None else {"sim_state": state}
     with pytest.raises(InvalidObservation, match=rf"sim_state.*{task}.*pd_ee_delta_pose"):
         expert.reset(Obs(info=info), "push the cube")
@@ -46,7 +46,7 @@ def test_without_the_simulators_state_the_expert_says_what_it_wants(task: str, s
 
 def test_a_stuck_arm_gets_shorter_commands() -> None:
     """ManiSkill's inverse kinematics fails for some long steps, and the arm then stays where it is."""
-    expert = expert_for("maniskill/PushCube-v1")
+    expert = expert_class("maniskill/PushCube-v1")("maniskill/PushCube-v1")
     state = np.zeros(35, np.float32)
     state[25:28] = (0.2, 0.0, 0.0)  # the goal
     state[18:21], state[28:31] = (-0.3, 0.0, 0.15), (0.0, 0.0, 0.02)  # the tool, far from the cube

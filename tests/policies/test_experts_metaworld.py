@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from experts.metaworld import MetaWorldExpert
 
 from vlagents_ray.envs.metaworld import MetaWorld
 from vlagents_ray.errors import ContractMismatch, InvalidObservation
 from vlagents_ray.interface import Obs
-from vlagents_ray.policies.experts import expert_for
 
 pytestmark = [pytest.mark.sim, pytest.mark.integration]
 
@@ -19,7 +19,7 @@ def test_the_oracle_solves_the_task(task: str) -> None:
     with MetaWorld(task, width=16, height=16) as env:
         for seed in range(2):
             obs, _ = env.reset(seed=seed)
-            expert = expert_for(f"metaworld/{task}")
+            expert = MetaWorldExpert(f"metaworld/{task}")
             expert.reset(obs, env.instruction)
             success = False
             for _ in range(100):
@@ -33,11 +33,11 @@ def test_the_oracle_solves_the_task(task: str) -> None:
 
 
 def test_without_the_simulators_observation_the_oracle_says_what_it_wants() -> None:
-    expert = expert_for("metaworld/reach-v3")
+    expert = MetaWorldExpert("metaworld/reach-v3")
     with pytest.raises(InvalidObservation, match=r"sim_state.*\(39,\)"):
         expert.reset(Obs(), "reach")
 
 
 def test_a_task_without_oracle_is_refused() -> None:
     with pytest.raises(ContractMismatch, match=r"reach-v2.*reach-v3"):
-        expert_for("metaworld/reach-v2")
+        MetaWorldExpert("metaworld/reach-v2")

@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 import pytest
+from experts.rcs import RcsPick
 
 from vlagents_ray.errors import InvalidObservation, MissingState
 from vlagents_ray.interface import Obs
-from vlagents_ray.policies.experts import expert_for
 
 
 def seen(*, tool: tuple[float, float, float] = (0.3, 0.0, 0.5), turn: float = 0.0) -> Obs:
@@ -20,7 +20,7 @@ def seen(*, tool: tuple[float, float, float] = (0.3, 0.0, 0.5), turn: float = 0.
 
 
 def test_it_sets_out_for_the_cuboid_in_small_steps_with_an_open_gripper() -> None:
-    expert = expert_for("rcs/pick")
+    expert = RcsPick("rcs/pick")
     expert.reset(seen(), "pick up the green cuboid")
     action = expert.act(seen()).action
     assert action.shape == (8,)
@@ -32,14 +32,14 @@ def test_it_sets_out_for_the_cuboid_in_small_steps_with_an_open_gripper() -> Non
 
 @pytest.mark.parametrize(("turn", "hand"), [(0.0, 0.0), (0.5, 0.5), (-1.0, -1.0), (2.5, 2.5 - math.pi)])
 def test_the_hand_turns_with_the_cuboid_the_shorter_way(turn: float, hand: float) -> None:
-    expert = expert_for("rcs/pick")
+    expert = RcsPick("rcs/pick")
     expert.reset(seen(turn=turn), "pick up the green cuboid")
     quaternion = expert.act(seen(turn=turn)).action[3:7]
     np.testing.assert_allclose(quaternion, [math.cos(hand / 2), math.sin(hand / 2), 0.0, 0.0], atol=1e-6)
 
 
 def test_what_it_cannot_do_without_is_named() -> None:
-    expert = expert_for("rcs/pick")
+    expert = RcsPick("rcs/pick")
     with pytest.raises(InvalidObservation, match=r"PickTask_box_joint.*tquat"):
         expert.reset(Obs(state=seen().state), "pick up the green cuboid")
     with pytest.raises(MissingState, match="tquat"):

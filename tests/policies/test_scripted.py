@@ -18,7 +18,7 @@ from vlagents_ray.errors import (
     NotReset,
 )
 from vlagents_ray.interface import Agent
-from vlagents_ray.policies.experts import EXPERTS, expert_for
+from vlagents_ray.policies.experts import EXPERTS, expert_class
 from vlagents_ray.policies.experts.tabletop import TabletopExpert
 from vlagents_ray.policies.scripted import Scripted
 from vlagents_ray.registry import env_suite
@@ -48,12 +48,12 @@ def test_the_env_of_reset_comes_before_the_task_of_the_config() -> None:
 
 
 def test_a_task_within_a_suite_finds_the_suites_expert() -> None:
-    assert isinstance(expert_for("tabletop/slide"), TabletopExpert)
+    assert expert_class("tabletop/slide") is TabletopExpert
 
 
 def test_a_task_without_expert_is_refused_with_those_there_are() -> None:
     with pytest.raises(ContractMismatch, match="maniskill/PushCube-v1") as caught:
-        expert_for("maniskill/PlugCharger-v1")
+        expert_class("maniskill/PlugCharger-v1")
     assert "PlugCharger" in str(caught.value)
 
 
@@ -76,8 +76,8 @@ def test_act_before_reset_is_refused() -> None:
 
 
 def test_an_unknown_setting_is_refused() -> None:
-    with pytest.raises(ConfigError, match="expert"):
-        Scripted.from_config({"expert": "x"})
+    with pytest.raises(ConfigError, match="exprt"):
+        Scripted.from_config({"exprt": "x"})
 
 
 def test_a_failed_reset_keeps_no_expert() -> None:

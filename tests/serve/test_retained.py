@@ -7,7 +7,6 @@ import gc
 import queue
 import socket
 import struct
-import tracemalloc
 from collections.abc import Iterator
 from dataclasses import asdict
 from urllib.parse import urlsplit
@@ -26,15 +25,13 @@ from vlagents_ray.client.transports.websocket import Stream
 from vlagents_ray.errors import MessageTooLarge, Overloaded, PolicyUnavailable, TooManyRequests, VLAgentsError
 from vlagents_ray.interface import Obs
 from vlagents_ray.protocol.frames import decode_replies, encode_request
-from vlagents_ray.protocol.messages import DEFAULT_LIMITS, STREAM_BYTES, Limits, Request
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, STREAM_BYTES, Request
 from vlagents_ray.serve.access import api_keys
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.dialects import gr00t
 from vlagents_ray.serve.dialects.base import GatewayContext
 from vlagents_ray.serve.engine.admission import Admission
 from vlagents_ray.serve.engine.sender import REFUSALS
-from vlagents_ray.wire.lerobot import read_chunk
-from vlagents_ray.wire.pickles import _CONSTANT
 
 SLACK = 48 * 2**20  # bytes of buffers in the kernel's and the interpreter's own care
 SEEN = Obs({"front": np.zeros((8, 8, 3), np.uint8)})
@@ -196,37 +193,3 @@ def _ended(connection: socket.socket) -> bool:
     except OSError:
         return True
     return True
-
-
-def _storage(numbers: int, recalls: int, *, again: bool) -> bytes:
-    """A pickle that recalls one bfloat16 storage, or states it each time."""
-
-    def text(value: str) -> bytes:
-        return b"\x8c" + bytes([len(value)]) + value.encode()
-
-    file = (
-        _CONSTANT
-        + b"\x80\x02(X\x07\0\0\0storageq\0ctorch\nBFloat16Storage\nq\x01X\x01\0\0\x007q\x02X\x03\0\0\0cpuq\x03J"
-        + struct.pack("<i", numbers)
-        + b"Ntq\x04Q.\x80\x02]q\0X\x01\0\0\x007q\x01a."
-        + struct.pack("<Q", numbers)
-        + bytes(2 * numbers)
-    )
-    load = text("torch.storage") + text("_load_from_bytes") + b"\x93\x94"
-    stated = b"B" + struct.pack("<I", len(file)) + file
-    if again:
-        return b"\x80\x04](" + load + (b"h\0" + stated + b"\x85R") * recalls + b"e."
-    return b"\x80\x04](" + load + stated + b"\x94" + b"h\0h\1\x85R" * recalls + b"e."
-
-
-@pytest.mark.parametrize(("numbers", "recalls", "again"), [(500_000, 800, False), (2_000_000, 8, True)])
-def test_a_pickle_takes_no_more_than_the_limit_of_decoded_bytes(numbers: int, recalls: int, again: bool) -> None:
-    data = _storage(numbers, recalls, again=again)
-    tracemalloc.start()
-    with pytest.raises(MessageTooLarge if again else VLAgentsError):
-        read_chunk(data, Limits(decoded_bytes=32 * 2**20))
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert peak < 32 * 2**20 + 16 * numbers
-    if not again:
-        assert peak < 20 * numbers

@@ -75,7 +75,9 @@ def run_episode(
     return outcome
 
 
-def play(env: EvalEnv, name: str, agent: Agent | None = None, *, seed: int = 0, **options: Any) -> EpisodeResult:
-    """The episode of `seed` and the reset's `options`; without an agent the env's scripted expert plays it."""
+def play(env: EvalEnv, name: str, agent: Agent | str, *, seed: int = 0, **options: Any) -> EpisodeResult:
+    """The episode of `seed` and the reset's `options`, played by an agent or by an expert, "module:Class"."""
+    if isinstance(agent, str):
+        agent = Scripted.from_config({"expert": agent})
     key = EpisodeKey(name, episode=0, seed=seed, settings="")
-    return run_episode(env, agent or Scripted(), key, reset_options=options)
+    return run_episode(env, agent, key, reset_options=options)

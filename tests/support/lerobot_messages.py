@@ -1,17 +1,15 @@
-"""The messages of LeRobot's asynchronous inference: look-alikes of its classes and torch's, with the same pickles."""
+"""The messages of LeRobot's asynchronous inference: look-alikes of its classes, with the same pickles."""
 
 from __future__ import annotations
 
 import io
 import pickle
-import struct
 import sys
 import types
-from collections import OrderedDict
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any
 
 import grpc
 import numpy as np
@@ -48,57 +46,6 @@ class RemotePolicyConfig:
     rename_map: dict[str, str] = field(default_factory=dict)
 
 
-class Tensor:
-    """A row of a chunk, which pickles as a view of a tensor of torch's does: with the storage of the whole chunk."""
-
-    def __init__(self, chunk: np.ndarray, row: int) -> None:
-        self.chunk, self.row = chunk, row
-
-    def __reduce_ex__(self, _protocol: object) -> tuple[Any, ...]:
-        size = self.chunk.shape[1]
-        stride = tuple([1])  # a new one each time, as torch's  # noqa: C409
-        return _rebuild_tensor_v2, (_Storage(self.chunk), self.row * size, (size,), stride, False, OrderedDict())
-
-
-class _Storage:
-    KINDS: ClassVar = {"float32": "FloatStorage", "float64": "DoubleStorage", "float16": "HalfStorage"}
-
-    def __init__(self, array: np.ndarray) -> None:
-        self.array = np.ascontiguousarray(array)
-
-    def __reduce_ex__(self, _protocol: object) -> tuple[Any, ...]:
-        """As torch.storage.TypedStorage: a file in the form of torch.save before version 1.6."""
-        file, key = io.BytesIO(), "94148566539200"
-        sizes = {"short": 2, "int": 4, "long": 4}
-        about = {"protocol_version": 1001, "little_endian": True, "type_sizes": sizes}
-        for value in (0x1950A86A20F9469CFC6C, 1001, about):
-            pickle.dump(value, file, 2)
-        kind = type(self.KINDS[self.array.dtype.name], (), {"__module__": "torch"})
-        sys.modules["torch"].__dict__[kind.__name__] = kind
-        _Persistent(file, 2, ("storage", kind, key, "cpu", self.array.size, None)).dump(self)
-        pickle.dump([key], file, 2)
-        file.write(struct.pack("<q", self.array.size) + self.array.tobytes())
-        return _load_from_bytes, (file.getvalue(),)
-
-
-class _Persistent(pickle.Pickler):
-    def __init__(self, file: io.BytesIO, protocol: int, found: tuple[Any, ...]) -> None:
-        super().__init__(file, protocol)
-        self._found = found
-
-    def persistent_id(self, one: Any) -> Any:
-        return self._found if isinstance(one, _Storage) else None
-
-
-def _rebuild_tensor_v2(*_: Any) -> None: ...
-def _load_from_bytes(*_: Any) -> None: ...
-
-
-_TORCH = {"torch": (), "torch._utils": (_rebuild_tensor_v2,), "torch.storage": (_load_from_bytes,)}
-for _module, _functions in _TORCH.items():
-    for _function in _functions:
-        _function.__module__ = _module
-
 MESSAGES = (TimedAction, TimedObservation, RemotePolicyConfig)
 for _one in MESSAGES:
     _one.__module__ = HELPERS
@@ -106,13 +53,12 @@ for _one in MESSAGES:
 
 @contextmanager
 def _importable() -> Iterator[None]:
-    """Let Python's pickler find the classes under LeRobot's and torch's names, whether these are installed or not."""
+    """Let Python's pickler find the classes under LeRobot's names, whether it is installed or not."""
     folders = HELPERS.split(".")
-    names = [*(".".join(folders[: n + 1]) for n in range(len(folders))), *_TORCH]
+    names = [".".join(folders[: n + 1]) for n in range(len(folders))]
     before = {name: sys.modules.get(name) for name in names}
     made = {name: types.ModuleType(name) for name in names}
-    for module, ones in {HELPERS: MESSAGES, **_TORCH}.items():
-        vars(made[module]).update({one.__name__: one for one in ones})
+    vars(made[HELPERS]).update({one.__name__: one for one in MESSAGES})
     sys.modules.update(made)
     try:
         yield
@@ -128,12 +74,6 @@ def pickled(message: Any, protocol: int = pickle.DEFAULT_PROTOCOL) -> bytes:
     """What LeRobot's client and server send."""
     with _importable():
         return pickle.dumps(message, protocol)
-
-
-def unpickled(data: bytes) -> Any:
-    """What LeRobot's server reads."""
-    with _importable():
-        return pickle.loads(data)  # noqa: S301 - a test's own
 
 
 class _Unpickler(pickle.Unpickler):
@@ -172,21 +112,6 @@ def field_of(number: int, value: int | bytes) -> bytes:
         size.append(length & 127 | 128)
         length >>= 7
     return bytes([number << 3 | 2, *size, length]) + value
-
-
-def fields_in(message: bytes) -> Iterator[tuple[int, Any]]:
-    """The fields of a message, as `field_of` writes them."""
-    at = 0
-    while at < len(message):
-        number, kind, at = message[at] >> 3, message[at] & 7, at + 1
-        value = shift = 0
-        while True:
-            value, shift, at = value | (message[at] & 127) << shift, shift + 7, at + 1
-            if message[at - 1] < 128:
-                break
-        if kind == 2:
-            value, at = message[at : at + value], at + value
-        yield number, value
 
 
 BEGIN, MIDDLE, END = 1, 2, 3

@@ -41,7 +41,6 @@ def surface() -> str:
         "Registered names": registered(),
         "Deployment file: args": models_of("vlagents_ray.serve.config.deployment:ServerArgs"),
         "Deployment file: args.config of each policy": settings_of("POLICIES"),
-        "Deployment file: settings of wrappers": settings_of("WRAPPERS"),
         "Deployment file: args.dialects": settings_of("DIALECTS"),
         "Evaluation file": models_of("vlagents_ray.evaluate.plan.config:EvalConfig"),
         "Evaluation file: env_options of each environment": settings_of("ENVS"),
@@ -114,7 +113,7 @@ def error_codes() -> Iterator[str]:
 
 def registered() -> Iterator[str]:
     registry = importlib.import_module("vlagents_ray.registry")
-    for kind in ("POLICIES", "WRAPPERS", "ENVS", "DIALECTS"):
+    for kind in ("POLICIES", "ENVS", "DIALECTS"):
         yield f"{kind.lower()}: {', '.join(sorted(getattr(registry, kind)))}"
 
 

@@ -10,9 +10,10 @@ import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from vlagents_ray.registry import ENVS, POLICIES, WRAPPERS, Adapter
+from vlagents_ray.registry import ENVS, POLICIES, Adapter
 
 ROOT = Path(__file__).parents[2]
+PLUGINS = ("arro",)  # pages among those of the policies, of packages in plugins/
 
 
 def _listed(adapters: dict[str, Adapter]) -> Iterator[tuple[str, Adapter]]:
@@ -68,8 +69,8 @@ TABLES: dict[str, dict[str, list[str]]] = {
 def with_tables(file: str, text: str) -> str:
     """Return the text of a page with its tables, or that of mkdocs.yml with the pages of the adapters."""
     if file == "mkdocs.yml":
-        for folder, kinds in (("policies", (POLICIES, WRAPPERS)), ("benchmarks", (ENVS,))):
-            found = dict.fromkeys(page_of(name, one) for kind in kinds for name, one in _listed(kind))
+        for folder, adapters, more in (("policies", POLICIES, PLUGINS), ("benchmarks", ENVS, ())):
+            found = dict.fromkeys([*(page_of(name, one) for name, one in _listed(adapters)), *more])
             pages = "".join(f"          - {folder}/{page}.md\n" for page in found if page)
             index = f"          - {folder}/index.md\n"
             text = re.sub(f"{index}(?:          - {folder}/.*\n)*", lambda _, new=index + pages: new, text)

@@ -3,8 +3,7 @@
 `python upstream_servers.py KIND PORT`; a kind is a protocol, and for GR00T also `gr00t sim`: with
 `Gr00tSimPolicyWrapper`, or `gr00t packed`: with the newest servers' arrays. What they answer depends on each bit of the
 observation, so that an action that equals `answer` was computed from the very observation. The formats are those of
-openpi_client.msgpack_numpy, gr00t/policy/server_client.py, json_numpy, vla_eval.protocol, and XPolicyLab's
-client_server/ws; LeRobot's server is in lerobot_server.
+openpi_client.msgpack_numpy, gr00t/policy/server_client.py, json_numpy and vla_eval.protocol.
 """
 
 from __future__ import annotations
@@ -136,40 +135,6 @@ def vla_eval(connection: Any) -> None:
             step += 1
 
 
-def pack_xpolicylab(value: Any) -> bytes:
-    def array(one: Any) -> Any:
-        return {b"nd": True, b"type": one.dtype.str, b"kind": b"", b"shape": one.shape, b"data": one.tobytes()}
-
-    return msgpack.packb(value, default=array)
-
-
-def xpolicylab(connection: Any) -> None:
-    def node(one: dict) -> Any:
-        if b"nd" in one:
-            return np.frombuffer(one[b"data"], one[b"type"]).reshape(one[b"shape"])
-        return one
-
-    replies = {"hello": "hello_ack", "reset": "reset_result", "infer": "infer_result"}
-    for data in connection:
-        request = msgpack.unpackb(data, object_hook=node)
-        kind, payload = replies[request["message_type"]], {"ok": True}
-        if request["message_type"] == "reset":
-            XPOLICYLAB["step"] = 0
-        elif request["message_type"] == "infer":
-            observation, step = request["payload"]["observation"], XPOLICYLAB["step"]
-            if observation["instruction"] == BROKEN:
-                kind, payload = "error", {"code": "infer_failed", "message": "a secret of the upstream", "details": {}}
-            else:
-                rows = answer(observation, step or 0).astype(np.float32)
-                payload = {"actions": [{"arm_joint_state": row[:6], "ee_joint_state": row[6:]} for row in rows]}
-                XPOLICYLAB["step"] = None if step is None else step + 1
-        named = {name: request[name] for name in ("message_id", "evaluation_id", "trial_id", "step", "sent_at")}
-        connection.send(pack_xpolicylab({"message_type": kind, "payload": payload, **named}))
-
-
-XPOLICYLAB: dict[str, int | None] = {"step": None}  # the state of its one model, which has none until it is reset
-
-
 def gr00t(port: int, *variants: str) -> None:
     packed = "packed" in variants
 
@@ -287,17 +252,12 @@ def _main(kind: str, port: int) -> None:
     protocol, *variants = kind.split()
     if protocol == "gr00t":
         gr00t(port, *variants)
-    elif protocol == "lerobot":
-        from lerobot_server import serve  # which only this kind waits for, and for gRPC
-
-        serve(port)
     elif protocol == "openvla":
         ThreadingHTTPServer(("127.0.0.1", port), OpenVLA).serve_forever()
     else:
         handlers = {"openpi": openpi, "openpi-batch": openpi, "roboarena": roboarena, "vla_eval": vla_eval}
-        handler = (handlers | {"xpolicylab": xpolicylab})[protocol]
         options: dict[str, Any] = {"compression": None, "max_size": None}
-        with websockets.sync.server.serve(handler, "127.0.0.1", port, **options) as server:
+        with websockets.sync.server.serve(handlers[protocol], "127.0.0.1", port, **options) as server:
             server.serve_forever()
 
 

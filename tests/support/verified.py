@@ -41,7 +41,7 @@ RUN_WITH = {
     name: (" ".join(one.requirements), (*one.checkouts, *one.needs[bool(one.checkouts) :]))
     for name, one in families()
     if one.page is None
-}
+} | {"arro": ("hf", ("transformers", "torch"))}
 
 
 class VerifyingTests:

@@ -14,7 +14,7 @@ from vlagents_ray.testing import check_agent, check_env
 # Registered names whose own test modules run the suites, because they need a simulator or a setting.
 CHECKED_ELSEWHERE = {
     "libero", "maniskill", "metaworld", "rcs", "duobench", "robosuite", "robocasa", "calvin", "simpler", "aloha",
-    "replay", "upstream",
+    "upstream",
 }  # fmt: skip
 ENV_NAMES = {
     "tabletop": ["tabletop"],

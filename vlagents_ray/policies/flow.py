@@ -238,14 +238,13 @@ def _weights(delay: int, length: int, horizon: int) -> np.ndarray:
 
 
 class FlowPasses(abc.ABC):
-    """The passes of a model."""
+    """The passes of a model: one over its inputs, and one for each step of the flow."""
 
     def __init__(self, model: Any, compilation: Compilation) -> None:
-        """Use the passes of a model of openpi, or of LeRobot, in their compiled form if there is one."""
+        """Use the passes of a model, in their compiled form if there is one."""
         self.model = model
         self.adapters = Adapters()  # of the policy
         self.module = sys.modules[type(model).__module__]  # with the functions of its authors' own passes
-        self.attention_mask = self.module.make_att_2d_masks
         self._encode = compilation.core("encode", self.encode)
         self._velocity = compilation.core("velocity", self.velocity)
 
@@ -255,7 +254,7 @@ class FlowPasses(abc.ABC):
 
     @abc.abstractmethod
     def encode(self, tokens: Any, mask: Any, cameras: Any, state: Any, *images: Any) -> tuple[Any, Any]:
-        """Return keys and values, and which of the tokens (P, L) are there, 1 or 0.
+        """Return keys and values, or all else that `velocity` reads of inputs, and which tokens (P, L) are there.
 
         Args:
             tokens: Of the instruction, (P, T) int64.
@@ -334,7 +333,7 @@ class Pi0Passes(FlowPasses):
 
         embedded, seen, causal = self.model.embed_prefix(list(images), list(cameras.unbind(1)), tokens, mask)
         _, cache = self.model.paligemma_with_expert.forward(
-            attention_mask=self._mask_4d(self.attention_mask(seen, causal)),
+            attention_mask=self._mask_4d(self.module.make_att_2d_masks(seen, causal)),
             position_ids=seen.cumsum(1) - 1,
             inputs_embeds=[embedded, None],
             use_cache=True,

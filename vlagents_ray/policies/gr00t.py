@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import copy
 import importlib.util
 import json
 import os
@@ -268,28 +267,23 @@ class Gr00tNetwork:
             processed = self.processor([{"type": types.MessageType.EPISODE_STEP.value, "content": step}])
         return {"processed": processed, "raw": raw}
 
-    def chunks(
-        self, rngs: Sequence[np.random.Generator], inputs: Sequence[dict[str, Any]], *, alike: bool
-    ) -> list[np.ndarray]:
+    def chunks(self, rngs: Sequence[np.random.Generator], inputs: Sequence[dict[str, Any]]) -> list[np.ndarray]:
         """Compute the chunks of rows, (horizon, D) float32 each, in one pass, or in one for each length of prompts.
 
         Args:
             rngs: The generator of each row's noise.
             inputs: What `inputs` returned for each of them.
-            alike: Whether each pass is to have as many rows, with prompts of one length.
         """
         whole = self._collated(inputs)
         lengths = whole["inputs"]["attention_mask"].sum(1).tolist()
-        if (self.masks_padding and not alike) or len(set(lengths)) == 1:
+        if self.masks_padding or len(set(lengths)) == 1:
             return self._chunks(rngs, inputs, whole)
         found: dict[int, np.ndarray] = {}
         for length in sorted(set(lengths)):
             places = [place for place, one in enumerate(lengths) if one == length]
-            spare = places[-1:] * (len(inputs) - len(places) if alike else 0)
-            some = [inputs[place] for place in places + spare]
-            noise = [*(rngs[place] for place in places), *(copy.deepcopy(rngs[place]) for place in spare)]
-            chunks = self._chunks(noise, some, self._collated(some))
-            found |= zip(places, chunks[: len(places)], strict=True)
+            some = [inputs[place] for place in places]
+            chunks = self._chunks([rngs[place] for place in places], some, self._collated(some))
+            found |= zip(places, chunks, strict=True)
         return [found[place] for place in range(len(inputs))]
 
     def _collated(self, inputs: Sequence[dict[str, Any]]) -> Any:
@@ -484,7 +478,6 @@ class Gr00t(ModelPolicy):
             chunks = self.loaded().chunks(
                 [rows[place].rng for place in places],
                 [read[place] for place in places],
-                alike=self.config.deterministic,
             )
             for place, chunk in zip(places, chunks, strict=True):
                 found[place] = Prediction(chunk)

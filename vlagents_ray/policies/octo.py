@@ -158,9 +158,7 @@ class Octo(ModelPolicy):
         network: OctoNetwork = self.model
         windows = {id(row.frames): row for row in rows}  # the samples of a session share its window
         place = {window: i for i, window in enumerate(windows)}
-        asked = list(windows.values())
-        size = next((size for size in self.config.batch_sizes or () if size >= len(asked)), len(asked))
-        asked += asked[-1:] * (size - len(asked))
+        asked = self.padded(list(windows.values()))
         tokens, mask = network.encode(self._observations(asked), self._tasks(asked))
 
         owners = [place[id(row.frames)] for row in rows]

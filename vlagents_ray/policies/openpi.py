@@ -564,8 +564,7 @@ class OpenPi(ModelPolicy):
         """
         each = list(range(len(rows)))
         firsts, owners = shared_frames(rows) if self.loaded().model.shares else (each, each)
-        size = next((size for size in self.config.batch_sizes or () if size >= len(firsts)), len(firsts))
-        return firsts + firsts[-1:] * (size - len(firsts)), owners
+        return self.padded(firsts), owners
 
     def _planned(self, row: Row) -> TransformedRow | Exception:
         """Return the row with its leftover actions in the model's units, or an exception for its session."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -32,7 +31,7 @@ from vlagents_ray.policies.base.model_inputs import (
     state_specs,
     state_vector,
 )
-from vlagents_ray.policies.flow import OFFERED, Change, Guide, RandomSteps, follow
+from vlagents_ray.policies.flow import OFFERED, Change, FlowPasses, Guide, RandomSteps, cache_of, layers_of
 from vlagents_ray.registry import require
 
 CAMERAS = ("base_0_rgb", "left_wrist_0_rgb", "right_wrist_0_rgb")  # openpi's names, in the order of the image tokens
@@ -64,7 +63,7 @@ class LoadedPi0:
     processor: Any
     device: Any
     dtype: Any
-    cores: FlowCores
+    passes: Pi0HfPasses
 
     def planned(self, row: Row) -> Row:
         """Return the row with its leftover actions in the model's units."""
@@ -129,11 +128,9 @@ class Pi0(ModelPolicy):
         dtype = torch_dtype(self.config.dtype, device)
         ensure_torchvision()
         network = _network(path, device, dtype)
-        cores = FlowCores(
-            self.compilation.core("encode", partial(encode, network)),
-            self.compilation.core("velocity", partial(velocity_of, network)),
-        )
-        return LoadedPi0(network, _processor(path), device, dtype, cores)
+        passes = Pi0HfPasses(network, self.compilation)
+        passes.adapters = self.adapters
+        return LoadedPi0(network, _processor(path), device, dtype, passes)
 
     def adapt(self, adapter: str, folder: Path) -> None:
         """Refuse an adapter beside which other statistics lie than those of the base."""
@@ -204,10 +201,26 @@ class Pi0(ModelPolicy):
         noise = convert(np.stack([row.noise(*shape) for row in rows]))
         guide = Guide.of([model.planned(row) for row in rows], *shape)
         random = RandomSteps.of(rows, (self._steps, *shape), self.config.noise_level, convert)
+        changes: list[Change] = []
+        if guide is not None:
+            changes.append(guide.to(convert).change(noise, steps=self._steps, limit=self.config.guidance))
+        if random is not None:
+            changes.append(random.change)
+        firsts, owners = shared_frames(rows)
+        inputs = self._inputs([rows[i] for i in firsts])
         with torch.inference_mode():
-            velocity = self._velocity(rows)
-            with self.adapters.rows([row.adapter for row in rows]):
-                flow = self._follow(velocity, noise, None if guide is None else guide.to(convert), random)
+            flow = model.passes.sample(
+                [inputs["pixel_values"]],
+                inputs["pixel_attention_mask"].unbind(1),
+                inputs["input_ids"],
+                inputs["attention_mask"],
+                inputs["state"],
+                noise=noise,
+                owners=owners,
+                steps=self._steps,
+                changes=changes,
+                fingerprints=[row.adapter for row in rows],
+            )
             stated = {} if random is None else random.stated(self.config.execute, len(model.processor.actions_mean))
         return [Prediction(model.actions(one), behaviour=stated.get(i, {})) for i, one in enumerate(flow.cpu().numpy())]
 
@@ -222,29 +235,6 @@ class Pi0(ModelPolicy):
             key: value.to(model.device, model.dtype if value.is_floating_point() else None, non_blocking=True)
             for key, value in batch.items()
         }
-
-    def _velocity(self, rows: Sequence[Row]) -> Callable[[Any, float], Any]:
-        """Return the flow's velocity for the rows; what the samples of a session see is encoded once."""
-        model = self.loaded()
-        firsts, owners = shared_frames(rows)
-        inputs = self._inputs([rows[i] for i in firsts])
-        shared = owners if len(firsts) < len(rows) else None
-        with self.adapters.rows([rows[i].adapter for i in firsts]):
-            return flow_velocity(model.network, inputs, model.dtype, shared, model.cores)
-
-    def _follow(
-        self, velocity: Callable[[Any, float], Any], noise: Any, guide: Guide | None, random: RandomSteps | None
-    ) -> Any:
-        """Integrate noise (B, H, D) to actions, in the Euler steps of `PI0ForConditionalGeneration.sample_actions`.
-
-        The actions are kept in float32 between the steps, also if the model computes in another type, as in openpi.
-        """
-        steps, limit, changes = self._steps, self.config.guidance, list[Change]()
-        if guide is not None:
-            changes.append(guide.change(noise, steps=steps, limit=limit))
-        if random is not None:
-            changes.append(random.change)
-        return follow(velocity, noise, steps, *changes)
 
 
 def _cameras(chosen: Mapping[str, str] | None) -> dict[str, str]:
@@ -271,44 +261,43 @@ def _processor(path: Path) -> Any:
     return processor
 
 
-@dataclass(frozen=True)
-class FlowCores:
-    """The two passes of the network, which are functions of tensors: `encode` and `velocity_of`, or compiled forms."""
+class Pi0HfPasses(FlowPasses):
+    """The passes of a `PI0ForConditionalGeneration`.
 
-    encode: Callable[..., Any]
-    velocity: Callable[..., Any]
+    The actions are kept in float32 between the steps, also if the model computes in another type, as in openpi.
+    """
+
+    def encode(self, tokens: Any, mask: Any, cameras: Any, state: Any, *images: Any) -> tuple[Any, Any]:
+        return encode(self.model, tokens, images[0], cameras, mask), mask
+
+    def velocity(self, encoded: Any, seen: Any, state: Any, actions: Any, times: Any) -> Any:
+        return velocity_of(self.model, encoded, seen, state, actions.to(state.dtype), times)
 
 
 def flow_velocity(
-    network: Any,
-    inputs: Mapping[str, Any],
-    dtype: Any,
-    owners: Sequence[int] | None = None,
-    cores: FlowCores | None = None,
+    network: Any, inputs: Mapping[str, Any], dtype: Any, owners: Sequence[int] | None = None
 ) -> Callable[[Any, float], Any]:
-    """Return the flow's velocity as a function of noisy actions (B, H, D) and time; inputs are encoded once.
+    """Return the velocity for a learner, as a function of noisy actions (B, H, D) and time; inputs are encoded once.
 
     Args:
         network: The `PI0ForConditionalGeneration`.
         inputs: Tokens, images and states of P observations, as `PI0Processor` returns them, on the network's device.
         dtype: The type in which the network computes.
         owners: The observation of each of the B rows; None: row i is of observation i.
-        cores: The passes of the network, if they are compiled.
 
     Returns:
         The function, whose result is (B, H, D) float32.
     """
     torch = require("torch")
-    cores = cores or FlowCores(partial(encode, network), partial(velocity_of, network))
     mask, state = inputs["attention_mask"], inputs["state"]
-    encoded = cores.encode(inputs["input_ids"], inputs["pixel_values"], inputs["pixel_attention_mask"], mask)
+    encoded = encode(network, inputs["input_ids"], inputs["pixel_values"], inputs["pixel_attention_mask"], mask)
     if owners is not None:
         index = torch.tensor(owners, device=mask.device)
         encoded, mask, state = encoded[index], mask[index], state[index]
 
     def velocity(actions: Any, time: float) -> Any:
         times = torch.full((len(actions),), time, dtype=torch.float32, device=actions.device)
-        return cores.velocity(encoded, mask, state, actions.to(dtype), times)
+        return velocity_of(network, encoded, mask, state, actions.to(dtype), times)
 
     return velocity
 
@@ -325,22 +314,18 @@ def encode(network: Any, tokens: Any, images: Any, cameras: Any, mask: Any) -> A
     """
     import torch  # the compiler follows a statement, and not `require`
 
-    layers = network.model.vlm(
+    cache = network.model.vlm(
         inputs_embeds=network.model.embed_prefix(tokens, images, cameras),
         attention_mask=mask,
         position_ids=mask.cumsum(-1) - 1,
         token_type_ids=torch.zeros_like(mask),
         use_cache=True,
-    ).past_key_values.layers
-    return torch.stack([torch.stack([layer.keys, layer.values], 1) for layer in layers], 1)
+    ).past_key_values
+    return torch.stack([torch.stack(layer, 1) for layer in layers_of(cache)], 1)
 
 
 def velocity_of(network: Any, encoded: Any, mask: Any, state: Any, actions: Any, times: Any) -> Any:
     """Return the velocity (B, H, D) float32 of noisy actions (B, H, D) at times (B,); see `encode` for the others."""
-    from transformers import DynamicCache
-
-    cache = DynamicCache()  # of this step alone: later ones must not attend to it
-    for number, layer in enumerate(encoded.unbind(1)):
-        cache.update(layer[:, 0], layer[:, 1], number)
+    cache = cache_of(encoded.unbind(1))  # of this step alone: later ones must not attend to it
     output = network(state=state, noise=actions, timestep=times, attention_mask=mask, past_key_values=cache)
     return output.logits.float()

@@ -9,23 +9,26 @@ from pydantic import BaseModel, Field
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import InvalidInput, NotReset
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.policies.experts import Expert, expert_for
+from vlagents_ray.policies.experts import Expert, expert_class
+from vlagents_ray.registry import named_class
 
 
 class ScriptedConfig(BaseModel, extra="forbid"):
-    """Settings of `Scripted`: the env to assume if a client does not name its own."""
+    """Settings of `Scripted`: the env to assume if a client does not name its own, and an expert of the user."""
 
     task: str | None = Field(default=None, description="an env's full name, e.g. 'tabletop' or 'maniskill/PushCube-v1'")
+    expert: str | None = Field(default=None, description="'module:Class' of an expert, in place of the env's own one")
 
 
 class Scripted(Agent):
-    """Chooses an expert for each session by the name of its env (see `policies.experts.EXPERTS`)."""
+    """Chooses an expert for each session by the name of its env (see `policies.experts`)."""
 
     Config: ClassVar[type] = ScriptedConfig
     shared: ClassVar[tuple[str, ...]] = ("config",)
 
     def __init__(self, config: ScriptedConfig | None = None) -> None:
         self.config = config or ScriptedConfig()
+        self._class = named_class(self.config.expert, {}) if self.config.expert else None
         self._expert: Expert | None = None
 
     @property
@@ -41,7 +44,7 @@ class Scripted(Agent):
                 f"scripted: got env={env!r}, want the env's name, e.g. reset(..., env='tabletop'); "
                 f"or set `task` in the policy's config"
             )
-        expert = expert_for(env)
+        expert: Expert = (self._class or expert_class(env))(env)
         expert.reset(obs, instruction or "")
         self._expert = expert
         return {"expert": type(expert).__name__}

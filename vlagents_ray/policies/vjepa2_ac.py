@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -36,7 +36,6 @@ from vlagents_ray.registry import require
 class VJepa2AcConfig(ModelConfig):
     """Settings of V-JEPA 2-AC, beside those of all models: its checkpoint, and the search for plans."""
 
-    deterministic: Literal[False] = Field(default=False, description="not for this family")
     encoder: str | None = Field(
         default=None,
         description="folder or hub id (org/name@COMMIT) of a `VJEPA2Model` instead of the encoder in the checkpoint",
@@ -349,39 +348,10 @@ def _energies(world: World, features: Tensor, poses: Tensor, goals: Tensor, acti
 
 
 def moved(poses: Tensor, actions: Tensor) -> Tensor:
-    """Apply actions (M, 7) to poses (M, 7): x, y, z, Euler angles about fixed x, y, z, closedness."""
+    """Apply actions (M, 7), of which none rotates, to poses (M, 7): x, y, z, Euler angles, closedness."""
     torch = require("torch")
-    rotation = _matrices(actions[:, 3:6].double()) @ _matrices(poses[:, 3:6].double())
-    angles = _angles(rotation).to(poses.dtype)
     closedness = (poses[:, 6:] + actions[:, 6:]).clip(0, 1)
-    return torch.cat([poses[:, :3] + actions[:, :3], angles, closedness], -1)
-
-
-def _matrices(angles: Tensor) -> Tensor:
-    """Convert Euler angles (M, 3) about fixed x, y, z to matrices (M, 3, 3)."""
-    torch = require("torch")
-    (sx, sy, sz), (cx, cy, cz) = angles.sin().unbind(-1), angles.cos().unbind(-1)
-    rows = (
-        (cz * cy, cz * sy * sx - sz * cx, cz * sy * cx + sz * sx),
-        (sz * cy, sz * sy * sx + cz * cx, sz * sy * cx - cz * sx),
-        (-sy, cy * sx, cy * cx),
-    )
-    return torch.stack([torch.stack(row, -1) for row in rows], -2)
-
-
-def _angles(matrices: Tensor) -> Tensor:
-    """Convert matrices to Euler angles, the second in [-pi/2, pi/2]; at these bounds the third is zero."""
-    torch = require("torch")
-    level = torch.hypot(matrices[:, 0, 0], matrices[:, 1, 0])
-    second = torch.atan2(-matrices[:, 2, 0], level)
-    locked = level < 1e-7
-    first = torch.where(
-        locked,
-        torch.atan2(-matrices[:, 1, 2], matrices[:, 1, 1]),
-        torch.atan2(matrices[:, 2, 1], matrices[:, 2, 2]),
-    )
-    third = torch.where(locked, 0.0, torch.atan2(matrices[:, 1, 0], matrices[:, 0, 0]))
-    return torch.stack([first, second, third], -1)
+    return torch.cat([poses[:, :3] + actions[:, :3], poses[:, 3:6], closedness], -1)
 
 
 CAMERA = "front"  # the model has one camera, without a name

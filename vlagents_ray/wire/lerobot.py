@@ -11,13 +11,12 @@ import enum
 import math
 import struct
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from vlagents_ray.errors import (
-    ConfigError,
     InvalidObservation,
     MalformedMessage,
     MessageTooLarge,
@@ -25,10 +24,9 @@ from vlagents_ray.errors import (
     MissingState,
 )
 from vlagents_ray.protocol.frame_layout import Buffer
-from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Budget, Limits
+from vlagents_ray.protocol.messages import Budget, Limits
 from vlagents_ray.protocol.values import is_number
-from vlagents_ray.wire.mapping import KeyMapping
-from vlagents_ray.wire.pickles import NUMPY_CALLS, TORCH_CALLS, Name, fields_of, read_pickle, text, write_record
+from vlagents_ray.wire.pickles import NUMPY_CALLS, Name, fields_of, read_pickle
 
 HELPERS = "lerobot.async_inference.helpers"
 SETUP, OBSERVATION = Name(HELPERS, "RemotePolicyConfig"), Name(HELPERS, "TimedObservation")
@@ -51,7 +49,6 @@ class PolicyInstructions:
     state: tuple[str, ...]  # names of the numbers of `observation.state`, in order
     cameras: tuple[str, ...]
     actions_per_chunk: int
-    device: str = "cpu"  # on which LeRobot's own server computes
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,12 +169,17 @@ def write_chunk(rows: np.ndarray, timestamp: float, timestep: int, period_s: flo
         values = b"".join(b"G" + struct.pack(">d", value) for value in row.tolist())
         parts += [
             b"h\0)\x81}(",
-            text("timestamp"), b"G", struct.pack(">d", timestamp + number * period_s),
-            text("timestep"), b"J", struct.pack("<i", timestep + number),
-            text("action"), b"h\1](", values, b"e\x85R",
+            _text_opcodes("timestamp"), b"G", struct.pack(">d", timestamp + number * period_s),
+            _text_opcodes("timestep"), b"J", struct.pack("<i", timestep + number),
+            _text_opcodes("action"), b"h\1](", values, b"e\x85R",
             b"ub",
         ]  # fmt: skip
     return b"".join([*parts, b"e."])
+
+
+def _text_opcodes(value: str) -> bytes:
+    data = value.encode()
+    return b"X" + struct.pack("<I", len(data)) + data
 
 
 def _global(memo: int, module: str, name: str) -> bytes:
@@ -217,7 +219,6 @@ def _names(feature: Mapping[str, Any]) -> tuple[str, ...]:
 SERVICE = "transport.AsyncInference"
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5  # types of a field
 _VARINT_BYTES = 10  # maximum length of a number
-_PART_BYTES = 2 * 2**20  # as LeRobot's own client sends; its server takes messages of 4 MiB
 
 
 class TransferState(enum.IntEnum):
@@ -248,14 +249,6 @@ def read_observation_part(message: bytes) -> ObservationPart:
         return ObservationPart(TransferState(number), data)
     except ValueError as error:
         raise MalformedMessage(f"observation: got transfer state {number}, want 1, 2 or 3") from error
-
-
-def write_observation_parts(data: bytes) -> Iterator[bytes]:
-    """Yield the `Observation` messages of a pickled observation."""
-    for at in range(0, len(data), _PART_BYTES):
-        end = at + _PART_BYTES
-        state = TransferState.END if end >= len(data) else TransferState.MIDDLE if at else TransferState.BEGIN
-        yield bytes([1 << 3 | _VARINT, state, *_head(2, len(data[at:end]))]) + data[at:end]
 
 
 def read_data(message: bytes) -> memoryview | None:
@@ -328,114 +321,3 @@ PRESETS: dict[str, dict[str, Any]] = {
         "instruction": TASK,
     },
 }
-
-
-# The client's side of LeRobot's asynchronous inference: instructions and observations are written, chunks are read.
-#
-# The facts come from LeRobot 0.4.4's `async_inference/policy_server.py` and `helpers.py`; those of 0.6.1 are the same.
-# The server unpickles what a client sends. It answers a pickled list of `TimedAction`, whose tensors are read as data,
-# see `pickles`.
-
-
-_ACTION = Name(HELPERS, "TimedAction")
-_REPLIES = {_ACTION: ("timestamp", "timestep", "action")}
-_ITEMS = 100_000  # opcodes of a chunk: a row has about fifty
-
-
-@dataclass(frozen=True, slots=True)
-class TimedChunk:
-    """The actions that a server answers."""
-
-    timestamp: float  # that of the observation, s since 1970
-    timestep: int  # that of the observation
-    rows: np.ndarray  # (H, D) of the type that the server computed
-
-
-def features_of(mapping: KeyMapping) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the names of the state's numbers and of the cameras; raises `ConfigError` if the mapping lacks some."""
-    cameras = tuple(one.key.removeprefix(IMAGES) for one in mapping.cameras.values())
-    for name, one in mapping.cameras.items():
-        if "*" in name or not one.key.startswith(IMAGES):
-            raise ConfigError(
-                f"mapping.cameras: got {name}: {one.key}, want each camera by its name, e.g. "
-                f"{{front: {IMAGES}front}}: LeRobot's server wants all names before the first observation"
-            )
-    ends = [part.stop for parts in mapping.state.values() for part in parts]
-    keys = {part.key for parts in mapping.state.values() for part in parts}
-    if mapping.gripper is not None:
-        keys.add(mapping.gripper.key)
-        ends.append(mapping.gripper.index + 1)
-    known = [end for end in ends if end is not None]
-    if keys != {STATE} or len(known) < len(ends):
-        raise ConfigError(
-            f"mapping.state: got the keys {sorted(keys)}, want {STATE} alone, and `stop` in each part, e.g. "
-            f"{{joints: {{key: {STATE}, stop: 6}}}}: LeRobot's server wants the number of numbers first"
-        )
-    if mapping.instruction not in (TASK, None) or mapping.info:
-        raise ConfigError(f"mapping: LeRobot's server reads images, {STATE} and {TASK}; remove other keys")
-    return tuple(f"{STATE}.{i}" for i in range(max(known))), cameras
-
-
-def write_instructions(instructions: PolicyInstructions) -> bytes:
-    state: dict[str, Any] = {
-        STATE: {"dtype": "float32", "shape": (len(instructions.state),), "names": list(instructions.state)}
-    }
-    # The server reads an image in its own size, and resizes it to the policy's.
-    image = {"dtype": "image", "shape": (None, None, 3), "names": ["height", "width", "channels"]}
-    return write_record(
-        SETUP,
-        {
-            "policy_type": instructions.policy_type,
-            "pretrained_name_or_path": instructions.checkpoint,
-            "lerobot_features": state | {IMAGES + name: image for name in instructions.cameras},
-            "actions_per_chunk": instructions.actions_per_chunk,
-            "device": instructions.device,
-            "rename_map": {},
-        },
-    )
-
-
-def write_observation(
-    theirs: Mapping[str, Any], instructions: PolicyInstructions, timestamp: float, timestep: int
-) -> bytes:
-    """Return the pickle of an observation, which the server computes in any case (`must_go`).
-
-    Args:
-        theirs: By LeRobot's names: `observation.state`, (D,) float32; `observation.images.NAME`, (H, W, 3) uint8; and
-            `task`, a text.
-        instructions: Those that the server got: they name the numbers and the cameras.
-        timestamp: Of the observation, s since 1970; the server's answer repeats it.
-        timestep: The server's answer repeats it.
-
-    Raises:
-        InvalidObservation: It lacks a camera or the state, or that has another length than the instructions say.
-    """
-    wanted = (STATE, *(IMAGES + name for name in instructions.cameras))
-    if missing := [name for name in wanted if name not in theirs]:  # which the mapping calls optional
-        raise InvalidObservation(f"lerobot: got no {missing}; the server wants all that the mapping names")
-    state = theirs[STATE]
-    if len(state) != len(instructions.state):
-        raise InvalidObservation(f"{STATE!r}: got {len(state)} numbers, the mapping says {len(instructions.state)}")
-    values: dict[str, Any] = dict(zip(instructions.state, map(float, state), strict=True))
-    values |= {name: theirs[IMAGES + name] for name in instructions.cameras}
-    if TASK in theirs:
-        values[TASK] = theirs[TASK]
-    fields = {"timestamp": timestamp, "timestep": timestep, "observation": values, "must_go": True}
-    return write_record(OBSERVATION, fields)
-
-
-def read_chunk(data: Buffer, limits: Limits = DEFAULT_LIMITS) -> TimedChunk:
-    """Return the chunk in a pickle; raises `MalformedMessage` or `MessageTooLarge`."""
-    actions = read_pickle(data, replace(limits, items=max(limits.items, _ITEMS)), _REPLIES, TORCH_CALLS)
-    if not isinstance(actions, list) or not actions:
-        raise MalformedMessage(f"actions: got {type(actions).__name__}, want a list of TimedAction")
-    fields = [fields_of(action, _ACTION) for action in actions]
-    rows = [one["action"] for one in fields]
-    if not all(isinstance(row, np.ndarray) for row in rows) or len({(row.shape, row.dtype) for row in rows}) != 1:
-        raise MalformedMessage("actions: want tensors of the same length and type")
-    if sum(row.nbytes for row in rows) > limits.reply_bytes:  # rows may share their bytes
-        raise MessageTooLarge(f"actions: more than {limits.reply_bytes} bytes")
-    timestamp, timestep = fields[0]["timestamp"], fields[0]["timestep"]
-    if not is_number(timestamp) or not math.isfinite(timestamp) or type(timestep) is not int:
-        raise MalformedMessage("actions: want a number as timestamp, and an integer as timestep")
-    return TimedChunk(float(timestamp), timestep, np.stack(rows))

@@ -6,12 +6,11 @@ for the caller's own functions. An opcode, a name or a shape that is not listed 
 
 The opcodes are those that Python's own pickler writes in protocol 4 and 5 for dicts, lists, tuples, texts, numbers,
 numpy's arrays and data classes. `Limits` bound the number of opcodes (`items`), the nesting (`depth`) and the texts.
-Bytes are not copied. Arrays that a call allocates count towards `decoded_bytes`, so that memory is bounded.
+Bytes are not copied, so that arrays take no memory beyond that of the message.
 """
 
 from __future__ import annotations
 
-import re
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -47,11 +46,10 @@ class Record:
 class Reduced:
     """An object that a pickle makes by a call, and may describe afterwards."""
 
-    __slots__ = ("allocated", "read_state", "value")
+    __slots__ = ("read_state", "value")
 
-    def __init__(self, read_state: Callable[[Any], Any] | None = None, value: Any = None, allocated: int = 0) -> None:
+    def __init__(self, read_state: Callable[[Any], Any] | None = None, value: Any = None) -> None:
         self.read_state = read_state
-        self.allocated = allocated  # bytes beyond those of the message
         self.value = value  # None until it was described
 
 
@@ -107,9 +105,6 @@ class _StackMachine:
         self._stack: list[_StackValue] = []
         self._below: list[list[_StackValue]] = []  # the stacks below each open mark
         self._memo: list[_StackValue] = []
-        self._allocated = 0  # bytes beyond those of the message
-        # Name, first argument and result of the last call that allocated.
-        self._latest: tuple[Any, Any, Reduced] = None, None, Reduced()
 
     def whole(self) -> Any:
         if self.take(1)[0] != _PROTO or self.take(1)[0] not in _PROTOCOLS:
@@ -216,20 +211,7 @@ class _StackMachine:
         read = self._calls.get(name) if isinstance(name, Name) else None
         if read is None or type(arguments) is not tuple:
             raise MalformedMessage(f"pickle: got a call of {_kind(name)}, want a numpy array of numbers")
-        first = arguments[0] if arguments else None
-        if (name, len(arguments)) == (self._latest[0], 1) and first is self._latest[1]:  # further tensors of a storage
-            self.push(self._latest[2])
-            return
-        found = read(arguments)
-        if isinstance(found, Reduced) and found.allocated:
-            self._allocated += found.allocated
-            if self._allocated > self._limits.decoded_bytes:
-                raise MessageTooLarge(
-                    f"pickle: takes over {self._limits.decoded_bytes} bytes, decoded; send less at once, or raise "
-                    "`limits.decoded_bytes`"
-                )
-            self._latest = name, first, found
-        self.push(found)
+        self.push(read(arguments))
 
     def new(self) -> None:
         arguments, name = self.pop(), self.pop()
@@ -433,119 +415,3 @@ def read_pickled_array(data: bytes) -> np.ndarray:
     if not isinstance(found, np.ndarray):
         raise MalformedMessage(f"pickle: got {type(found).__name__}, want a numpy array")
     return found
-
-
-# torch's tensors in a pickle: the calls by which torch states them, and the file of numbers within.
-#
-# The facts come from the pickles of torch 2.13. A tensor is a view of a storage, whose bytes are a file of
-# `torch.save` in its form before version 1.6: four pickles of protocol 2 that are always the same but for the type, the
-# key and the number of elements, a fifth with the key, and the numbers. That text is compared, and not read as pickles.
-
-
-_DTYPES = {b"Float": "<f4", b"Double": "<f8", b"Half": "<f2", b"BFloat16": "<u2"}
-_CONSTANT = (
-    b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P\x19."  # torch's magic number
-    b"\x80\x02M\xe9\x03."  # version 1001
-    b"\x80\x02}q\0(X\x10\0\0\0protocol_versionq\1M\xe9\3X\r\0\0\0little_endianq\2\x88X\n\0\0\0type_sizesq\3}q\4("
-    b"X\5\0\0\0shortq\5K\2X\3\0\0\0intq\6K\4X\4\0\0\0longq\7K\4uu."
-)
-_FILE = re.compile(
-    re.escape(_CONSTANT) + rb"\x80\x02\(X\x07\0\0\0storageq\0ctorch\n(?P<kind>Float|Double|Half|BFloat16)Storage\nq\x01"
-    rb"X.\0\0\0(?P<key>[0-9]{1,20})q\x02X\x03\0\0\0cpuq\x03(?:K.|M..|J....)Ntq\x04Q\."
-    rb"\x80\x02\]q\0X.\0\0\0(?P=key)q\x01a\."
-    rb"(?P<size>.{8})",
-    re.DOTALL,
-)
-
-
-def _storage(arguments: tuple[Any, ...]) -> Reduced:
-    """`_load_from_bytes`: (a file of torch.save,)."""
-    match arguments:
-        case (memoryview() as data,) if (file := _FILE.match(data)) is not None:
-            numbers, size = data[file.end() :], int.from_bytes(file["size"], "little")
-            found = read_array(numbers, _DTYPES[file["kind"]], (size,))
-            if file["kind"] != b"BFloat16":
-                return Reduced(value=found)
-            wide = found.astype("<u4")  # the upper half of a float32
-            wide <<= 16
-            return Reduced(value=wide.view("<f4"), allocated=wide.nbytes)
-    raise MalformedMessage("pickle: torch: want a storage of floating-point numbers on the CPU")
-
-
-def _tensor(arguments: tuple[Any, ...]) -> Reduced:
-    """`_rebuild_tensor_v2`: (storage, offset, size, stride, whether it has a gradient, no hooks)."""
-    match arguments:
-        case (np.ndarray() as storage, int(start), (int(size),), (int(stride),), bool(), dict() as hooks) if (
-            not hooks and start >= 0 and size >= 0 and start + size <= storage.size and (stride == 1 or size < 2)
-        ):
-            return Reduced(value=storage[start : start + size])
-    raise MalformedMessage("pickle: torch: want a tensor of one dimension, whose numbers lie side by side")
-
-
-def _no_hooks(arguments: tuple[Any, ...]) -> Reduced:
-    """`OrderedDict`: ()."""
-    if arguments:
-        raise MalformedMessage("pickle: torch: want a tensor without hooks")
-    return Reduced(value={})
-
-
-TORCH_CALLS: dict[Name, Call | None] = {
-    Name("torch._utils", "_rebuild_tensor_v2"): _tensor,
-    Name("torch.storage", "_load_from_bytes"): _storage,
-    Name("collections", "OrderedDict"): _no_hooks,
-}
-
-
-# Pickles that are written by hand, as Python's own pickler would need the classes.
-
-
-_ARRAY, _KIND, _DTYPE = (
-    Name("numpy._core.multiarray", "_reconstruct"),
-    Name("numpy", "ndarray"),
-    Name("numpy", "dtype"),
-)
-
-
-def write_record(name: Name, fields: Mapping[str, Any]) -> bytes:
-    """Return the pickle (protocol 4) of a data class; fields are plain values, arrays, and containers of these."""
-    return b"".join((b"\x80\4", _named(name), b")\x81", written(fields), b"b."))
-
-
-def written(value: Any) -> bytes:
-    if isinstance(value, str):
-        return text(value)
-    if isinstance(value, float):
-        return b"G" + struct.pack(">d", value)
-    if isinstance(value, np.ndarray):
-        return _written_array(value)
-    if isinstance(value, Mapping):
-        return b"}(" + b"".join(text(key) + written(one) for key, one in value.items()) + b"u"
-    if isinstance(value, tuple):
-        return b"(" + b"".join(map(written, value)) + b"t"
-    if isinstance(value, list):
-        return b"](" + b"".join(map(written, value)) + b"e"
-    if value is None or isinstance(value, bool):
-        return {None: b"N", True: b"\x88", False: b"\x89"}[value]
-    return b"J" + struct.pack("<i", value)
-
-
-def text(value: str) -> bytes:
-    data = value.encode()
-    return b"X" + struct.pack("<I", len(data)) + data
-
-
-def _named(name: Name) -> bytes:
-    return text(name.module) + text(name.name) + b"\x93"
-
-
-def _written_array(value: np.ndarray) -> bytes:
-    """Return the calls by which numpy's own pickles, from version 1.26 on, state an array of protocol 4."""
-    value = np.ascontiguousarray(value)
-    order, kind = value.dtype.str[0], value.dtype.str[1:]
-    dtype = (
-        _named(_DTYPE) + written((kind, False, True)) + b"R" + written((3, order, None, None, None, -1, -1, 0)) + b"b"
-    )
-    data = value.tobytes()
-    made = _named(_ARRAY) + _named(_KIND) + written((0,)) + b"C\1b\x87R"
-    head = written(1) + written(value.shape) + dtype + written(False) + b"B" + struct.pack("<I", len(data))
-    return b"".join((made, b"(", head, data, b"tb"))

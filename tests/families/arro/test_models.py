@@ -12,9 +12,9 @@ import pytest
 from tests.families.arro.tiny import make_grounding_dino, make_sam2
 from vlagents_ray import Act, Agent, Obs
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.policies.arro import Arro
-from vlagents_ray.policies.arro.parts import make_part
 from vlagents_ray.serve.models.agent_copies import AgentCopies
+from vlagents_ray_arro import Arro
+from vlagents_ray_arro.parts import make_part
 
 PHRASES = [["red cube", "the bowl"], ["blue"], ["lift the red cube put on the bowl"]]
 SIZES = [(48, 64), (48, 64), (72, 56)]

@@ -159,14 +159,6 @@ def test_a_session_gets_the_same_in_any_company(policy_of: Policy, kind: str) ->
     assert np.ptp(np.stack(alone), axis=0).mean() > 100 * ATOL  # six answers, not one
 
 
-@pytest.mark.verifies("batches")
-def test_with_one_size_of_batches_actions_are_equal_to_the_bit(policy_of: Policy) -> None:
-    policy = policy_of("relative", deterministic=True, batch_sizes=(4,))
-    alone = begun(policy, 1).act(view(1)).action
-    acts = policy.act_batch([view(0), view(1), view(2)], [begun(policy, number) for number in range(3)])
-    assert np.array_equal(acts[1].action, alone)
-
-
 @pytest.mark.parametrize(("kind", "sizes"), [("relative", [5]), ("history", [2, 3])])
 def test_rows_share_a_pass_unless_padding_would_change_them(
     policy_of: Policy, monkeypatch: pytest.MonkeyPatch, kind: str, sizes: list[int]

@@ -33,7 +33,6 @@ if importlib.util.find_spec("ray") is None:
         "test_async_client.py",
         "test_commands.py",
         "test_datasets.py",
-        "test_policy_server.py",
         "test_training.py",
     )
     LEFT_OUT |= dict.fromkeys(of_ray, "no Ray here, as its Python is another")

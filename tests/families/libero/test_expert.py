@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from assets import assets
+from experts.osc_pose import LiberoExpert
 
 from vlagents_ray.envs.libero import Libero
 from vlagents_ray.errors import ContractMismatch, InvalidObservation, NotReset
 from vlagents_ray.interface import Obs
-from vlagents_ray.policies.experts import expert_for
 
 
 def observation(goal: list[list[str]]) -> Obs:
@@ -24,7 +24,7 @@ def observation(goal: list[list[str]]) -> Obs:
 def test_the_expert_solves_the_task_within_its_steps(task: str) -> None:
     with Libero(task, width=16, height=16, assets=str(assets("libero"))) as env:
         obs, _ = env.reset(seed=0, options={"init_state": 0})
-        expert = expert_for(f"libero/{task}")
+        expert = LiberoExpert(f"libero/{task}")
         expert.reset(obs, env.instruction)
         over = False
         while not over:
@@ -36,7 +36,7 @@ def test_the_expert_solves_the_task_within_its_steps(task: str) -> None:
 
 
 def test_it_opens_the_hand_over_the_thing_first() -> None:
-    expert = expert_for("libero/libero_object/7")
+    expert = LiberoExpert("libero/libero_object/7")
     obs = observation([["in", "milk_1", "basket_1_contain_region"]])
     expert.reset(obs, "")
     action = expert.act(obs).action
@@ -48,16 +48,16 @@ def test_it_opens_the_hand_over_the_thing_first() -> None:
 @pytest.mark.parametrize("goal", [[["open", "cabinet_1"]], [["on", "milk_1", "a"], ["on", "b", "a"]], []])
 def test_another_kind_of_goal_is_refused(goal: list[list[str]]) -> None:
     with pytest.raises(ContractMismatch, match="one thing to one place"):
-        expert_for("libero/libero_object/0").reset(observation(goal), "")
+        LiberoExpert("libero/libero_object/0").reset(observation(goal), "")
 
 
 def test_a_suite_without_expert_is_refused() -> None:
     with pytest.raises(ContractMismatch, match=r"libero_10/3.*libero_spatial"):
-        expert_for("libero/libero_10/3")
+        LiberoExpert("libero/libero_10/3")
 
 
 def test_without_the_simulators_state_it_says_what_it_wants() -> None:
-    expert = expert_for("libero/libero_spatial/0")
+    expert = LiberoExpert("libero/libero_spatial/0")
     with pytest.raises(InvalidObservation, match="sim_state"):
         expert.reset(Obs(), "")
     with pytest.raises(NotReset):

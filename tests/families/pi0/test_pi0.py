@@ -103,17 +103,6 @@ def test_neighbours_change_nothing(loaded: Pi0, size: int) -> None:
         np.testing.assert_allclose(act.action, one, atol=BATCHED)
 
 
-@pytest.mark.verifies("batches")
-def test_deterministic_actions_are_equal_to_the_bit_in_any_batch(folder: Path) -> None:
-    policy = Pi0.from_config({"checkpoint": str(folder), "deterministic": True, "batch_sizes": [4]})
-    policy.initialize()
-    alone = begun(policy, 0).act(seen(0)).action
-    for place, size in ((0, 2), (2, 3), (3, 4), (5, 7)):
-        others = [place - i for i in range(size)]  # 0 at the place
-        batch = policy.act_batch([seen(abs(i)) for i in others], [begun(policy, abs(i)) for i in others])
-        np.testing.assert_array_equal(alone, batch[place].action)
-
-
 def test_state_images_and_instruction_all_matter(loaded: Pi0) -> None:
     def acted(words: str, obs: Obs) -> np.ndarray:
         session = copy.copy(loaded)

@@ -38,7 +38,7 @@ def test_it_keeps_the_promises_of_an_env() -> None:
 
 def test_the_expert_picks_the_cuboid_up_and_that_ends_the_episode(pick: Rcs) -> None:
     for seed in range(4):
-        result = play(pick, "rcs/pick", seed=seed)
+        result = play(pick, "rcs/pick", "experts.rcs:RcsPick", seed=seed)
         assert (result.success_once, result.success_at_end, result.ending) == (True, True, "terminated")
         assert result.steps < 100
 

@@ -136,16 +136,6 @@ def test_a_session_without_its_adapter_here_is_unknown(tmp_path: Path) -> None:
     assert isinstance(gone, UnknownSession)
 
 
-def test_deterministic_rows_do_not_change_with_the_adapters_of_others(tmp_path: Path) -> None:
-    three(tmp_path)
-    policy = loaded(tmp_path, adapters=paths(tmp_path, "stack", "pour"), deterministic=True, batch_sizes=[4])
-    alone = begun(policy, 1, adapter="stack").act(at(1)).action
-    company = [begun(policy, seed, adapter=("pour", "stack", None)[seed]) for seed in range(3)]
-    acts = policy.act_batch([at(seed) for seed in range(3)], company)
-    assert isinstance(acts[1], Act)
-    assert np.array_equal(acts[1].action, alone)
-
-
 def test_an_adapter_that_is_not_offered_is_refused_with_what_is(tmp_path: Path) -> None:
     three(tmp_path)
     policy = loaded(tmp_path, adapters=paths(tmp_path, "stack", "pour"))

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.policies.arro.parts import box_of, connected, flat, grown, make_part, overlap, split
-from vlagents_ray.policies.arro.wrapper import Background, BackgroundConfig
+from vlagents_ray_arro.parts import box_of, connected, flat, grown, make_part, overlap, split
+from vlagents_ray_arro.wrapper import Background, BackgroundConfig
 
 GREY, RED, BLUE = (200, 200, 200), (220, 40, 40), (40, 60, 220)
 

@@ -9,19 +9,24 @@ from typing import Any
 
 import numpy as np
 import pytest
+import tomllib
+import yaml
 from in_process_replicas import Replicas
 
 from vlagents_ray import Act, Agent, Obs
+from vlagents_ray.cli.listing import policies_and_wrappers
 from vlagents_ray.contract import CameraSpec, Contract
 from vlagents_ray.envs.tabletop import Tabletop
-from vlagents_ray.errors import ConfigError, InvalidObservation, MissingCamera, NotReset
-from vlagents_ray.policies.arro import Arro
-from vlagents_ray.policies.arro.parts import Detection
+from vlagents_ray.errors import ConfigError, InvalidObservation, MissingCamera, NotReset, UnknownWrapper
 from vlagents_ray.policies.base.checkpoint import find_checkpoint
 from vlagents_ray.policies.wrapper import build_agent
+from vlagents_ray.registry import wrapper_class
 from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.testing import check_agent
+from vlagents_ray_arro import Arro, ArroConfig
+from vlagents_ray_arro.parts import Detection
 
+ROOT = Path(__file__).parents[3]
 BACKGROUND = (0, 0, 60)
 PARTS: dict[str, Any] = {
     "detector": "colour",
@@ -192,6 +197,28 @@ def test_settings_that_cannot_work_are_refused_before_serving(settings: dict[str
         arro(**settings)
 
 
+def test_the_package_registers_its_wrapper_by_an_entry_point(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    project = tomllib.loads((ROOT / "plugins/vlagents_ray_arro/pyproject.toml").read_text())["project"]
+    [(name, target)] = project["entry-points"]["vlagents_ray.wrappers"].items()
+    info = tmp_path / "vlagents_ray_arro-1.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: vlagents_ray_arro\nVersion: 1\n")
+    (info / "entry_points.txt").write_text(f"[vlagents_ray.wrappers]\n{name} = {target}\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    assert wrapper_class("arro") is Arro
+    assert [(one.kind, one.what[:11]) for one in policies_and_wrappers() if one.name == "arro"] == [
+        ("wrapper", "ARRO (arXiv")
+    ]
+    with pytest.raises(UnknownWrapper, match=r"'aro' is not registered.*did you mean 'arro'"):
+        wrapper_class("aro")
+
+
+def test_its_deployment_file_is_right() -> None:
+    [app] = yaml.safe_load((ROOT / "plugins/vlagents_ray_arro/arro.yaml").read_text())["applications"]
+    [entry] = app["args"]["wrappers"]
+    assert ArroConfig(**entry["arro"]).detector == "colour"
+
+
 def test_acting_before_a_reset_is_refused() -> None:
     with pytest.raises(NotReset):
         arro().act(view())
@@ -218,7 +245,7 @@ def test_keeps_the_promises_of_an_agent() -> None:
         env = Tabletop()
         begun.append((env.reset(seed=seed)[0], env.instruction))
     check_agent(
-        build_agent("scripted", {}, [{"arro": SETTINGS}]),
+        build_agent("scripted", {}, [{"vlagents_ray_arro:Arro": SETTINGS}]),
         obs=[obs for obs, _ in begun],
         instructions=[instruction for _, instruction in begun],
         reset_kwargs={"env": "tabletop"},
@@ -226,7 +253,7 @@ def test_keeps_the_promises_of_an_agent() -> None:
 
 
 def test_an_expert_that_sees_only_segments_still_solves_its_tasks() -> None:
-    replicas = Replicas([build_agent("scripted", {}, [{"arro": SETTINGS}])])
+    replicas = Replicas([build_agent("scripted", {}, [{"vlagents_ray_arro:Arro": SETTINGS}])])
 
     def solves(seed: int) -> bool:
         env, agent = Tabletop(), replicas.agent()

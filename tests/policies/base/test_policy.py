@@ -118,36 +118,12 @@ def test_one_forward_pass_for_a_batch_and_padding_to_the_sizes_that_were_warmed_
     assert policy.model["batches"] == [2, 4, 4]
 
 
-class LooksAround(Wobble):
-    """Its actions change a little with the other rows, and with the number of rows."""
-
-    def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
-        others = sum(float(row.frames[-1].sum()) + len(row.instruction) for row in rows)
-        return [Prediction(np.full((HORIZON, DIM), 1 + 1e-6 * others, np.float32)) for _ in rows]
-
-
-class LooksBack(Wobble):
-    """Its actions change with the place of a row."""
-
-    def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
-        return [Prediction(np.full((HORIZON, DIM), place, np.float32)) for place in range(len(rows))]
-
-
 class CountsViews(Wobble):
     """Its actions change with the number of views that are encoded."""
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
         firsts, _ = shared_frames(rows)
         return [Prediction(np.full((HORIZON, DIM), len(firsts), np.float32)) for _ in rows]
-
-
-def test_deterministic_actions_do_not_change_with_the_batch() -> None:
-    policy = loaded(deterministic=True, batch_sizes=[4])
-    assert set(policy.model["batches"]) == {4}
-    for cls in (LooksAround, LooksBack):
-        with pytest.raises(ConfigError, match=r"deterministic: a row's actions change by up to .* in a batch of 4"):
-            cls.from_config({"checkpoint": "none", "deterministic": True, "batch_sizes": [4]}).initialize()
-        cls.from_config({"checkpoint": "none", "deterministic": True, "batch_sizes": [1]}).initialize()
 
 
 def test_a_policy_that_names_no_network_cannot_be_quantized() -> None:
@@ -190,17 +166,6 @@ def test_what_torchao_cannot_quantize_is_named(monkeypatch: pytest.MonkeyPatch) 
         loaded(quantization="int8")
 
 
-def test_a_deterministic_pass_encodes_every_row_also_those_of_samples() -> None:
-    policy = CountsViews.from_config({"checkpoint": "none", "deterministic": True, "batch_sizes": [4]})
-    policy.initialize()
-    session = copy.copy(policy)
-    session.reset(at(0.0), "go")
-    for info in ({}, {SAMPLES: 2}):
-        [act] = policy.act_batch([at(0.0, **info)], [session])
-        assert isinstance(act, Act)
-        assert set(act.action.ravel()) == {4}
-
-
 def test_padding_has_no_observations_of_its_own() -> None:
     policy = CountsViews.from_config({"checkpoint": "none", "batch_sizes": [4, 8]})
     policy.initialize()
@@ -209,12 +174,6 @@ def test_padding_has_no_observations_of_its_own() -> None:
         session.reset(at(0.0), "go")
     acts = policy.act_batch([at(0.0, **{SAMPLES: 3}), at(1.0)], sessions)
     assert [set(act.action.ravel()) for act in acts] == [{2}, {2}]  # of eight rows
-
-
-@pytest.mark.parametrize("sizes", [None, [1, 2]])
-def test_deterministic_wants_one_size(sizes: list[int] | None) -> None:
-    with pytest.raises(ConfigError, match=r"deterministic with batch_sizes .*: want one size, such as \[8\]"):
-        made(deterministic=True, batch_sizes=sizes)
 
 
 def test_a_queue_asks_the_model_every_execute_acts_and_remembers_every_observation() -> None:

@@ -25,22 +25,13 @@ from vlagents_ray.serve.ports import free_port
 
 PLAIN = {"state": {"position": "observation/state"}, "instruction": "prompt"}
 CAMERA = {"front": "observation/image"}
-
-
-LEROBOT = {
-    "cameras": {"front": "observation.images.front"},
-    "state": {"position": {"key": "observation.state", "stop": 1}},
-    "instruction": "task",
-}
-LOADED = {"policy_type": "act", "pretrained_name_or_path": "me/act", "actions_per_chunk": 4}
-SCHEMES = {"gr00t": "tcp", "openvla": "http", "lerobot": "grpc"}
+SCHEMES = {"gr00t": "tcp", "openvla": "http"}
 
 
 def settings(*ports: int, protocol: str = "openpi", **more: Any) -> dict[str, Any]:
     urls = [f"{SCHEMES.get(protocol, 'ws')}://127.0.0.1:{port}" for port in ports]
     mapping = {} if protocol in ("vla_eval", "roboarena") else {"mapping": PLAIN}
-    loaded = {"lerobot": LOADED, "mapping": LEROBOT} if protocol == "lerobot" else {}
-    return {"protocol": protocol, "urls": urls, "connect_timeout_s": 60, **mapping, **loaded, **more}
+    return {"protocol": protocol, "urls": urls, "connect_timeout_s": 60, **mapping, **more}
 
 
 def seen(number: int) -> Obs:
@@ -124,7 +115,6 @@ PIXELS = {
         "state": {"position": "state/arm"},
         "action": {"arm": {"stop": 6}, "gripper": {"start": 6}},
     },
-    "lerobot": LEROBOT,
 }
 
 
@@ -132,9 +122,8 @@ PIXELS = {
 def test_connections_that_ended_while_nobody_acted_cost_a_row_nothing(opened: Open, start: Any, protocol: str) -> None:
     port = free_port()
     server = start(port, protocol)
-    connections = 1 if protocol == "lerobot" else 5
-    agent = opened(port, protocol=protocol, mapping=PIXELS[protocol], connections=connections, retry_s=60)
-    wait_for(lambda: len(agent._lanes._wait_ready(0)) == connections)
+    agent = opened(port, protocol=protocol, mapping=PIXELS[protocol], connections=5, retry_s=60)
+    wait_for(lambda: len(agent._lanes._wait_ready(0)) == 5)
     image = np.zeros((8, 8, 3), np.uint8)
     obs = Obs({"front": image, "wrist": image}, state={"position": np.ones(1, np.float32)})
     [session] = sessions(agent, 1)
@@ -218,7 +207,7 @@ def test_the_connection_of_an_ended_session_is_closed(opened: Open, start: Any) 
     wait_for(lambda: not agent._sessions._clients)
 
 
-@pytest.mark.parametrize("protocol", ["lerobot", "openpi", "vla_eval"])
+@pytest.mark.parametrize("protocol", ["openpi", "vla_eval"])
 def test_an_upstream_that_is_killed_and_restarted_fails_no_episode(protocol: str, start: Any, tmp_path: Path) -> None:
     port = free_port()
     servers = [start(port, protocol)]

@@ -18,7 +18,7 @@ from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.serve.ports import free_port
 from vlagents_ray.testing import check_agent
 
-SCHEMES = {"gr00t": "tcp", "openvla": "http", "lerobot": "grpc"}
+SCHEMES = {"gr00t": "tcp", "openvla": "http"}
 MAPPINGS: dict[str, Any] = {
     "openpi": "openpi-libero",
     "openpi-batch": "openpi-libero",
@@ -30,19 +30,6 @@ MAPPINGS: dict[str, Any] = {
     },
     "vla_eval": {"preset": "vla-eval", "state": {"joints": "states"}},
 }
-MAPPINGS["lerobot"] = {
-    "preset": "lerobot",
-    "cameras": {"front": "observation.images.top", "wrist": "observation.images.wrist"},
-    "state": {"joints": {"key": "observation.state", "stop": 7}},
-}
-MAPPINGS["xpolicylab"] = {
-    "cameras": {"front": "vision/cam_head/color", "wrist": "vision/cam_wrist/color"},
-    "state": {"joints": "state/arm_joint_state"},
-    "gripper": {"key": "state/ee_joint_state", "open": 0.04, "closed": 0},
-    "instruction": "instruction",
-    "action": {"arm_joint_state": {"stop": 6}, "ee_joint_state": {"start": 6, "stop": 7}},
-}
-LOADED = {"policy_type": "act", "pretrained_name_or_path": "me/act", "actions_per_chunk": 4}
 MAPPINGS["gr00t packed"] = MAPPINGS["gr00t"]
 MAPPINGS["gr00t sim"] = MAPPINGS["gr00t"] | {
     "preset": "gr00t-n1.5",
@@ -81,17 +68,6 @@ def so100(obs: Obs, text: str) -> np.ndarray:
     return np.concatenate([actions["arm"], actions["gripper"]], -1)[0]
 
 
-def robodojo(obs: Obs, text: str) -> dict[str, Any]:
-    """As XPolicyLab's README has an observation of one arm."""
-    return {
-        "data_format_version": "v1.0",
-        "env_idx": 0,
-        "instruction": text,
-        "vision": {"cam_head": {"color": obs.cameras["front"]}, "cam_wrist": {"color": obs.cameras["wrist"]}},
-        "state": {"arm_joint_state": obs.state["joints"], "ee_joint_state": np.array([0.04 / 4], np.float32)},
-    }
-
-
 DIRECT: dict[str, Callable[[Obs, str, int], np.ndarray]] = {
     "openpi": lambda obs, text, _step: answer(libero(obs, text)),
     "openpi-batch": lambda obs, text, _step: answer(libero(obs, text)),
@@ -99,15 +75,6 @@ DIRECT: dict[str, Callable[[Obs, str, int], np.ndarray]] = {
     "gr00t": lambda obs, text, _step: so100(obs, text),
     "gr00t packed": lambda obs, text, _step: so100(obs, text),
     "gr00t sim": lambda obs, text, _step: so100(obs, text),
-    "lerobot": lambda obs, text, _step: answer(
-        {
-            "observation.images.top": obs.cameras["front"],
-            "observation.images.wrist": obs.cameras["wrist"],
-            "observation.state": obs.state["joints"],
-            "task": text,
-        }
-    ),
-    "xpolicylab": lambda obs, text, _step: answer(robodojo(obs, text)),
     "openvla": lambda obs, text, _step: answer({"image": obs.cameras["front"], "instruction": text})[0],
     "vla_eval": lambda obs, text, step: answer(
         {
@@ -142,7 +109,6 @@ def served(request: pytest.FixtureRequest) -> Iterator[tuple[str, dict[str, Any]
         scheme = SCHEMES.get(protocol, "ws")
         urls = [f"{scheme}://127.0.0.1:{port}" for port in ports]
         settings = {"protocol": protocol, "urls": urls, "connect_timeout_s": 30}
-        settings |= {"lerobot": {"lerobot": LOADED}, "xpolicylab": {"sessions": "none"}}.get(protocol, {})
         yield kind, settings | ({"mapping": MAPPINGS[kind]} if kind in MAPPINGS else {})
 
 

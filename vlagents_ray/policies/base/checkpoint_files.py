@@ -72,16 +72,23 @@ def _trouble(file: Path) -> str | None:
 
 
 def _safetensors(file: Path) -> str | None:
-    """Check the format: 8 bytes with the header's length, the header (JSON), and the data that it describes."""
     size = file.stat().st_size
     with file.open("rb") as opened:
         length = int.from_bytes(opened.read(8), "little")
         if size < 8 + length:
             return f"has {size} bytes, its header alone has {8 + length}"
-        header = json.loads(opened.read(length))
-    ends = [tensor["data_offsets"][1] for name, tensor in header.items() if name != "__metadata__"]
+        ends = [end for _, end in _places(opened.read(length))]
     wanted = 8 + length + max(ends, default=0)
     return None if size == wanted else f"has {size} bytes, its header says {wanted}"
+
+
+def _places(header: bytes) -> list[tuple[int, int]]:
+    """Return begin and end of each tensor's bytes behind the header (JSON) of a .safetensors file.
+
+    The file begins with 8 bytes, the header's length.
+    """
+    tensors = json.loads(header)
+    return [tuple(one["data_offsets"]) for name, one in tensors.items() if name != "__metadata__"]
 
 
 def _index(file: Path) -> str | None:
@@ -203,16 +210,14 @@ def _parts(file: Path, opened: BinaryIO, size: int) -> Iterator[bytes]:
 def _header(opened: BinaryIO) -> tuple[bytes, list[tuple[int, int]]] | None:
     """Return the header of a .safetensors file, and the start and length of a block in the middle of each tensor.
 
-    Returns None if the file has another format. The format is: 8 bytes with the header's length, the header (JSON), and
-    the data that it describes.
+    Returns None if the file has another format.
     """
     length = int.from_bytes(opened.read(8), "little")
     if length > _LONGEST_HEADER:
         return None
     text = opened.read(length)
     try:
-        ranges = [tensor["data_offsets"] for name, tensor in json.loads(text).items() if name != "__metadata__"]
-        blocks = [(max(begin, (begin + end - _BLOCK) // 2), min(_BLOCK, end - begin)) for begin, end in ranges]
+        blocks = [(max(begin, (begin + end - _BLOCK) // 2), min(_BLOCK, end - begin)) for begin, end in _places(text)]
     except (ValueError, KeyError, TypeError, AttributeError):
         return None
     return text, [(8 + length + start, size) for start, size in blocks]

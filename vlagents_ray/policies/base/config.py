@@ -76,18 +76,6 @@ class ModelConfig(BaseModel, extra="forbid"):
         "smaller batches are padded; unset: if `compile` is set those of the deployment's `batch`, else any",
     )
 
-    deterministic: bool = Field(
-        default=False,
-        description="actions of a session are equal to the bit in any batch; needs one number in `batch_sizes`, to "
-        "which every batch is padded, so that a lone request takes as long as a full batch",
-    )
-
-    @model_validator(mode="after")
-    def _one_size_is_deterministic(self) -> Self:
-        if self.deterministic and (self.batch_sizes is None or len(self.batch_sizes) != 1):
-            raise ValueError(f"deterministic with batch_sizes {self.batch_sizes}: want one size, such as [8]")
-        return self
-
     @model_validator(mode="after")
     def _step_has_a_place(self) -> Self:
         if (STEP in self.checkpoint) != (self.checkpoint_step is not None):

@@ -7,12 +7,12 @@ import copy
 import itertools
 import logging
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
@@ -38,6 +38,8 @@ from vlagents_ray.policies.loading import COMPILED_SIZES, LoadingReport, current
 from vlagents_ray.validation import check_action
 
 logger = logging.getLogger(__name__)
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,8 +157,6 @@ class ModelPolicy(Agent, abc.ABC):
             self._run_examples(size, seeds)
         if sizes:
             free_memory()  # which a full batch took, and usual ones do not need
-        if self.config.deterministic:
-            require_deterministic(self._chunks, self._example, self.config.rows)
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         """Begin the episode with `kwargs["seed"]`, an int, by default 0, and the adapter named `kwargs["adapter"]`."""
@@ -340,19 +340,20 @@ class ModelPolicy(Agent, abc.ABC):
     def _size(self, rows: int) -> int:
         return next((size for size in self.config.batch_sizes or () if size >= rows), rows)
 
+    def padded(self, items: Sequence[T]) -> list[T]:
+        """Return the items of a batch, with its last one again up to the next of `batch_sizes`."""
+        return [*items, *list(items[-1:]) * (self._size(len(items)) - len(items))]
+
     def _passes(self, rows: list[Row]) -> list[Prediction | Exception]:
         found: list[Prediction | Exception] = []
         most = self.most_rows
         for start in range(0, len(rows), most):
             part = rows[start : start + most]
-            size = self._size(len(part))
-            last = part[-1]  # whose copies see what it sees
-            filled = [*part, *(copy.deepcopy(last, {id(last.frames): last.frames}) for _ in range(size - len(part)))]
-            if self.config.deterministic:  # each row has frames of its own, so that as many are encoded in every batch
-                filled = [replace(row, frames=(*row.frames,)) for row in filled]
+            spare = self.padded(part)[len(part) :]  # copies, so that their noise is not the session's
+            filled = [*part, *(copy.deepcopy(row, {id(row.frames): row.frames}) for row in spare)]
             results = self.predict(filled)
-            if len(results) != size:
-                raise PolicyFailed(f"predict: got {size} rows, returned {len(results)} chunks")
+            if len(results) != len(filled):
+                raise PolicyFailed(f"predict: got {len(filled)} rows, returned {len(results)} chunks")
             found += results[: len(part)]
         return found
 
@@ -396,27 +397,3 @@ def _stacked(stated: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         name: _stacked(values) if isinstance(values[0], Mapping) else np.stack(values)
         for name, values in columns.items()
     }
-
-
-_INSTRUCTION = "go"
-_OTHER = "warm up"  # longer, as some models pad instructions to the longest one
-
-
-def require_deterministic(
-    chunks: Callable[[Sequence[Any]], list[np.ndarray]], example: Callable[[int, str], Any], size: int
-) -> None:
-    """Compare a row's chunk alone, and first and last among others; raises `ConfigError` if they differ."""
-
-    def others() -> list[Any]:
-        return [example(seed, _OTHER) for seed in range(1, size)]
-
-    def own() -> Any:
-        return example(0, _INSTRUCTION)
-
-    alone, first, last = chunks([own()])[0], chunks([own(), *others()])[0], chunks([*others(), own()])[-1]
-    if not (np.array_equal(alone, first) and np.array_equal(alone, last)):
-        error = max(float(np.abs(alone - one).max()) for one in (first, last))
-        raise ConfigError(
-            f"deterministic: a row's actions change by up to {error:.2g} with the others in a batch of {size}; want "
-            f"batch_sizes: [1] for this model on this device, or no `deterministic`"
-        )

@@ -1,33 +1,23 @@
-"""Scripted experts: for each simulator a small class that solves its tasks without learning.
+"""Scripted experts: small classes that solve simulated tasks without learning.
 
 `EXPERTS` maps an env's full name, or the suite alone, to "module:Class"; the full name wins. A
-module is imported when the first of its experts is used.
+module is imported when the first of its experts is used. Experts for more simulators are in `examples/experts`.
 """
 
 from __future__ import annotations
 
-import importlib
 from typing import Protocol
 
 import numpy as np
 
 from vlagents_ray.errors import ContractMismatch, InvalidObservation
 from vlagents_ray.interface import Act, Obs
-from vlagents_ray.registry import env_suite
+from vlagents_ray.registry import env_suite, named_class
 
 EXPERTS: dict[str, str] = {
     "tabletop": "vlagents_ray.policies.experts.tabletop:TabletopExpert",
     "maniskill/PushCube-v1": "vlagents_ray.policies.experts.maniskill:PushCube",
     "maniskill/PickCube-v1": "vlagents_ray.policies.experts.maniskill:PickCube",
-    "aloha": "vlagents_ray.policies.experts.mujoco:AlohaExpert",
-    "metaworld": "vlagents_ray.policies.experts.mujoco:MetaWorldExpert",
-    "pusht": "vlagents_ray.policies.experts.pusht:PushTExpert",
-    "rcs/pick": "vlagents_ray.policies.experts.mujoco:RcsPick",
-    "gymnasium/FetchReach-v4": "vlagents_ray.policies.experts.mujoco:FetchReach",
-    "gymnasium/FetchReachDense-v4": "vlagents_ray.policies.experts.mujoco:FetchReach",
-    "libero": "vlagents_ray.policies.experts.osc_pose:LiberoExpert",
-    "robosuite": "vlagents_ray.policies.experts.osc_pose:RobosuiteExpert",
-    "simpler": "vlagents_ray.policies.experts.maniskill:SimplerExpert",
 }
 
 
@@ -45,17 +35,15 @@ class Expert(Protocol):
         ...
 
 
-def expert_for(env_name: str) -> Expert:
-    """Make an expert for an env, e.g. "tabletop/slide"; raises `ContractMismatch` if there is none."""
+def expert_class(env_name: str) -> type[Expert]:
+    """Return the expert for an env, e.g. "tabletop/slide"; raises `ContractMismatch` if there is none."""
     target = EXPERTS.get(env_name) or EXPERTS.get(env_suite(env_name))
     if target is None:
         raise ContractMismatch(
-            f"no scripted expert for env {env_name!r}: there are experts for {sorted(EXPERTS)}; "
-            f"choose one of these envs, or another policy"
+            f"no scripted expert for env {env_name!r}: there are experts for {sorted(EXPERTS)}; choose one of these "
+            f"envs, set `expert` to one of examples/experts, 'experts.pusht:PushTExpert', or choose another policy"
         )
-    module, _, name = target.partition(":")
-    expert: Expert = getattr(importlib.import_module(module), name)(env_name)
-    return expert
+    return named_class(target, {})
 
 
 def sim_vector(obs: Obs, size: int, env_name: str, cure: str = "this expert cannot act on images") -> np.ndarray:

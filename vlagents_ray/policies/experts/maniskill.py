@@ -1,8 +1,6 @@
-"""Experts for ManiSkill's PushCube and PickCube, and for SIMPLER's Bridge tasks, from the simulator's state."""
+"""Experts for ManiSkill's PushCube and PickCube, from the simulator's state."""
 
 from __future__ import annotations
-
-from typing import NamedTuple
 
 import numpy as np
 
@@ -116,86 +114,3 @@ class _Hand:
         action[6] = gripper
         self._at, self._commanded_m = tool, _UNIT_M * float(np.linalg.norm(action[:3]))
         return Act(action=action)
-
-
-_TWIN_OPEN, _TWIN_CLOSED = 1.0, 0.0
-_STEP_M = 0.04  # largest command along an axis
-_STEP_RAD = 0.2  # largest command about the vertical
-_OVER_M = 0.08  # height of the gripper above the object before the grasp, and above the target after the release
-_LIFT_M = 0.10
-_LOWEST_M = 0.0135  # height of the gripper above the robot's foot; lower, the fingers press on the table
-_DROP_M = 0.04  # height of the object's centre above the target's at the release
-
-
-class _Stage(NamedTuple):
-    name: str
-    gripper: float
-    steps: int  # after which the next stage begins
-    near_m: float  # distance to the goal at which the next stage begins
-
-
-_STAGES = (
-    _Stage("over", _TWIN_OPEN, 12, 0.012),
-    _Stage("down", _TWIN_OPEN, 6, 0.006),
-    _Stage("grasp", _TWIN_CLOSED, 4, 0.0),
-    _Stage("lift", _TWIN_CLOSED, 5, 0.01),
-    _Stage("across", _TWIN_CLOSED, 9, 0.006),
-    _Stage("lower", _TWIN_CLOSED, 6, 0.006),
-    _Stage("release", _TWIN_OPEN, 3, 0.0),
-    _Stage("away", _TWIN_OPEN, 5, 0.01),
-)
-
-
-class SimplerExpert:
-    """Needs `info["sim_state"]`, as `vlagents_ray.envs.simpler` gives it."""
-
-    def __init__(self, env_name: str) -> None:
-        self._name = env_name
-        self._stage = self._steps = 0
-        self._goal = np.zeros(3)  # of the gripper in this stage, m in the base frame
-        self._turn = 0.0  # remaining rotation, rad
-
-    def reset(self, obs: Obs, instruction: str) -> None:
-        places, yaw = self._state(obs)
-        self._begin(0, places)
-        self._turn = (yaw + np.pi / 2) % np.pi - np.pi / 2  # the fingers open across the object, in either direction
-
-    def act(self, obs: Obs) -> Act:
-        places, _ = self._state(obs)
-        _, _, gripper, commanded = places
-        stage = _STAGES[self._stage]
-        arrived = float(np.linalg.norm(gripper - self._goal)) < stage.near_m and not self._turn
-        if self._stage + 1 < len(_STAGES) and self._steps and (arrived or self._steps >= stage.steps):
-            self._begin(self._stage + 1, places)
-            stage = _STAGES[self._stage]
-        self._steps += 1
-        action = np.zeros(7, dtype=np.float32)
-        action[:3] = np.clip(self._goal - commanded, -_STEP_M, _STEP_M)
-        action[5] = np.clip(self._turn, -_STEP_RAD, _STEP_RAD)
-        action[6] = stage.gripper
-        self._turn -= float(action[5]) if abs(self._turn) > _STEP_RAD else self._turn
-        return Act(action=action)
-
-    def _begin(self, stage: int, places: np.ndarray) -> None:
-        self._stage, self._steps = stage, 0
-        thing, target, gripper, _ = places
-        up = np.array([0.0, 0.0, 1.0])
-        held = gripper - thing  # from the object to the gripper, when grasped
-        name = _STAGES[stage].name
-        if name == "over":
-            self._goal = np.maximum(thing, [-np.inf, -np.inf, _LOWEST_M]) + _OVER_M * up
-        elif name == "down":
-            self._goal = self._goal - _OVER_M * up
-        elif name == "lift":
-            self._goal = self._goal + _LIFT_M * up
-        elif name == "across":
-            self._goal = np.array([*(target + held)[:2], gripper[2]])
-        elif name == "lower":
-            self._goal = target + held + _DROP_M * up
-        elif name == "away":
-            self._goal = self._goal + _OVER_M * up
-
-    def _state(self, obs: Obs) -> tuple[np.ndarray, float]:
-        """Return the positions of object, target, gripper and its command, (4, 3) m, and the object's yaw, rad."""
-        exact = sim_vector(obs, 13, self._name).astype(np.float64)
-        return exact[:12].reshape(4, 3), float(exact[12])

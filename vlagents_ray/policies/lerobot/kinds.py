@@ -300,7 +300,7 @@ class SmolVLAPasses(FlowPasses):
 
         embedded, seen, causal = self.model.embed_prefix(patches, cameras.unbind(1), tokens, mask, state=state)
         _, cache = self.model.vlm_with_expert.forward(
-            attention_mask=self.attention_mask(seen, causal),
+            attention_mask=self.module.make_att_2d_masks(seen, causal),
             position_ids=seen.cumsum(1) - 1,
             inputs_embeds=[embedded, None],
             use_cache=True,

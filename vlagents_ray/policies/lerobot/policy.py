@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -183,16 +182,14 @@ class LeRobot(ModelPolicy):
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
         predictions: dict[int, Prediction | Exception] = {}
         for members in self._groups(rows):
-            missing = len(rows) - len(members) if self.config.deterministic and self.model.kind.batched else 0
-            extra = [copy.deepcopy(rows[members[-1]]) for _ in range(missing)]
             drawn: list[Prediction | Exception] = []
             try:
-                drawn += self._draw([rows[i] for i in members] + extra)
+                drawn += self._draw([rows[i] for i in members])
             except Exception as error:
                 if self.model.kind.batched:
                     raise
                 drawn.append(error)  # of that session alone
-            predictions |= zip(members, drawn[: len(members)], strict=True)
+            predictions |= zip(members, drawn, strict=True)
         return [predictions[i] for i in range(len(rows))]
 
     def _groups(self, rows: Sequence[Row]) -> list[list[int]]:

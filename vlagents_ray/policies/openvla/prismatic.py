@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import abc
 import contextlib
-import copy
 import hashlib
 import importlib
 import importlib.util
@@ -154,7 +153,6 @@ class Prismatic:
     prompt: str
     device: Any
     dtype: Any
-    deterministic: bool  # whether longer prompts than that are refused
     padded_tokens: int  # the length to which shorter prompts are padded; 0: that of the longest one
     own: dict[str, Statistics] = field(default_factory=dict)  # of adapters that were trained on other datasets
 
@@ -165,7 +163,7 @@ class Prismatic:
     def tokens(self, instruction: str) -> list[int]:
         """Return the prompt for an instruction, not to be changed; raises `InvalidObservation` if it is too long."""
         ids = self._tokenized(instruction)
-        most = self.padded_tokens if self.deterministic else self.network.config.llm_max_length
+        most = self.network.config.llm_max_length
         if len(ids) > most:
             raise InvalidObservation(f"instruction: got {len(ids)} tokens with the prompt, want {most} at most")
         return ids
@@ -218,8 +216,7 @@ def load_prismatic(config: PrismaticConfig, bounds: Bounds = "q99") -> Prismatic
         prompt=_PROMPT_V01 if "openvla-v01" in config.checkpoint else _PROMPT,
         device=device,
         dtype=dtype,
-        padded_tokens=config.compiled_tokens if config.compile or config.deterministic else 0,
-        deterministic=config.deterministic,
+        padded_tokens=config.compiled_tokens if config.compile else 0,
     )
 
 
@@ -229,8 +226,7 @@ class PrismaticConfig(ModelConfig):
     compiled_tokens: int = Field(
         default=64,
         ge=1,
-        description="with `compile` or `deterministic`: tokens to which prompts are padded; longer ones run without "
-        "compilation, or are refused",
+        description="with `compile`: tokens to which prompts are padded; longer ones run without compilation",
     )
     unnorm_key: str | None = Field(
         default=None,
@@ -458,9 +454,7 @@ class PrismaticPolicy(ModelPolicy):
             except Exception as error:  # noqa: BLE001 - handed to the session whose request failed
                 results[i] = error
         entries = list(prepared.values())
-        if entries and self.config.deterministic:  # as many as without errors
-            entries += [copy.deepcopy(entries[-1]) for _ in range(len(rows) - len(entries))]
-        answers = self._compute(entries)[: len(prepared)] if entries else []
+        answers = self._compute(entries) if entries else []
         for (i, entry), answer in zip(prepared.items(), answers, strict=True):
             results[i] = answer.prediction(entry.scale)
         return [results[i] for i in range(len(rows))]

@@ -17,7 +17,6 @@ from websockets.sync.client import connect
 
 from vlagents_ray.errors import ConnectionLost, MalformedMessage, PolicyFailed, PolicyUnavailable, Unauthorized
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
-from vlagents_ray.wire.lerobot import PolicyInstructions
 from vlagents_ray.wire.outgoing import Outgoing
 
 if TYPE_CHECKING:
@@ -38,8 +37,6 @@ class ClientOptions:
     timeout_s: float  # s: an answer that takes longer counts as lost
     key: str | None = field(default=None, repr=False)  # the upstream's API key
     limits: Limits = DEFAULT_LIMITS
-    instructions: PolicyInstructions | None = None  # of LeRobot's server: the checkpoint that it loads
-    load_s: float = 600.0  # s: for loading it
 
 
 class UpstreamClient(abc.ABC):
@@ -49,10 +46,6 @@ class UpstreamClient(abc.ABC):
     """Whether `ask` sends all observations in one message."""
     keeps_sessions: ClassVar[bool] = False
     """Whether the upstream keeps a session for each connection, by default."""
-    one_client: ClassVar[bool] = False
-    """Whether the upstream keeps the state of one client, and takes one connection therefore."""
-    one_session: ClassVar[bool] = False
-    """Whether the upstream keeps the state of one session, whatever its connections."""
     mapping: ClassVar[str | None] = None
     """The preset that is used if the deployment states no mapping."""
     schemes: ClassVar[tuple[str, ...]] = ()

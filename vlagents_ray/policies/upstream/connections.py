@@ -240,9 +240,6 @@ class SessionConnections:
     def begin(self, session: str) -> None:
         """Connect for an episode of a session; raises `NoReplica` if no upstream answers within `retry_s`."""
         client = self._connected(self._retry_s)
-        if client.one_session:  # whose state the begin of this episode ends
-            for other in list(self._clients):
-                self.drop(other)
         try:
             client.begin()
         except BaseException:
@@ -277,10 +274,7 @@ class SessionConnections:
         with self._lock:
             client = self._clients.get(session)
         if client is None:
-            return UnknownSession(
-                "upstream: the session's connection is lost, or another session began at an upstream that keeps one; "
-                "reset it"
-            )
+            return UnknownSession("upstream: the session's connection is lost; reset it")
         try:
             [answer] = client.ask([observation])
         except ConnectionLost as error:

@@ -20,13 +20,10 @@ from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.policies.upstream.client import ClientOptions, UpstreamClient
 from vlagents_ray.policies.upstream.connections import Lanes, SessionConnections
 from vlagents_ray.policies.upstream.gr00t import GR00TClient
-from vlagents_ray.policies.upstream.lerobot import LeRobotClient
 from vlagents_ray.policies.upstream.openpi import OpenPiBatchClient, OpenPiClient, RoboArenaClient
 from vlagents_ray.policies.upstream.openvla import OpenVLAClient
 from vlagents_ray.policies.upstream.vla_eval import VlaEvalClient
 from vlagents_ray.policies.upstream.vlagents import VlagentsClient
-from vlagents_ray.policies.upstream.xpolicylab import XPolicyLabClient
-from vlagents_ray.wire.lerobot import PolicyInstructions, features_of
 from vlagents_ray.wire.mapping import KeyMapping
 from vlagents_ray.wire.outgoing import Outgoing
 from vlagents_ray.wire.presets import read_mapping
@@ -39,41 +36,18 @@ PROTOCOLS: dict[str, type[UpstreamClient]] = {
     "openvla": OpenVLAClient,
     "vla_eval": VlaEvalClient,
     "vlagents": VlagentsClient,
-    "lerobot": LeRobotClient,
-    "xpolicylab": XPolicyLabClient,
 }
-
-
-class LoadedPolicy(BaseModel, extra="forbid"):
-    """What LeRobot's server loads for its client, as the options of LeRobot's `robot_client` state it."""
-
-    policy_type: str = Field(description="e.g. act, smolvla, pi0")
-    pretrained_name_or_path: str = Field(description="of the checkpoint, as the server's machine finds it")
-    actions_per_chunk: int = Field(ge=1, description="rows of a chunk that the server sends, at most")
-    device: str = Field(default="cuda", description="on which the server computes")
-
-    @field_validator("policy_type")
-    @classmethod
-    def _needs_one_observation(cls, value: str) -> str:
-        if value in ("diffusion", "tdmpc", "vqbet"):  # async_inference/policy_server.py, LeRobot 0.4.4 and 0.6.1
-            raise ValueError(
-                f"got {value}, want a policy whose chunk depends on one observation: LeRobot's server asks for a chunk "
-                "without the earlier ones; serve the checkpoint here, with `policy: lerobot`"
-            )
-        return value
 
 
 class UpstreamConfig(BaseModel, extra="forbid"):
     """Where the other policy server is, how it is asked, and how long it is waited for."""
 
-    protocol: Literal[
-        "openpi", "openpi-batch", "roboarena", "gr00t", "openvla", "vla_eval", "vlagents", "lerobot", "xpolicylab"
-    ]
+    protocol: Literal["openpi", "openpi-batch", "roboarena", "gr00t", "openvla", "vla_eval", "vlagents"]
     urls: list[str] = Field(
         min_length=1,
         max_length=64,
         description="of servers with the same model, e.g. ws://gpu-box:8000, tcp://gpu-box:5555 (gr00t), "
-        "http://gpu-box:8000 (openvla), grpc://gpu-box:8080 (lerobot); a batch is spread over them",
+        "http://gpu-box:8000 (openvla); a batch is spread over them",
     )
     mapping: str | dict[str, Any] | None = Field(
         default=None,
@@ -87,20 +61,17 @@ class UpstreamConfig(BaseModel, extra="forbid"):
     sessions: Literal["none", "connection"] | None = Field(
         default=None,
         description="none: the model keeps nothing between two observations, and connections are shared; connection: a "
-        "session has a connection of its own, and is reset; default: connection for roboarena, vla_eval and xpolicylab",
+        "session has a connection of its own, and is reset; default: connection for roboarena and vla_eval",
     )
     connections: int = Field(
         default=1, ge=1, le=64, description="to each URL, over which a batch is spread too; for `sessions: none`"
     )
-    lerobot: LoadedPolicy | None = Field(default=None, description="what the server loads; for `protocol: lerobot`")
     timeout_s: float = Field(default=30.0, gt=0, description="for an answer; then the connection counts as lost, s")
     retry_s: float = Field(
         default=2.0, ge=0, description="for a lost upstream to return, before a request is answered with 503, s"
     )
     connect_timeout_s: float = Field(
-        default=600.0,
-        gt=0,
-        description="for the first upstream to answer at the start, and for LeRobot's server to load, s",
+        default=600.0, gt=0, description="for the first upstream to answer at the start, s"
     )
     key_env: str | None = Field(
         default=None, description="name of the environment variable with the upstream's API key"
@@ -133,22 +104,7 @@ class UpstreamConfig(BaseModel, extra="forbid"):
                 f"mapping: {self.protocol} has none of its own; give an object, or a preset, such as openpi-libero for "
                 f"openpi"
             )
-        if (self.lerobot is not None) is not (self.protocol == "lerobot"):
-            want = "what the server loads" if self.lerobot is None else f"nothing for {self.protocol}"
-            raise ValueError(f"lerobot: want {want}")
-        if self.client.one_client and (
-            self.connections > 1 or self.keeps_sessions or len(set(self.urls)) < len(self.urls)
-        ):
-            raise ValueError(
-                f"{self.protocol}: its server has one client at a time, so that it takes one connection to each URL, "
-                "each URL once, and `sessions: none`; name more servers in urls instead"
-            )
-        if self.client.one_session and self.keeps_sessions and len(self.urls) > 1:
-            raise ValueError(
-                f"{self.protocol}: its server keeps one session, so that `sessions: connection` takes one URL; "
-                "set `sessions: none` if the model keeps nothing between two observations"
-            )
-        self.instructions()
+        self.keys()  # raises an error for a mapping that is wrong
         return self
 
     @property
@@ -159,15 +115,6 @@ class UpstreamConfig(BaseModel, extra="forbid"):
     def keeps_sessions(self) -> bool:
         """Whether each session has a connection of its own."""
         return self.client.keeps_sessions if self.sessions is None else self.sessions == "connection"
-
-    def instructions(self) -> PolicyInstructions | None:
-        """Return what LeRobot's server is told; raises `ConfigError` if the mapping does not say all of it."""
-        keys, policy = self.keys(), self.lerobot
-        if policy is None:
-            return None
-        state, cameras = features_of(keys)
-        checkpoint, rows = policy.pretrained_name_or_path, policy.actions_per_chunk
-        return PolicyInstructions(policy.policy_type, checkpoint, state, cameras, rows, policy.device)
 
     def keys(self) -> KeyMapping:
         return read_mapping(self.mapping if self.mapping is not None else str(self.client.mapping))
@@ -208,13 +155,10 @@ class Upstream(Agent):
         if (name := self.config.key_env) is not None and not (key := os.environ.get(name)):
             raise ConfigError(f"key_env: the environment variable {name!r} is not set; set it where the replica runs")
 
-        config, instructions = self.config, self.config.instructions()
+        config = self.config
 
         def make(url: str) -> UpstreamClient:
-            options = ClientOptions(
-                url, config.timeout_s, key, instructions=instructions, load_s=config.connect_timeout_s
-            )
-            return config.client(options)
+            return config.client(ClientOptions(url, config.timeout_s, key))
 
         if self.config.keeps_sessions:
             self._sessions = SessionConnections(self.config.urls, make, self._check, self.config.retry_s)

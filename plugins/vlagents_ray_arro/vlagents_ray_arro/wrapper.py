@@ -14,7 +14,10 @@ from typing_extensions import Self
 from vlagents_ray.contract import CameraSpec, Contract
 from vlagents_ray.errors import ConfigError, InvalidObservation, MissingCamera, NotReset, VLAgentsError
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.policies.arro.parts import (
+from vlagents_ray.policies.base.checkpoint import used_checkpoints
+from vlagents_ray.policies.base.checkpoint_files import weights_of, with_parts
+from vlagents_ray.policies.wrapper import Wrapper
+from vlagents_ray_arro.parts import (
     Detection,
     Detector,
     Images,
@@ -25,9 +28,6 @@ from vlagents_ray.policies.arro.parts import (
     make_part,
     overlap,
 )
-from vlagents_ray.policies.base.checkpoint import used_checkpoints
-from vlagents_ray.policies.base.checkpoint_files import weights_of, with_parts
-from vlagents_ray.policies.wrapper import Wrapper
 
 Channel = int
 Colour = tuple[Channel, Channel, Channel]  # RGB, 0 to 255

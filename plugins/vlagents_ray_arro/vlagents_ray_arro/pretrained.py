@@ -9,8 +9,8 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import Field
 
-from vlagents_ray.policies.arro.parts import Detection, Images, Pretrained, PretrainedConfig, overlap, writable
 from vlagents_ray.registry import require
+from vlagents_ray_arro.parts import Detection, Images, Pretrained, PretrainedConfig, overlap, writable
 
 
 class GroundingDinoConfig(PretrainedConfig):

@@ -26,17 +26,17 @@ Images = Sequence[np.ndarray]  # (H, W, 3) uint8 RGB each, of any sizes
 
 PARTS: dict[str, dict[str, str]] = {
     "detector": {
-        "colour": "vlagents_ray.policies.arro.parts:ColourDetector",
-        "grounding_dino": "vlagents_ray.policies.arro.pretrained:GroundingDinoDetector",
+        "colour": "vlagents_ray_arro.parts:ColourDetector",
+        "grounding_dino": "vlagents_ray_arro.pretrained:GroundingDinoDetector",
     },
     "segmenter": {
-        "flat": "vlagents_ray.policies.arro.parts:FlatSegmenter",
-        "sam2": "vlagents_ray.policies.arro.pretrained:Sam2Segmenter",
+        "flat": "vlagents_ray_arro.parts:FlatSegmenter",
+        "sam2": "vlagents_ray_arro.pretrained:Sam2Segmenter",
     },
-    "selector": {"circle": "vlagents_ray.policies.arro.parts:CircleSelector"},
+    "selector": {"circle": "vlagents_ray_arro.parts:CircleSelector"},
     "tracker": {
-        "iou": "vlagents_ray.policies.arro.parts:IouTracker",
-        "sam2": "vlagents_ray.policies.arro.pretrained:Sam2Tracker",
+        "iou": "vlagents_ray_arro.parts:IouTracker",
+        "sam2": "vlagents_ray_arro.pretrained:Sam2Tracker",
     },
 }
 

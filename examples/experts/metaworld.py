@@ -1,0 +1,33 @@
+"""Meta-World's own oracles, from the simulator's state."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.errors import ContractMismatch
+from vlagents_ray.interface import Act, Obs
+from vlagents_ray.policies.experts import sim_vector
+from vlagents_ray.registry import env_task, require
+
+_SIZE = 39  # hand 3, gripper 1, objects 14, the same of the step before, goal 3
+
+
+class MetaWorldExpert:
+    """Passes the simulator's observation, in `info["sim_state"]`, to the task's oracle."""
+
+    def __init__(self, env_name: str) -> None:
+        oracles: dict[str, Any] = require("metaworld.policies").ENV_POLICY_MAP
+        task = env_task(env_name) or "reach-v3"
+        if task not in oracles:
+            raise ContractMismatch(f"Meta-World has no oracle for {env_name!r}: want one of {sorted(oracles)}")
+        self._name = env_name
+        self._oracle = oracles[task]()
+
+    def reset(self, obs: Obs, instruction: str) -> None:
+        sim_vector(obs, _SIZE, self._name)
+
+    def act(self, obs: Obs) -> Act:
+        action = np.asarray(self._oracle.get_action(sim_vector(obs, _SIZE, self._name)), dtype=np.float32)
+        return Act(action=np.clip(action, -1.0, 1.0))
