@@ -18,6 +18,7 @@ import pytest
 from asgi_server import served
 from eval_fakes import wait_for
 from in_memory_keys import ChangingKeys
+from probes import bytes_probe
 from starlette.testclient import TestClient
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
@@ -29,7 +30,7 @@ from vlagents_ray.client.transports.websocket import Stream
 from vlagents_ray.errors import PolicyUnavailable, TooManyRequests, Unauthorized
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.frames import decode_reply, encode_request
-from vlagents_ray.protocol.messages import PROTOCOL_VERSION, Limits, Request, bytes_probe
+from vlagents_ray.protocol.messages import PROTOCOL_VERSION, Limits, Request
 from vlagents_ray.serve import periodic
 from vlagents_ray.serve.access import api_keys
 from vlagents_ray.serve.access.api_keys import NoKey

@@ -38,6 +38,7 @@ from api_key_replica import (
 from dialect_server import body, libero
 from eval_fakes import wait_for
 from in_flight import read_requests
+from probes import bytes_probe, is_probe_answer
 
 import vlagents_ray
 from vlagents_ray.client.credentials import Credentials
@@ -64,8 +65,6 @@ from vlagents_ray.protocol.messages import (
     PlasmaAddress,
     Reply,
     Request,
-    bytes_probe,
-    is_probe_answer,
 )
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints.shm import ShmServer
@@ -216,7 +215,6 @@ CARRY: dict[str, list[Callable[[Visitor, str], str]]] = {
 NOTHING_TO_DECODE = {
     *(way for way in WAYS if way.startswith("`GET")),
     "`POST /v1/close`",  # nothing that it brings is decoded
-    "`POST /v1/probe`",
     "own port, another path",  # is refused
     "`WS /v1/weights`",  # is refused without the scope
     "`POST /v1/live/command`",  # is refused without the scope
@@ -252,10 +250,12 @@ def test_every_way_in_is_tried() -> None:
 
 @pytest.mark.parametrize("path", ["/v1/stream", "own"])
 def test_a_probe_through_a_websocket_counts_for_the_rate(replica: KeyedReplica, path: str) -> None:
-    def read(data: Any) -> str:
-        return "answered" if is_probe_answer(data) else _read_reply(data)
+    probe = bytes_probe(100)
 
-    attempt = over_websocket(path, lambda _: bytes_probe(100), read)
+    def read(data: Any) -> str:
+        return "answered" if is_probe_answer(data, probe) else _read_reply(data)
+
+    attempt = over_websocket(path, lambda _: probe, read)
     assert attempt(replica.visitor("right"), "after") == "answered"
     assert attempt(replica.visitor("over its rate"), "after") == "429"
 

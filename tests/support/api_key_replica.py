@@ -37,7 +37,7 @@ from websockets.uri import parse_uri
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.connection import Connection
 from vlagents_ray.client.credentials import Credentials
-from vlagents_ray.client.transports.codec_selection import CodecChoice
+from vlagents_ray.client.transports.base import CodecChoice
 from vlagents_ray.client.transports.shm import ShmTransport
 from vlagents_ray.errors import BY_CODE, VLAgentsError
 from vlagents_ray.interface import Act, Agent, Obs
@@ -49,7 +49,6 @@ from vlagents_ray.protocol.messages import (
     PlasmaAddress,
     RankName,
     Request,
-    bytes_probe,
 )
 from vlagents_ray.registry import dialect_class
 from vlagents_ray.serve import periodic
@@ -278,7 +277,7 @@ def over_http(method: str, path: str, **options: Any) -> Way:
             headers = {"x-session-id": "robot-1", "content-type": "application/json"} if path != "/act" else {}
             headers |= {} if token is None else {"authorization": f"Bearer {token}"}
             with contextlib.closing(connection):
-                content = bytes_probe(10) if path == "/v1/probe" else json.dumps(document).encode()
+                content = json.dumps(document).encode()
                 connection.request(method, path, None if document is None else content, headers)
                 return connection.getresponse().status
 
@@ -591,7 +590,6 @@ WAYS: dict[str, Way] = {
     "`GET /docs`": over_http("GET", "/docs"),
     "`GET /health`": over_http("GET", "/health"),
     "`GET /no/such/path`": over_http("GET", "/no/such/path"),
-    "`POST /v1/probe`": over_http("POST", "/v1/probe", document=lambda _: {}),
     "`POST /v1/reset`": over_http("POST", "/v1/reset", document=_reset),
     "`POST /v1/act`": over_http("POST", "/v1/act", document=_act, session=True),
     "`POST /v1/close`": over_http("POST", "/v1/close", document=lambda _: {}, session=True),

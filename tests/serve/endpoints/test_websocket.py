@@ -16,6 +16,7 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 from eval_fakes import wait_for
+from probes import bytes_probe, is_probe_answer
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
@@ -34,8 +35,6 @@ from vlagents_ray.protocol.messages import (
     Limits,
     Reply,
     Request,
-    bytes_probe,
-    is_probe_answer,
 )
 from vlagents_ray.serve.access.api_keys import Keys, NoKey
 from vlagents_ray.serve.access.key_store import new_key
@@ -105,7 +104,7 @@ def test_an_ordinary_websocket_client_is_served_too(endpoint: WebSocketServer) -
         socket_.ping().wait(5)
         probe = bytes_probe(300_000)
         socket_.send(probe)
-        assert is_probe_answer(socket_.recv(5))
+        assert is_probe_answer(socket_.recv(5), probe)
         socket_.send(encode_request(Request("reset", Obs())))
         assert decode_reply(socket_.recv(5)).error is None
 
