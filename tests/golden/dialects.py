@@ -57,10 +57,6 @@ def maps() -> Iterator[Trace]:
     named = asks(*(infer(session_id=name) for name in ("one", "one", "two")), again, infer(), infer(endpoint="jump"))
     at, on = ("/roboarena",), {"roboarena": mapped}
     yield from scenario("roboarena: episodes, and an error", at, first, named, gets(), dialects=on)
-    seeded = asks(infer(seed=3), infer(), again, infer())
-    errors = asks(infer(seed=-1, prompt="new"), infer(prompt="fail"), RUBBISH, infer())
-    at, on = ("/v1/realtime/robot/openpi",), {"vllm_omni": mapped}
-    yield from scenario("vllm_omni: episodes, and errors", at, first, seeded, errors, dialects=on)
 
 
 def documents() -> Iterator[Trace]:

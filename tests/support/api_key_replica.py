@@ -17,7 +17,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, ClassVar
 
-import msgpack
 import numpy as np
 import pytest
 from asgi_server import served
@@ -407,15 +406,6 @@ def _read_map(data: bytes | str) -> str | None:
     return "done" if b"actions" in data else None  # what it says first
 
 
-def _read_vllm_omni(data: bytes | str) -> str | None:
-    """After its configuration, which names the action space, an array, or a map for an error."""
-    assert isinstance(data, bytes)
-    if b"__ndarray__" in data:
-        return "done"
-    said = msgpack.unpackb(data)
-    return status_of(said["message"]) if said.get("type") == "error" else None
-
-
 def _read_vla_eval(data: bytes | str) -> str:
     assert isinstance(data, bytes)
     payload = vla_eval_codec.decode(data).payload
@@ -598,7 +588,6 @@ WAYS: dict[str, Way] = {
     "`WS /`": over_websocket("/", partial(libero, 1), _read_map),
     "`WS /openpi`": over_websocket("/openpi", partial(libero, 1), _read_map),
     "`WS /roboarena`": over_websocket("/roboarena", _arena, _read_map),
-    "`WS /v1/realtime/robot/openpi`": over_websocket("/v1/realtime/robot/openpi", _arena, _read_vllm_omni),
     "`WS /vla-eval`": over_websocket("/vla-eval", _see, _read_vla_eval),
     "`GET /v1/weights`": over_http("GET", "/v1/weights"),
     "`GET /v1/weights`, scope `weights`": _with_scope("weights", over_http("GET", "/v1/weights")),

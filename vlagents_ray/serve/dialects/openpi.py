@@ -16,7 +16,6 @@ latter reads the replies of `Rows`.
 from __future__ import annotations
 
 import abc
-import asyncio
 import time
 import uuid
 from collections.abc import Mapping, Sequence
@@ -68,11 +67,6 @@ class MapDialect(RouteDialect):
     def speaks(self, message: dict[str, Any]) -> bool:
         """Return whether a message comes from a client of this dialect."""
 
-    @property
-    def idle_s(self) -> float | None:
-        """The time after which the connection of a client that sends nothing is closed, s; None if it stays open."""
-        return None
-
     def begins(self, message: dict[str, Any], connection: MapConnection) -> bytes | str | None:
         """Begin an episode if the message requires it.
 
@@ -89,10 +83,6 @@ class MapDialect(RouteDialect):
         """Return how many rows the client executes before its next message; None if it gets whole chunks."""
         return None
 
-    def reset_arguments(self, message: dict[str, Any]) -> dict[str, Any]:
-        """Return the keyword arguments of the policy's reset, should this observation begin an episode."""
-        return {}
-
     def answer(self, replies: Sequence[Reply], before_ms: float | None, *, batched: bool) -> Any:
         """Return the replies in the client's format; `before_ms` is the server's time for the previous message."""
         inference_ms = max(reply.timing["inference_ms"] for reply in replies)
@@ -103,10 +93,6 @@ class MapDialect(RouteDialect):
             "policy_timing": {"infer_ms": inference_ms} | ({"batch_size": len(rows)} if batched else {}),
             "server_timing": {"infer_ms": infer_ms} | ({} if before_ms is None else {"prev_total_ms": before_ms}),
         }
-
-    def failure(self, text: str) -> bytes | None:
-        """Return an error as a message after which the connection stays open; None: it is a text, then a close."""
-        return None
 
 
 def _stacked(chunks: Sequence[np.ndarray]) -> np.ndarray:
@@ -218,7 +204,7 @@ class MapConnection:
         if number is not None and not begins and self._rows.has(number, stacked=batched):
             return openpi.encode(self._rows.take(number))
         incoming.decoded_alike(len(observations))
-        replies = await act_together(incoming, seen, request_id, **dialect.reset_arguments(message))
+        replies = await act_together(incoming, seen, request_id)
         data = incoming.written(lambda: openpi.encode(self._said(replies, number, batched=batched)))
         self._before_ms = (time.perf_counter() - incoming.arrived) * 1e3
         return data
@@ -259,12 +245,9 @@ class MapEndpoint:
         gate = self._dialects[0].gate()
         try:
             await socket.send_bytes(openpi.encode(self._dialects[-1].first()))
-            first = self._dialects[0]
-            while (received := await first.receive(socket, gate, first.idle_s)) is not None:
+            while (received := await self._dialects[0].receive(socket, gate)) is not None:
                 if not await self._answer(socket, *received, connections, gate):
                     return
-        except asyncio.TimeoutError:
-            await socket.close()
         except WebSocketDisconnect:
             return
         finally:
@@ -291,16 +274,13 @@ class MapEndpoint:
         except Exception as error:  # noqa: BLE001 - the error is the reply to the client
             problem = public_problem(error, incoming.transport, request_id)
             incoming.record_failure(problem.code)
-            text = f"{problem} (request {request_id})"
-            failure = self._dialects[0].failure(text)
-            await (socket.send_text(text) if failure is None else socket.send_bytes(failure))
+            await socket.send_text(f"{problem} (request {request_id})")
             if isinstance(problem, TooManyRequests):  # the connection stays open, as nothing was acted on
                 if gate.refused_too_often:
                     await socket.close(POLICY_VIOLATION, REFUSED)
                 return not gate.refused_too_often
-            if failure is None:
-                await socket.close(INTERNAL_ERROR, "Internal server error.")
-            return failure is not None
+            await socket.close(INTERNAL_ERROR, "Internal server error.")
+            return False
         finally:
             admission.release()
         if isinstance(answer, str):
