@@ -66,8 +66,7 @@ from vlagents_ray.protocol.messages import (
     Request,
 )
 from vlagents_ray.serve.access.api_keys import NoKey
-from vlagents_ray.serve.endpoints.shm import ShmServer
-from vlagents_ray.serve.endpoints.unix_messages import UnixConnection
+from vlagents_ray.serve.endpoints.shm import ShmServer, UnixConnection
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.admission import Admission, MessageAdmission, NeedsDecodingThread
 from vlagents_ray.serve.engine.engine import Engine
@@ -539,12 +538,12 @@ def test_a_client_that_leaves_while_its_image_is_decoded_leaves_nothing(
     other = _connected(own)
     other.send(frame(reset(), files=[LARGE]), 10)
     wait_for(lambda: decoders != [])
-    assert own._engine.admission.held > 0
+    assert own.engine.admission.held > 0
     other.close()
     go_on.set()
     wait_for(lambda: not own._clients)
-    wait_for(lambda: own._engine.admission.held == 0)
-    assert len(own._engine.sessions) == 0
+    wait_for(lambda: own.engine.admission.held == 0)
+    assert len(own.engine.sessions) == 0
 
 
 def test_an_event_loop_goes_on_while_a_message_is_decoded(held_up: tuple[threading.Event, list[str]]) -> None:
@@ -629,7 +628,7 @@ def test_a_local_client_over_its_rate_is_not_read_meanwhile(replica: KeyedReplic
 
     def is_left_alone(op: Any) -> bool:  # for a second, in which this process may have stood still
         assert isinstance(transport.call([Request(op, seen)], 10)[0].error, TooManyRequests)
-        return held._pauses == 1
+        return not held._polled
 
     for op in ("act", "reset"):  # in compact form, and in a frame
         wait_for(lambda op=op: is_left_alone(op))  # type: ignore[misc]
@@ -670,7 +669,7 @@ def test_local_clients_over_their_rate_wait_without_threads_and_leave_nothing_be
         one.send(visitor.token.encode())
         for _ in range(6):
             socket.send_fds(one, [LocalAddress.REQUEST.pack(0, 0, len(message))], [descriptor])
-    wait_for(lambda: len(held()) == len(crowd) and all(one._pauses for one in held()))
+    wait_for(lambda: len(held()) == len(crowd) and all(not one._polled for one in held()))
     wait_for(lambda: len(read) > 2)  # one a second of all that wait
     for one in crowd:
         one.close()

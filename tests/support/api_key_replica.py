@@ -55,7 +55,7 @@ from vlagents_ray.serve.access import api_keys
 from vlagents_ray.serve.config.dialects import DialectArgs
 from vlagents_ray.serve.dialects.base import GatewayContext, ReplicaContext
 from vlagents_ray.serve.dialects.routes import dialect_routes
-from vlagents_ray.serve.endpoints import access_middleware, websocket_connection
+from vlagents_ray.serve.endpoints import access_middleware, websocket
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.endpoints.shm import ShmServer
@@ -307,7 +307,7 @@ def over_websocket(path: str, message: Callable[[str], bytes], read: Callable[[b
             if when == "before":
                 visitor.become()
                 with pytest.MonkeyPatch.context() as impatient:
-                    impatient.setattr(websocket_connection, "_HANDSHAKE_S", 0.1)
+                    impatient.setattr(websocket, "_HANDSHAKE_S", 0.1)
                     connection.sendall(_frame(message(visitor.mark)) * 3)
                     return _until_closed(connection)
             refused = visitor.credential in ("none", "wrong")
