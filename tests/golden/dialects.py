@@ -51,8 +51,6 @@ def maps() -> Iterator[Trace]:
         "too much": bytes(4097),
     }.items():
         yield from scenario(f"openpi: {says}", at[:1], first, asks(sent), gets(), dialects=on)
-    rows = {"openpi": mapped | {"answer": "row", "execute": 1}}
-    yield from scenario("openpi: rows", at[:1], first, asks(seen, seen), dialects=rows)
     yield from scenario("openpi: not ready", at[:1], opened, dialects=on, ready=False)
     named = asks(*(infer(session_id=name) for name in ("one", "one", "two")), again, infer(), infer(endpoint="jump"))
     at, on = ("/roboarena",), {"roboarena": mapped}
