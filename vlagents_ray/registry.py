@@ -216,7 +216,6 @@ ENVS: dict[str, Adapter] = {
 DIALECTS: dict[str, str] = {
     "openpi": "vlagents_ray.serve.dialects.openpi:OpenPiDialect",
     "roboarena": "vlagents_ray.serve.dialects.roboarena:RoboArenaDialect",
-    "vllm_omni": "vlagents_ray.serve.dialects.roboarena:VllmOmniDialect",
     "openvla": "vlagents_ray.serve.dialects.openvla:OpenVLADialect",
     "vla_eval": "vlagents_ray.serve.dialects.vla_eval:VlaEvalDialect",
     "gr00t": "vlagents_ray.serve.dialects.gr00t:GR00TDialect",

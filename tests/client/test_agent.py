@@ -7,7 +7,7 @@ import pytest
 
 from vlagents_ray import ConfigError, NotReset, Obs, PolicyUnavailable, RemoteAgent
 from vlagents_ray.client.credentials import warn_of_plain_http
-from vlagents_ray.client.transports.codec_selection import CodecName
+from vlagents_ray.client.transports.base import CodecName
 from vlagents_ray.client.transports.select import TransportName
 from vlagents_ray.errors import InvalidInput
 from vlagents_ray.images.codecs import (
@@ -61,10 +61,9 @@ def test_what_does_not_go_together_is_refused_at_once(url: str, transport: Trans
         (ImageCodec("jpeg", 50, "420"), ImageCodec("jpeg", 50, "420")),
     ],
 )
-def test_a_codec_is_forced_or_waits_for_the_link(codec: ImageCodec | CodecName, forced: ImageCodec | None) -> None:
+def test_a_codec_is_forced_or_left_to_the_connection(codec: ImageCodec | CodecName, forced: ImageCodec | None) -> None:
     agent = RemoteAgent("http://gpu-box:8000", codec=codec)
     assert agent.codec == forced
-    assert agent.link is None
 
 
 def test_an_unknown_codec_is_refused_at_once() -> None:

@@ -3,7 +3,7 @@
 What is recorded. A scenario of `own_protocol` or `dialects` is a list of messages and of events at the server. It is
 played at each of its endpoints: shared memory, plasma (its store alone is replaced by a dict), the WebSocket of a
 replica's own port and that of `/v1/stream`, HTTP (frames, documents, forms), the entry point of a Serve handle, and the
-protocols of openpi, RoboArena, vLLM-Omni, OpenVLA, vla-eval, GR00T, LeRobot and vlagents. The server, `replica.Server`,
+protocols of openpi, RoboArena, OpenVLA, vla-eval, GR00T, LeRobot and vlagents. The server, `replica.Server`,
 is the real engine with its endpoints and dialects, without Ray, over a policy whose action is a function of what it
 saw. The clients of `lines` carry bytes and know nothing of this package; for GR00T and LeRobot, ZeroMQ and gRPC carry
 the messages. `traces/FILE.txt` has, for each scenario,

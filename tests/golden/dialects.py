@@ -52,16 +52,10 @@ def maps() -> Iterator[Trace]:
         "too much": bytes(4097),
     }.items():
         yield from scenario(f"openpi: {says}", at[:1], first, asks(sent), gets(), dialects=on)
-    rows = {"openpi": mapped | {"answer": "row", "execute": 1}}
-    yield from scenario("openpi: rows", at[:1], first, asks(seen, seen), dialects=rows)
     yield from scenario("openpi: not ready", at[:1], opened, dialects=on, ready=False)
     named = asks(*(infer(session_id=name) for name in ("one", "one", "two")), again, infer(), infer(endpoint="jump"))
     at, on = ("/roboarena",), {"roboarena": mapped}
     yield from scenario("roboarena: episodes, and an error", at, first, named, gets(), dialects=on)
-    seeded = asks(infer(seed=3), infer(), again, infer())
-    errors = asks(infer(seed=-1, prompt="new"), infer(prompt="fail"), RUBBISH, infer())
-    at, on = ("/v1/realtime/robot/openpi",), {"vllm_omni": mapped}
-    yield from scenario("vllm_omni: episodes, and errors", at, first, seeded, errors, dialects=on)
 
 
 def documents() -> Iterator[Trace]:

@@ -28,7 +28,7 @@ from tests.golden.traces import Step, Trace
 from vlagents_ray.interface import Obs
 from vlagents_ray.protocol.frame_layout import pack
 from vlagents_ray.protocol.frames import CONTENT_TYPE, encode_requests
-from vlagents_ray.protocol.messages import LocalAddress, Request, bytes_probe
+from vlagents_ray.protocol.messages import LocalAddress, Request
 
 PIXELS = np.full((8, 8, 3), 7, np.uint8)
 SEEN = Obs({"front": PIXELS}, 0.5, {"joints": np.array([0.25, -0.5], np.float32)})
@@ -174,7 +174,7 @@ def streams() -> Iterator[Trace]:
     yield from scenario("a handshake", STREAMS, opened, begin)
     yield from scenario("a handshake at another path", ("/v1/strea",), opened)
     yield from scenario("full", STREAMS, begin, Step("b", "opens"), gets("b"), gets("b"), end, sessions=1)
-    odd = asks((bytes_probe(8) + b"xyz",), (b"VLA?",), (b"hello", b"\x81"))
+    odd = asks((b"VLA?" + bytes(4) + b"xyz",), (b"VLA?",), (b"hello", b"\x81"))
     fragments = [Send("a", (b"part", b"\x02")), Send("a", (b"", b"\x80")), gets()]
     yield from scenario("probes, text, and a fragment", STREAMS, begin, odd, end, fragments)
     yield from scenario("a client says goodbye", STREAMS, begin, asks((b"\x03\xe8bye", b"\x88")))
@@ -241,8 +241,7 @@ def of_http() -> Iterator[Trace]:
     yield from scenario("headers and frames that are refused", ("http",), begin, refused, frames)
     pages = asks((http("GET", "/healthz"),), (http("GET", "/v1/metadata"),))
     others = asks((http("GET", "/v1/nothing"),), (http("GET", "/v1/act"),))
-    probes = asks(*((http("POST", "/v1/probe", body, "x/y"),) for body in (bytes_probe(8) + b"xyz", b"rubbish!")))
-    yield from scenario("other paths", ("http",), pages, others, probes)
+    yield from scenario("other paths", ("http",), pages, others)
     yield from scenario(
         "other paths, while the policy loads", ("http",), pages, asks((http("GET", "/docs"),)), ready=False
     )

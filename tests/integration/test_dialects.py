@@ -23,7 +23,6 @@ CALLS = 12
 DIALECTS = {
     "openpi": {"mapping": "openpi-libero"},
     "roboarena": {"mapping": {"preset": "roboarena", "action_gripper": {"index": 6}}},  # Mirror's rows have 7 numbers
-    "vllm_omni": {"mapping": {"preset": "roboarena", "action_gripper": {"index": 6}}},
     "openvla": {},
     "vla_eval": {},
 }
@@ -56,7 +55,7 @@ def websocket(server: Server, path: str = "") -> str:
 def url_for(client: str, server: Server) -> str:
     if client == "openvla":
         return server.url
-    return websocket(server, {"vla_eval": "/vla-eval", "vllm_omni": "/v1/realtime/robot/openpi"}.get(client, ""))
+    return websocket(server, "/vla-eval" if client == "vla_eval" else "")
 
 
 def require_own_answers(said: list[list[Any]], client: str) -> None:
@@ -73,7 +72,7 @@ def require_own_answers(said: list[list[Any]], client: str) -> None:
 
 
 @pytest.mark.parametrize("clients", [1, 8])
-@pytest.mark.parametrize("client", ["openpi", "roboarena", "vllm_omni", "openvla", "vla_eval"])
+@pytest.mark.parametrize("client", ["openpi", "roboarena", "openvla", "vla_eval"])
 def test_the_real_clients_get_their_own_answers(server: Server, python: Path, client: str, clients: int) -> None:
     said = drive(python, client, url_for(client, server), clients, CALLS)
     assert [len(one) for one in said] == [CALLS] * clients

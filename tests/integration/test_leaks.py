@@ -16,7 +16,7 @@ from process_resources import unpooled_threads
 
 from tests.integration.conftest import serving
 from vlagents_ray import Obs, RemoteAgent
-from vlagents_ray.client.transports.codec_selection import CodecName
+from vlagents_ray.client.transports.base import CodecName
 from vlagents_ray.client.transports.select import TransportName
 from vlagents_ray.serve.launch.server import Server
 

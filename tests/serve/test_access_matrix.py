@@ -74,7 +74,7 @@ def test_the_table_names_every_way_in(replica: KeyedReplica) -> None:
     routes = {getattr(route, "path", "") for route in _routes(replica)}
     named = {way.strip("`").partition(" ")[2] for way in WAYS if way.startswith("`")}
     assert routes - {"/openapi.json"} <= named | {f"/v1/{op}" for op in OPS}
-    tried = {"openpi", "roboarena", "vllm_omni", "openvla", "vla_eval", "gr00t", "vlagents", "lerobot"}
+    tried = {"openpi", "roboarena", "openvla", "vla_eval", "gr00t", "vlagents", "lerobot"}
     assert set(DIALECTS) == tried, "`keyed_replica` serves a new one, WAYS tries it, docs/access.md has its rows"
 
 

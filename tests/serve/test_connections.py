@@ -18,6 +18,7 @@ import pytest
 from asgi_server import served
 from eval_fakes import wait_for
 from in_memory_keys import ChangingKeys
+from probes import bytes_probe
 from starlette.testclient import TestClient
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
@@ -29,12 +30,12 @@ from vlagents_ray.client.transports.websocket import Stream
 from vlagents_ray.errors import PolicyUnavailable, TooManyRequests, Unauthorized
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.frames import decode_reply, encode_request
-from vlagents_ray.protocol.messages import PROTOCOL_VERSION, Limits, Request, bytes_probe
+from vlagents_ray.protocol.messages import PROTOCOL_VERSION, Limits, Request
 from vlagents_ray.serve import periodic
 from vlagents_ray.serve.access import api_keys
 from vlagents_ray.serve.access.api_keys import NoKey
-from vlagents_ray.serve.endpoints import unix_messages as local
-from vlagents_ray.serve.endpoints import websocket_connection
+from vlagents_ray.serve.endpoints import shm as local
+from vlagents_ray.serve.endpoints import websocket
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.endpoints.shm import ShmServer
@@ -196,7 +197,7 @@ def test_a_page_of_another_site_has_nothing_read_either() -> None:
 
 @pytest.mark.parametrize("first", [RESET, b"GET / HTTP/1.1\r\n" + RESET, b"\r\n\r\n" + RESET, b"\0" * 40_000])
 def test_what_comes_without_a_handshake_is_not_read(keyed: Replica, first: bytes, monkeypatch) -> None:
-    monkeypatch.setattr(websocket_connection, "_HANDSHAKE_S", 0.2)
+    monkeypatch.setattr(websocket, "_HANDSHAKE_S", 0.2)
     assert not answer(keyed.own.address.port, first).startswith(b"HTTP/1.1 101")
     wait_for(lambda: not keyed.own._clients)
     assert keyed.policy.seen == []
@@ -246,7 +247,7 @@ def test_half_a_message_is_not_waited_for() -> None:
 
 @pytest.mark.parametrize("first", [b"", b"GET / HTTP/1.1\r\nHost: x\r\n"])
 def test_who_does_not_say_what_he_wants_is_cut_off(keyed: Replica, first: bytes, monkeypatch) -> None:
-    monkeypatch.setattr(websocket_connection, "_HANDSHAKE_S", 0.2)
+    monkeypatch.setattr(websocket, "_HANDSHAKE_S", 0.2)
     silent = [socket.create_connection(("127.0.0.1", keyed.own.address.port)) for _ in range(20)]
     for each in silent:
         each.sendall(first)

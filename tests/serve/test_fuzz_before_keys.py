@@ -124,9 +124,7 @@ def at_http(_replica: KeyedReplica, choose: random.Random) -> Sequence:
     if choose.random() < 0.4:
         path = choose.choice(("/v1/stream", "/", "/openpi", "/roboarena", "/vla-eval", "/nope"))
         return [handshake(choose, path), *frames(choose)]
-    path = choose.choice(
-        ("/v1/reset", "/v1/act", "/v1/close", "/v1/probe", "/act", "/docs", "/v1/metadata", "/healthz/")
-    )
+    path = choose.choice(("/v1/reset", "/v1/act", "/v1/close", "/act", "/docs", "/v1/metadata", "/healthz/"))
     kind, content = choose.choice(
         (
             ("application/json", b'{"instruction": "move to the human"}'),

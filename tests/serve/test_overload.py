@@ -30,7 +30,6 @@ from api_key_replica import (
     _read_map,
     _read_reply,
     _read_vla_eval,
-    _read_vllm_omni,
     keyed_replica,
     over_gr00t,
     over_websocket,
@@ -38,6 +37,7 @@ from api_key_replica import (
 from dialect_server import body, libero
 from eval_fakes import wait_for
 from in_flight import read_requests
+from probes import bytes_probe, is_probe_answer
 
 import vlagents_ray
 from vlagents_ray.client.credentials import Credentials
@@ -64,12 +64,9 @@ from vlagents_ray.protocol.messages import (
     PlasmaAddress,
     Reply,
     Request,
-    bytes_probe,
-    is_probe_answer,
 )
 from vlagents_ray.serve.access.api_keys import NoKey
-from vlagents_ray.serve.endpoints.shm import ShmServer
-from vlagents_ray.serve.endpoints.unix_messages import UnixConnection
+from vlagents_ray.serve.endpoints.shm import ShmServer, UnixConnection
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.admission import Admission, MessageAdmission, NeedsDecodingThread
 from vlagents_ray.serve.engine.engine import Engine
@@ -206,7 +203,6 @@ CARRY: dict[str, list[Callable[[Visitor, str], str]]] = {
     "`WS /`": [over_websocket("/", lambda mark: libero(1, mark), _read_map)],
     "`WS /openpi`": [over_websocket("/openpi", lambda mark: libero(1, mark), _read_map)],
     "`WS /roboarena`": [over_websocket("/roboarena", _arena, _read_map)],
-    "`WS /v1/realtime/robot/openpi`": [over_websocket("/v1/realtime/robot/openpi", _arena, _read_vllm_omni)],
     "`WS /vla-eval`": [over_websocket("/vla-eval", _image_of_vla_eval, _read_vla_eval)],
     PUSH: [WAYS[PUSH]],
     "shared memory": [_over_shm],
@@ -216,7 +212,6 @@ CARRY: dict[str, list[Callable[[Visitor, str], str]]] = {
 NOTHING_TO_DECODE = {
     *(way for way in WAYS if way.startswith("`GET")),
     "`POST /v1/close`",  # nothing that it brings is decoded
-    "`POST /v1/probe`",
     "own port, another path",  # is refused
     "`WS /v1/weights`",  # is refused without the scope
     "`POST /v1/live/command`",  # is refused without the scope
@@ -252,10 +247,12 @@ def test_every_way_in_is_tried() -> None:
 
 @pytest.mark.parametrize("path", ["/v1/stream", "own"])
 def test_a_probe_through_a_websocket_counts_for_the_rate(replica: KeyedReplica, path: str) -> None:
-    def read(data: Any) -> str:
-        return "answered" if is_probe_answer(data) else _read_reply(data)
+    probe = bytes_probe(100)
 
-    attempt = over_websocket(path, lambda _: bytes_probe(100), read)
+    def read(data: Any) -> str:
+        return "answered" if is_probe_answer(data, probe) else _read_reply(data)
+
+    attempt = over_websocket(path, lambda _: probe, read)
     assert attempt(replica.visitor("right"), "after") == "answered"
     assert attempt(replica.visitor("over its rate"), "after") == "429"
 
@@ -541,12 +538,12 @@ def test_a_client_that_leaves_while_its_image_is_decoded_leaves_nothing(
     other = _connected(own)
     other.send(frame(reset(), files=[LARGE]), 10)
     wait_for(lambda: decoders != [])
-    assert own._engine.admission.held > 0
+    assert own.engine.admission.held > 0
     other.close()
     go_on.set()
     wait_for(lambda: not own._clients)
-    wait_for(lambda: own._engine.admission.held == 0)
-    assert len(own._engine.sessions) == 0
+    wait_for(lambda: own.engine.admission.held == 0)
+    assert len(own.engine.sessions) == 0
 
 
 def test_an_event_loop_goes_on_while_a_message_is_decoded(held_up: tuple[threading.Event, list[str]]) -> None:
@@ -631,7 +628,7 @@ def test_a_local_client_over_its_rate_is_not_read_meanwhile(replica: KeyedReplic
 
     def is_left_alone(op: Any) -> bool:  # for a second, in which this process may have stood still
         assert isinstance(transport.call([Request(op, seen)], 10)[0].error, TooManyRequests)
-        return held._pauses == 1
+        return not held._polled
 
     for op in ("act", "reset"):  # in compact form, and in a frame
         wait_for(lambda op=op: is_left_alone(op))  # type: ignore[misc]
@@ -672,7 +669,7 @@ def test_local_clients_over_their_rate_wait_without_threads_and_leave_nothing_be
         one.send(visitor.token.encode())
         for _ in range(6):
             socket.send_fds(one, [LocalAddress.REQUEST.pack(0, 0, len(message))], [descriptor])
-    wait_for(lambda: len(held()) == len(crowd) and all(one._pauses for one in held()))
+    wait_for(lambda: len(held()) == len(crowd) and all(not one._polled for one in held()))
     wait_for(lambda: len(read) > 2)  # one a second of all that wait
     for one in crowd:
         one.close()

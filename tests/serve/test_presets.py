@@ -44,8 +44,8 @@ def test_cameras_state_gripper_and_instruction_arrive(sent: Sent) -> None:
     assert all(camera.shape == (32, 32, 3) and camera.max() > 0 for camera in obs.cameras.values())
     assert {name: part.size for name, part in obs.state.items()} == sent.state
     assert (obs.gripper is not None) == sent.gripper
-    # The gateway of vlagents takes the instruction from beside the observation; BEHAVIOR sends a task's number.
-    if sent.preset not in ("vlagents", "behavior-r1pro"):
+    # The gateway of vlagents takes the instruction from beside the observation.
+    if sent.preset != "vlagents":
         assert instruction == ("smoke test" if "smoke" in sent.source else TASK)
 
 
@@ -154,3 +154,26 @@ def test_what_the_policy_does_not_want_may_have_any_value(reading: float) -> Non
         np.testing.assert_array_equal(obs.state["gripper_qpos"], np.float32([reading, 0.5]))
     with pytest.raises(InvalidObservation, match=r"mapping\.gripper"):
         mapping.obs(theirs, contract=Contract(gripper=True))
+
+
+def test_an_alpha_channel_is_left_out() -> None:
+    mapping = KeyMapping.from_json({"cameras": {"front": {"key": "image", "layout": "rgba"}}})
+    pixels = np.arange(8 * 8 * 4, dtype=np.uint8).reshape(8, 8, 4)
+    obs, _ = mapping.obs({"image": pixels})
+    assert np.array_equal(obs.cameras["front"], pixels[:, :, :3])
+    with pytest.raises(InvalidObservation, match="image"):
+        mapping.obs({"image": np.zeros((8, 8, 5), np.uint8)})
+
+
+@pytest.mark.parametrize("number", [np.array([3]), np.array([[3]])])
+def test_a_number_in_place_of_an_instruction_has_its_text(number: np.ndarray) -> None:
+    fields = {"state": {"joints": "state"}, "instruction": "prompt|task_id", "instructions": {"3": "turn on the radio"}}
+    mapping = KeyMapping.from_json(fields)
+    theirs = {"state": np.zeros(7), "task_id": number}
+    assert mapping.obs(theirs)[1] == "turn on the radio"
+    needed = Contract(instruction=True)
+    with pytest.raises(InvalidObservation, match=r"got 4, want one of \['3'\]; add its text to mapping.instructions"):
+        mapping.obs(theirs | {"task_id": number + 1}, contract=needed)
+    with pytest.raises(InvalidObservation, match="want text"):
+        mapping.obs(theirs | {"task_id": np.array([0.5])})
+    assert mapping.obs(theirs | {"task_id": number + 1})[1] is None, "a policy without an instruction needs no texts"

@@ -6,17 +6,12 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from probes import bytes_probe, is_probe_answer
 from starlette.testclient import TestClient
 
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.frames import decode_reply, encode_request
-from vlagents_ray.protocol.messages import (
-    LEAST_BYTES,
-    Limits,
-    Request,
-    bytes_probe,
-    is_probe_answer,
-)
+from vlagents_ray.protocol.messages import Limits, Request
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.engine.engine import Engine
@@ -48,33 +43,13 @@ def client(engine: Engine) -> Iterator[TestClient]:
         yield client
 
 
-@pytest.mark.parametrize("message", [bytes_probe(0), bytes_probe(5_000), bytes_probe(100_000)])
-def test_a_probe_is_answered_by_both_endpoints(client: TestClient, engine: Engine, message: bytes) -> None:
-    before = len(engine.sessions)
-    posted = client.post("/v1/probe", content=message)
-    assert posted.status_code == 200
-    assert len(engine.sessions) == before
+@pytest.mark.parametrize("size", [8, 5_000, 100_000])
+def test_a_probe_is_answered_without_a_session(client: TestClient, engine: Engine, size: int) -> None:
+    before, probe = len(engine.sessions), bytes_probe(size)
     with client.websocket_connect("/v1/stream") as socket:
-        socket.send_bytes(message)
-        streamed = socket.receive_bytes()
-    assert posted.content == streamed
-    assert is_probe_answer(streamed)
-    assert int.from_bytes(streamed[4:], "little") == len(message)
-
-
-@pytest.mark.parametrize(
-    ("message", "code"),
-    [
-        (b"", "malformed"),
-        (b"VLA?\0\0", "malformed"),
-        (b"not a probe", "malformed"),
-        (bytes_probe(100_001), "too_large"),
-    ],
-)
-def test_what_is_no_probe_is_refused_by_name(client: TestClient, message: bytes, code: str) -> None:
-    answer = client.post("/v1/probe", content=message)
-    assert answer.json()["code"] == code
-    assert answer.headers["content-type"] == "application/problem+json"
+        socket.send_bytes(probe)
+        assert is_probe_answer(socket.receive_bytes(), probe)
+        assert len(engine.sessions) == before
 
 
 def test_a_broken_probe_leaves_the_stream_as_it_was(client: TestClient) -> None:
@@ -85,7 +60,3 @@ def test_a_broken_probe_leaves_the_stream_as_it_was(client: TestClient) -> None:
         assert error.code == "malformed"
         socket.send_bytes(encode_request(Request("reset", OBS, request_id="r")))
         assert decode_reply(socket.receive_bytes()).error is None
-
-
-def test_a_probe_has_the_size_asked_for() -> None:
-    assert [len(bytes_probe(size)) for size in (0, LEAST_BYTES, 1000)] == [LEAST_BYTES, LEAST_BYTES, 1000]

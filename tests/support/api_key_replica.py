@@ -17,7 +17,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, ClassVar
 
-import msgpack
 import numpy as np
 import pytest
 from asgi_server import served
@@ -37,7 +36,7 @@ from websockets.uri import parse_uri
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.connection import Connection
 from vlagents_ray.client.credentials import Credentials
-from vlagents_ray.client.transports.codec_selection import CodecChoice
+from vlagents_ray.client.transports.base import CodecChoice
 from vlagents_ray.client.transports.shm import ShmTransport
 from vlagents_ray.errors import BY_CODE, VLAgentsError
 from vlagents_ray.interface import Act, Agent, Obs
@@ -49,7 +48,6 @@ from vlagents_ray.protocol.messages import (
     PlasmaAddress,
     RankName,
     Request,
-    bytes_probe,
 )
 from vlagents_ray.registry import dialect_class
 from vlagents_ray.serve import periodic
@@ -57,7 +55,7 @@ from vlagents_ray.serve.access import api_keys
 from vlagents_ray.serve.config.dialects import DialectArgs
 from vlagents_ray.serve.dialects.base import GatewayContext, ReplicaContext
 from vlagents_ray.serve.dialects.routes import dialect_routes
-from vlagents_ray.serve.endpoints import access_middleware, websocket_connection
+from vlagents_ray.serve.endpoints import access_middleware, websocket
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.endpoints.shm import ShmServer
@@ -278,7 +276,7 @@ def over_http(method: str, path: str, **options: Any) -> Way:
             headers = {"x-session-id": "robot-1", "content-type": "application/json"} if path != "/act" else {}
             headers |= {} if token is None else {"authorization": f"Bearer {token}"}
             with contextlib.closing(connection):
-                content = bytes_probe(10) if path == "/v1/probe" else json.dumps(document).encode()
+                content = json.dumps(document).encode()
                 connection.request(method, path, None if document is None else content, headers)
                 return connection.getresponse().status
 
@@ -309,7 +307,7 @@ def over_websocket(path: str, message: Callable[[str], bytes], read: Callable[[b
             if when == "before":
                 visitor.become()
                 with pytest.MonkeyPatch.context() as impatient:
-                    impatient.setattr(websocket_connection, "_HANDSHAKE_S", 0.1)
+                    impatient.setattr(websocket, "_HANDSHAKE_S", 0.1)
                     connection.sendall(_frame(message(visitor.mark)) * 3)
                     return _until_closed(connection)
             refused = visitor.credential in ("none", "wrong")
@@ -406,15 +404,6 @@ def _read_map(data: bytes | str) -> str | None:
     if isinstance(data, str):
         return status_of(data)
     return "done" if b"actions" in data else None  # what it says first
-
-
-def _read_vllm_omni(data: bytes | str) -> str | None:
-    """After its configuration, which names the action space, an array, or a map for an error."""
-    assert isinstance(data, bytes)
-    if b"__ndarray__" in data:
-        return "done"
-    said = msgpack.unpackb(data)
-    return status_of(said["message"]) if said.get("type") == "error" else None
 
 
 def _read_vla_eval(data: bytes | str) -> str:
@@ -591,7 +580,6 @@ WAYS: dict[str, Way] = {
     "`GET /docs`": over_http("GET", "/docs"),
     "`GET /health`": over_http("GET", "/health"),
     "`GET /no/such/path`": over_http("GET", "/no/such/path"),
-    "`POST /v1/probe`": over_http("POST", "/v1/probe", document=lambda _: {}),
     "`POST /v1/reset`": over_http("POST", "/v1/reset", document=_reset),
     "`POST /v1/act`": over_http("POST", "/v1/act", document=_act, session=True),
     "`POST /v1/close`": over_http("POST", "/v1/close", document=lambda _: {}, session=True),
@@ -600,7 +588,6 @@ WAYS: dict[str, Way] = {
     "`WS /`": over_websocket("/", partial(libero, 1), _read_map),
     "`WS /openpi`": over_websocket("/openpi", partial(libero, 1), _read_map),
     "`WS /roboarena`": over_websocket("/roboarena", _arena, _read_map),
-    "`WS /v1/realtime/robot/openpi`": over_websocket("/v1/realtime/robot/openpi", _arena, _read_vllm_omni),
     "`WS /vla-eval`": over_websocket("/vla-eval", _see, _read_vla_eval),
     "`GET /v1/weights`": over_http("GET", "/v1/weights"),
     "`GET /v1/weights`, scope `weights`": _with_scope("weights", over_http("GET", "/v1/weights")),

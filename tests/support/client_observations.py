@@ -34,10 +34,6 @@ def chw(size: int = 32) -> np.ndarray:
     return np.ascontiguousarray(image(size).transpose(2, 0, 1))
 
 
-def rgba(size: int = 32) -> np.ndarray:
-    return np.concatenate([image(size), np.full((size, size, 1), 255, np.uint8)], axis=2)
-
-
 LIBERO_STATE = np.array([-0.05, 0.03, 0.91, 3.1, 0.02, -0.1, 0.0388, -0.0388])
 _LIBERO = {"xyz_axis_angle": 6, "gripper_qpos": 2}
 _ALOHA = {"left/joints": 6, "left/gripper": 1, "right/joints": 6, "right/gripper": 1}
@@ -88,21 +84,6 @@ SENT = [
         },
         ("front", "left_wrist", "right_wrist"),
         _ALOHA,
-    ),
-    Sent(
-        "behavior-r1pro",
-        "BEHAVIOR-1K, OmniGibson/omnigibson/eval/evaluator.py at c71025a",
-        {
-            "robot_r1::robot_r1:zed_link:Camera:0::rgb": rgba(),
-            "robot_r1::robot_r1:left_realsense_link:Camera:0::rgb": rgba(),
-            "robot_r1::robot_r1:right_realsense_link:Camera:0::rgb": rgba(),
-            "robot_r1::robot_r1:zed_link:Camera:0::depth_linear": np.ones((32, 32), np.float32),
-            "robot_r1::proprio": np.arange(61, dtype=np.float32),
-            "robot_r1::cam_rel_poses": np.zeros(21, np.float32),
-            "task_id": np.array([3]),
-        },
-        ("front", "left_wrist", "right_wrist"),
-        {"proprio": 61},
     ),
     Sent(
         "roboarena",

@@ -27,7 +27,6 @@ METADATA = {"policy": "mirror", "version": "0", "protocol": 1, "checkpoint": Non
 ALL: dict[str, Any] = {
     "openpi": {"mapping": "openpi-libero", "metadata": {"reset_pose": [0.5]}},
     "roboarena": {"mapping": "openpi-libero"},
-    "vllm_omni": {"mapping": "openpi-libero"},
     "openvla": {},
     "vla_eval": {"observation_params": {"send_state": True}},
 }

@@ -274,7 +274,6 @@ WAYS: dict[str, tuple[Callable[[], bytes], Attack]] = {
     "WS /vla-eval": (_of_vla_eval, _websocket("/vla-eval")),
     "POST /v1/reset, form": (_form, _post("/v1/reset", "multipart/form-data; boundary=X")),
     "POST /v1/reset, frame": (_frame, _post("/v1/reset", CONTENT_TYPE)),
-    "POST /v1/probe": (_probe, _post("/v1/probe", "application/octet-stream")),
     "POST /act": (_of_openvla, _post("/act", "application/json")),
     "shared memory": (_frame, _shared_memory),
 }

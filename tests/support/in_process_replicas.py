@@ -14,7 +14,7 @@ from in_flight import submit
 
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.connection import Connection
-from vlagents_ray.client.transports.codec_selection import CodecChoice
+from vlagents_ray.client.transports.base import CodecChoice
 from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, PolicyUnavailable, UnknownApp
 from vlagents_ray.interface import Agent
 from vlagents_ray.protocol.frames import (

@@ -6,14 +6,12 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from itertools import count
 from pathlib import Path
 
 import pytest
-
-from vlagents_ray import Obs, RemoteAgent
 
 SERVER = Path(__file__).with_name("noop_http_server.py")
 _numbers = count()
@@ -46,19 +44,6 @@ def shaped(rate: str) -> Iterator[str]:
             _do(*where, "ip", "link", "set", link, "up")
             _do(*where, "tc", "qdisc", "add", "dev", link, *limit)
         yield stack.enter_context(_server(peer, inside))
-
-
-def measure_until(agent: RemoteAgent, obs: Obs, true: Callable[[], bool], attempts: int = 10) -> bool:
-    """Begin episodes over new connections of `agent` until `true()`; whether it came true.
-
-    A connection is measured once, and a machine that is busy for that tenth of a second misleads it.
-    """
-    for _ in range(attempts):
-        agent.close()
-        agent.reset(obs, "look")
-        if true():
-            return True
-    return False
 
 
 @contextmanager

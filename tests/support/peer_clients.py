@@ -88,36 +88,6 @@ def roboarena(url: str, client: int, calls: int) -> list[Any]:
     return said
 
 
-def vllm_omni(url: str, client: int, calls: int) -> list[Any]:
-    """vLLM-Omni's client, which stands in its tests: openpi-client's encoding, actions as an array, resets as a map."""
-    from openpi_client import msgpack_numpy
-    from websockets.sync.client import connect
-
-    said = []
-    with connect(url, compression=None, max_size=None) as socket:
-
-        def ask(message: dict[str, Any]) -> Any:
-            socket.send(msgpack_numpy.Packer().pack(message))
-            return msgpack_numpy.unpackb(socket.recv())
-
-        if msgpack_numpy.unpackb(socket.recv())["action_space"] != "joint_position":
-            raise RuntimeError("no configuration")
-        for number, one in enumerate(observations(client, calls)):
-            if number == calls // 2 and ask({"endpoint": "reset"}) != {"status": "reset successful"}:
-                raise RuntimeError("reset failed")
-            obs = {
-                "observation/exterior_image_0_left": image(one["pixel"]),
-                "observation/wrist_image_left": image(0),
-                "observation/joint_position": np.array([one["number"], 0, 0, 0, 0, 0, 0], np.float32),
-                "observation/gripper_position": np.zeros(1, np.float32),
-                "prompt": one["task"],
-                "session_id": f"episode-{number >= calls // 2}",
-                "endpoint": "infer",
-            }
-            said.append([one, ask(obs).tolist()])
-    return said
-
-
 def openpi_error(url: str, client: int, calls: int) -> list[Any]:
     """What openpi-client raises for an observation that lacks a key."""
     from openpi_client.websocket_client_policy import WebsocketClientPolicy

@@ -15,7 +15,7 @@ from vlagents_ray.client.commands import CommandInbox
 from vlagents_ray.client.connection import Connection
 from vlagents_ray.client.credentials import Credentials
 from vlagents_ray.client.session import ClientSession, EpisodeState, call_with_recovery
-from vlagents_ray.client.transports.codec_selection import CodecChoice, CodecName, LinkSpeed
+from vlagents_ray.client.transports.base import CodecChoice, CodecName
 from vlagents_ray.client.transports.select import TransportName, select_transport
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import (
@@ -73,10 +73,9 @@ class RemoteAgent(Agent):
                 less. 2 to 5 s suit a robot, since a call to a hung replica lasts until its end.
             connect_timeout_s: How long to wait for a server that cannot be reached or is still loading, by default
                 `timeout_s`; after 2 s, a warning is logged.
-            codec: How images are encoded for a network. "auto" measures the link when the first ones are sent (0.15 s,
-                or ten round trips), and takes raw pixels from 300 MB/s on, else JPEG. "exact" leaves out JPEG, which
-                changes the pixels a little: raw pixels from 25 MB/s on, else PNG. "raw", "lossless" (PNG), "jpeg" or
-                an `ImageCodec` force one. To a server on this machine pixels stay raw.
+            codec: How images are encoded for a network: "auto" is JPEG, which changes the pixels a little, and
+                "exact" PNG; to a server on this machine, both leave the pixels raw. "raw", which is faster from
+                300 MB/s (2.4 Gbit/s) on, "lossless" (PNG), "jpeg" or an `ImageCodec` force one.
             rank: The class of the requests: a "robot" goes before a "simulation".
             resume: False raises the loss of a session as `ConnectionLost`; the episode then needs a new `reset`.
             api_key: The API key, for a server that requires one; by default the value of `VLAGENTS_RAY_API_KEY`.
@@ -132,13 +131,8 @@ class RemoteAgent(Agent):
 
     @property
     def codec(self) -> ImageCodec | None:
-        """The codec of the cameras; None until it is chosen for the first images."""
+        """The codec of the cameras; None until it is chosen when the agent connects."""
         return RAW if self.transport in ("shm", "plasma", "handle") else self._connection.codec.codec
-
-    @property
-    def link(self) -> LinkSpeed | None:
-        """Round trip (s) and bandwidth (bytes/s) to the server; None if they were not measured to choose a codec."""
-        return self._connection.codec.link
 
     @property
     def reconnects(self) -> int:

@@ -17,8 +17,7 @@ from vlagents_ray.interface import OF_THE_LOOP
 from vlagents_ray.protocol.messages import PROTOCOL_VERSION, Reply, Request, boot_id, is_loopback
 
 if TYPE_CHECKING:
-    from vlagents_ray.client.transports.base import Transport
-    from vlagents_ray.client.transports.codec_selection import CodecChoice
+    from vlagents_ray.client.transports.base import CodecChoice, Transport
 
 logger = logging.getLogger(__name__)
 
@@ -195,7 +194,6 @@ class Connection:
             self._drop_next()
             self._close_old_transport()
             self.transport.close()
-            self.codec.forget()  # the next connection may be over another link
             self.metadata, self._must_reconnect, self._asked_to_move = None, False, False
 
     def _close_old_transport(self) -> None:

@@ -18,7 +18,7 @@ from typing_extensions import Self
 from websockets.exceptions import ConnectionClosed
 
 from vlagents_ray.client.credentials import Credentials
-from vlagents_ray.client.transports.codec_selection import CodecChoice
+from vlagents_ray.client.transports.base import CodecChoice
 from vlagents_ray.client.transports.http import HttpTransport, http_url
 from vlagents_ray.client.transports.websocket import ProxiedSocket, open_websocket
 from vlagents_ray.errors import ConfigError, InvalidWeights, PolicyUnavailable, VLAgentsError

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ipaddress
-import os
 import socket
 import struct
 from dataclasses import dataclass, field
@@ -226,20 +225,13 @@ class Budget:
         self.count(size)
 
 
-# A probe is answered at once, to measure the link; it reaches neither a session nor the policy. It is b"VLA?", a uint32
-# that is not read, and as many bytes as the link is to carry, in a WebSocket message or the body of `POST /v1/probe`,
-# under the limits of a request. The answer is b"VLA!" and the number of bytes that arrived, uint64 little-endian.
+# A probe is answered at once, to test the link; it reaches neither a session nor the policy. It is b"VLA?", a uint32
+# that is not read, and as many bytes as the link is to carry, in a WebSocket message, under the limits of a request.
+# The answer is b"VLA!" and the number of bytes that arrived, uint64 little-endian.
 
-_HEAD = struct.Struct("<4sI")
+_HEAD_BYTES = 8  # of the tag and the uint32
 _PROBE_TAG, _ANSWER_TAG = b"VLA?", b"VLA!"
 _ANSWER = struct.Struct("<4sQ")
-
-LEAST_BYTES = _HEAD.size
-
-
-def bytes_probe(size: int) -> bytes:
-    """Return a probe of `size` bytes, at least `LEAST_BYTES`; random, so that no tunnel compresses it."""
-    return _HEAD.pack(_PROBE_TAG, 0) + os.urandom(max(0, size - LEAST_BYTES))
 
 
 def is_probe(message: bytes | memoryview) -> bool:
@@ -252,16 +244,11 @@ def read_probe(message: bytes, budget: Budget) -> None:
     budget.begin_message()
     if not is_probe(message):
         raise MalformedMessage(f"probe: got {message[:4]!r} at its start, want {_PROBE_TAG!r}")
-    if len(message) < LEAST_BYTES:
-        raise MalformedMessage(f"probe: got {len(message)} bytes, want at least {LEAST_BYTES}")
+    if len(message) < _HEAD_BYTES:
+        raise MalformedMessage(f"probe: got {len(message)} bytes, want at least {_HEAD_BYTES}")
     budget.begin("probe", "simulation")
 
 
 def probe_answer(size: int) -> bytes:
     """Return the answer to a probe of `size` bytes."""
     return _ANSWER.pack(_ANSWER_TAG, size)
-
-
-def is_probe_answer(message: bytes | memoryview) -> bool:
-    """Whether a message is the answer to a probe; no other message of a server begins like it."""
-    return len(message) == _ANSWER.size and message[: len(_ANSWER_TAG)] == _ANSWER_TAG

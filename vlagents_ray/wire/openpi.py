@@ -123,20 +123,6 @@ PRESETS: dict[str, dict[str, Any]] = {
         "instruction": "prompt",
         "action_gripper": ALOHA_ACTION,
     },
-    # BEHAVIOR-1K, OmniGibson/omnigibson/eval, evaluator.py and r1pro.yaml at c71025a: RGBA images; the proprioception
-    # has 61 numbers (`PROPRIOCEPTION_INDICES` in utils/eval_utils.py), 256 in the challenge of 2025; an action has 23,
-    # the grippers' from -1 (closed) to 1; no text is sent, only the task's number
-    "behavior-r1pro": {
-        "cameras": {
-            "front": {"key": "robot_r1::robot_r1:zed_link:Camera:0::rgb", "layout": "rgba"},
-            "left_wrist": {"key": "robot_r1::robot_r1:left_realsense_link:Camera:0::rgb", "layout": "rgba"},
-            "right_wrist": {"key": "robot_r1::robot_r1:right_realsense_link:Camera:0::rgb", "layout": "rgba"},
-        },
-        "state": {"proprio": "robot_r1::proprio"},
-        "instruction": "prompt|task_id",
-        "info": {"task_id": "task_id"},
-        "action_gripper": [{"index": 14, "open": 1.0, "closed": -1.0}, {"index": 22, "open": 1.0, "closed": -1.0}],
-    },
 }
 
 ROBOARENA: dict[str, dict[str, Any]] = {

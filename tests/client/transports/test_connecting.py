@@ -10,7 +10,7 @@ import ray
 
 from vlagents_ray.client.credentials import Credentials
 from vlagents_ray.client.transports import base, http, serve_handle, websocket
-from vlagents_ray.client.transports.codec_selection import CodecChoice
+from vlagents_ray.client.transports.base import CodecChoice
 from vlagents_ray.client.transports.http import HttpTransport
 from vlagents_ray.client.transports.serve_handle import HandleTransport
 from vlagents_ray.client.transports.websocket import WebSocketTransport

@@ -19,8 +19,7 @@ from websockets.sync.server import ServerConnection, serve
 
 from vlagents_ray.client.credentials import Credentials
 from vlagents_ray.client.transports import websocket
-from vlagents_ray.client.transports.base import first_timeout_s
-from vlagents_ray.client.transports.codec_selection import CodecChoice
+from vlagents_ray.client.transports.base import CodecChoice, first_timeout_s
 from vlagents_ray.client.transports.websocket import ProxiedSocket, Stream, WebSocketTransport
 from vlagents_ray.errors import PolicyUnavailable
 

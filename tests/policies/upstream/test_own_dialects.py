@@ -25,7 +25,6 @@ from vlagents_ray.serve.models.agent_copies import AgentCopies
 DIALECTS: dict[str, Any] = {
     "openpi": {"mapping": "openpi-libero"},
     "roboarena": {"mapping": "openpi-libero", "n_external_cameras": 0},
-    "vllm_omni": {"mapping": "openpi-libero", "n_external_cameras": 0},
     "openvla": {"mapping": "openvla-oft", "chunk": True},
     "vla_eval": {},
 }
@@ -33,7 +32,6 @@ WAYS = {
     "openpi": ("openpi", "ws", "/openpi", "openpi-libero"),
     "openpi-batch": ("openpi-batch", "ws", "/openpi", "openpi-libero"),
     "roboarena": ("roboarena", "ws", "/roboarena", "openpi-libero"),
-    "vllm_omni": ("roboarena", "ws", "/v1/realtime/robot/openpi", "openpi-libero"),
     "openvla": ("openvla", "http", "/act", "openvla-oft"),
     "vla_eval": ("vla_eval", "ws", "/vla-eval", "vla-eval"),
 }

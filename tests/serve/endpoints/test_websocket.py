@@ -16,6 +16,7 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 from eval_fakes import wait_for
+from probes import bytes_probe, is_probe_answer
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
@@ -34,12 +35,10 @@ from vlagents_ray.protocol.messages import (
     Limits,
     Reply,
     Request,
-    bytes_probe,
-    is_probe_answer,
 )
 from vlagents_ray.serve.access.api_keys import Keys, NoKey
 from vlagents_ray.serve.access.key_store import new_key
-from vlagents_ray.serve.endpoints import websocket_connection
+from vlagents_ray.serve.endpoints import websocket
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.engine import Engine
 
@@ -83,13 +82,13 @@ def test_each_connection_is_a_session_that_ends_with_it(endpoint: WebSocketServe
             act = ask(client, "act", 3 * step + number).act
             assert act is not None
             assert act.action.tolist() == [3 * step + number]
-    assert len(endpoint._engine.sessions) == 3
+    assert len(endpoint.engine.sessions) == 3
     clients[0].close()
     clients[1]._socket.close()  # without a word
-    wait_for(lambda: len(endpoint._engine.sessions) == 1)
+    wait_for(lambda: len(endpoint.engine.sessions) == 1)
     assert ask(clients[2], "act", 9).act is not None
     clients[2].close()
-    wait_for(lambda: len(endpoint._engine.sessions) == 0)
+    wait_for(lambda: len(endpoint.engine.sessions) == 0)
 
 
 def test_who_does_not_know_the_path_is_not_let_in(endpoint: WebSocketServer) -> None:
@@ -105,7 +104,7 @@ def test_an_ordinary_websocket_client_is_served_too(endpoint: WebSocketServer) -
         socket_.ping().wait(5)
         probe = bytes_probe(300_000)
         socket_.send(probe)
-        assert is_probe_answer(socket_.recv(5))
+        assert is_probe_answer(socket_.recv(5), probe)
         socket_.send(encode_request(Request("reset", Obs())))
         assert decode_reply(socket_.recv(5)).error is None
 
@@ -160,8 +159,8 @@ def test_what_is_too_long_or_in_pieces_ends_the_connection_that_sent_it_alone(
 def test_who_stays_after_a_wrong_message_is_cut_off(
     endpoint: WebSocketServer, floods: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(websocket_connection, "_HANDSHAKE_S", 1e9 if floods else 0.2)
-    endpoint._limits = Limits(body_bytes=1_000_000)
+    monkeypatch.setattr(websocket, "_HANDSHAKE_S", 1e9 if floods else 0.2)
+    endpoint.limits = Limits(body_bytes=1_000_000)
     client = stream(endpoint)
     ask(client, "reset")
     client._socket.sendall(b"\x82\xff" + (2**40).to_bytes(8, "big") + bytes(4))  # a message of a TB begins
@@ -169,7 +168,7 @@ def test_who_stays_after_a_wrong_message_is_cut_off(
         client._socket.settimeout(5)
         with pytest.raises(OSError, match=r"reset|pipe"):
             client._socket.sendall(bytes(1_000_000_000))
-    wait_for(lambda: not endpoint._clients and not len(endpoint._engine.sessions))
+    wait_for(lambda: not endpoint._clients and not len(endpoint.engine.sessions))
     client._socket.close()
 
 
@@ -188,7 +187,7 @@ def test_a_client_that_takes_no_replies_holds_up_nobody(
         act = ask(other, "act", pixel).act
         assert act is not None
         assert act.action.tolist() == [pixel]
-    wait_for(lambda: len(endpoint._engine.sessions) == 1)  # it was cut off
+    wait_for(lambda: len(endpoint.engine.sessions) == 1)  # it was cut off
     wait_for(lambda: not [thread for thread in threading.enumerate() if thread.name == "send-slowly"])
     slow.close()
     other.close()
@@ -239,7 +238,7 @@ def test_what_nobody_foresaw_ends_the_connection_that_it_came_by_alone(
             raise RuntimeError
         return decode_requests(frame, budget)
 
-    monkeypatch.setattr("vlagents_ray.serve.endpoints.websocket_connection.decode_requests", decode)
+    monkeypatch.setattr("vlagents_ray.serve.endpoints.websocket.decode_requests", decode)
     other, client = stream(endpoint), stream(endpoint)
     for each in (other, client):
         ask(each, "reset")
@@ -247,7 +246,7 @@ def test_what_nobody_foresaw_ends_the_connection_that_it_came_by_alone(
     with pytest.raises(ConnectionClosed):
         client.recv(5)
     client.close()
-    wait_for(lambda: len(endpoint._engine.sessions) == len(endpoint._clients) == 1)
+    wait_for(lambda: len(endpoint.engine.sessions) == len(endpoint._clients) == 1)
     assert ask(other, "act", 7).act is not None
     other.close()
 
@@ -275,7 +274,7 @@ def test_who_does_not_wait_for_answers_fills_no_memory_and_gets_them_all(
         (one,) = endpoint._clients
         wait_for(lambda: one._paused or not sending.is_alive())
         assert sending.is_alive()
-        assert endpoint._engine.queue.depth() < 400  # 256, and what was in the same read: 85 frames in 1 MiB
+        assert endpoint.engine.queue.depth() < 400  # 256, and what was in the same read: 85 frames in 1 MiB
         hurry.set()
         replies = [decode_reply(client.recv(10)) for _ in frames]
         sending.join(10)

@@ -5,11 +5,16 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
+from vlagents_ray.images.codecs import JPEG, LOSSLESS, RAW, ImageCodec
+from vlagents_ray.interface import Obs
 from vlagents_ray.protocol.messages import Reply, Request
 
 logger = logging.getLogger(__name__)
+
+CodecName = Literal["auto", "exact", "raw", "lossless", "jpeg"]
+_OVER_A_NETWORK = {"auto": JPEG, "exact": LOSSLESS}  # the codecs whose choice depends on where the server is
 
 _ANSWER_S = 2.0  # most s that the first replica asked may take to send anything
 _SILENT_S = 2.0  # s after which an attempt to connect that goes on is reported
@@ -85,3 +90,33 @@ def left_s(deadline: float) -> float:
 def is_answer(replies: Sequence[Reply], requests: Sequence[Request]) -> bool:
     """Whether these replies belong to these requests, not to earlier ones. An unreadable frame has no id."""
     return replies[0].request_id in ("", requests[0].request_id)
+
+
+class CodecChoice:
+    """The codec of a connection's cameras: the one that the user names, or one that depends on where the server is.
+
+    Within a machine, "auto" and "exact" take raw pixels; over a network, "auto" takes JPEG and "exact" PNG. On one core
+    of a server, JPEG costs 3 ns for a byte of pixels, encoded and decoded, and leaves 7 to 10 % of the bytes, so
+    that it is faster than raw pixels up to 300 MB/s (2.4 Gbit/s). PNG costs 18 ns and leaves about half.
+    """
+
+    def __init__(self, requested: CodecName | ImageCodec) -> None:
+        self._compressed = None if isinstance(requested, ImageCodec) else _OVER_A_NETWORK.get(requested)
+        self.codec: ImageCodec | None = None  # None until there is a connection by which to choose
+        if isinstance(requested, ImageCodec):
+            self.codec = requested
+        elif self._compressed is None:
+            self.codec = ImageCodec(requested)
+
+    def connected(self, *, near: bool) -> None:
+        """Choose for a new connection; `near` says whether its server is on this machine."""
+        if self._compressed is not None:
+            self.codec = RAW if near else self._compressed
+
+    def codec_for(self, obs: Obs | None, most_bytes: float = float("inf")) -> ImageCodec:
+        """Return the codec for an observation; over `most_bytes` it is never raw, unless the user named that."""
+        codec = self.codec or RAW
+        if codec == RAW and self._compressed is not None and obs is not None:
+            size = sum(image.nbytes for image in obs.cameras.values())
+            return self._compressed if size > most_bytes else RAW
+        return codec

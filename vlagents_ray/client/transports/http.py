@@ -14,8 +14,7 @@ from typing import Any
 from urllib.parse import SplitResult, urlsplit
 
 from vlagents_ray.client.credentials import ANONYMOUS, KEY_VARIABLE, Credentials, require_plain, tls_failure
-from vlagents_ray.client.transports.base import ConnectReport, first_timeout_s
-from vlagents_ray.client.transports.codec_selection import CodecChoice
+from vlagents_ray.client.transports.base import CodecChoice, ConnectReport, first_timeout_s
 from vlagents_ray.errors import (
     ConfigError,
     ConnectionLost,
@@ -113,19 +112,12 @@ class HttpTransport:
             "content-type": CONTENT_TYPE,
             "accept": CONTENT_TYPE,
         }
-        codec = self._codec.codec_for(requests[0].obs, lambda probe: self._probe(probe, timeout_s), timeout_s=timeout_s)
-        frame = encode_requests(requests, codec)
+        frame = encode_requests(requests, self._codec.codec_for(requests[0].obs))
         status, kind, body = self._exchange("POST", f"/v1/{requests[0].op}", frame, headers, timeout_s)
         if status == 200:
             return decode_replies(body)
         refused = refusal(status, kind, body)
         return [Reply(request.request_id, error=refused) for request in requests]
-
-    def _probe(self, probe: bytes, timeout_s: float) -> None:
-        headers = {SESSION_HEADER: self._session, "content-type": "application/octet-stream"}
-        status, kind, body = self._exchange("POST", "/v1/probe", probe, headers, timeout_s)
-        if status != 200:
-            raise refusal(status, kind, body)
 
     def close(self) -> None:
         """Close the connection; the next one may reach another replica."""

@@ -8,8 +8,7 @@ from typing import Any, Literal, get_args
 from urllib.parse import urlsplit
 
 from vlagents_ray.client.credentials import ANONYMOUS, Credentials
-from vlagents_ray.client.transports.base import RequestChannel, Transport
-from vlagents_ray.client.transports.codec_selection import CodecChoice
+from vlagents_ray.client.transports.base import CodecChoice, RequestChannel, Transport
 from vlagents_ray.client.transports.http import HttpTransport, http_url
 from vlagents_ray.client.transports.serve_handle import HandleTransport, PlasmaTransport
 from vlagents_ray.client.transports.shm import ShmTransport, reaches

@@ -1,6 +1,6 @@
 """Messages on a Unix socket that say where the observations lie, and shared memory as the place.
 
-`vlagents_ray.serve.endpoints.unix_messages` and `.shm` are the server's side. Plasma (`.plasma`) is the other place.
+`vlagents_ray.serve.endpoints.shm` is the server's side. Plasma (`.serve_handle`) is the other place.
 """
 
 from __future__ import annotations

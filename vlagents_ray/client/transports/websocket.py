@@ -27,19 +27,17 @@ from websockets.sync.client import connect
 from websockets.uri import parse_uri
 
 from vlagents_ray.client.credentials import ANONYMOUS, WEBSOCKET_LOG, Credentials, require_plain, tls_failure
-from vlagents_ray.client.transports.base import first_timeout_s, is_answer, left_s
-from vlagents_ray.client.transports.codec_selection import CodecChoice
+from vlagents_ray.client.transports.base import CodecChoice, first_timeout_s, is_answer, left_s
 from vlagents_ray.client.transports.http import HttpTransport, http_url, refusal
 from vlagents_ray.errors import (
     ConnectionLost,
     DeadlineExceeded,
-    MalformedMessage,
     MessageTooLarge,
     NoReplica,
     PolicyUnavailable,
 )
 from vlagents_ray.protocol.frame_layout import Buffer
-from vlagents_ray.protocol.frames import decode_replies, decode_reply, request_parts
+from vlagents_ray.protocol.frames import decode_replies, request_parts
 from vlagents_ray.protocol.messages import (
     DEFAULT_LIMITS,
     SERVERS_MACHINE,
@@ -47,7 +45,6 @@ from vlagents_ray.protocol.messages import (
     Reply,
     Request,
     StreamAddress,
-    is_probe_answer,
 )
 
 logger = logging.getLogger(__name__)
@@ -298,10 +295,7 @@ class WebSocketTransport:
     def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
         """Send one frame and return its replies; replies to earlier requests that timed out are discarded."""
         deadline = time.monotonic() + timeout_s
-        codec = self._codec.codec_for(
-            requests[0].obs, lambda probe: self._probe(probe, left_s(deadline)), STREAM_BYTES, timeout_s
-        )
-        pieces = request_parts(requests, codec)
+        pieces = request_parts(requests, self._codec.codec_for(requests[0].obs, STREAM_BYTES))
         if (size := sum(map(len, pieces))) > STREAM_BYTES:  # the server would only close the connection
             raise MessageTooLarge(
                 f"{self._url}: got {size} bytes, the limit of a WebSocket message is {STREAM_BYTES}; "
@@ -319,22 +313,6 @@ class WebSocketTransport:
         except (ConnectionClosed, OSError) as error:
             self.close()
             raise ConnectionLost(f"{self._url}: {error}; reset before the next act") from error
-
-    def _probe(self, probe: bytes, timeout_s: float) -> None:
-        connection = self._stream(timeout_s)
-        try:
-            connection.send(probe, timeout_s)
-            data = connection.recv(timeout_s)
-        except TimeoutError as error:
-            self.close()  # its reply may come later, and would be taken for that of another request
-            raise DeadlineExceeded(
-                f"{self._url}: no answer to a probe of {len(probe)} bytes within {timeout_s:g} s"
-            ) from error
-        except (ConnectionClosed, OSError) as error:
-            self.close()
-            raise ConnectionLost(f"{self._url}: {error}; reset before the next act") from error
-        if not is_probe_answer(data):
-            raise decode_reply(data).error or MalformedMessage(f"{self._url}: got another answer to a probe")
 
     def close(self) -> None:
         """Close the connection, and with it its sessions."""

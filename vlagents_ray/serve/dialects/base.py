@@ -42,7 +42,6 @@ The following is a complete dialect, for clients that post `{"q": [...], "task":
 from __future__ import annotations
 
 import abc
-import asyncio
 import logging
 import socket
 from collections.abc import Awaitable, Callable, Mapping, Sequence
@@ -217,21 +216,18 @@ class RouteDialect(Dialect):
         """Return a session of that sender, its own if `name` is empty, which begins without a reset by the client."""
         return ImplicitSession(self.context.engine, sender, self.rank, name)
 
-    async def receive(
-        self, socket: WebSocket, gate: Sender, idle_s: float | None = None
-    ) -> tuple[bytes | None, MessageAdmission] | None:
+    async def receive(self, socket: WebSocket, gate: Sender) -> tuple[bytes | None, MessageAdmission] | None:
         """Wait for the next message of a WebSocket, unless its key is over its rate.
 
         Args:
             socket: The connection.
             gate: The sender that `gate` returned for it.
-            idle_s: Maximum time for the message, s, after which `asyncio.TimeoutError` is raised.
 
         Returns:
             The message, None for a text, and its admission; or None if the client is gone.
         """
         await gate.wait_unthrottled()
-        event = await asyncio.wait_for(socket.receive(), idle_s)
+        event = await socket.receive()
         if event["type"] == "websocket.disconnect":
             return None
         data = event.get("bytes")

@@ -9,18 +9,16 @@ sends a traceback.
 
 A batch, `{"batch": [observation, ...]}`, is that of openpi's pull request 941 (its head 5bdadc8), which was open when
 this was written: the reply is one map, whose `actions` are stacked. openpi's own client sends nothing when it is reset;
-the message `{"reset": True}` is that of its derivatives, such as BEHAVIOR-1K's client, which waits for no reply. The
-latter reads the replies of `Rows`.
+the message `{"reset": True}` is that of its derivatives.
 """
 
 from __future__ import annotations
 
 import abc
-import asyncio
 import time
 import uuid
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -68,11 +66,6 @@ class MapDialect(RouteDialect):
     def speaks(self, message: dict[str, Any]) -> bool:
         """Return whether a message comes from a client of this dialect."""
 
-    @property
-    def idle_s(self) -> float | None:
-        """The time after which the connection of a client that sends nothing is closed, s; None if it stays open."""
-        return None
-
     def begins(self, message: dict[str, Any], connection: MapConnection) -> bytes | str | None:
         """Begin an episode if the message requires it.
 
@@ -85,14 +78,6 @@ class MapDialect(RouteDialect):
         """Return the observations of a message that is a batch; None if it is one observation."""
         return None
 
-    def rows_taken(self, message: dict[str, Any]) -> int | None:
-        """Return how many rows the client executes before its next message; None if it gets whole chunks."""
-        return None
-
-    def reset_arguments(self, message: dict[str, Any]) -> dict[str, Any]:
-        """Return the keyword arguments of the policy's reset, should this observation begin an episode."""
-        return {}
-
     def answer(self, replies: Sequence[Reply], before_ms: float | None, *, batched: bool) -> Any:
         """Return the replies in the client's format; `before_ms` is the server's time for the previous message."""
         inference_ms = max(reply.timing["inference_ms"] for reply in replies)
@@ -103,10 +88,6 @@ class MapDialect(RouteDialect):
             "policy_timing": {"infer_ms": inference_ms} | ({"batch_size": len(rows)} if batched else {}),
             "server_timing": {"infer_ms": infer_ms} | ({} if before_ms is None else {"prev_total_ms": before_ms}),
         }
-
-    def failure(self, text: str) -> bytes | None:
-        """Return an error as a message after which the connection stays open; None: it is a text, then a close."""
-        return None
 
 
 def _stacked(chunks: Sequence[np.ndarray]) -> np.ndarray:
@@ -128,12 +109,6 @@ class OpenPiDialectConfig(DialectConfig):
     answer_reset: bool = Field(
         default=False, description='whether {"reset": True} is answered, by the same; clients differ in waiting for it'
     )
-    answer: Literal["chunk", "row"] = Field(
-        default="chunk",
-        description="a reply has a whole chunk, as `actions`; or the next row of one that is kept here, as `action`, "
-        "which BEHAVIOR-1K's client reads",
-    )
-    execute: int | None = Field(default=None, ge=1, description="rows of each chunk that are used; null: all")
 
 
 class OpenPiDialect(MapDialect):
@@ -170,17 +145,11 @@ class OpenPiDialect(MapDialect):
 
     def batch(self, message: dict[str, Any]) -> list[Any] | None:
         if message.keys() != {"batch"}:
-            return unstacked(message, self.context.engine.sessions.limit) if self.config.answer == "row" else None
+            return None
         batch = message["batch"]
         if not isinstance(batch, list) or not batch:
             raise MalformedMessage(f"batch: got {shown(batch)}, want a list of one observation or more")
         return batch
-
-    def rows(self, reply: Reply) -> np.ndarray:
-        return super().rows(reply)[: self.config.execute]
-
-    def rows_taken(self, message: dict[str, Any]) -> int | None:
-        return number_of_rows(message) if self.config.answer == "row" else None
 
 
 class MapConnection:
@@ -192,7 +161,6 @@ class MapConnection:
         self.session: ImplicitSession = dialect.session(self.sender)
         self.episode: str | None = None  # the client's name of the episode
         self._batched: list[ImplicitSession] = []  # the session of each place in a batch
-        self._rows = Rows()
         self._before_ms: float | None = None
 
     def end_episodes(self) -> None:
@@ -213,23 +181,12 @@ class MapConnection:
         if not sessions[0].episode.begun:
             dialect.mapping.warn_of_unread_cameras(observations[0], dialect.name)
         seen = [SessionObs(session, *one) for session, one in zip(sessions, read, strict=True)]
-        number, batched = dialect.rows_taken(message), batch is not None
-        begins = any(session.episode.begins(instruction) for session, _, instruction in seen)
-        if number is not None and not begins and self._rows.has(number, stacked=batched):
-            return openpi.encode(self._rows.take(number))
         incoming.decoded_alike(len(observations))
-        replies = await act_together(incoming, seen, request_id, **dialect.reset_arguments(message))
-        data = incoming.written(lambda: openpi.encode(self._said(replies, number, batched=batched)))
+        replies = await act_together(incoming, seen, request_id)
+        before_ms, batched = self._before_ms, batch is not None
+        data = incoming.written(lambda: openpi.encode(dialect.answer(replies, before_ms, batched=batched)))
         self._before_ms = (time.perf_counter() - incoming.arrived) * 1e3
         return data
-
-    def _said(self, replies: Sequence[Reply], number: int | None, *, batched: bool) -> Any:
-        """Return the replies in the client's format, with the first `number` rows only unless it is None."""
-        said = self.dialect.answer(replies, self._before_ms, batched=batched)
-        if number is not None:
-            self._rows.replace(said.pop("actions"))
-            said |= self._rows.take(number)
-        return said
 
     async def _of_batch(self, number: int) -> list[ImplicitSession]:
         """Return the session of each place in a batch of that size; the episodes of another size end."""
@@ -259,12 +216,9 @@ class MapEndpoint:
         gate = self._dialects[0].gate()
         try:
             await socket.send_bytes(openpi.encode(self._dialects[-1].first()))
-            first = self._dialects[0]
-            while (received := await first.receive(socket, gate, first.idle_s)) is not None:
+            while (received := await self._dialects[0].receive(socket, gate)) is not None:
                 if not await self._answer(socket, *received, connections, gate):
                     return
-        except asyncio.TimeoutError:
-            await socket.close()
         except WebSocketDisconnect:
             return
         finally:
@@ -291,16 +245,13 @@ class MapEndpoint:
         except Exception as error:  # noqa: BLE001 - the error is the reply to the client
             problem = public_problem(error, incoming.transport, request_id)
             incoming.record_failure(problem.code)
-            text = f"{problem} (request {request_id})"
-            failure = self._dialects[0].failure(text)
-            await (socket.send_text(text) if failure is None else socket.send_bytes(failure))
+            await socket.send_text(f"{problem} (request {request_id})")
             if isinstance(problem, TooManyRequests):  # the connection stays open, as nothing was acted on
                 if gate.refused_too_often:
                     await socket.close(POLICY_VIOLATION, REFUSED)
                 return not gate.refused_too_often
-            if failure is None:
-                await socket.close(INTERNAL_ERROR, "Internal server error.")
-            return failure is not None
+            await socket.close(INTERNAL_ERROR, "Internal server error.")
+            return False
         finally:
             admission.release()
         if isinstance(answer, str):
@@ -308,63 +259,3 @@ class MapEndpoint:
         elif answer:
             await socket.send_bytes(answer)
         return True
-
-
-# Replies that have one row of a chunk, as BEHAVIOR-1K's client reads them.
-#
-# The client is `WebsocketPolicy` or `MultiWebsocketPolicy` of BEHAVIOR-1K's OmniGibson/omnigibson/eval/policies.py at
-# 020ca52, over utils/network_utils.py at c8a6cd8; docs/challenge/evaluation.md at 01f0ed2 describes its protocol.
-#
-# It reads `action`, (D,). It may ask for K rows by `__action_chunk_size__`, to execute them without a further message:
-# they come as `action_chunk`, (K, D), whose first row equals `action`; if that is absent, it asks for single rows from
-# then on. The observations of B environments may be stacked, those of a single one included: `task_id` is then (B, 1),
-# and `action` (B, D). The client of the challenge of 2025 (omnigibson/learning) reads the same, without chunks and
-# stacks.
-
-
-_NUMBER = "__action_chunk_size__"
-
-
-class Rows:
-    """The rows of a connection's chunks that its client has not got yet."""
-
-    def __init__(self) -> None:
-        self._left: np.ndarray | None = None  # (H, D), or (B, H, D) of stacked environments
-
-    def replace(self, chunk: np.ndarray) -> None:
-        """Let the next rows be those of a chunk, (H, D) or (B, H, D)."""
-        self._left = chunk
-
-    def has(self, number: int, *, stacked: bool) -> bool:
-        """Return whether `number` rows are left, of stacked environments or of one."""
-        return self._left is not None and self._left.ndim == 2 + stacked and self._left.shape[-2] >= number
-
-    def take(self, number: int) -> dict[str, np.ndarray]:
-        """Return the reply with the next `number` rows; it has a single one if fewer are left."""
-        if self._left is None or not self._left.shape[-2]:
-            raise IndexError("no row is left")
-        number = number if number <= self._left.shape[-2] else 1
-        taken, self._left = self._left[..., :number, :], self._left[..., number:, :]
-        return {"action": taken[..., 0, :]} | ({"action_chunk": taken} if number > 1 else {})
-
-
-def number_of_rows(message: dict[str, Any]) -> int:
-    """Return how many rows the client executes before its next message."""
-    number = message.get(_NUMBER, 1)
-    if type(number) is not int or number < 1:
-        raise MalformedMessage(f"{_NUMBER}: got {shown(number)}, want an integer, 1 or more")
-    return number
-
-
-def unstacked(message: dict[str, Any], most: int) -> list[dict[str, Any]] | None:
-    """Return the observation of each environment, at most `most`, if they are stacked; None if they are not."""
-    task = message.get("task_id")
-    if not isinstance(task, np.ndarray) or task.ndim != 2:
-        return None
-    if not 1 <= len(task) <= most:
-        raise MalformedMessage(f"task_id: got {task.shape}, want 1 to {most} environments, the limit of sessions")
-    arrays = {key: value for key, value in message.items() if isinstance(value, np.ndarray)}
-    for key, value in arrays.items():
-        if value.shape[:1] != task.shape[:1]:
-            raise MalformedMessage(f"{key[:80]}: got {value.shape}, want {len(task)} environments, as task_id has")
-    return [message | {key: value[place] for key, value in arrays.items()} for place in range(len(task))]

@@ -45,9 +45,6 @@ _PATHS = f"""\
     Ends the session.
 `WS /v1/stream`
     Binary frames; sessions end with the connection. A message that begins with `VLA?` is a probe.
-`POST /v1/probe`
-    For measuring the link: `VLA?`, four zero bytes and any others, which reach neither a session nor the policy. The
-    answer, at once, is `VLA!` and the number of bytes, 64 bits, little-endian.
 `WS /v1/weights`, `GET /v1/weights`
     New weights from a learner, with a key of the scope `weights`; see `vlagents_ray.learn.Publisher`. The versions
     that act.

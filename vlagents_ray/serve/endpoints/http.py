@@ -1,7 +1,6 @@
 """The HTTP endpoint: HTTP and WebSocket on one port, as an ASGI application over an engine.
 
     POST /v1/reset, /v1/act, /v1/close   multipart/form-data, application/json, or one binary frame
-    POST /v1/probe                       answered at once, for measuring the link
     WS   /v1/stream                      sessions that end with the connection; binary frames or probes
     WS   /v1/weights                     new weights from a learner, see `vlagents_ray.serve.endpoints.weights`
     GET  /live, /v1/live, WS /v1/live    what the sessions do, see `vlagents_ray.serve.observers.live_page`
@@ -91,7 +90,6 @@ def build_http_app(
     app = Starlette(
         routes=[
             *(Route(f"/v1/{op}", server.endpoint(op), methods=["POST"]) for op in OPS),
-            Route("/v1/probe", server.probe, methods=["POST"]),
             WebSocketRoute("/v1/stream", server.stream),
             Route("/v1/metadata", server.show_metadata),
             Route("/healthz", server.health),
@@ -141,19 +139,6 @@ class _HttpEndpoint:
 
     async def docs(self, http: HttpRequest) -> Response:
         return self._when_ready(http, lambda: html_response(docs_page(self._metadata()), styles=[STYLE]))
-
-    async def probe(self, http: HttpRequest) -> Response:
-        """Reply to a probe, without a session and without the policy."""
-        sender = Sender(self._engine, "http", caller=current_caller(), connected=False)
-        admission = sender.admission(self._limits, rank="simulation")
-        try:
-            message = await self._requests.body(http, admission)
-            read_probe(message, admission)
-            return Response(probe_answer(len(message)), media_type="application/octet-stream")
-        except ClientDisconnect:
-            return Response(status_code=499)
-        except VLAgentsError as error:
-            return problem_response(error, request_id(http))
 
     def _when_ready(self, http: HttpRequest, answer: Callable[[], Response]) -> Response:
         try:

@@ -2,7 +2,7 @@
 
 The replica keeps a pool of observation channels (mutable objects, the memory under Ray's `Channel`) and leases them to
 clients: a client writes its frames into one as raw bytes, so that nothing is unpickled and the client may use another
-version of numpy. The rest is `vlagents_ray.serve.endpoints.unix_messages`: a message on a Unix socket announces a
+version of numpy. The rest is `vlagents_ray.serve.endpoints.shm`: a message on a Unix socket announces a
 frame, the policy thread reads the frame and replies, and the end of the connection, whatever its cause, returns the
 channel to the pool.
 
@@ -42,7 +42,8 @@ from vlagents_ray.ray_tools.private import (
     write_channel,
 )
 from vlagents_ray.serve.access.api_keys import NoKey
-from vlagents_ray.serve.endpoints.unix_messages import BACKLOG, UnixServer
+from vlagents_ray.serve.endpoints.connection import BACKLOG
+from vlagents_ray.serve.endpoints.shm import UnixServer
 from vlagents_ray.serve.engine.engine import Engine
 
 logger = logging.getLogger(__name__)

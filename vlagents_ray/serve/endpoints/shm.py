@@ -1,30 +1,254 @@
-"""The endpoint for processes on the same machine: observations in shared memory.
+"""The endpoints for processes on the same machine: messages on Unix sockets that locate observations in shared memory.
 
-A client connects to an abstract Unix socket whose unguessable name is in the metadata, and passes memory files that it
-writes its frames into (`vlagents_ray.serve.endpoints.unix_messages`). Neither side creates a file name, so that
-memory and socket are freed with their processes, however those end.
+A `Payload` reads that memory: the client's memory files, or channels in the node's object store
+(`vlagents_ray.serve.endpoints.plasma`). For memory files, a client connects to an abstract socket whose unguessable
+name is in the metadata, and passes files that it writes its frames into. Neither side creates a file name, so that
+memory and socket are freed with their processes, however those end. Only processes of the same user may connect.
 """
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
+import logging
 import mmap
 import os
 import secrets
+import select
+import socket
+import struct
+import threading
+import time
 import weakref
-from collections.abc import Sequence
+from abc import abstractmethod
+from array import array
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import ClassVar
+from typing import ClassVar, Protocol
 
 import numpy as np
 
-from vlagents_ray.errors import MalformedMessage, MessageTooLarge, VLAgentsError
-from vlagents_ray.protocol.messages import OPS, Limits, LocalAddress, Op, boot_id
-from vlagents_ray.serve.access.api_keys import NoKey
-from vlagents_ray.serve.endpoints.unix_messages import BACKLOG, Admit, UnixServer
+from vlagents_ray.errors import MalformedMessage, MessageTooLarge, PolicyUnavailable, VLAgentsError
+from vlagents_ray.protocol import shm_layout
+from vlagents_ray.protocol.frames import Decoded, decode_requests, encode_replies
+from vlagents_ray.protocol.messages import OPS, Limits, LocalAddress, Op, Reply, boot_id, peer_uid
+from vlagents_ray.serve.access.api_keys import Caller, NoKey
+from vlagents_ray.serve.endpoints.connection import (
+    BACKLOG,
+    DECODING,
+    POLICY_VIOLATION,
+    Admit,
+    PolledConnection,
+    PolledServer,
+)
+from vlagents_ray.serve.engine import arrival
+from vlagents_ray.serve.engine.admission import MessageAdmission
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.sender import REFUSED, Sender
+from vlagents_ray.serve.requests import Message
 
+logger = logging.getLogger(__name__)
+
+_MESSAGE_BYTES = 256 * 1024
+_CONTROL = socket.CMSG_SPACE(struct.calcsize("i")) + arrival.SPACE  # room for one descriptor and the time stamp
+_INLINE = 64 * 1024  # a longer reply travels in a memory file
+_KEY_S = 5.0  # time within which a client must send its key
+_KEY_BYTES = 4096  # maximum size of a key
 _MAX_VIEWS = 8  # number of memory files that a policy may hold views of before requests are copied
+
+
+class Payload(Protocol):
+    """The memory outside of the messages that holds the requests of one connection."""
+
+    def read(self, message: memoryview, descriptors: list[int]) -> tuple[np.ndarray, bool, memoryview]:
+        """Return the memory of a message, whether that is in compact form, and the message's text for that form.
+
+        Removes the descriptors that it uses from `descriptors`.
+        """
+        ...
+
+    def freed(self) -> int:
+        """Return a bit field; bit n means that the client may reuse its memory n, which no reply has stated yet."""
+        ...
+
+    def free(self) -> None:
+        """Free the memory of a connection that has ended."""
+        ...
+
+
+class UnixServer(PolledServer["UnixConnection"]):
+    """Accepts processes of the same user at a Unix socket."""
+
+    def __init__(
+        self,
+        engine: Engine,
+        admit: Admit | NoKey,
+        limits: Limits,
+        payload: Callable[[], Payload],
+        ops: Sequence[Op] = OPS,
+    ) -> None:
+        """See `PolledServer`; `payload` creates the payload of a connection.
+
+        Requests of other operations than `ops` are refused.
+        """
+        listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
+        super().__init__(engine, limits, admit, listener)
+        self.payload = payload
+        self.ops = ops
+
+    @abstractmethod
+    def listen(self) -> None:
+        """Bind the socket to its name and listen."""
+
+    def open(self) -> None:
+        """Start to listen; call it before the engine starts."""
+        self.listen()
+        super().open()
+
+    def _add_client(self, connection: socket.socket) -> None:
+        if peer_uid(connection) != os.getuid():
+            logger.warning("a process of another user tried to connect")
+            connection.close()
+            return
+        if len(self._clients) >= self.engine.sessions.limit:
+            full = PolicyUnavailable(f"this replica has {len(self._clients)} local clients, its limit of sessions")
+            with contextlib.suppress(OSError):  # the client is gone already
+                connection.send(LocalAddress.REPLY.pack(0, 0) + encode_replies([Reply(error=full)]))
+            connection.close()
+            return
+        self._serve(UnixConnection(self, connection), connection)
+
+
+class UnixConnection(PolledConnection):
+    """One connection of a process on this machine."""
+
+    def __init__(self, server: UnixServer, connection: socket.socket) -> None:
+        super().__init__(server, connection)
+        self._admit, self._limits, self._ops = server.admit, server.limits, server.ops
+        self._payload = server.payload()
+        arrival.enable_timestamps(connection)
+        self._reader = shm_layout.ShmReader(server.limits)
+        self._connected_at = time.monotonic()
+        self._key: bytes | None = None  # the key as sent
+        if isinstance(server.admit, NoKey):
+            self.caller = server.admit
+            self._sender = Sender(server.engine, server.name, caller=server.admit)
+
+    def _read(self) -> None:
+        if self._sender is not None and self._sender.rated and self._is_throttled():
+            return
+        message = Message(self._engine.stats, self._name)
+        buffer = _buffers.bytes
+        try:
+            size, control, _, _ = self._connection.recvmsg_into([buffer], _CONTROL)
+        except BlockingIOError:
+            return
+        except OSError as error:
+            logger.info("local client: %s", error)
+            size, control = 0, []
+        descriptors = [
+            number
+            for _, kind, data in control
+            if kind == socket.SCM_RIGHTS
+            for number in array("i", data[: len(data) // 4 * 4])
+        ]
+        try:
+            if not size:
+                self.disconnect()
+                return
+            sender = self._sender or self._authenticate(bytes(buffer[: min(size, _KEY_BYTES)]))
+            if sender is not None:
+                self._receive(sender, message, arrival.waited_s(control), memoryview(buffer)[:size], descriptors)
+        except VLAgentsError as error:
+            message.refuse(error)
+            self._write(message)
+            if self._sender is not None and self._sender.refused_too_often:
+                self.end(REFUSED)
+        finally:
+            for descriptor in descriptors:
+                os.close(descriptor)
+        if self._sender is not None and self._sender.rated:
+            self._is_throttled()
+
+    def _receive(
+        self, sender: Sender, message: Message, waited_s: float, data: memoryview, descriptors: list[int]
+    ) -> None:
+        try:  # only locates the memory; a new memory file of the client is taken even if the message is refused
+            memory, compact_form, text = self._payload.read(data, descriptors)
+        except VLAgentsError:
+            sender.count_message()
+            raise
+        if not compact_form:
+            admission = sender.admission(self._limits)
+            submit = partial(self._submit, sender, message, admission, waited_s)
+            self._decode(message, partial(decode_requests, memory.data, ops=self._ops), admission, submit)
+            return
+        if sender.rated:
+            sender.count_message()
+        decoded = Decoded(self._reader.read(text, memory), {})
+        message.decoded(decoded)
+        sender.send(message, decoded, self._write, waited_s=waited_s)
+
+    def _submit(
+        self, sender: Sender, message: Message, admission: MessageAdmission, waited_s: float, decoded: Decoded
+    ) -> None:
+        message.decoded(decoded)
+        if DECODING in self._unpolled_for:
+            waited_s += time.perf_counter() - message.arrived
+        sender.send(message, decoded, self._write, admission=admission, waited_s=waited_s)
+
+    def _unthrottle(self) -> None:
+        if not self._ended and _has_hung_up(self._connection):  # its messages, if decoded, would delay others
+            self.disconnect()
+        super()._unthrottle()
+
+    def _authenticate(self, message: bytes) -> Sender | None:
+        """Take the first message for the client's key; if that is refused, each later message tries that key again."""
+        if isinstance(self._admit, NoKey):
+            raise TypeError(f"a key, although none is asked for: {self._admit.value}")
+        first, self._key = self._key is None, self._key or message
+        caller = self._admit(self._key.decode(errors="replace"))
+        caller.hold()
+        caller.note("let in by", self._name)
+        self.caller, self._sender = caller, Sender(self._engine, self._name, caller=caller)
+        return None if first else self._sender
+
+    def overdue(self, now: float, refusal: Callable[[Caller], str | None]) -> tuple[str, int] | None:
+        """See `PolledConnection`; a client must send its key within 5 s."""
+        if self._sender is not None:
+            return super().overdue(now, refusal)
+        with self._sending:
+            late = now - self._connected_at > _KEY_S and not self._ended
+            return ("no key", POLICY_VIOLATION) if late and not arrival.has_unread(self._connection) else None
+
+    def _discard(self) -> None:
+        self._payload.free()
+
+    def _write(self, message: Message) -> None:
+        self._send(*message.packed())
+        message.record()
+
+    def _send(self, frame: bytes, compact_form: bool) -> None:
+        flags = LocalAddress.COMPACT if compact_form else 0
+        with self._sending:
+            if self._ended:
+                return
+            freed = self._payload.freed()
+            try:
+                if len(frame) <= _INLINE:
+                    self._connection.send(LocalAddress.REPLY.pack(freed, flags) + frame)
+                    return
+                descriptor = os.memfd_create("vlagents-ray-reply")
+                try:
+                    os.write(descriptor, frame)
+                    header = LocalAddress.REPLY.pack(freed, flags | LocalAddress.IN_FILE)
+                    socket.send_fds(self._connection, [header], [descriptor])
+                finally:
+                    os.close(descriptor)
+            except OSError as error:  # the client is gone, or does not read its replies: `ready` handles the end
+                logger.info("local client: %s", error)
+                with contextlib.suppress(OSError):  # the connection is closed already
+                    self._connection.shutdown(socket.SHUT_RDWR)
 
 
 class ShmServer(UnixServer):
@@ -114,3 +338,20 @@ class MemoryFiles:
         finally:
             os.close(descriptor)
         self._files[number] = mapped
+
+
+def _has_hung_up(connection: socket.socket) -> bool:
+    """Return whether the peer has closed its end; messages may be unread."""
+    poller = select.poll()
+    poller.register(connection, 0)  # reports a hang-up in any case
+    return bool(poller.poll(0))
+
+
+class _Buffers(threading.local):
+    """One buffer per thread for the message that is being read, which is processed before the next one is read."""
+
+    def __init__(self) -> None:
+        self.bytes = bytearray(_MESSAGE_BYTES)
+
+
+_buffers = _Buffers()

@@ -3,44 +3,83 @@
 The metadata gives a client the port and an unguessable path, so that a client that may not read the metadata cannot
 use the port; where there are API keys, the handshake must contain one, too. Messages are those of `WS /v1/stream` on
 the server's port, which remains for clients that cannot reach this one. As with local clients the policy thread reads
-the sockets (see `vlagents_ray.serve.endpoints.unix_messages`) and decodes the messages.
+the sockets (see `vlagents_ray.serve.endpoints.connection`) and decodes the messages.
 """
 
 from __future__ import annotations
 
+import logging
 import secrets
 import socket
 import time
-from collections.abc import Collection
-from functools import cache
+from collections import deque
+from collections.abc import Callable, Collection
+from functools import partial
+from typing import ClassVar
 
+from websockets.frames import Frame, Opcode
 from websockets.http11 import Request as Handshake
+from websockets.http11 import Response
+from websockets.protocol import State
+from websockets.server import ServerProtocol
 
-from vlagents_ray.errors import ConfigError, PolicyUnavailable, UnknownApp, VLAgentsError
-from vlagents_ray.protocol.messages import STREAM_PATH, Limits, StreamAddress
-from vlagents_ray.serve.access.api_keys import (
-    Caller,
-    Identity,
-    NoKey,
-    token_of,
+from vlagents_ray.errors import (
+    ConfigError,
+    MalformedMessage,
+    Overloaded,
+    PolicyUnavailable,
+    TooManyRequests,
+    UnknownApp,
+    VLAgentsError,
 )
+from vlagents_ray.protocol.frames import Decoded, decode_requests
+from vlagents_ray.protocol.messages import (
+    STREAM_BYTES,
+    STREAM_PATH,
+    Limits,
+    StreamAddress,
+    is_probe,
+    probe_answer,
+    read_probe,
+)
+from vlagents_ray.serve.access.api_keys import Caller, Identity, NoKey, token_of
 from vlagents_ray.serve.access.origin_check import require_own_page
-from vlagents_ray.serve.endpoints.acceptor import Acceptor
-from vlagents_ray.serve.endpoints.unix_messages import Admit
-from vlagents_ray.serve.endpoints.websocket_connection import WebSocketConnection
+from vlagents_ray.serve.endpoints.buffers import READ_BYTES, ReceiveBuffer, SendBuffer, receive
+from vlagents_ray.serve.endpoints.connection import (
+    BACKLOG,
+    DECODING,
+    POLICY_VIOLATION,
+    THROTTLED,
+    Admit,
+    PolledConnection,
+    PolledServer,
+)
 from vlagents_ray.serve.engine import arrival
+from vlagents_ray.serve.engine.admission import MessageAdmission, image_bytes
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.periodic import each_half_second
+from vlagents_ray.serve.engine.sender import REFUSED, Sender
+from vlagents_ray.serve.requests import Message
 
-_BACKLOG = 128
+logger = logging.getLogger(__name__)
+
 _MAX_HANDSHAKES = 64  # maximum of connections without a completed handshake
+_HANDSHAKE_BYTES = 16 * 1024  # maximum size of a handshake
+_HANDSHAKE_S = 5.0  # maximum time of a handshake
+_REFUSED_S = 1.0  # maximum time for which the refusal of a handshake is delayed
+_END_OF_HEADERS = b"\r\n\r\n"
+_UNANSWERED = 256  # maximum of unanswered messages of one client: further ones stay unread in its connection
+_GOING_AWAY, _UNSUPPORTED_DATA, _TRY_AGAIN_LATER = 1001, 1003, 1013  # close codes
+# Further reasons for which a connection is not polled.
+_BACKLOGGED, _REFUSED = "too much of it is unanswered", "its handshake is refused"
 
 # The kernel detects a peer that vanished: after 20 s of silence it sends three probes, 5 s apart.
 _KEEPALIVE = (("TCP_KEEPIDLE", 20), ("TCP_KEEPINTVL", 5), ("TCP_KEEPCNT", 3), ("TCP_USER_TIMEOUT", 35_000))
 
 
-class WebSocketServer:
-    """Listens from `open` on; all reading happens on the thread that polls for the batch queue."""
+class WebSocketServer(PolledServer["WebSocketConnection"]):
+    """Accepts WebSockets at a port of the replica."""
+
+    name: ClassVar[str] = "websocket"
 
     def __init__(
         self,
@@ -69,34 +108,19 @@ class WebSocketServer:
         Raises:
             ConfigError: All ports are in use.
         """
+        super().__init__(engine, limits, admit, _bind(host, ports))
+        self.slow_s, self.idle_s = slow_s, idle_s
         self._hosts = hosts
-        self._admit = admit
-        self._engine = engine
-        self._limits = limits
-        self._slow_s = slow_s
-        self._idle_s = idle_s
         self.path = STREAM_PATH + secrets.token_urlsafe(24)
-        self._clients: set[WebSocketConnection] = set()
         self._handshaking: dict[WebSocketConnection, None] = {}  # without a handshake so far, in order of arrival
-        self._listener = _bind(host, ports)
-        self._acceptor = Acceptor(self._listener, self._add_client)
         self.address = StreamAddress(self._listener.getsockname()[1], self.path)
 
     def open(self) -> None:
         """Accept clients; call it before the engine starts."""
         arrival.enable_timestamps(self._listener)  # accepted connections inherit it; the kernel takes a moment to begin
-        self._engine.queue.watch(self._listener, self._acceptor.accept)
-        each_half_second.add(self.close_overdue)
+        super().open()
 
-    def close(self) -> None:
-        """Close the listener and all connections; call it after the engine has ended."""
-        each_half_second.remove(self.close_overdue)
-        self._listener.close()
-        self._acceptor.close()
-        for client in list(self._clients):
-            client.release()
-
-    def _identify(self, client: WebSocketConnection, request: Handshake) -> Identity:
+    def identify(self, client: WebSocketConnection, request: Handshake) -> Identity:
         """Return the owner of the handshake's key, and count one connection more for that key.
 
         Raises:
@@ -110,39 +134,25 @@ class WebSocketServer:
             raise UnknownApp("no such path")
         headers = {name.lower(): value for name, value in request.headers.raw_items()}
         caller: Identity
-        if isinstance(self._admit, NoKey):
+        if isinstance(self.admit, NoKey):
             require_own_page(headers, self._hosts)
-            caller = self._admit
+            caller = self.admit
         else:
-            caller = self._admit(token_of(headers))
-        if (full := self._full()) is not None:
-            raise full
+            caller = self.admit(token_of(headers))
+        held, limit = len(self._clients) - len(self._handshaking), self.engine.sessions.limit
+        if held >= limit:
+            raise PolicyUnavailable(f"this replica has {held} streams, its limit of sessions")
         if isinstance(caller, Caller):
             caller.require_unthrottled()
             caller.hold()
-            caller.note("let in by", client.name)
+            caller.note("let in by", self.name)
         del self._handshaking[client]
         return caller
 
-    def _full(self) -> VLAgentsError | None:
-        """Return the error for further clients if the replica has as many connections as it may hold sessions."""
-        held, limit = len(self._clients) - len(self._handshaking), self._engine.sessions.limit
-        return PolicyUnavailable(f"this replica has {held} streams, its limit of sessions") if held >= limit else None
-
-    def _remove(self, client: WebSocketConnection) -> None:
-        """Remove a client whose connection is closed."""
+    def remove(self, client: WebSocketConnection) -> None:
+        """See `PolledServer`."""
         self._handshaking.pop(client, None)
-        self._clients.discard(client)
-        if isinstance(client.caller, Caller):
-            client.caller.hold(-1)
-
-    def close_overdue(self) -> None:
-        """Close the connections that are overdue, silent, or whose key is no longer valid; works on any thread."""
-        now = time.monotonic()
-        refusal = cache(Caller.refusal)  # evaluated once for all connections of a key
-        for client in list(self._clients):
-            if (cause := client.overdue(now, refusal)) is not None:
-                client.end(*cause)
+        super().remove(client)
 
     def _add_client(self, connection: socket.socket) -> None:
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -152,18 +162,285 @@ class WebSocketServer:
                 connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
         if len(self._handshaking) >= _MAX_HANDSHAKES:
             next(iter(self._handshaking)).disconnect()
-        client = WebSocketConnection(
-            connection,
-            self._engine,
-            self._limits,
-            self._identify,
-            self._remove,
-            slow_s=self._slow_s,
-            idle_s=self._idle_s,
-        )
-        self._clients.add(client)
+        client = WebSocketConnection(self, connection)
         self._handshaking[client] = None
-        self._engine.queue.watch(connection, client.ready)
+        self._serve(client, connection)
+
+
+class WebSocketConnection(PolledConnection):
+    """One WebSocket, from its handshake to its end."""
+
+    def __init__(self, server: WebSocketServer, connection: socket.socket) -> None:
+        super().__init__(server, connection)
+        self._server, self._limits = server, server.limits
+        self._arrived = 0.0  # arrival time of the bytes read last, s
+        self._protocol = ServerProtocol(max_size=STREAM_BYTES)  # guarded by the lock
+        self._head = b""  # received part of the handshake
+        self._refused_for_s = 0.0  # time after which the handshake would not be over the rate of its key
+        self._received = ReceiveBuffer()
+        self._out = SendBuffer(connection, self._sending, STREAM_BYTES)
+        self._paused = False  # whether too much is unanswered; guarded by the lock
+        # Received but unprocessed frames, their arrival times, s, and the admissions of those that came in parts.
+        self._frames: deque[tuple[Frame, float, MessageAdmission | None]] = deque()
+        self._partial: MessageAdmission | None = None  # admission of the message of which a part is here
+        self._unanswered = self._unanswered_bytes = 0  # messages; bytes with the decoded images
+        self._messages = 0  # number received so far
+        self._ending = False  # `end` was called; bytes that arrive now are ignored
+        self._discarded = 0  # bytes that arrived after a wrong message, which nobody reads
+        # Of `overdue` alone: messages at its last call, since when so many, since when a part of the next is here (s).
+        self._seen, self._quiet_since, self._part_since = 0, time.monotonic(), float("inf")
+
+    def _read(self) -> None:
+        if self._sender is not None and self._sender.rated and self._is_throttled():
+            return
+        try:
+            data, control = receive(self._connection, _HANDSHAKE_BYTES if self._sender is None else READ_BYTES)
+            self._arrived = time.perf_counter() - arrival.waited_s(control)
+        except BlockingIOError:
+            return
+        except OSError as error:
+            logger.info("stream client: %s", error)
+            data = b""
+        if closing := self._protocol.state is State.CLOSING:
+            self._discarded += len(data)
+        if self._ending or self._discarded > self._limits.body_bytes or not (data or (self._sender and not closing)):
+            self.disconnect()
+            return
+        if closing:  # bytes left unread would reset the connection before the client reads the close code
+            return
+        if self._sender is None:
+            self._head += data
+            end = self._head.find(_END_OF_HEADERS)
+            if end < 0 and len(self._head) <= _HANDSHAKE_BYTES:
+                return
+            head, data = self._head[: end + len(_END_OF_HEADERS)], self._head[end + len(_END_OF_HEADERS) :]
+            if end < 0 or not self._handshake(head):
+                self._refuse_handshake()
+                return
+            self._head = b""
+            if not data:
+                return
+        self._receive(data)
+
+    def _receive(self, data: bytes | memoryview) -> None:
+        """Process bytes that follow the handshake; empty `data` means that the connection has ended."""
+        with self._sending:
+            if data:
+                self._received.parse(data)
+            else:
+                self._protocol.receive_eof()
+            events = self._protocol.events_received()
+            self._flush()
+        for event in events:
+            if isinstance(event, Frame) and event.opcode in (Opcode.BINARY, Opcode.TEXT, Opcode.CONT):
+                self._messages += 1
+                self._frames.append((event, self._arrived, self._partial))
+                self._partial = None
+        self._process_frames()
+        if self._received.size and self._sender is not None and not self._ended:
+            self._hold_partial(self._sender)
+        if not data or self._protocol.state is State.CLOSED or self._protocol.close_rcvd is not None:
+            self.disconnect()
+            return
+        with self._sending:
+            paused = self._paused = self._is_backlogged() and self._protocol.state is State.OPEN
+        if paused:
+            self._pause(_BACKLOGGED)
+
+    def _hold_partial(self, sender: Sender) -> None:
+        """Count a message of which a part is here for its key, before the rest is read, and its bytes as they come."""
+        try:
+            if self._partial is None:
+                admission = sender.admission(self._limits)
+                admission.begin_message()
+                self._partial = admission
+            self._partial.grow(self._received.size)
+        except TooManyRequests:  # the rest stays unread until the key is under its rate
+            self._is_throttled()
+            if sender.refused_too_often:
+                self.end(REFUSED)
+        except VLAgentsError as error:
+            self.end(str(error), _TRY_AGAIN_LATER if isinstance(error, Overloaded) else POLICY_VIOLATION)
+
+    def _is_backlogged(self) -> bool:
+        """Whether the client has too many unanswered messages or bytes; the caller holds the lock."""
+        return self._unanswered >= _UNANSWERED or self._unanswered_bytes > self._limits.body_bytes
+
+    def _discard(self) -> None:
+        self._partial = None
+        self._received.discard()
+        self._out.close()
+
+    def overdue(self, now: float, refusal: Callable[[Caller], str | None]) -> tuple[str, int] | None:
+        """See `PolledConnection`.
+
+        Time counts against the client only while the server has read all that arrived: a slow policy keeps its thread
+        from reading.
+        """
+        if (cause := super().overdue(now, refusal)) is not None:
+            return cause
+        if self._messages != self._seen or self._unanswered or not self._polled:
+            self._seen, self._quiet_since, self._part_since = self._messages, now, float("inf")
+        if not self._received.size:
+            self._part_since = float("inf")
+        elif self._part_since > now:
+            self._part_since = now
+        if self._protocol.state is not State.OPEN and now - self._quiet_since > _HANDSHAKE_S:
+            reason = "no handshake" if self._sender is None else "open long after a wrong message"
+            cause = reason, POLICY_VIOLATION
+        elif now - self._part_since > self._server.slow_s:
+            cause = f"a message took longer than {self._server.slow_s:g} s", POLICY_VIOLATION
+        elif now - self._quiet_since > self._server.idle_s:
+            cause = "silent for too long", _GOING_AWAY
+        with self._sending:
+            if cause is not None and not self._ended and arrival.has_unread(self._connection):
+                self._quiet_since, self._part_since, cause = now, float("inf"), None
+        return cause
+
+    def _take_leave(self, code: int, reason: str) -> None:
+        self._ending = True
+        if self._protocol.state is State.OPEN:
+            self._protocol.send_close(code, reason[:120])
+            self._flush()
+
+    def _handshake(self, head: bytes) -> bool:
+        """Accept the handshake; return False if it is refused, with the response yet to be sent."""
+        with self._sending:
+            self._protocol.receive_data(head)
+            events = self._protocol.events_received()
+        if len(events) == 1 and isinstance(events[0], Handshake):
+            response = self._handshake_response(events[0])
+            with self._sending:
+                self._protocol.send_response(response)
+        if self._protocol.state is not State.OPEN or self.caller is None:
+            return False
+        with self._sending:
+            self._flush()
+        self._received.attach(self._protocol)
+        self._sender = Sender(self._engine, self._name, caller=self.caller)
+        return True
+
+    def _refuse_handshake(self) -> None:
+        """Refuse the handshake, after a moment if the key is over its rate, which bounds how often it is refused."""
+        self._pause(_REFUSED)
+
+        def refuse() -> None:
+            with self._sending:
+                if not self._ended:
+                    self._flush()
+            self.disconnect()
+
+        if self._refused_for_s > 0:
+            self._engine.queue.call_later(min(self._refused_for_s, _REFUSED_S), refuse)
+        else:
+            refuse()
+
+    def _handshake_response(self, request: Handshake) -> Response:
+        try:
+            self.caller = self._server.identify(self, request)
+            return self._protocol.accept(request)
+        except VLAgentsError as refused:
+            response = self._protocol.reject(refused.status, f"{refused}\n")
+            if isinstance(refused, TooManyRequests | PolicyUnavailable):
+                response.headers["Retry-After"] = "1"
+            if isinstance(refused, TooManyRequests):
+                self._refused_for_s = refused.retry_after_s
+            return response
+
+    def _process_frames(self) -> None:
+        """Process the received frames in order, until one has to wait."""
+        while self._frames and not (self._ended or self._unpolled_for & {DECODING, THROTTLED}):
+            self._process(*self._frames.popleft())
+
+    def _unthrottle(self) -> None:
+        self._unpolled_for.discard(THROTTLED)
+        if self._ended or self._is_throttled():
+            return
+        if self._received.size and self._partial is None and self._sender is not None:
+            self._hold_partial(self._sender)
+        self._continue()
+
+    def _continue(self) -> None:
+        self._process_frames()
+        self._poll()
+
+    def _process(self, frame: Frame, arrived: float, admission: MessageAdmission | None) -> None:
+        if self._sender is None:  # nothing is read before the handshake is accepted
+            raise VLAgentsError("stream: a message before the handshake was accepted")
+        if frame.opcode is Opcode.CONT or not frame.fin:
+            with self._sending:
+                self._protocol.fail(_UNSUPPORTED_DATA, "messages in fragments; send each in one frame")
+                self._flush()
+            return
+        sender, message = self._sender, self._sender.message()
+        admission = admission or sender.admission(self._limits)
+        admission.size = len(frame.data)
+        try:
+            admission.begin_message()
+            if frame.opcode is Opcode.TEXT:
+                raise MalformedMessage("stream: got a text message, want a binary frame")
+            data = bytes(frame.data)
+            if is_probe(data):
+                read_probe(data, admission)
+                self._send(probe_answer(len(data)))
+            else:
+                submit = partial(self._submit, sender, message, admission, len(data), arrived)
+                self._decode(message, partial(decode_requests, data), admission, submit)
+        except VLAgentsError as error:
+            message.refuse(error)
+            self._write(message)
+            if sender.refused_too_often:
+                self.end(REFUSED)
+        if sender.rated:
+            self._is_throttled()
+
+    def _submit(
+        self,
+        sender: Sender,
+        message: Message,
+        admission: MessageAdmission,
+        size: int,
+        arrived: float,
+        decoded: Decoded,
+    ) -> None:
+        """Send the requests of a message to the engine; their deadlines count from the arrival of the message."""
+        message.decoded(decoded)
+        waited_s = time.perf_counter() - arrived
+        size += sum(map(image_bytes, decoded.requests))
+        with self._sending:
+            self._unanswered += 1
+            self._unanswered_bytes += size
+        sender.send(
+            message,
+            decoded,
+            partial(self._answer, size),
+            admission=admission,
+            waited_s=waited_s if waited_s > arrival.LEAST_S else 0.0,
+        )
+
+    def _answer(self, size: int, message: Message) -> None:
+        with self._sending:
+            self._unanswered -= 1
+            self._unanswered_bytes -= size
+            resume = self._paused and not self._is_backlogged()
+            self._paused = self._paused and not resume
+        if resume:
+            self._engine.queue.call_soon(partial(self._resume, _BACKLOGGED))
+        self._send(message.frame())
+
+    def _write(self, message: Message) -> None:
+        self._send(message.frame())
+
+    def _send(self, data: bytes) -> None:
+        with self._sending:
+            if not self._ended and self._protocol.state is State.OPEN:
+                self._protocol.send_binary(data)
+                self._flush()
+
+    def _flush(self) -> None:
+        """Send the bytes that the protocol has produced; the caller holds the lock."""
+        pieces = self._protocol.data_to_send()
+        self._out.send(b"".join(pieces), last=b"" in pieces)
 
 
 def _bind(host: str, ports: tuple[int, int] | None) -> socket.socket:
@@ -173,7 +450,7 @@ def _bind(host: str, ports: tuple[int, int] | None) -> socket.socket:
         try:
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             listener.bind((host, port))
-            listener.listen(_BACKLOG)
+            listener.listen(BACKLOG)
             listener.setblocking(False)
         except OSError as error:
             listener.close()

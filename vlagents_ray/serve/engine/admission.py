@@ -17,7 +17,7 @@ import asyncio
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 from vlagents_ray.errors import MessageTooLarge, Overloaded, PolicyUnavailable, VLAgentsError
 from vlagents_ray.images import thread_map
@@ -95,24 +95,6 @@ class Admission:
             threads = list(self._threads.values())
         for each in threads:
             each.shutdown(wait=False, cancel_futures=True)
-
-
-class Queue(Protocol):
-    """The queue that continues with decoded messages: `vlagents_ray.serve.queue.batch_queue.BatchQueue`."""
-
-    def call_soon(self, call: Callable[[], None]) -> None:
-        """Schedule `call` to run on the thread that polls the connections."""
-        ...
-
-
-def decode_in_background(
-    queue: Queue, admission: MessageAdmission, read: Callable[[Budget], T], then: Callable[[Callable[[], T]], None]
-) -> None:
-    """Decode a message with `read` on a decoding thread, then call `then` on the polling thread of `queue`.
-
-    `then` receives a function that returns the decoded message, or raises the error of `read`.
-    """
-    admission.decode_on_thread(read).add_done_callback(lambda done: queue.call_soon(lambda: then(done.result)))
 
 
 class MessageAdmission(Budget):

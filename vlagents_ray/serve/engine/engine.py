@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any
 
 from vlagents_ray.contract import Contract
@@ -29,12 +30,11 @@ from vlagents_ray.serve.engine.admission import Admission
 from vlagents_ray.serve.engine.arrival import PauseDetector
 from vlagents_ray.serve.engine.metrics_buffer import MetricsBuffer
 from vlagents_ray.serve.engine.observer import Observers
-from vlagents_ray.serve.engine.resets import Resets
-from vlagents_ray.serve.engine.responses import build_reply, public_error, raised_at, timing
+from vlagents_ray.serve.engine.responses import build_reply, public_error, raised_at, require_serializable, timing
 from vlagents_ray.serve.engine.session_transfer import DrainList, SessionTransfer
 from vlagents_ray.serve.models.checkpoints import Checkpoints
 from vlagents_ray.serve.models.loaded_model import LoadedModel, Loader
-from vlagents_ray.serve.models.model_manager import ModelManager
+from vlagents_ray.serve.models.model_manager import ModelManager, too_late
 from vlagents_ray.serve.queue.batch_queue import BatchQueue, Taken
 from vlagents_ray.serve.queue.call_limits import CallLimits, PolicyCall, PolicyCalls
 from vlagents_ray.serve.queue.poller import Poller
@@ -112,7 +112,6 @@ class Engine:
         self._answers = ThreadPoolExecutor(1, "policy-answers")
         self.weights = WeightUpdates(lambda: self.models.own_weights, self.sessions.all)
         self.transfer = SessionTransfer(self.sessions, self.models, self.require_ready)
-        self._resets = Resets(self.sessions, self.models, self.queue, finder, clock, reply_bytes)
         self.observers = Observers()
 
     def start(self, *, threaded: bool = True) -> None:
@@ -382,7 +381,7 @@ class Engine:
                     session, model, weights = self._ready(pending)
                     acting.setdefault((model, weights), []).append((pending, session))
                 elif pending.opening is not None:
-                    self._resets.run(pending, pending.opening)
+                    self._reset(pending, pending.opening)
                 else:
                     pending.finish(Reply(pending.request.request_id, info=self._other(pending)))
             except Exception as error:  # noqa: BLE001 - becomes the reply
@@ -398,6 +397,82 @@ class Engine:
                 group, prepared_s = self._prepared(model, group)  # noqa: PLW2901 - without those that failed
             if group:
                 self._act(model, weights, group, prepared_s)
+
+    def _reset(self, pending: PendingRequest, opening: Opening) -> None:
+        """Begin the episode that a reset asks for, and answer it.
+
+        A reset whose checkpoint is not loaded leaves the queue. It is queued again when the checkpoint is loaded, and
+        answered with an error if that fails. Meanwhile the session may be reset again or closed, or its client may stop
+        waiting.
+        """
+        session_id = pending.session_id
+        if pending.loaded is None:
+            if self.sessions.is_past(session_id, opening.first):
+                raise UnknownSession(f"session {session_id!r}: reset elsewhere, or ended, while this reset waited")
+            session = self.sessions.open(session_id, pending.origin)
+            session.agent, session.weights, session.follows = None, None, opening.follows
+            session.steps, session.resetting = opening.first, pending
+            session.first, session.moves = opening.first, 0
+            session.expected = max(session.expected, opening.first)
+            is_abandoned = partial(self._is_abandoned, pending, session)
+            pending.begun = False  # while its checkpoint is loaded, the policy is not at work on it
+            if self.models.hold(session, opening.choice, partial(self._requeue, pending), is_abandoned) is None:
+                return  # `_requeue` queues it again
+            pending.begun = True
+        else:
+            session = self.sessions.get(session_id)
+            if session.resetting is not pending:
+                raise UnknownSession(f"session {session_id!r}: reset anew, or closed, while this reset waited")
+            if self._is_abandoned(pending, session):
+                self.models.release_model(session)
+                raise too_late(opening.choice)
+        session.resetting = None
+        try:
+            self._begin_episode(pending, opening, session)
+        except BaseException:
+            self.models.release_model(session)  # else the session might hold the model for long without an episode
+            raise
+
+    def _begin_episode(self, pending: PendingRequest, opening: Opening, session: Session[LoadedModel]) -> None:
+        """Begin an episode on the model that the session holds, and answer the request."""
+        request, model = pending.request, session.model
+        if model is None or request.obs is None:  # the decoder ensures the second
+            raise UnknownSession(f"session {pending.session_id!r}: closed before its reset was over")
+        model.check(request)
+        with model.busy, model.uncaptured, model.call("reset") as call:
+            model.require_open()
+            model.parameters.use(model.parameters.begin(session, follows=opening.follows))
+            agent = model.copies.make()
+            info = agent.reset(request.obs, request.instruction, **opening.kwargs)
+            if not isinstance(info, dict):
+                raise PolicyFailed(f"reset: the policy returned {type(info).__name__}, want a dict")
+            for obs in request.history:
+                agent.observe(obs)
+        info = {**model.identity, **info}  # a session with an adapter states both by itself
+        spent = timing(pending.arrived, call.began, call.ended)
+        require_serializable(info, self._reply_bytes)
+        session.agent, session.instruction = agent, request.instruction or ""
+        model.padding.record_reset(request, opening.kwargs)
+        request.drop_observations()
+        if not session.announced and self.finder is not None:
+            session.announced = True
+            self.finder.announce(session.id, session.steps)
+        pending.finish(Reply(request.request_id, info=info, step=session.steps, timing=spent))
+
+    def _requeue(self, pending: PendingRequest, error: VLAgentsError | None) -> None:
+        """Queue a reset again whose checkpoint was loaded, or answer it with the error."""
+        pending.loaded = self.clock()
+        try:
+            if error is not None:
+                raise error
+            self.queue.put(pending)
+        except VLAgentsError as reason:
+            pending.request.drop_observations()  # the session may still refer to the request
+            pending.fail(reason)
+
+    def _is_abandoned(self, pending: PendingRequest, session: Session[LoadedModel]) -> bool:
+        """Return whether the caller no longer waits for that reset, or the session was reset again."""
+        return pending.over or pending.expired(self.clock()) or session.resetting is not pending
 
     def _other(self, pending: PendingRequest) -> dict[str, Any]:
         """Return the info of the answer to a request that is neither an act nor a reset."""

@@ -10,7 +10,7 @@ from contextlib import ExitStack, contextmanager
 
 import pytest
 
-from vlagents_ray.serve.endpoints.acceptor import Acceptor
+from vlagents_ray.serve.endpoints.connection import Acceptor
 
 
 class Endpoint:

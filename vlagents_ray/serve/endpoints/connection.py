@@ -1,0 +1,284 @@
+"""Servers and connections whose sockets the thread of the batch queue reads: shared memory, plasma, own WebSockets.
+
+That thread accepts clients, reads and decodes their messages, and submits the requests, so that a request needs no
+change of threads; while a batch runs for milliseconds, another thread does (`vlagents_ray.serve.queue.poller`).
+Answers are written by the thread that has them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import logging
+import os
+import socket
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from functools import cache, partial
+from pathlib import Path
+from typing import Any, BinaryIO, ClassVar, Generic, TypeVar
+
+from vlagents_ray.errors import VLAgentsError
+from vlagents_ray.protocol.frames import Decoded
+from vlagents_ray.protocol.messages import Budget, Limits
+from vlagents_ray.serve.access.api_keys import Caller, Identity, NoKey
+from vlagents_ray.serve.engine.admission import MessageAdmission, NeedsDecodingThread
+from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.sender import Sender
+from vlagents_ray.serve.periodic import each_half_second
+from vlagents_ray.serve.requests import Message
+
+logger = logging.getLogger(__name__)
+
+BACKLOG = 128
+POLICY_VIOLATION = 1008  # WebSocket close code
+# Reasons for which a connection is not polled.
+DECODING, THROTTLED = "a frame is decoded on another thread", "the key is over its rate"
+
+Admit = Callable[[str | None], Caller]  # returns the caller with that key; raises `Unauthorized` or `Forbidden`
+
+
+class Acceptor:
+    """Accepts connections; errors (an aborted connection, EMFILE) never stop the listener."""
+
+    def __init__(self, listener: socket.socket, on_connection: Callable[[socket.socket], None]) -> None:
+        """Prepare to accept.
+
+        Args:
+            listener: The listening socket.
+            on_connection: Called with each connection, which is non-blocking; it must close those that it refuses.
+        """
+        self._listener = listener
+        self._on_connection = on_connection
+        # Without a free descriptor a client could not even be refused, and the listener would stay readable.
+        self._spare = _descriptor()
+
+    def accept(self) -> None:
+        """Accept one client; call it when the listener is readable."""
+        try:
+            connection, _ = self._listener.accept()
+        except OSError as error:
+            logger.warning("a client was not let in: %s", error)
+            if error.errno in (errno.EMFILE, errno.ENFILE):
+                self._refuse()
+            return
+        try:
+            connection.setblocking(False)
+            self._on_connection(connection)
+        except Exception:
+            logger.exception("a client was not let in")
+            connection.close()
+
+    def close(self) -> None:
+        """Free the spare descriptor; the listener stays open."""
+        self._spare.close()
+
+    def _refuse(self) -> None:
+        self._spare.close()
+        with contextlib.suppress(OSError):
+            self._listener.accept()[0].close()
+        self._spare = _descriptor()
+
+
+def _descriptor() -> BinaryIO:
+    return Path(os.devnull).open("rb")
+
+
+class PolledConnection(ABC):
+    """One connection of a client; its sessions end with it."""
+
+    def __init__(self, server: PolledServer[Any], connection: socket.socket) -> None:
+        self._engine = server.engine
+        self._remove = server.remove
+        self._name = server.name
+        self._connection = connection
+        self.caller: Identity | None = None  # None until the client has shown its key
+        self._sender: Sender | None = None  # None until then, too
+        self._sending = threading.Lock()  # guards the sending: other threads send answers, or end the connection
+        self._ended = False
+        self._polled = True  # whether the batch queue polls the connection
+        self._unpolled_for: set[str] = set()  # reasons for which it shall not
+
+    @abstractmethod
+    def _read(self) -> None:
+        """Read the connection, which has bytes or has ended."""
+
+    @abstractmethod
+    def _write(self, message: Message) -> None:
+        """Send and record the answers of a message."""
+
+    @abstractmethod
+    def _discard(self) -> None:
+        """Free the memory of a connection that is about to be closed; called with the lock held."""
+
+    def _take_leave(self, code: int, reason: str) -> None:  # noqa: B027 - not all protocols have close codes
+        """Send a close code and its reason, if the protocol has any; called with the lock held."""
+
+    def _continue(self) -> None:
+        """Continue after a reason not to poll has gone; called on the thread that polls."""
+        self._poll()
+
+    def ready(self) -> None:
+        """Read the connection; the batch queue calls this."""
+        try:
+            self._read()
+        except Exception:
+            logger.exception("%s: disconnected a client after an error", self._name)
+            self.disconnect()
+
+    def _pause(self, reason: str) -> None:
+        """Stop polling the connection until `_resume` is called with the same reason."""
+        self._unpolled_for.add(reason)
+        if self._polled:
+            self._polled = False
+            self._engine.queue.unwatch(self._connection)
+
+    def _resume(self, reason: str) -> None:
+        self._unpolled_for.discard(reason)
+        self._continue()
+
+    def _poll(self) -> None:
+        if not (self._ended or self._polled or self._unpolled_for):
+            self._polled = True
+            self._engine.queue.watch(self._connection, self.ready)
+
+    def _is_throttled(self) -> bool:
+        """Return whether the client's key is over its rate; if so, the connection is read again later."""
+        if THROTTLED in self._unpolled_for:
+            return True
+        if self._ended or self._sender is None or (wait_s := self._sender.throttled_s()) <= 0:
+            return False
+        self._pause(THROTTLED)
+        self._engine.queue.call_later(wait_s, self._unthrottle)
+        return True
+
+    def _unthrottle(self) -> None:
+        """Read the connection again, unless the client is gone or another one with its key was over the rate since."""
+        self._unpolled_for.discard(THROTTLED)
+        if not self._ended and not self._is_throttled():
+            self._continue()
+
+    def _decode(
+        self,
+        message: Message,
+        read: Callable[[Budget], Decoded],
+        admission: MessageAdmission,
+        submit: Callable[[Decoded], None],
+    ) -> None:
+        """Decode a message with `read`, on another thread if that is slow, and `submit` its requests."""
+        try:
+            decoded = read(admission)
+        except NeedsDecodingThread:
+            self._pause(DECODING)
+            then, queue = partial(self._decoded, message, submit), self._engine.queue
+            admission.decode_on_thread(read).add_done_callback(lambda done: queue.call_soon(lambda: then(done.result)))
+        else:
+            submit(decoded)
+
+    def _decoded(self, message: Message, submit: Callable[[Decoded], None], result: Callable[[], Decoded]) -> None:
+        """Submit the requests that another thread has decoded; called on the thread that polls."""
+        try:
+            if not self._ended:
+                submit(result())
+        except VLAgentsError as error:
+            message.refuse(error)
+            self._write(message)
+        except Exception:
+            logger.exception("%s: disconnected a client after an error", self._name)
+            self.disconnect()
+        self._resume(DECODING)
+
+    def overdue(self, now: float, refusal: Callable[[Caller], str | None]) -> tuple[str, int] | None:
+        """Return a reason and a close code if the connection has to end; called periodically, on any thread.
+
+        Args:
+            now: Time, s, of `time.monotonic`.
+            refusal: Returns the reason if a key is no longer valid.
+        """
+        reason = refusal(self.caller) if isinstance(self.caller, Caller) else None
+        return None if reason is None else (reason, POLICY_VIOLATION)
+
+    def end(self, reason: str, code: int = POLICY_VIOLATION) -> None:
+        """Close the connection from any thread, even while the policy runs."""
+        logger.info("%s: a client is cut off: %s", self._name, reason)
+        with self._sending:
+            if not self._ended:
+                self._take_leave(code, reason)
+                with contextlib.suppress(OSError):  # the client closed it already
+                    self._connection.shutdown(socket.SHUT_RDWR)
+
+    def disconnect(self) -> None:
+        """Stop polling the connection and close it; call it on the thread that polls."""
+        if not self._ended:
+            if self._polled:
+                self._engine.queue.unwatch(self._connection)
+            self.release()
+
+    def release(self) -> None:
+        """End the sessions, and close the connection."""
+        if self._sender is not None:
+            self._sender.release()
+        with self._sending:
+            self._ended = True  # the number of its descriptor may soon be reused
+            self._discard()
+            self._connection.close()
+        self._remove(self)
+
+
+C = TypeVar("C", bound=PolledConnection)
+
+
+class PolledServer(ABC, Generic[C]):
+    """Listens from `open` on; all reading happens on the thread that polls for the batch queue.
+
+    Args:
+        engine: Executes the requests.
+        limits: Limits of a request.
+        admit: Returns the caller that a key belongs to, or raises for an invalid key; or why no key is needed.
+        listener: A non-blocking socket.
+    """
+
+    name: ClassVar[str]
+
+    def __init__(self, engine: Engine, limits: Limits, admit: Admit | NoKey, listener: socket.socket) -> None:
+        self.engine, self.limits, self.admit = engine, limits, admit
+        self._clients: set[C] = set()
+        self._listener = listener
+        self._acceptor = Acceptor(listener, self._add_client)
+
+    @abstractmethod
+    def _add_client(self, connection: socket.socket) -> None:
+        """Serve a client by `_serve`, or close its connection."""
+
+    def open(self) -> None:
+        """Accept clients; call it before the engine starts."""
+        self.engine.queue.watch(self._listener, self._acceptor.accept)
+        each_half_second.add(self.close_overdue)
+
+    def close(self) -> None:
+        """Close the listener and all connections; call it after the engine has ended."""
+        each_half_second.remove(self.close_overdue)
+        self._listener.close()
+        self._acceptor.close()
+        for client in list(self._clients):
+            client.release()
+
+    def close_overdue(self) -> None:
+        """Close the connections that are overdue, or whose key is no longer valid; works on any thread."""
+        now = time.monotonic()
+        refusal = cache(Caller.refusal)  # evaluated once for all connections of a key
+        for client in list(self._clients):
+            if (cause := client.overdue(now, refusal)) is not None:
+                client.end(*cause)
+
+    def remove(self, client: C) -> None:
+        """Remove a client whose connection is closed."""
+        self._clients.discard(client)
+        if isinstance(client.caller, Caller):
+            client.caller.hold(-1)
+
+    def _serve(self, client: C, connection: socket.socket) -> None:
+        self._clients.add(client)
+        self.engine.queue.watch(connection, client.ready)
