@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import os
+import signal
 import sqlite3
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import pytest
 from eval_fakes import DRIFTING_LINE, LINE, OTHER_LINE, ToZero
+from in_process_pool import without_ray
 
-from vlagents_ray.errors import ConfigError
-from vlagents_ray.evaluate import EvalConfig, Summary, evaluate
+from vlagents_ray.errors import ClusterLost, ConfigError, EnvFailed
+from vlagents_ray.evaluate import EvalConfig, EvaluationInterrupted, Summary, evaluate
+from vlagents_ray.evaluate.episode.failures import Failure
+from vlagents_ray.evaluate.plan.jobs import Job
+from vlagents_ray.evaluate.workers.rollout import Report
+from vlagents_ray.evaluate.workers.worker import InProcessWorkers
 
 Config = Callable[..., EvalConfig]
 
@@ -74,3 +81,23 @@ def test_suites_whose_workers_differ_have_their_turns(config: Config) -> None:
     other = suite.model_copy(update={"envs": [OTHER_LINE], "worker": config(cpus_per_worker=2.0).worker})
     both = config().model_copy(update={"suites": [suite, other]})
     assert evaluate(both, agent_factory=ToZero, in_process=True).total.episodes == 4
+
+
+@pytest.mark.parametrize("cluster_is_lost", [False, True])
+def test_what_a_signal_to_the_whole_group_ends_first_costs_no_attempt(config: Config, cluster_is_lost: bool) -> None:
+    class EndedFirst(InProcessWorkers):
+        def wait(self, timeout_s: float) -> Iterator[tuple[Job, Report]]:
+            waiting = [job for one in self._workers for job in one.jobs]
+            reports = [*super().wait(timeout_s)]
+            if waiting and waiting[0].key.episode == 2:
+                threading.Timer(0.02, os.kill, (os.getpid(), signal.SIGTERM)).start()  # it arrives here, too
+                if cluster_is_lost:
+                    raise ClusterLost("no head")
+                reports = [(job, Report(failure=Failure("worker", EnvFailed.code, "killed"))) for job in waiting]
+            yield from reports
+
+    with without_ray(pool=EndedFirst), pytest.raises(EvaluationInterrupted) as stopped:
+        evaluate(config(), agent_factory=ToZero)
+    assert stopped.value.summary.total.episodes == 2
+    with closing(sqlite3.connect(config().out / "results.db")) as db:
+        assert db.execute("SELECT count(*) FROM attempts").fetchone() == (0,)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from vlagents_ray.errors import ConfigError, StorageFailed, from_code
+from vlagents_ray.errors import ConfigError, StorageFailed, VLAgentsError, from_code
 from vlagents_ray.evaluate.artifacts.recorder import Artifacts, save
 from vlagents_ray.evaluate.artifacts.storage import driver_code, policy_code, save_diffs, storing, versions
 from vlagents_ray.evaluate.episode.failures import Failure
@@ -36,6 +37,7 @@ log = logging.getLogger(__name__)
 POLL_S = 0.25  # how soon a signal is noticed
 MARGIN = 1.25  # by which the next episode may be longer than the longest so far
 CLOSING_S = 10.0  # for workers to close their simulators, and for the report to be written
+SIGNAL_S = 0.2  # s for which a signal that ended a worker may be late in this process: it goes to one after the other
 
 
 class EvaluationInterrupted(KeyboardInterrupt):
@@ -189,10 +191,15 @@ class _Run:
             self._progress.begin(self._store.cells, self._recorded, len(self._queue))
             try:
                 with (InProcessWorkers if self._in_process else WorkerPool)(self._config, factory) as pool:
-                    while not stop.is_set() and not self._deadline.is_over:
-                        if not pool.busy and not (len(self._queue) and self._deadline.leaves_room):
-                            break
-                        self._poll_pool(pool)
+                    try:
+                        while not stop.is_set() and not self._deadline.is_over:
+                            if not pool.busy and not (len(self._queue) and self._deadline.leaves_room):
+                                break
+                            self._poll_pool(pool, stop)
+                    except VLAgentsError as error:
+                        if isinstance(error, StorageFailed) or not stop.wait(SIGNAL_S):
+                            raise
+                        log.info("a part of the evaluation that the signal ended, too, reported: %s", error)
                     state = OutOfTime.why if len(self._queue) or pool.busy else "complete"
                     if not stop.is_set():
                         pool.close()
@@ -202,11 +209,14 @@ class _Run:
             finally:
                 self._progress.end()
 
-    def _poll_pool(self, pool: Workers) -> None:
+    def _poll_pool(self, pool: Workers, stop: threading.Event) -> None:
         if self._deadline.leaves_room:
             dispatch(pool, self._queue, self._deadline.begin)
         for job, report in pool.wait(POLL_S):
             self._deadline.end(job)
+            # A terminal or a service manager signals workers and policies as well: that costs no attempt.
+            if report.failure is not None and stop.wait(SIGNAL_S):
+                continue
             with storing(self._config.out):
                 self._handle(job, report)
 
