@@ -113,6 +113,15 @@ def test_nothing_comes_for_long_and_the_thread_is_told(queue: Callable[[int], Ba
     quiet.release()
 
 
+def test_the_time_spent_waiting_for_requests_counts_as_idle() -> None:
+    quiet = BatchQueue(1, idle_s=0.05)
+    quiet.bind()
+    before_s, began = quiet.idle_time_s(), time.perf_counter()
+    quiet.next()
+    assert 0.05 <= quiet.idle_time_s() - before_s <= time.perf_counter() - began
+    quiet.release()
+
+
 def test_the_queue_costs_a_lone_request_little(queue: Callable[[int], BatchQueue]) -> None:
     """Against a bare hand-over to a thread and back, in the same run."""
 
