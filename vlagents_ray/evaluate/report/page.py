@@ -37,7 +37,6 @@ from vlagents_ray.evaluate.report.success import (
     compare_all,
     learning_curves,
     real_time_gaps,
-    success_over_time,
     success_table,
 )
 from vlagents_ray.evaluate.results.reader import Results, by_timing, rate_of
@@ -102,7 +101,6 @@ def report(summary: Summary, gallery: Gallery) -> str:
         Section("Comparison", "comparison", compare_all(summary)),
         Section("Gap to the synchronous score", "real_time", real_time_gaps(summary)),
         Section("Learning curve", "learning_curve", learning_curves(summary)),
-        Section("Success over time", "success_over_time", success_over_time(summary)),
         Section("Latency", "latency", latency(summary)),
         Section("Failures", "failures", failures(results, gallery)),
         Section("Episodes", "episodes", episodes(results, gallery)),
