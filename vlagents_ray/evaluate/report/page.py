@@ -107,7 +107,7 @@ def report(summary: Summary, gallery: Gallery) -> str:
         Section("Errors", "errors", errors(results)),
         Section("Protocol", "protocol", protocol(results)),
         Section("Configuration", "configuration", configuration(results)),
-        Section("To cite and to repeat", "repeat", repeat(summary)),
+        Section("To repeat", "repeat", repeat(results)),
     ]
     return (
         _templates()
