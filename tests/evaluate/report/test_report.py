@@ -150,20 +150,12 @@ def test_videos_are_linked_from_where_the_page_is(results: Results, tmp_path: Pa
 def test_videos_are_in_the_page_up_to_a_budget(results: Results) -> None:
     videos = [video for cell in results.cells for one in cell.episodes for video in one.videos]
     size = (results.out / videos[0]).stat().st_size
-    gallery = Gallery(results, results.out / "report.html", "inline", budget=size)
+    gallery = Gallery(results, results.out / "report.html", inline=True, budget=size)
     players = [gallery.player(video, "a label") for video in videos[:2]]
     inside, beside = (str(player.source) for player in players if player is not None)
     assert inside.startswith("data:video/mp4;base64,")
     assert beside.startswith("videos/")
     assert (gallery.inlined, gallery.linked) == (1, 1)
-
-
-def test_without_videos_there_are_stills(results: Results, tmp_path: Path) -> None:
-    page = Read(write_report(results, tmp_path / "report.html", videos="none"))
-    assert page.all("video") == []
-    stills = page.all("img")
-    assert stills
-    assert all((one["src"] or "").startswith("data:image/jpeg") and one["alt"] for one in stills)
 
 
 def test_a_video_that_is_gone_or_broken_leaves_the_rest(tmp_path: Path) -> None:
