@@ -18,9 +18,9 @@ from typing import Annotated
 import typer
 
 from benchmarks.console import Json, show_round_trips
+from benchmarks.drivers import ClientProcess, Driver
 from benchmarks.own_clients import OwnClient, connected, observation
 from benchmarks.round_trips import POLICY, RoundTripsOfAll, in_turns
-from vlagents_ray.bench.line_process import Driver, LineProcess
 from vlagents_ray.cli.console import errors, progress, save
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Obs
@@ -49,11 +49,11 @@ def measure_clients(url: str, calls: int, progress: Callable[[str], None] = lamb
         drivers: dict[str, Driver] = {
             f"Python, {one.transport}": stack.enter_context(connected(one, url, "")) for one in PYTHON
         }
-        drivers[CPP] = stack.enter_context(LineProcess(CPP, [_compiled(folder), url, str(folder)]))
+        drivers[CPP] = stack.enter_context(ClientProcess(CPP, [_compiled(folder), url, str(folder)]))
         script = str(HERE / "node_client.mjs")
         for name, transport in NODE.items():
             command = [node, script, str(TYPESCRIPT / "dist" / "index.js"), url, transport, str(folder)]
-            drivers[name] = stack.enter_context(LineProcess(name, command))
+            drivers[name] = stack.enter_context(ClientProcess(name, command))
         for driver in drivers.values():
             driver.ready()
         return RoundTripsOfAll(tuple(in_turns(drivers, calls, progress).values()))

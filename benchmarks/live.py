@@ -29,9 +29,10 @@ import typer
 from websockets.sync.client import connect
 
 from benchmarks.console import Json
+from benchmarks.drivers import START_S
 from benchmarks.own_clients import observation
 from vlagents_ray.bench.line_client import die_with_parent, own_stdout
-from vlagents_ray.bench.line_process import START_S, LineProcess, our_environment
+from vlagents_ray.bench.line_process import LineProcess, our_environment
 from vlagents_ray.cli.console import errors, out, progress, save, table
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.transports.select import TransportName

@@ -21,8 +21,9 @@ from typing import Any, get_args
 
 import numpy as np
 
+from benchmarks.drivers import CALL_S, START_S, ClientProcess, Driver
 from vlagents_ray.bench.line_client import WARM_UP, die_with_parent, obey, own_stdout, timed
-from vlagents_ray.bench.line_process import CALL_S, START_S, Driver, LineProcess, our_environment
+from vlagents_ray.bench.line_process import our_environment
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.transports.select import TransportName
 from vlagents_ray.errors import ConfigError
@@ -209,7 +210,7 @@ def connected(client: OwnClient, url: str, app: str, prefix: Sequence[str] = ())
         return
     settings = json.dumps({"url": url, "transport": client.transport, "codec": client.codec})
     command = [*prefix, sys.executable, "-m", "benchmarks.own_clients", settings]
-    with LineProcess(client.name, command, our_environment()) as child:
+    with ClientProcess(client.name, command, our_environment()) as child:
         yield child
 
 

@@ -7,6 +7,7 @@ again as soon as they are answered. The policy is loaded once for both.
 from __future__ import annotations
 
 import statistics
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any
@@ -16,7 +17,7 @@ import typer
 
 from benchmarks.console import Json, Rounds, Seconds
 from benchmarks.figures import measured_on
-from vlagents_ray.bench.measured_policy import MeasuredPolicy, QueuedTurn, device_name, forget_peak, peak_mib
+from vlagents_ray.bench.measured_policy import WARM, MeasuredPolicy, QueuedTurn, device_name, forget_peak, peak_mib
 from vlagents_ray.cli.console import errors, out, progress, save, table
 from vlagents_ray.cli.options import Set, StateDims, parse_counts, parse_dims, parse_settings
 from vlagents_ray.contract import Contract
@@ -40,6 +41,21 @@ class PolicyPlan:
     dims: Mapping[str, int] = field(default_factory=dict)  # of parts of the state for which it does not say
 
 
+class BareAndQueued(MeasuredPolicy):
+    """A policy that is also measured without the queue."""
+
+    def bare(self, size: int, seconds: float) -> dict[str, float]:
+        """Measure `act_batch` on full batches of that size, one after another, without the queue."""
+        views, sessions = self._views(size), self._sessions(range(size))
+        times: list[float] = []
+        while len(times) < WARM + 1 or sum(times[WARM:]) < seconds:
+            begun = time.perf_counter()
+            self._act(views, sessions)
+            times.append(time.perf_counter() - begun)
+        times = times[WARM:]
+        return {"actions_per_s": size * len(times) / sum(times), "batch_ms": statistics.median(times) * 1e3}
+
+
 def measure_policy(plan: PolicyPlan, progress: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
     """Measure what the plan says; returns plain JSON values: actions a second, ms, MiB."""
     batch = plan.args.batch
@@ -50,7 +66,7 @@ def measure_policy(plan: PolicyPlan, progress: Callable[[str], None] = lambda _:
     def view(contract: Contract | None, seed: int) -> Obs:
         return random_observation(contract, seed, side=plan.side, dims=plan.dims)
 
-    measured = MeasuredPolicy(
+    measured = BareAndQueued(
         agent, view, max_size=max(plan.batches), patience=batch.patience, batch_sizes=batch.sizes or ()
     )  # fmt: skip
     with measured:
@@ -88,7 +104,7 @@ class _SizedRow:
 
         `queued_share` is the median of the rounds' actions a second behind the queue, divided by those without it.
         """
-        queued = [turn.to_json() for turn in self.queued]
+        queued = [_figures(turn) for turn in self.queued]
         shares = [ours["actions_per_s"] / bare["actions_per_s"] for ours, bare in zip(queued, self.bare, strict=True)]
         p99 = float(np.quantile([trip for turn in self.queued for trip in turn.trips_ms], 0.99))
         return {
@@ -99,6 +115,15 @@ class _SizedRow:
             "peak_mib": max(self.memory),
             "rounds": {"bare": self.bare, "queued": queued},
         }
+
+
+def _figures(turn: QueuedTurn) -> dict[str, float]:
+    return {
+        "actions_per_s": turn.actions_per_s,
+        "round_trip_ms": statistics.median(turn.trips_ms),
+        "p99_ms": float(np.quantile(turn.trips_ms, 0.99)),
+        "mean_batch": turn.mean_batch,
+    }
 
 
 def _medians(rounds: list[dict[str, float]]) -> dict[str, float]:

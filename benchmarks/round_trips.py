@@ -20,9 +20,9 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.drivers import Driver
 from benchmarks.figures import RoundTrips, lost_db, ratios
 from benchmarks.own_clients import OwnClient, connected, observation, save_observation
-from vlagents_ray.bench.line_process import Driver
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.noop import Noop

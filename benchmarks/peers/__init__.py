@@ -20,8 +20,9 @@ from typing import Annotated
 
 import typer
 
+from benchmarks.drivers import START_S, ClientProcess, Driver
 from benchmarks.round_trips import LOOPBACK, StartClient
-from vlagents_ray.bench.line_process import START_S, Driver, LineProcess
+from vlagents_ray.bench.line_process import LineProcess
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.launch.server import free_port
 
@@ -103,7 +104,7 @@ def peer_connected(
     alone = {"PYTHONPATH": ""}  # nothing of ours in the peer's environment
     with (
         LineProcess(f"{client.name}, server", [*command, "serve", *address], alone),
-        LineProcess(client.name, [*prefix, *command, "drive", *address, str(obs), client.mode], alone) as process,
+        ClientProcess(client.name, [*prefix, *command, "drive", *address, str(obs), client.mode], alone) as process,
     ):
         yield process
 

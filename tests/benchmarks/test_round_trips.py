@@ -6,9 +6,9 @@ from collections.abc import Mapping
 
 import pytest
 
+from benchmarks.drivers import Driver
 from benchmarks.own_clients import OWN_CLIENTS, connect, observation, own_clients
 from benchmarks.round_trips import ROUND, in_turns
-from vlagents_ray.bench.line_process import Driver
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.images.jpeg_png import encode_jpeg
 

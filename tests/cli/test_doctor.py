@@ -3,7 +3,6 @@ from __future__ import annotations
 import io
 import os
 import socket
-import sys
 from pathlib import Path
 
 import pytest
@@ -47,7 +46,6 @@ def test_every_check_gives_a_row_of_its_own_and_none_breaks() -> None:
         "GPU",
         "Vulkan",
         "EGL",
-        "video",
         "shared memory",
         "open files",
     ):
@@ -155,10 +153,6 @@ def test_a_machine_on_which_workers_without_a_gpu_could_not_render_is_told(
     assert ("gpus: 0.25" in row.cure) is not software
 
 
-def test_h264_survives_encoding_and_decoding() -> None:
-    assert doctor.video().status == "ok"
-
-
 def test_shared_memory_must_hold_the_object_store_that_ray_will_make() -> None:
     assert doctor.judge_shared_memory(total=32 * GB, free=30 * GB, memory=64 * GB).status == "ok"
     docker_default = doctor.judge_shared_memory(total=0.064 * GB, free=0.064 * GB, memory=16 * GB)
@@ -197,13 +191,11 @@ def test_open_files_count_as_ray_will_raise_them(soft: int, hard: int, status: s
     assert doctor.judge_open_files(soft, hard).status == status
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-def test_a_taken_port_names_its_holder_and_another_port() -> None:
+def test_a_taken_port_has_another_one_as_cure() -> None:
     port = free_port()  # no other process takes it meanwhile
     with socket.create_server(("127.0.0.1", port)):
         row = doctor.port_free(port)
-    assert row.status == "warn"
-    assert f"pid {os.getpid()}" in row.detail
+    assert (row.status, row.detail) == ("warn", "taken")
     assert f"--port {port + 1}" in row.cure
     assert doctor.port_free(port).status == "ok"
 

@@ -225,7 +225,7 @@ def test_symbolic_links_lead_no_further_than_their_folder(
 
 
 def report_of(results: Results, folder: Path) -> str:
-    return write_report(results, folder / "page.html", videos="inline").read_text()
+    return write_report(results, folder / "page.html", inline=True).read_text()
 
 
 def test_links_within_a_folder_and_to_it_are_followed(part: Callable[..., Path], tmp_path: Path) -> None:

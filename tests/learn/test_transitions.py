@@ -22,9 +22,8 @@ from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job, plan
 from vlagents_ray.evaluate.workers.rollout import Report, Rollout
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.learn import transitions as recording
-from vlagents_ray.learn.columns import RowMemory, answers, arrays
+from vlagents_ray.learn.columns import answers, arrays
 from vlagents_ray.learn.transitions import TransitionRecorder
-from vlagents_ray.registry import policy_class
 
 
 class Stating(ToZero):
@@ -100,19 +99,6 @@ def test_episodes_side_by_side_have_the_transitions_of_each_by_itself() -> None:
         assert isinstance(result, EpisodeResult)
         alone, _ = transitions(Stating(stated={"value": 1.0}), key=key, want=["value"])
         assert recorder.finish(result, lambda *_: None).transitions.equals(alone)
-
-
-def test_episodes_in_memory_that_is_used_again_have_the_transitions_of_each_by_itself() -> None:
-    """The first episode is kept, so that its memory is not used again; that of the second is."""
-    scripted = policy_class("random").from_config({"action_dim": 4})
-    options: dict[str, Any] = {"env_options": {"width": 64, "height": 64, "max_steps": 5}}
-    keys, memory = [EpisodeKey("tabletop", seed, seed, "x") for seed in (1, 2, 3)], RowMemory(4)
-    first, _ = transitions(scripted, "tabletop", keys[0], memory=memory, **options)
-    transitions(scripted, "tabletop", keys[1], memory=memory, **options)
-    third, _ = transitions(scripted, "tabletop", keys[2], memory=memory, **options)
-    assert first.equals(transitions(scripted, "tabletop", keys[0], **options)[0])
-    assert third.equals(transitions(scripted, "tabletop", keys[2], **options)[0])
-    assert first.column("cameras.front") != third.column("cameras.front")
 
 
 @pytest.mark.torch

@@ -11,13 +11,13 @@ import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
+
+from typing_extensions import Self
 
 import vlagents_ray
 from vlagents_ray.errors import VLAgentsError
 
-START_S = 90.0
-CALL_S = 30.0
 _END_S = 10.0
 _KEPT = 2000  # characters of its standard error that are shown when it fails
 
@@ -84,16 +84,6 @@ class LineProcess:
         self.send(line)
         return self.read(timeout_s)
 
-    def ready(self) -> dict[str, Any]:
-        """Read the first line of a client, which is connected and warm then: what it says of itself."""
-        said: dict[str, Any] = self.read(START_S)
-        return said
-
-    def measure(self, calls: int) -> list[float]:
-        """Let a client make calls; returns the milliseconds of each."""
-        taken: list[float] = self.request(str(calls), CALL_S + calls)
-        return taken
-
     def close(self) -> None:
         """End its standard input, which ends it; kill it if that does not."""
         if self._process.stdin is not None:
@@ -108,7 +98,7 @@ class LineProcess:
             self._process.stdout.close()
         self._errors.close()
 
-    def __enter__(self) -> LineProcess:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *exc: object) -> None:
@@ -118,16 +108,6 @@ class LineProcess:
         self._errors.seek(0, os.SEEK_END)
         self._errors.seek(max(0, self._errors.tell() - _KEPT))
         return self._errors.read().decode(errors="replace").strip()
-
-
-class Driver(Protocol):
-    """A client that is connected and makes calls when it is its turn."""
-
-    def ready(self) -> dict[str, Any]:
-        """Wait until it is connected and warm; returns what it says of itself."""
-
-    def measure(self, calls: int) -> list[float]:
-        """Make calls; returns the milliseconds of each."""
 
 
 def our_environment() -> dict[str, str]:

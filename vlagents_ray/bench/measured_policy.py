@@ -1,10 +1,9 @@
-"""A policy in this process, bare and behind a replica's batch queue, whose calls are timed; without Ray."""
+"""A policy in this process, behind a replica's batch queue, whose calls are timed; without Ray."""
 
 from __future__ import annotations
 
 import queue
 import resource
-import statistics
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -33,14 +32,6 @@ class QueuedTurn:
     actions_per_s: float
     mean_batch: float
     trips_ms: Sequence[float]  # of each call
-
-    def to_json(self) -> dict[str, float]:
-        return {
-            "actions_per_s": self.actions_per_s,
-            "round_trip_ms": statistics.median(self.trips_ms),
-            "p99_ms": float(np.quantile(self.trips_ms, 0.99)),
-            "mean_batch": self.mean_batch,
-        }
 
 
 class MeasuredPolicy:
@@ -76,17 +67,6 @@ class MeasuredPolicy:
 
     def __exit__(self, *exc: object) -> None:
         self.engine.close()
-
-    def bare(self, size: int, seconds: float) -> dict[str, float]:
-        """Measure `act_batch` on full batches of that size, one after another, without the queue."""
-        views, sessions = self._views(size), self._sessions(range(size))
-        times: list[float] = []
-        while len(times) < WARM + 1 or sum(times[WARM:]) < seconds:
-            begun = time.perf_counter()
-            self._act(views, sessions)
-            times.append(time.perf_counter() - begun)
-        times = times[WARM:]
-        return {"actions_per_s": size * len(times) / sum(times), "batch_ms": statistics.median(times) * 1e3}
 
     def actions(self, size: int, count: int) -> list[np.ndarray]:
         """Return the first actions of episodes 0, 1, … of their own observations and seeds, in batches of that size.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import importlib.metadata
-import io
 import os
 import re
 import resource
@@ -17,8 +16,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
-
-import numpy as np
 
 from vlagents_ray.errors import MissingDependency
 from vlagents_ray.registry import require
@@ -38,6 +35,7 @@ _SOCKET_PATH_MAX = 107  # bytes of a Unix socket's path, without its final NUL
 _SESSION_SOCKET = "/ray/session_2026-01-01_00-00-00_000000_1234567/sockets/plasma_store"
 _DISK_FULL = 0.95
 DEFAULT_PORT = 8000
+_FIRST_FREE = 1024  # ports below are root's
 OLDEST_PYTHON = (3, 10)
 _WIDTH = 120  # columns of the table in a file or a pipe
 _STYLE = {"ok": "green", "warn": "yellow", "fail": "bold red"}
@@ -75,11 +73,8 @@ def judge_shared_memory(total: float, free: float, memory: float) -> Check:
     if free >= store:
         return Check("ok", detail)
     need = int(store / GB) + 1
-    return Check(
-        "warn",
-        f"{detail}, so Ray will use slow files on disk",
-        f"docker run --shm-size={need}g, or as root: mount -o remount,size={need}G {SHM}",
-    )
+    cure = f"docker run --shm-size={need}g, or as root: mount -o remount,size={need}G {SHM}"
+    return Check("warn", f"{detail}, so Ray will use slow files on disk", cure)
 
 
 def memory_bytes(limit_file: Path = Path("/sys/fs/cgroup/memory.max")) -> float:
@@ -124,11 +119,8 @@ def judge_temp_dir(path: str, total: float, free: float) -> Check:
 
 def open_files() -> Check:
     """Check that one process may hold as many sockets and files as a server needs."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    unlimited = sys.maxsize
-    return judge_open_files(
-        unlimited if soft == resource.RLIM_INFINITY else soft, unlimited if hard == resource.RLIM_INFINITY else hard
-    )
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    return judge_open_files(*(sys.maxsize if one == resource.RLIM_INFINITY else one for one in limits))
 
 
 def judge_open_files(soft: int, hard: int) -> Check:
@@ -136,15 +128,12 @@ def judge_open_files(soft: int, hard: int) -> Check:
     effective = max(soft, min(hard, _FILES_RAISED_TO))
     if effective >= _FILES_ENOUGH:
         return Check("ok", f"{soft} a process, {effective} under Ray")
-    return Check(
-        "warn",
-        f"{effective} a process; many robots or workers at once may run out",
-        f"ulimit -Hn {_FILES_WANTED} as root, or LimitNOFILE={_FILES_WANTED} in the service's systemd unit",
-    )
+    cure = f"ulimit -Hn {_FILES_WANTED} as root, or LimitNOFILE={_FILES_WANTED} in the service's systemd unit"
+    return Check("warn", f"{effective} a process; many robots or workers at once may run out", cure)
 
 
 def port_free(port: int) -> Check:
-    """Check that the TCP port is free; else say which process holds it."""
+    """Check that the TCP port is free."""
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # ports that only linger are free
         try:
@@ -152,41 +141,10 @@ def port_free(port: int) -> Check:
         except OSError as error:
             if error.errno not in (errno.EADDRINUSE, errno.EACCES):
                 raise
-            refused = error.errno == errno.EACCES
-        else:
-            return Check("ok", "free")
-    other = f"vlagents-ray serve POLICY --port {port + 1 if not refused else 8000}"
-    if refused:
-        return Check("warn", "only root may listen on it", other)
-    return Check("warn", f"taken by {_holder(port)}", f"stop that, or {other}")
-
-
-def _holder(port: int) -> str:
-    inodes = set(_listening_inodes(port))
-    if not inodes:
-        return "another process"
-    for link in Path("/proc").glob("[0-9]*/fd/*"):
-        try:
-            held = re.fullmatch(r"socket:\[(\d+)\]", os.readlink(link))
-            if held and held[1] in inodes:
-                pid = link.parts[2]
-                return f"pid {pid} ({Path('/proc', pid, 'comm').read_text().strip()})"
-        except OSError:
-            continue  # it has ended, or is another user's
-    return "another user's process"
-
-
-def _listening_inodes(port: int) -> Iterator[str]:
-    # /proc/net/tcp: "sl local_address rem_address st ... inode", addresses as HEX:HEXPORT, state 0A = LISTEN
-    for table in ("/proc/net/tcp", "/proc/net/tcp6"):
-        try:
-            lines = Path(table).read_text().splitlines()[1:]
-        except OSError:
-            continue  # not Linux, or no IPv6
-        for line in lines:
-            columns = line.split()
-            if columns[3] == "0A" and int(columns[1].rpartition(":")[2], 16) == port:
-                yield columns[9]
+            why = "taken" if error.errno == errno.EADDRINUSE else "only root may listen on it"
+            other = port + 1 if port >= _FIRST_FREE else DEFAULT_PORT
+            return Check("warn", why, f"`ss -ltnp` names its process; or vlagents-ray serve POLICY --port {other}")
+    return Check("ok", "free")
 
 
 def run(console: Console, port: int = DEFAULT_PORT) -> int:
@@ -216,7 +174,6 @@ def checks(port: int = DEFAULT_PORT) -> Iterator[tuple[str, Check]]:
         ("GPU", gpu),
         ("Vulkan", vulkan),
         ("EGL", egl),
-        ("video", video),
         ("shared memory", shared_memory),
         (f"port {port}", lambda: port_free(port)),
         ("temporary files", temp_dir),
@@ -320,26 +277,6 @@ def egl() -> Check:
         return found
     cure = f"apt-get install libegl1 libgl1-mesa-dri; or {SHARE}"
     return Check("warn", f"{found.detail}; no device renders in software, for workers without a GPU", cure)
-
-
-def video() -> Check:
-    """Check that videos can be written: five H.264 frames are encoded and decoded."""
-    av = require("av")
-    file = io.BytesIO()
-    with av.open(file, "w", format="mp4") as container:
-        stream = container.add_stream("libx264", rate=20, options={"preset": "ultrafast"})
-        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
-        for grey in range(5):
-            frame = av.VideoFrame.from_ndarray(np.full((48, 64, 3), 50 * grey, np.uint8), format="rgb24")
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode())
-    file.seek(0)
-    with av.open(file) as container:
-        greys = [int(frame.to_ndarray(format="rgb24").mean()) for frame in container.decode(video=0)]
-    detail = f"H.264 with PyAV {av.__version__}"
-    if len(greys) != 5 or any(abs(grey - 50 * i) > 10 for i, grey in enumerate(greys)):
-        return Check("fail", f"{detail} gave other frames back: {greys}", "pip install --force-reinstall av")
-    return Check("ok", detail)
 
 
 def _rendered(simulator: str, probe: RenderProbe) -> Check:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -17,18 +16,10 @@ if TYPE_CHECKING:
     from vlagents_ray.open_loop.replay import ReplayPlan
 
 
-class Videos(str, Enum):
-    """Where the videos of the page are."""
-
-    INLINE = "inline"
-    LINK = "link"
-    NONE = "none"
-
-
 def report_command(
     folders: Annotated[list[Path], typer.Argument(metavar="OUT...", help="Folders that evaluations wrote to.")],
     html: Annotated[Path | None, typer.Option(help="Default: report.html in OUT; of several folders, here.")] = None,
-    videos: Annotated[Videos, typer.Option(help="As far as they fit, beside the page, or stills.")] = Videos.LINK,
+    inline: Annotated[bool, typer.Option("--inline", help="With videos in the page, as far as they fit.")] = False,
     live: Live = False,
     live_at: LiveAt = None,
 ) -> None:
@@ -50,7 +41,7 @@ def report_command(
             return
         results = combined([Results.load(folder) for folder in folders])
         path = html or (folders[0] / FILE if len(folders) == 1 else Path(FILE))
-        written = write_report(results, path, videos=videos.value)
+        written = write_report(results, path, inline=inline)
         out.print(f"report: {written}")
 
 

@@ -26,11 +26,9 @@ from vlagents_ray.evaluate.results.reader import Results, synchronous_twin
 from vlagents_ray.evaluate.results.statistics import (
     Pairs,
     Rate,
-    SuccessCurve,
     difference_interval,
     holm,
     mcnemar,
-    success_curve,
     wilson,
 )
 from vlagents_ray.evaluate.results.stopping import confidence_sequence
@@ -62,7 +60,6 @@ __all__ = [
     "Rate",
     "Results",
     "StopConfig",
-    "SuccessCurve",
     "SuiteConfig",
     "Summary",
     "Trajectory",
@@ -79,7 +76,6 @@ __all__ = [
     "print_summary",
     "progress_for",
     "results_table",
-    "success_curve",
     "synchronous_twin",
     "wilson",
 ]

@@ -24,12 +24,11 @@ from vlagents_ray.evaluate.workers.pool import WorkerPool
 from vlagents_ray.evaluate.workers.rollout import Report, agents
 from vlagents_ray.evaluate.workers.worker import FailedAttempts, dispatch
 from vlagents_ray.interface import Agent
-from vlagents_ray.learn.columns import EXTRA, RowMemory
+from vlagents_ray.learn.columns import EXTRA
 from vlagents_ray.learn.transitions import WANTED, TransitionRecorder
 from vlagents_ray.registry import require
 
 POLL_S = 0.25  # longest wait for a report, after which workers that are needed are started
-_BLOCKS = 4  # of memory for images that a worker keeps for each of its environments
 _CURE = "mend this, and go on with `first=rollouts.position`"
 
 
@@ -135,10 +134,7 @@ class Rollouts:
         require_envs(config)
         self._settings, self._config, self._cells = plan, config, cells(config)
         self._factory = agents(config, None if isinstance(plan.policy, str) else plan.policy)
-        memory = RowMemory(_BLOCKS * plan.num_envs)  # each worker gets one of its own
-        self._recorders = functools.partial(
-            TransitionRecorder, want=tuple(plan.want), images=plan.images, memory=memory
-        )
+        self._recorders = functools.partial(TransitionRecorder, want=tuple(plan.want), images=plan.images)
         self._block = math.lcm(plan.groups, plan.num_envs)  # episodes that are queued together
         self._ahead = self._block * max(2, math.ceil(2 * plan.workers * plan.num_envs / self._block))
         self._position = self._planned = plan.first

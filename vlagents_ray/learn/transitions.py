@@ -13,7 +13,7 @@ from vlagents_ray.evaluate.episode.records import EpisodeResult, version_of
 from vlagents_ray.evaluate.episode.second_pass import SecondPass
 from vlagents_ray.evaluate.plan.config import EpisodeChoice, EvalConfig
 from vlagents_ray.interface import BEHAVIOUR, WANT, Act, Obs
-from vlagents_ray.learn.columns import EXTRA, FINAL, REPLAY, RowMemory, at_rows, constant, tensors, words
+from vlagents_ray.learn.columns import EXTRA, FINAL, REPLAY, at_rows, constant, tensors, words
 from vlagents_ray.registry import require
 
 WANTED = ("logprob", "value", "entropy", REPLAY)  # columns that a policy fills
@@ -31,12 +31,10 @@ class TransitionRecorder(EpisodeRecorder):
         *,
         want: Sequence[str] = (),
         images: bool = True,
-        memory: RowMemory | None = None,
     ) -> None:
         """Begin an episode."""
         self._pa: Any = require("pyarrow", extra=EXTRA)
         self._want, self._images = tuple(want), images
-        self._memory = memory or RowMemory(0)
         self.request_info: Mapping[str, Any] = {WANT: list(want)} if want else {}
         self._seen: dict[str, _Rows] = {}  # the columns of the observations
         self._rows: list[tuple[np.ndarray, float, bool, int, int, str]] = []  # action, reward, success, act, version …
@@ -58,10 +56,7 @@ class TransitionRecorder(EpisodeRecorder):
             seen["gripper"] = np.float32(obs.gripper)
         got = {name: part.shape for name, part in seen.items()}
         if not self._seen:
-            self._seen = {
-                name: _Rows(part, np.uint8 if part.ndim == 3 else np.float32, self._memory)
-                for name, part in seen.items()
-            }
+            self._seen = {name: _Rows(part, np.uint8 if part.ndim == 3 else np.float32) for name, part in seen.items()}
         elif got != (want := {name: rows.shape for name, rows in self._seen.items()}):
             raise EnvFailed(f"env step: got {got}, want {want} as after reset")
         for name, part in seen.items():
@@ -100,7 +95,7 @@ class TransitionRecorder(EpisodeRecorder):
                 f"act.info[{BEHAVIOUR!r}][{REPLAY!r}]: got {stated!r}, want numbers and arrays of numbers by name"
             )
         if not self._replay:
-            self._replay = {name: _Rows(value, value.dtype, self._memory) for name, value in values.items()}
+            self._replay = {name: _Rows(value, value.dtype) for name, value in values.items()}
         got = {name: f"{value.dtype} {value.shape}" for name, value in values.items()}
         if got != (want := {name: f"{rows.dtype} {rows.shape}" for name, rows in self._replay.items()}):
             raise ConfigError(f"act.info[{BEHAVIOUR!r}][{REPLAY!r}]: got {got}, want {want} as in the first act")
@@ -142,15 +137,14 @@ class TransitionRecorder(EpisodeRecorder):
 class _Rows:
     """Arrays of one shape, copied into an array that grows, so that none of them is copied twice."""
 
-    def __init__(self, first: np.ndarray, dtype: Any, memory: RowMemory) -> None:
+    def __init__(self, first: np.ndarray, dtype: Any) -> None:
         self.shape, self.dtype = first.shape, dtype
-        self._memory = memory
-        self._rows = memory.rows(_FIRST_ROWS, first.shape, dtype)
+        self._rows = np.empty((_FIRST_ROWS, *first.shape), dtype)
         self._number = 0
 
     def add(self, row: np.ndarray) -> None:
         if self._number == len(self._rows):
-            full, self._rows = self._rows, self._memory.rows(2 * self._number, self.shape, self.dtype)
+            full, self._rows = self._rows, np.empty((2 * self._number, *self.shape), self.dtype)
             self._rows[: self._number] = full
         self._rows[self._number] = row
         self._number += 1

@@ -322,7 +322,6 @@ def test_a_recording_that_states_more_than_it_has_is_refused(bundle: Path, tmp_p
 def test_an_evaluation_that_is_written_to_is_bundled_as_it_stands(line: Path, tmp_path: Path) -> None:
     shutil.copytree(line, tmp_path / "run")
     with closing(sqlite3.connect(tmp_path / "run/results.db")) as db:
-        db.execute("PRAGMA journal_mode = wal")
         db.execute("UPDATE episodes SET seconds = 99")
         write_bundle(tmp_path / "run", tmp_path / "b.zip")
         db.rollback()

@@ -10,7 +10,7 @@ import pytest
 from browser import Page, browser
 from recorded_results import record, runs
 
-from vlagents_ray.evaluate.report.page import Videos, write_report
+from vlagents_ray.evaluate.report.page import write_report
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
@@ -21,11 +21,10 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
         yield opened
 
 
-@pytest.fixture(scope="module", params=["link", "inline"])
+@pytest.fixture(scope="module", params=[False, True], ids=["link", "inline"])
 def report(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("results")
-    videos: Videos = request.param
-    return write_report(record(runs(out), videos=True, troubles=True), out / "report.html", videos=videos)
+    return write_report(record(runs(out), videos=True, troubles=True), out / "report.html", inline=request.param)
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
@@ -37,7 +36,7 @@ def test_it_fits_without_errors_or_requests(page: Page, report: Path, width: int
     assert page.value("document.documentElement.scrollWidth") <= width
     assert page.said == []
     assert [address for address in page.asked if not address.startswith("data:")] == [report.as_uri()]
-    assert page.value("document.querySelectorAll('h2').length") == 11
+    assert page.value("document.querySelectorAll('h2').length") == 10
     light = page.value("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
     assert light == (scheme == "light")
 

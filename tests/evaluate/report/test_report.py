@@ -102,8 +102,8 @@ def test_workers_are_counted_where_they_ran_by_transport_and_renderer(page: Read
 
 
 def test_every_part_is_there(page: Read) -> None:
-    headings = ["Success", "Comparison", "Learning curve", "Success over time", "Latency", "Failures", "Episodes"]
-    headings += ["Errors", "Protocol", "Configuration", "To cite and to repeat"]
+    headings = ["Success", "Comparison", "Learning curve", "Latency", "Failures", "Episodes"]
+    headings += ["Errors", "Protocol", "Configuration", "To repeat"]
     links = [attributes["href"] for attributes in page.all("a") if (attributes["href"] or "").startswith("#")]
     assert links == [f"#{attributes['id']}" for attributes in page.all("h2")]
     for heading in headings:
@@ -150,20 +150,12 @@ def test_videos_are_linked_from_where_the_page_is(results: Results, tmp_path: Pa
 def test_videos_are_in_the_page_up_to_a_budget(results: Results) -> None:
     videos = [video for cell in results.cells for one in cell.episodes for video in one.videos]
     size = (results.out / videos[0]).stat().st_size
-    gallery = Gallery(results, results.out / "report.html", "inline", budget=size)
+    gallery = Gallery(results, results.out / "report.html", inline=True, budget=size)
     players = [gallery.player(video, "a label") for video in videos[:2]]
     inside, beside = (str(player.source) for player in players if player is not None)
     assert inside.startswith("data:video/mp4;base64,")
     assert beside.startswith("videos/")
     assert (gallery.inlined, gallery.linked) == (1, 1)
-
-
-def test_without_videos_there_are_stills(results: Results, tmp_path: Path) -> None:
-    page = Read(write_report(results, tmp_path / "report.html", videos="none"))
-    assert page.all("video") == []
-    stills = page.all("img")
-    assert stills
-    assert all((one["src"] or "").startswith("data:image/jpeg") and one["alt"] for one in stills)
 
 
 def test_a_video_that_is_gone_or_broken_leaves_the_rest(tmp_path: Path) -> None:
@@ -183,7 +175,7 @@ def test_one_policy_that_solved_everything_has_no_failures_and_nothing_to_compar
     page = Read(write_report(record(config, lambda _cell, _seed: 7), tmp_path / "report.html"))
     headings = {attributes["id"] for attributes in page.all("h2")}
     assert not headings & {"failures", "errors", "comparison", "learning-curve"}
-    assert "a solved 100.0 % of 10 episodes" in page.words
+    assert "100.0 % solved" in page.words
 
 
 def test_a_run_without_an_episode_has_a_page(tmp_path: Path) -> None:
@@ -199,7 +191,6 @@ def test_many_checkpoints_are_compared_with_the_best_first(tmp_path: Path) -> No
     results = record(runs(tmp_path, steps=list(range(200, 2001, 200)), episodes=6), better_later)
     words = Read(write_report(results, tmp_path / "report.html")).words
     assert "45 further pairs" in words  # 11 contenders: 55 pairs, 10 of them with the best
-    assert "5 are not" in words  # of the curves over time
 
 
 def test_of_very_many_checkpoints_only_the_pairs_that_are_asked_for_most_are_compared(

@@ -1,4 +1,4 @@
-"""results.db on a disk of this host, on one that hosts share, and where nothing can be written."""
+"""results.db, as it is written, as others read it, and where nothing can be written."""
 
 from __future__ import annotations
 
@@ -60,69 +60,21 @@ def kill_in(config: EvalConfig) -> None:
     assert subprocess.run(command, check=False, env=os.environ | {"PYTHONPATH": PYTHONPATH}).returncode == 9
 
 
-def journal(out: Path) -> str:
-    with closing(sqlite3.connect(out / "results.db")) as db:
-        return str(db.execute("PRAGMA journal_mode").fetchone()[0])
-
-
 def episodes(results: Results) -> int:
     return sum(len(cell.episodes) for cell in results.cells)
 
 
-@pytest.fixture
-def shared(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The disk is one that other hosts may mount."""
-    monkeypatch.setattr(database, "is_local", lambda _folder: False)
-
-
-def test_a_file_system_is_local_if_it_is_known_to_be(tmp_path: Path) -> None:
-    assert database.is_local(Path("/dev/shm"))
-    assert not database.is_local(Path("/proc"))  # stands for whatever is not on the list
-    assert not database.is_local(tmp_path / "gone")
-
-
-def test_a_log_that_readers_look_beside_is_for_local_disks(config: Config) -> None:
-    with begun(config()):
-        assert journal(config().out) == "wal"
-
-
-def test_on_a_shared_disk_there_is_no_write_ahead_log_and_commits_reach_the_disk(shared: None, config: Config) -> None:
+def test_another_process_reads_meanwhile_and_commits_reach_the_disk(config: Config) -> None:
     with begun(config()) as store:
-        assert journal(config().out) == "delete"  # of this connection: a rollback journal
         [[synchronous]] = store._db.execute("PRAGMA synchronous")
         assert synchronous == 2
-        assert not [path.name for path in config().out.glob("results.db-*") if path.suffix != ".db-journal"]
         done = subprocess.run([sys.executable, "-c", COUNT, config().out], capture_output=True, text=True, check=True)
-        assert done.stdout.split() == ["1"]  # read by another process, meanwhile
-
-
-def test_results_that_were_begun_on_a_local_disk_are_gone_on_with_on_a_shared_one(
-    config: Config, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    kill_in(config())
-    assert (config().out / "results.db-wal").stat().st_size
-    monkeypatch.setattr(database, "is_local", lambda _folder: False)
-    with Store(config(resume=True)) as store:
-        assert len(store.finished()) == 1
-        assert not (config().out / "results.db-wal").exists()
-
-
-def test_a_reader_that_keeps_the_wrong_journal_is_named(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(database, "WAIT_S", 0.1)
-    with begun(config()):
-        other = sqlite3.connect(config().out / "results.db")
-        other.execute("BEGIN")
-        other.execute("SELECT * FROM runs").fetchone()
-    with closing(other):
-        monkeypatch.setattr(database, "is_local", lambda _folder: False)
-        with pytest.raises(ConfigError, match=r"results.db.* end what reads it"):
-            Store(config(resume=True))
+        assert done.stdout.split() == ["1"]
 
 
 def test_results_at_rest_are_one_file(config: Config) -> None:
     begun(config()).close()
     assert sorted(path.name for path in config().out.iterdir()) == ["results.db", "results.lock"]
-    assert journal(config().out) == "delete"
 
 
 def test_a_reader_cannot_write(config: Config) -> None:
@@ -181,11 +133,8 @@ def test_a_file_that_is_no_results_is_one_sentence(tmp_path: Path, damage: bytes
 
 
 @pytest.mark.hosts
-@pytest.mark.parametrize("mode", ["delete", "wal"])
-def test_a_folder_that_cannot_be_written_to_is_read(config: Config, mode: str) -> None:
-    begun(config()).close()
-    with closing(sqlite3.connect(config().out / "results.db")) as db:
-        db.execute(f"PRAGMA journal_mode = {mode}")  # "wal": as a killed evaluation leaves it
+def test_a_folder_that_cannot_be_written_to_is_read(config: Config) -> None:
+    kill_in(config())
     done = python_on(READ_ONLY, config().out, COUNT)
     assert done.stdout.split() == ["1"], done.stderr
 

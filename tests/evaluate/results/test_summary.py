@@ -211,8 +211,8 @@ def test_real_time_and_synchronous_episodes_are_in_no_rate_together(tmp_path: Pa
     page = write_report(summary.results, tmp_path / "report.html").read_text()
     assert ">50.0" not in page
     assert "solved, synchronous" in page
-    for sentence in ("policy, synchronous solved 100.0 % of 4", "policy, in real time solved 0.0 % of 4"):
-        assert sentence in page
+    assert ">100.0" in page, "of the episodes that waited"
+    assert ">0.0" in page, "of those in real time"
 
 
 def test_cells_that_stopped_after_different_numbers_have_no_rate_in_common(config: Config, tmp_path: Path) -> None:

@@ -46,7 +46,6 @@ _SQLITE = {
     "unable to open database file": errno.EACCES,
     "disk I/O error": errno.EIO,
 }
-_NOTHING_LEFT = 2**16  # bytes: SQLite has no word for a full disk where it extends a memory-mapped file
 
 
 def episode_folder(out: Path, kind: str, cell: EvalCase) -> Path:
@@ -172,8 +171,6 @@ def _number(error: sqlite3.OperationalError, folder: Path) -> int | None:
     """The errno of an error of SQLite; None if it is not about the disk."""
     number = _SQLITE.get(str(error))
     disk = os.statvfs(next(one for one in (folder, *folder.absolute().parents) if one.exists()))
-    if number == errno.EIO and disk.f_bavail * disk.f_frsize < _NOTHING_LEFT:
-        return errno.ENOSPC
     if number == errno.EACCES and disk.f_flag & os.ST_RDONLY:
         return errno.EROFS
     return number

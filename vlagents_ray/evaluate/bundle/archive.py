@@ -229,7 +229,6 @@ def write_bundle(folder: Path, archive: Path, *, videos: bool = False) -> str:
             # One consistent state, also while an evaluation writes to it.
             with reading(folder) as source, closing(sqlite3.connect(stage / DATABASE)) as target:
                 source.backup(target)
-                target.execute("PRAGMA journal_mode = DELETE")
             _link_files(folder, stage, Results.load(stage), videos=videos)
             _name_what_is_there(stage)
             return pack(stage, archive)

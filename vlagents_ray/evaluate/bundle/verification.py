@@ -23,7 +23,7 @@ from vlagents_ray.envs.base import make_batch
 from vlagents_ray.errors import ConfigError, VLAgentsError
 from vlagents_ray.evaluate.artifacts.storage import storing, versions
 from vlagents_ray.evaluate.artifacts.trajectory import Trajectory
-from vlagents_ray.evaluate.bundle.archive import MANIFEST, MOST_BYTES, Manifest, unpack
+from vlagents_ray.evaluate.bundle.archive import MANIFEST, MOST_BYTES, unpack
 from vlagents_ray.evaluate.episode.episode import options_of_reset
 from vlagents_ray.evaluate.episode.failures import env_side
 from vlagents_ray.evaluate.episode.second_pass import play_actions
@@ -106,7 +106,7 @@ def verify(
             fine = f"{len(manifest.files)} files have the SHA-256 that {MANIFEST} states"
             findings = [_finding("digests", odd, fine)]
             try:
-                findings += _check(folder, manifest, replay, trust=trust)
+                findings += _check(folder, replay, trust=trust)
             except (VLAgentsError, sqlite3.Error):
                 raise
             except (ArithmeticError, LookupError, RecursionError, TypeError, ValueError, AttributeError) as error:
@@ -119,7 +119,7 @@ def verify(
     return Verification(digest, findings)
 
 
-def _check(folder: Path, manifest: Manifest, replay: int, *, trust: bool) -> Iterator[Finding]:
+def _check(folder: Path, replay: int, *, trust: bool) -> Iterator[Finding]:
     """All findings but that of the digests; summary and report are written on the way."""
     if not (folder / DATABASE).is_file():
         raise ConfigError(f"got no {DATABASE} in the bundle; want one that `vlagents-ray bundle` wrote")
@@ -128,8 +128,7 @@ def _check(folder: Path, manifest: Manifest, replay: int, *, trust: bool) -> Ite
         raise ConfigError(f"{DATABASE}: has no run, or no cell; want the results of an evaluation")
     yield _check_cells(results)
     write_summary(summarize(results))
-    has_videos = any(name.endswith(".mp4") for name in manifest.files)
-    write_report(results, folder / REPORT, videos="link" if has_videos else "none")
+    write_report(results, folder / REPORT)
     yield _check_trajectories(results)
     yield _check_versions(results)
     yield from _check_replays(results, replay, trust=trust)

@@ -10,7 +10,6 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
-from itertools import pairwise
 from typing import NamedTuple
 
 from vlagents_ray.evaluate.results.statistics import Rate
@@ -103,7 +102,6 @@ class Series:
 
     name: str
     points: Sequence[tuple[float, Rate]]
-    stepped: bool = False  # constant up to the next point, rather than a straight line to it
     level: bool = False  # one rate, whatever x is
 
 
@@ -169,13 +167,12 @@ def rate_chart(series: Sequence[Series], x_label: str, title: str) -> RateChart:
         known = [(x, rate) for x, rate in one.points if rate.rate is not None]
         bounds = [(rate.rate or 0.0, *rate.interval) for _, rate in known]
         rates, lows, highs = (
-            _corners([(x_of(x), PLOT.y(shares[i])) for (x, _), shares in zip(known, bounds, strict=True)], one.stepped)
-            for i in range(3)
+            [(x_of(x), PLOT.y(shares[i])) for (x, _), shares in zip(known, bounds, strict=True)] for i in range(3)
         )
         dots = [
             (x_of(x), PLOT.y(rate.rate or 0.0), f"{one.name}, {short(x)}: {percent(rate)} % ({interval(rate)})")
             for x, rate in known
-            if not (one.stepped or one.level)
+            if not one.level
         ]
         style = Style(one.name, f"c{index % _COLOURS}", _DASHES[index % len(_DASHES)])
         band = f"{_path([*lows, *reversed(highs)])}Z"
@@ -238,14 +235,6 @@ def short(value: float) -> str:
 def px(value: float) -> str:
     """A coordinate with at most two decimals."""
     return f"{value:.2f}".rstrip("0").rstrip(".")
-
-
-def _corners(points: Sequence[tuple[float, float]], stepped: bool) -> list[tuple[float, float]]:
-    """The corners of a line through `points`."""
-    if not stepped:
-        return list(points)
-    corners = [corner for (_, y), (x, then) in pairwise(points) for corner in ((x, y), (x, then))]
-    return [*points[:1], *corners]
 
 
 def _path(points: Iterable[tuple[float, float]]) -> str:

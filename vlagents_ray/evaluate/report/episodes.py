@@ -9,7 +9,6 @@ import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 from urllib.parse import quote
 
 import numpy as np
@@ -20,8 +19,6 @@ from vlagents_ray.evaluate.results.reader import Attempt, CellResults, Episode, 
 from vlagents_ray.evaluate.results.summary import errors_of_policies
 from vlagents_ray.images.jpeg_png import encode_jpeg
 from vlagents_ray.registry import require
-
-Videos = Literal["inline", "link", "none"]
 
 BUDGET = 24 * 2**20  # bytes of videos that one page carries
 POSTER = 224  # the most pixels of a poster's side
@@ -38,10 +35,10 @@ Found = tuple[CellResults, Episode]
 
 @dataclass(frozen=True, slots=True)
 class Player:
-    """A video, or its last frame if `source` is None."""
+    """A video."""
 
     label: str
-    source: str | None  # URL of the video
+    source: str | None  # its URL
     still: str | None  # URL of its last frame; None: the file does not play
     style: str | None  # a class of the stylesheet
     tall: float | None  # height / width
@@ -96,11 +93,10 @@ class Errors:
 class Gallery:
     """Chooses which videos the report embeds or links, within a size budget."""
 
-    def __init__(self, results: Results, page: Path, mode: Videos, budget: int = BUDGET) -> None:
+    def __init__(self, results: Results, page: Path, *, inline: bool, budget: int = BUDGET) -> None:
         self._results = results
         self._page = page
-        self._mode = mode
-        self._budget = budget
+        self._budget = budget if inline else 0
         self.inlined = 0
         self.linked = 0
         self.outside: set[str] = set()  # paths that are symbolic links out of their folder of results: not shown
@@ -118,15 +114,13 @@ class Gallery:
         frame = last_frame(path)
         still = None if frame is None else poster(frame)
         style = "small" if frame is not None and max(frame.shape[:2]) < SMALL else None
-        if self._mode == "none":
-            return None if still is None else Player(f"{label}: the last frame", None, still, style, None)
         tall = None if frame is None else frame.shape[0] / frame.shape[1]
         return Player(label, self._source(video, path), still, style, tall)
 
     def link(self, video: str) -> str | None:
         """Where the page finds the file; None if it has none to link to."""
         path = self._file(video)
-        if self._mode == "none" or path is None:
+        if path is None:
             return None
         return quote(Path(os.path.relpath(path, self._page.parent.resolve())).as_posix())
 
@@ -145,7 +139,7 @@ class Gallery:
 
     def _source(self, video: str, path: Path) -> str | None:
         size = path.stat().st_size
-        if self._mode == "inline" and size <= self._budget:
+        if size <= self._budget:
             self._budget -= size
             self.inlined += 1
             return data_url("video/mp4", path.read_bytes())

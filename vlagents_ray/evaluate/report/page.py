@@ -31,13 +31,12 @@ from vlagents_ray.evaluate.report.charts import (
     percent,
     quantity,
 )
-from vlagents_ray.evaluate.report.episodes import AT_ONCE, Gallery, Videos, episodes, errors, failures
+from vlagents_ray.evaluate.report.episodes import AT_ONCE, Gallery, episodes, errors, failures
 from vlagents_ray.evaluate.report.provenance import configuration, protocol, repeat
 from vlagents_ray.evaluate.report.success import (
     compare_all,
     learning_curves,
     real_time_gaps,
-    success_over_time,
     success_table,
 )
 from vlagents_ray.evaluate.results.reader import Results, by_timing, rate_of
@@ -76,19 +75,18 @@ class Section:
         return self.title.lower().replace(" ", "-")
 
 
-def write_report(results: Results, path: Path, *, videos: Videos = "link") -> Path:
+def write_report(results: Results, path: Path, *, inline: bool = False) -> Path:
     """Write the report of `results` to `path`, one HTML file, whole or not at all.
 
     Args:
         results: Of one folder, or of several (`combined`).
         path: The file; folders that are missing are made.
-        videos: "link" to the files (relative to `path`), "inline" up to `episodes.BUDGET` bytes and links for the
-            rest, or "none", with a still of each.
+        inline: Whether videos are in the page, up to `episodes.BUDGET` bytes; the others are links, relative to `path`.
 
     Returns:
         `path`.
     """
-    text = report(summarize(results), Gallery(results, path, videos))
+    text = report(summarize(results), Gallery(results, path, inline=inline))
     with storing(path.parent), whole(path) as part:
         part.write_text(text, encoding="utf-8")
     return path
@@ -102,14 +100,13 @@ def report(summary: Summary, gallery: Gallery) -> str:
         Section("Comparison", "comparison", compare_all(summary)),
         Section("Gap to the synchronous score", "real_time", real_time_gaps(summary)),
         Section("Learning curve", "learning_curve", learning_curves(summary)),
-        Section("Success over time", "success_over_time", success_over_time(summary)),
         Section("Latency", "latency", latency(summary)),
         Section("Failures", "failures", failures(results, gallery)),
         Section("Episodes", "episodes", episodes(results, gallery)),
         Section("Errors", "errors", errors(results)),
         Section("Protocol", "protocol", protocol(results)),
         Section("Configuration", "configuration", configuration(results)),
-        Section("To cite and to repeat", "repeat", repeat(summary)),
+        Section("To repeat", "repeat", repeat(results)),
     ]
     return (
         _templates()

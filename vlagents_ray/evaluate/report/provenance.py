@@ -1,4 +1,4 @@
-"""Where the numbers come from: protocol, contracts, settings, versions; and how to cite and repeat them."""
+"""Where the numbers come from: protocol, contracts, settings, versions; and how to repeat them."""
 
 from __future__ import annotations
 
@@ -12,16 +12,7 @@ import yaml
 from vlagents_ray.evaluate.plan.config import EvalConfig
 from vlagents_ray.evaluate.results.changes import Change
 from vlagents_ray.evaluate.results.reader import CellResults, Results, Run
-from vlagents_ray.evaluate.results.statistics import Rate
-from vlagents_ray.evaluate.results.summary import (
-    TOTAL,
-    Summary,
-    checkpoint_of,
-    group_of,
-    pushed_of,
-    revision_of,
-    weights_of,
-)
+from vlagents_ray.evaluate.results.summary import checkpoint_of, pushed_of, revision_of, weights_of
 
 PROTOCOL = "protocol"  # of what an env describes: the constants of its benchmark
 _SETTINGS = ("env_options", "reset_options", "clock")
@@ -53,18 +44,6 @@ class Configuration:
 
 
 @dataclass(frozen=True, slots=True)
-class Quote:
-    """The numbers of one policy id in a sentence for a paper."""
-
-    name: str
-    envs: list[str]
-    success_once: Rate
-    success_at_end: Rate
-    version: str | None
-    seeds: str
-
-
-@dataclass(frozen=True, slots=True)
 class Again:
     """The settings of a run as a file; a policy that Python code made cannot be in it."""
 
@@ -74,9 +53,8 @@ class Again:
 
 @dataclass(frozen=True, slots=True)
 class Repeat:
-    """Sentences for a paper, and the commands that repeat the evaluation and this page."""
+    """What the commands that repeat the evaluation and this page need."""
 
-    quotes: list[Quote]
     runs: list[Again]
     folders: list[str]
 
@@ -117,13 +95,10 @@ def _identity(cell: CellResults) -> list[str]:
     return [one for one in found if one is not None]
 
 
-def repeat(summary: Summary) -> Repeat:
-    """Return sentences to cite the evaluation, and commands to repeat it."""
-    results = summary.results
-    version = next((run.versions.get("vlagents-ray") for run in reversed(results.runs)), None)
-    quotes = [_quote(name, cells, version) for name, cells in summary.quotable if any(cell.counted for cell in cells)]
+def repeat(results: Results) -> Repeat:
+    """Return what repeats the evaluation."""
     folders = list(dict.fromkeys(str(run.config.get("out")) for run in results.runs))
-    return Repeat(quotes, [_again(run) for run in _last_runs(results)], folders)
+    return Repeat([_again(run) for run in _last_runs(results)], folders)
 
 
 def _env(cell: CellResults, tasks: list[str]) -> Env:
@@ -137,15 +112,6 @@ def _env(cell: CellResults, tasks: list[str]) -> Env:
 def _last_runs(results: Results) -> list[Run]:
     """The last run of each folder: those before had the same settings, as far as results depend on them."""
     return list({run.config.get("out"): run for run in results.runs}.values())
-
-
-def _quote(name: str, cells: list[CellResults], version: str | None) -> Quote:
-    group = group_of((cells[0].contender, "", TOTAL), cells)
-    envs = list(dict.fromkeys(cell.env for cell in cells))
-    seeds = sorted({one.result.key.seed for cell in cells for one in cell.episodes if one.counts})
-    between = f"{seeds[0]} to {seeds[-1]}"
-    text = f"seeds {between}" if seeds[-1] - seeds[0] + 1 == len(seeds) else f"{len(seeds)} seeds from {between}"
-    return Quote(name, envs, group.success_once, group.success_at_end, version, text)
 
 
 def _again(run: Run) -> Again:

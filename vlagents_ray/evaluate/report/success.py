@@ -9,10 +9,9 @@ from dataclasses import dataclass
 from vlagents_ray.evaluate.report.charts import Glyph, RateChart, Series, difference_glyph, rate_chart
 from vlagents_ray.evaluate.results.comparison import Comparison, Line, clock_gaps, comparable, comparisons
 from vlagents_ray.evaluate.results.reader import CellResults, Results, by_timing
-from vlagents_ray.evaluate.results.statistics import ERROR_RATE, Pairs, Rate, success_curve
+from vlagents_ray.evaluate.results.statistics import ERROR_RATE, Pairs, Rate
 from vlagents_ray.evaluate.results.summary import TOTAL, Group, Summary, group_of
 
-MOST_CURVES = 6  # that a chart holds and a reader tells apart
 MOST_PAIRS = 15  # shown unfolded: those of six policy ids
 MOST_COMPARED = 780  # pairs, those of 40 policy ids; of more, as of a whole training's, only those asked for most
 
@@ -44,15 +43,6 @@ class LearningCurve:
     rows: list[tuple[str, float | None, Rate]]  # (policy, step, rate); no step: a policy without checkpoints
 
 
-@dataclass(frozen=True, slots=True)
-class SuccessOverTime:
-    """The share of episodes that are solved by each step."""
-
-    chart: RateChart
-    rows: list[tuple[str, list[Rate], int]]  # (name, rates at each quarter of the steps, steps)
-    left_out: int  # curves that are not drawn
-
-
 def success_table(summary: Summary) -> SuccessTable:
     """The table that the page begins with."""
     total = summary.total
@@ -68,31 +58,6 @@ def success_table(summary: Summary) -> SuccessTable:
 def learning_curves(summary: Summary) -> list[LearningCurve]:
     """Success over the training steps of each policy that has several; empty if none has."""
     return [curve for title, cells in _parts_with_a_rate(summary) if (curve := _learning_curve(title, cells))]
-
-
-def success_over_time(summary: Summary) -> SuccessOverTime | None:
-    """The curves of what can be quoted, of the best `MOST_CURVES`; None if no episode was played."""
-    parts = [(name, [one for cell in cells for one in cell.counted]) for name, cells in summary.quotable]
-    groups = {name: results for name, results in parts if results}
-    if not groups:
-        return None
-    solved = {name: sum(bool(one.success_once) for one in found) / len(found) for name, found in groups.items()}
-    best = sorted(groups, key=lambda name: -solved[name])[:MOST_CURVES]
-    shown = [name for name in groups if name in best]
-    horizon = max(1, *(one.steps for name in shown for one in groups[name]))
-    series, rows = [], []
-    for name in shown:
-        curve = success_curve([one.first_success for one in groups[name]], horizon)
-        points = list(zip(curve.steps, curve.solved, strict=True))
-        steps = points[-1][0]
-        quarters = [
-            next(rate for step, rate in reversed(points) if step <= share * steps) for share in (0.25, 0.5, 0.75, 1)
-        ]
-        series.append(Series(name, points, stepped=True))
-        rows.append((name, quarters, steps))
-    return SuccessOverTime(
-        rate_chart(series, "env steps", "Episodes solved by each step"), rows, len(groups) - len(shown)
-    )
 
 
 def _blocks(summary: Summary) -> Iterator[Block]:

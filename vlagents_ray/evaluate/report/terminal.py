@@ -67,7 +67,8 @@ def print_summary(console: Console, summary: Summary) -> None:
     pushed = {cell.contender: words for cell in summary.results.cells if (words := pushed_of(cell)) is not None}
     lines += [f"{name}: weights pushed by a learner, {words}" for name, words in pushed.items()]
     lines += [_stopped(group) for group in summary.cells if group.stopped]
-    if len(summary.quotable) > sum(len(summary.parts(name)) for name in summary.results.contenders):
+    parts = [part for name in summary.results.contenders for part in summary.parts(name).values()]
+    if not all(part.success_once.pooled for part in parts):
         lines.append("cells that stopped after different numbers of episodes have no rate in common: quote each alone")
     lines += [_gap(one) for one in clock_gaps(summary.results)]
     if summary.state == RUNNING:

@@ -1,20 +1,17 @@
 """results.db: its tables, its lock, and how it is opened, by the one evaluation that writes it and by all that read it.
 
-SQLite's write-ahead log lets readers look while an evaluation writes, but its index is shared memory: all processes
-must be on one host (https://www.sqlite.org/wal.html). On a file system that other hosts may mount, or that is not
-known, the older rollback journal is used, whose locks are the file system's.
+Its journal is SQLite's rollback journal, whose locks are the file system's: hosts may share the folder, which a
+write-ahead log forbids (https://www.sqlite.org/wal.html). A commit takes a few milliseconds, and one comes an episode.
 """
 
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import errno
 import fcntl
 import functools
 import os
 import sqlite3
-import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -112,78 +109,10 @@ def _columns(db: sqlite3.Connection, table: str) -> set[str]:
 
 WAIT_S = 60.0  # for another process's transaction to end
 
-# `f_type` of statfs(2), of those that one host has to itself; see linux/magic.h and statfs(2).
-_LOCAL = {
-    0xEF53: "ext2, ext3, ext4", 0x58465342: "xfs", 0x9123683E: "btrfs", 0x2FC12FC1: "zfs", 0xF2F52010: "f2fs",
-    0xCA451A4E: "bcachefs", 0x3153464A: "jfs", 0x52654973: "reiserfs", 0x01021994: "tmpfs", 0x858458F6: "ramfs",
-    0x794C7630: "overlayfs", 0x7366746E: "ntfs3", 0x2011BAB0: "exfat", 0x4D44: "vfat",
-}  # fmt: skip
-
-
-def is_local(folder: Path) -> bool:
-    """Whether `folder` is on a file system that only this host can write to; False for one that is not known."""
-    if not sys.platform.startswith("linux"):
-        return False
-    answer = (ctypes.c_long * 64)()  # a struct statfs, which begins with `f_type`, is at most half as long
-    libc = ctypes.CDLL(None, use_errno=True)
-    if libc.statfs(os.fsencode(folder), ctypes.byref(answer)):
-        return False
-    return answer[0] & 0xFFFFFFFF in _LOCAL
-
-
-def writable(out: Path) -> sqlite3.Connection:
-    """Open `out/results.db`, made if it is missing, with a journal mode that its file system supports."""
-    mode, synchronous = ("wal", "NORMAL") if is_local(out) else ("truncate", "FULL")
-    db = sqlite3.connect(out / FILE, timeout=WAIT_S)
-    try:
-        try:
-            db.execute(f"PRAGMA journal_mode = {mode}")
-        except sqlite3.OperationalError as error:
-            if "locked" not in str(error):
-                raise
-            raise ConfigError(
-                f"{out / FILE}: its journal has to be changed to one that works on its file system, but somebody has "
-                f"been reading it for {WAIT_S:g} s; end what reads it"
-            ) from error
-        # WAL with NORMAL is safe against a killed process, without an fsync an episode; a rollback journal needs FULL.
-        db.execute(f"PRAGMA synchronous = {synchronous}")
-    except BaseException:
-        db.close()
-        raise
-    return db
-
-
-def close(db: sqlite3.Connection) -> None:
-    """Close what `writable` opened. The database is one file then, which can be read on a read-only file system."""
-    try:
-        db.execute("PRAGMA busy_timeout = 0")
-        with contextlib.suppress(sqlite3.OperationalError):  # it is being read just now: the next writer will do it
-            db.execute("PRAGMA journal_mode = DELETE")
-    finally:
-        db.close()
-
 
 def read_only(out: Path) -> sqlite3.Connection:
     """Open `out/results.db` so that nothing can change it; it may be on a read-only file system."""
-    uri = (out / FILE).resolve().as_uri()
-    db = sqlite3.connect(f"{uri}?mode=ro", uri=True, timeout=WAIT_S)
-    try:
-        db.execute("PRAGMA user_version").fetchone()
-    except sqlite3.OperationalError as error:
-        db.close()
-        unfinished = any(_size(out / f"{FILE}{suffix}") for suffix in ("-wal", "-journal"))  # not all is in the file
-        if unfinished or "unable to open" not in str(error):
-            raise
-        # Closed in order, with a write-ahead log that no process here can make, so that none writes to it.
-        db = sqlite3.connect(f"{uri}?mode=ro&immutable=1", uri=True)
-    return db
-
-
-def _size(path: Path) -> int:
-    try:
-        return path.stat().st_size
-    except FileNotFoundError:
-        return 0
+    return sqlite3.connect(f"{(out / FILE).resolve().as_uri()}?mode=ro", uri=True, timeout=WAIT_S)
 
 
 LOCK = "results.lock"

@@ -89,40 +89,6 @@ class Rate:
 
 
 @dataclass(frozen=True, slots=True)
-class SuccessCurve:
-    """The share of episodes solved by each env step: constant between `steps`, a jump at each."""
-
-    steps: tuple[int, ...]  # 0, each step after which an episode was first solved, and the horizon
-    solved: tuple[Rate, ...]  # by each of `steps`
-
-
-def success_curve(first_successes: Sequence[int | None], horizon: int) -> SuccessCurve:
-    """Compute the share of episodes that are solved by each step.
-
-    E. L. Kaplan, P. Meier, "Nonparametric Estimation from Incomplete Observations", JASA 53 (1958): their estimate
-    where nothing is censored. An episode that ended unsolved, at the step limit, by an error or by the policy's own
-    word, will not be solved any more, so it stays in the denominator; leaving it out as censored would claim that it
-    might have been. The band is Wilson's interval at each step by itself, and so at the end the interval of the rate.
-
-    Args:
-        first_successes: For each episode the number of steps after which it was first solved; None: it never was.
-        horizon: The number of steps at which the curve ends.
-
-    Returns:
-        The curve.
-
-    Raises:
-        InvalidInput: A number of steps is not in 1 … `horizon`.
-    """
-    known = [step for step in first_successes if step is not None]
-    if any(not 0 < step <= horizon for step in known):
-        raise InvalidInput(f"success_curve: got steps from {min(known)} to {max(known)}, want them in 1 … {horizon}")
-    steps = sorted({0, *known, horizon})
-    n = len(first_successes)
-    return SuccessCurve(tuple(steps), tuple(Rate(sum(one <= step for one in known), n) for step in steps))
-
-
-@dataclass(frozen=True, slots=True)
 class Pairs:
     """Numbers of episodes that both A and B played, by which of them solved the task. Two of these can be added.
 

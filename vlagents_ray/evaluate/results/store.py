@@ -21,7 +21,6 @@ from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult, Worker
 from vlagents_ray.evaluate.plan.cases import EvalCase, cells
 from vlagents_ray.evaluate.plan.config import EvalConfig, canonical
 from vlagents_ray.evaluate.plan.jobs import Job
-from vlagents_ray.evaluate.results import database
 from vlagents_ray.evaluate.results.changes import (
     IDENTITY,
     MIX,
@@ -32,7 +31,16 @@ from vlagents_ray.evaluate.results.changes import (
     program_changes,
     program_id,
 )
-from vlagents_ray.evaluate.results.database import RUNNING, SCHEMA, VERSION, insert, require_readable
+from vlagents_ray.evaluate.results.database import (
+    FILE,
+    RUNNING,
+    SCHEMA,
+    VERSION,
+    WAIT_S,
+    insert,
+    lock,
+    require_readable,
+)
 
 
 class Store:
@@ -51,7 +59,7 @@ class Store:
         self._out = config.out
         with storing(config.out):
             self._out.mkdir(parents=True, exist_ok=True)
-            self._lock = database.lock(self._out)
+            self._lock = lock(self._out)
         self._run = 0
         self._accepts = config.accept_changes
         self._changes: list[Change] = []  # accepted in this run
@@ -75,7 +83,7 @@ class Store:
 
     def close(self) -> None:
         """Close the file, and release the lock."""
-        database.close(self._db)
+        self._db.close()
         os.close(self._lock)
 
     def begin_run(self, config: EvalConfig, versions: dict[str, Any], started: float | None = None) -> None:
@@ -266,7 +274,7 @@ class Store:
             self._db.execute("INSERT OR REPLACE INTO policies VALUES (?, ?)", (name, value))
 
     def _open(self, config: EvalConfig) -> sqlite3.Connection:
-        db = database.writable(self._out)
+        db = sqlite3.connect(self._out / FILE, timeout=WAIT_S)  # by default each commit reaches the disk
         try:
             version = db.execute("PRAGMA user_version").fetchone()[0]
             if version == 0:
@@ -275,7 +283,7 @@ class Store:
             self._require_resumable(db, config)
             self._note_cells(db, config)
         except BaseException:
-            database.close(db)
+            db.close()
             raise
         return db
 

@@ -14,7 +14,7 @@ import numpy as np
 from vlagents_ray.evaluate.artifacts.storage import whole
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.results.comparison import gap_to_synchronous
-from vlagents_ray.evaluate.results.reader import CellResults, Results, Run, by_timing, have_common_rate, rate_of
+from vlagents_ray.evaluate.results.reader import CellResults, Results, Run, by_timing, rate_of
 from vlagents_ray.evaluate.results.statistics import Rate
 
 FILE = "summary.json"
@@ -96,24 +96,6 @@ class Summary:
             for name in self.results.contenders
         }
         return sorted(rates, key=lambda name: -sum(rates[name]) / len(rates[name]))
-
-    @property
-    def quotable(self) -> list[tuple[str, list[CellResults]]]:
-        """The largest parts of each policy id's cells that have a common rate, with names that tell them apart.
-
-        Usually these are all its cells; with several clocks, those of each; and each cell by itself where cells stopped
-        after different numbers of episodes.
-        """
-        found = []
-        for contender in self.results.contenders:
-            timings = by_timing(self.results.of(contender))
-            for timing, cells in timings.items():
-                name = contender if len(timings) == 1 else f"{contender}, {timing}"
-                if have_common_rate(cells):
-                    found.append((name, cells))
-                else:
-                    found += [(f"{name}, {' '.join(filter(None, (cell.suite, cell.env)))}", [cell]) for cell in cells]
-        return found
 
     @property
     def transports(self) -> list[str]:

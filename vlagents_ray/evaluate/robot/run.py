@@ -283,8 +283,7 @@ def _write_results(config: EvalConfig, planned: Sequence[EvalCase], log: TrialLo
     """Write results.db as an evaluation in simulation does, from all that the log has; it replaces an earlier one."""
     trials = schedule(planned, log.key)
     with storing(config.out):
-        for name in (RESULTS, f"{RESULTS}-wal", f"{RESULTS}-shm"):
-            (config.out / name).unlink(missing_ok=True)
+        (config.out / RESULTS).unlink(missing_ok=True)
     with Store(config.model_copy(update={"resume": True})) as store, storing(config.out):
         store.begin_run(config, versions(), log.started)
         save_diffs(config.out, driver_code().values())
