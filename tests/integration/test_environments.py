@@ -58,7 +58,7 @@ def served(shared_ray: None, tmp_path_factory: pytest.TempPathFactory) -> Iterat
             "python": str(make_environment(requirements, home / "apart", light=True)),
             "env_vars": {"VARIABLE": "set"},
         },
-        "installed": {"requirements": ["six==1.16.0"], "installer": "uv", "env_vars": {"VARIABLE": "set"}},
+        "installed": {"env_vars": {"VARIABLE": "set"}},
     }
     notes = {name: home / f"{name}.jsonl" for name in environments}
     file = home / "deployment.yaml"
@@ -72,6 +72,7 @@ def served(shared_ray: None, tmp_path_factory: pytest.TempPathFactory) -> Iterat
                 "config": {"needs": "six", "notes": str(notes[name])},
                 "environment": environment,
             },
+            **({"runtime_env": {"uv": ["six==1.16.0"]}} if name == "installed" else {}),
         }
         for name, environment in environments.items()
     ]
