@@ -15,7 +15,7 @@ from vlagents_ray.serve.weights import PushOptions, WeightUpdates
 
 
 def raised(cause: Exception) -> RayTaskError:
-    return RayTaskError("weights", "a traceback", cause)
+    return RayTaskError("peer", "a traceback", cause)
 
 
 @pytest.mark.parametrize(
@@ -31,7 +31,7 @@ def raised(cause: Exception) -> RayTaskError:
 )
 def test_errors_of_another_replica(monkeypatch: pytest.MonkeyPatch, error: Exception, becomes: type[Exception]) -> None:
     async def call(actor: Any, method: Any, *args: Any) -> Any:
-        assert (actor, method.__name__, args) == ("actor", "weights", ("stage", 1, {}, PushOptions()))
+        assert (actor, method.__name__, args) == ("actor", "peer", ("WeightUpdates.stage", 1, {}, PushOptions()))
         raise error
 
     monkeypatch.setattr(sibling_replicas, "call_replica", call)

@@ -8,7 +8,7 @@ import importlib.metadata
 import logging
 import os
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from typing import Any
@@ -19,7 +19,7 @@ from ray.serve.exceptions import RayServeException
 from starlette.types import ASGIApp
 
 from vlagents_ray.client.transports.serve_handle import ClientApi
-from vlagents_ray.errors import PolicyFailed, PolicyUnavailable, UnknownSession, VLAgentsError
+from vlagents_ray.errors import PolicyFailed, PolicyUnavailable, VLAgentsError
 from vlagents_ray.policies.base.accelerator import VISIBLE
 from vlagents_ray.policies.base.program import loaded_code
 from vlagents_ray.protocol.frames import Decoded, decode_requests
@@ -43,7 +43,7 @@ from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import Sender
 from vlagents_ray.serve.models.checkpoints import resolved
 from vlagents_ray.serve.observers.live_page import live_routes
-from vlagents_ray.serve.observers.live_view import Fleet, Snapshot
+from vlagents_ray.serve.observers.live_view import Fleet
 from vlagents_ray.serve.observers.opening import open_observers
 from vlagents_ray.serve.ports import EVERYWHERE, HOST, LOOPBACK
 from vlagents_ray.serve.python_env.child_agent import make_agent, version_of
@@ -51,9 +51,9 @@ from vlagents_ray.serve.queue.batch_queue import LoadMeter
 from vlagents_ray.serve.replica.metrics import Exporter, tags_of
 from vlagents_ray.serve.scaling.autoscaling import SESSIONS, UTILISATION, WAITING
 from vlagents_ray.serve.scaling.rebalancer import ClientLocation, Rebalancer, ReplicaLoad
-from vlagents_ray.serve.scaling.session_migration import PEER_METHODS, SessionMigrator
-from vlagents_ray.serve.scaling.sibling_replicas import SiblingApi, SiblingReplicas
-from vlagents_ray.serve.scaling.weight_push import WEIGHT_METHODS, ThisReplica, Values, WeightPusher, WeightsReplica
+from vlagents_ray.serve.scaling.session_migration import HeldSessions, SessionMigrator
+from vlagents_ray.serve.scaling.sibling_replicas import PEER_METHODS, SiblingApi, SiblingReplicas
+from vlagents_ray.serve.scaling.weight_push import ThisReplica, Values, WeightPusher, WeightsReplica
 from vlagents_ray.serve.weights import NewestVersion, PushOptions, PushResult, WeightUpdates
 from vlagents_ray.weights.safetensors import ValueSpec
 
@@ -323,19 +323,13 @@ class PolicyReplica(ClientApi, SiblingApi):
         return self._connection_info()
 
     async def peer(self, method: str, *args: Any) -> Any:
-        """Call one of `PEER_METHODS` for another replica, about sessions that migrate."""
-        return await PEER_METHODS[method](self._migrator.held, *args)
-
-    async def live(self, since: int, shown: Collection[str]) -> Snapshot:
-        """Return what happened here since a snapshot, with pictures of the sessions `shown`."""
-        return await asyncio.to_thread(self._observers.view.read, since, shown)
-
-    async def press(self, session: str, do: str, by: str) -> dict[str, Any] | None:
-        """Give a command to a session; None if the session is not here."""
-        try:
-            return self._observers.view.press(session, do, by)
-        except UnknownSession:
-            return None
+        """Call one of `PEER_METHODS` for another replica."""
+        part, call, _ = PEER_METHODS[method]
+        if part is HeldSessions:
+            return await call(self._migrator.held, *args)
+        if part is WeightUpdates:
+            return await self._weights.weights(call, *args)
+        return await asyncio.to_thread(call, self._observers.view, *args)
 
     # New weights: from learners, and from the replica that coordinates a push.
 
@@ -361,10 +355,6 @@ class PolicyReplica(ClientApi, SiblingApi):
             *(replica.weights(WeightUpdates.newest) for replica in replicas), return_exceptions=True
         )
         return [newest.number for newest in found if isinstance(newest, NewestVersion)]
-
-    async def weights(self, method: str, *args: Any) -> Any:
-        """Call one of `WEIGHT_METHODS` for another replica, which coordinates a push or has missed one."""
-        return await self._weights.weights(WEIGHT_METHODS[method], *args)
 
     # What the replica does by itself.
 

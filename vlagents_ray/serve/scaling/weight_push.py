@@ -31,19 +31,6 @@ _MOST_AHEAD = 10**9  # of a version that a learner numbers, such as by its step 
 _ATTEMPTS = 3  # at the commit of a replica that cannot be reached
 
 
-WEIGHT_METHODS: dict[str, Callable[..., Any]] = {
-    method.__name__: method
-    for method in (
-        WeightUpdates.newest,
-        WeightUpdates.stage,
-        WeightUpdates.commit,
-        WeightUpdates.drop,
-        WeightUpdates.held,
-    )
-}
-"""The methods that a replica may call at another one, by name."""
-
-
 class WeightsReplica(Protocol):
     """A replica as a push sees it."""
 
