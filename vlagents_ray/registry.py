@@ -260,7 +260,6 @@ _EXTRAS = {
     "av": "record",
     "pyarrow": "record",
     "pyspacemouse": "spacemouse",
-    "opentelemetry": "otel",
     "wandb": "wandb",
     "trackio": "trackio",
     "tensorboard": "tensorboard",
