@@ -41,7 +41,7 @@ def replica(start: Any) -> Bare:
         _engine=engine,
         _configured=False,
         _gateway=None,
-        _rebalancer=SimpleNamespace(start=lambda: None),
+        _rebalancer=SimpleNamespace(run=lambda: asyncio.sleep(0)),
         _pusher=SimpleNamespace(catch_up=lambda: asyncio.sleep(0)),
         _watch_shutdown=lambda: asyncio.sleep(0),
         _keep_catching_up=lambda: asyncio.sleep(0),
@@ -161,11 +161,11 @@ def test_a_replica_answers_what_waits_before_its_observers_and_its_ways_in_close
             _tasks=[asyncio.ensure_future(asyncio.sleep(60))],
             _engine=part("engine", draining=True),
             _migrator=SimpleNamespace(hand_over=lambda: ended("sessions"), close=lambda: ended("migrator")),
-            **{f"_{name}": part(name) for name in ("rebalancer", "observers", "metrics", "local", "stream")},
+            **{f"_{name}": part(name) for name in ("observers", "metrics", "local", "stream")},
             _plasma=None,
         )
         await one.close()
         assert await asyncio.gather(*one._tasks, return_exceptions=True)
 
     asyncio.run(close())
-    assert closed == ["sessions", "rebalancer", "migrator", "engine", "observers", "metrics", "local", "stream"]
+    assert closed == ["sessions", "migrator", "engine", "observers", "metrics", "local", "stream"]

@@ -146,8 +146,7 @@ class PolicyReplica(ClientApi, SiblingApi):
         self._configured = True
         await self._load_policy()
         await self._catch_up()  # takes the others' versions before this replica is ready
-        self._rebalancer.start()
-        works = [self._watch_shutdown(), self._keep_catching_up()]
+        works = [self._watch_shutdown(), self._keep_catching_up(), self._rebalancer.run()]
         if self._gateway is not None:
             works.append(self._poll_gateways())
         self._tasks = [asyncio.ensure_future(work) for work in works]
@@ -171,7 +170,6 @@ class PolicyReplica(ClientApi, SiblingApi):
             task.cancel()
         if self._engine.draining:
             await self._migrator.hand_over()
-        self._rebalancer.close()
         await self._migrator.close()
         for part in (self._engine, self._observers, self._metrics):
             await asyncio.to_thread(part.close)
@@ -284,7 +282,7 @@ class PolicyReplica(ClientApi, SiblingApi):
 
     async def nodes(self) -> dict[str, int]:
         """Return the number of replicas that accept sessions by node, so that clients can be placed near them."""
-        loads = [self._rebalancer.load(), *await asyncio.to_thread(self._peers.loads)]
+        loads = [self._rebalancer.load(), *await self._peers.loads()]
         return dict(Counter(load.node for load in loads if load.accepts))
 
     def _connection_info(self) -> tuple[dict[str, Any], Any]:
@@ -300,17 +298,10 @@ class PolicyReplica(ClientApi, SiblingApi):
 
     async def _place_at_sibling(self, *places: ClientLocation) -> tuple[dict[str, Any], Any] | None:
         """Return metadata and actor of another replica if it suits the client better, see `Rebalancer.place`."""
-        reference = await asyncio.wrap_future(self._rebalancer.place(*places))
-        if reference is None:
-            return None
-        found: tuple[dict[str, Any], Any] | None = await asyncio.to_thread(self._peers.answer, reference)
+        found: tuple[dict[str, Any], Any] | None = await self._rebalancer.place(*places)
         return found
 
     # Other replicas: `SiblingApi`.
-
-    async def load(self) -> ReplicaLoad:
-        """Return this replica's load, which other replicas compare with theirs."""
-        return self._rebalancer.load()
 
     def _load_of(self, sessions: int) -> ReplicaLoad:
         accepts = self._engine.ready and not (self._engine.draining or replica_is_ending())
@@ -327,6 +318,8 @@ class PolicyReplica(ClientApi, SiblingApi):
         part, call, _ = PEER_METHODS[method]
         if part is HeldSessions:
             return await call(self._migrator.held, *args)
+        if part is Rebalancer:
+            return call(self._rebalancer)
         if part is WeightUpdates:
             return await self._weights.weights(call, *args)
         return await asyncio.to_thread(call, self._observers.view, *args)

@@ -16,7 +16,7 @@ from vlagents_ray.client.transports.serve_handle import call_replica
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.serve.config.deployment import POLICY
 from vlagents_ray.serve.observers.live_view import OtherReplicas, ReplicaView, SnapshotReader
-from vlagents_ray.serve.scaling.rebalancer import ReplicaLoad
+from vlagents_ray.serve.scaling.rebalancer import Rebalancer, ReplicaLoad
 from vlagents_ray.serve.scaling.session_migration import HeldSessions, Peer, PeerEnded, PeerUnreachable
 from vlagents_ray.serve.weights import WeightUpdates
 
@@ -36,10 +36,6 @@ _VIEW_S = 2.0  # time for which the replicas that were found are not looked up a
 
 class SiblingApi(Protocol):
     """The actor methods that the replicas of an application call at each other."""
-
-    async def load(self) -> ReplicaLoad:
-        """Return the replica's load, for comparison with that of others."""
-        ...
 
     async def expect_client(self) -> tuple[dict[str, Any], Any]:
         """Expect a client that is sent here; return the metadata for the client, and the actor."""
@@ -71,11 +67,12 @@ PEER_METHODS = {
         PeerMethod(WeightUpdates, WeightUpdates.commit, _ANSWER_S),
         PeerMethod(WeightUpdates, WeightUpdates.drop, _ANSWER_S),
         PeerMethod(WeightUpdates, WeightUpdates.held, _TRANSFER_S),
+        PeerMethod(Rebalancer, Rebalancer.load, _QUICK_S),
         PeerMethod(ReplicaView, ReplicaView.read, _VIEW_ANSWER_S),
         PeerMethod(ReplicaView, ReplicaView.press, _ANSWER_S),
     )
 }
-"""What replicas call at each other, beside `SiblingApi`: moves of sessions, pushes of weights, and the live page."""
+"""What replicas call at each other, beside `SiblingApi`: moves of sessions, pushes of weights, loads, the live page."""
 
 
 class _Sibling(Peer):
@@ -172,35 +169,23 @@ class SiblingReplicas(ReplicasInCluster):
         super().__init__([context.app_name], but=self.own_name)
         self._silent: dict[str, float] = {}  # time until which a silent replica is not asked, by its name
 
-    def loads(self) -> list[ReplicaLoad]:
+    async def loads(self) -> list[ReplicaLoad]:
         """Return the loads of the replicas that answer within 0.3 s."""
         now = time.monotonic()
         self._silent = {name: until for name, until in self._silent.items() if until > now}
-        responsive = [(name, actor) for name, actor in self._actors() if name not in self._silent]
-        asked = {call_replica(actor, SiblingApi.load): name for name, actor in responsive}
-        if not asked:
-            return []
-        ready, late = ray.wait(list(asked), num_returns=len(asked), timeout=_QUICK_S)
-        for reference in late:
-            self._silent[asked[reference]] = now + _SILENT_S
-        return [load for reference in ready if (load := _result(reference)) is not None]
+        asked = [one for one in await self.others() if one.name not in self._silent]
+        answers = await asyncio.gather(*(one.call(Rebalancer.load) for one in asked), return_exceptions=True)
+        for one, answer in zip(asked, answers, strict=True):
+            if not isinstance(answer, ReplicaLoad):
+                logger.info("another replica does not answer: %s", answer)
+                self._silent[one.name] = now + _SILENT_S
+        return [answer for answer in answers if isinstance(answer, ReplicaLoad)]
 
-    def announce_client(self, replica: str) -> Any:
-        """Announce a client to another replica; return the reference for `answer`, or None if that replica ended."""
+    async def announce_client(self, replica: str) -> Any:
+        """Announce a client to another replica; return its answer to the client; None if there is none within 0.3 s."""
         try:
-            return call_replica(ray.get_actor(replica, namespace=_NAMESPACE), SiblingApi.expect_client)
-        except ValueError:  # the replica has ended meanwhile
+            actor = await asyncio.to_thread(ray.get_actor, replica, namespace=_NAMESPACE)
+            return await asyncio.wait_for(call_replica(actor, SiblingApi.expect_client), _QUICK_S)
+        except (ValueError, ray.exceptions.RayError, TimeoutError, asyncio.TimeoutError) as error:
+            logger.info("another replica does not answer: %s", error)  # it may have ended meanwhile
             return None
-
-    @staticmethod
-    def answer(reference: Any) -> Any:
-        """Wait for the other replica's answer to the client; None if it does not answer within 0.3 s."""
-        return _result(reference, _QUICK_S)
-
-
-def _result(reference: Any, timeout_s: float = _ANSWER_S) -> Any:
-    try:
-        return ray.get(reference, timeout=timeout_s)
-    except (ray.exceptions.RayError, TimeoutError) as error:
-        logger.info("another replica does not answer: %s", error)
-        return None
