@@ -260,6 +260,7 @@ _EXTRAS = {
     "av": "record",
     "pyarrow": "record",
     "pyspacemouse": "spacemouse",
+    "opentelemetry": "otel",
     "wandb": "wandb",
     "trackio": "trackio",
     "tensorboard": "tensorboard",

@@ -25,7 +25,7 @@ from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.observers.live_page import live_routes
 from vlagents_ray.serve.observers.live_view import Fleet, OtherReplicas, ReplicaView
-from vlagents_ray.serve.observers.opening import ReplicaObservers
+from vlagents_ray.serve.observers.opening import open_observers
 from vlagents_ray.serve.ports import free_port
 
 METADATA = {
@@ -107,7 +107,7 @@ def live_server(
     engine = Engine(agent or Noop.from_config({}))
     engine.start()
     args = ServerArgs(policy="noop", live=settings)
-    observers = ReplicaObservers(engine, args, "SERVE_REPLICA::app#Policy#this", "here", lambda: METADATA)
+    observers = open_observers(engine, args, "SERVE_REPLICA::app#Policy#this", "here", lambda: METADATA)
     view = observers.view
     fleet = Fleet(view, others)
     routes = live_routes(fleet, open_to_network=insecure)

@@ -20,7 +20,7 @@ from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.config.deployment import RecordArgs, ServerArgs
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import Sender
-from vlagents_ray.serve.observers.opening import ReplicaObservers
+from vlagents_ray.serve.observers.opening import open_observers
 from vlagents_ray.serve.observers.recording import SessionRecorder
 
 HEIGHT, WIDTH = 33, 48
@@ -105,7 +105,7 @@ def recorded(folder: Path, agent: Agent | None = None, **settings: Any) -> Itera
         return {"policy": "brightness", "contract": engine.contract.to_json()}
 
     args = ServerArgs(policy="noop", record=RecordArgs(folder=str(folder), **settings))
-    observers = ReplicaObservers(engine, args, "SERVE_REPLICA::app#Policy#a1", "here", metadata)
+    observers = open_observers(engine, args, "SERVE_REPLICA::app#Policy#a1", "here", metadata)
     assert observers.recorder is not None
     try:
         yield Recorded(engine, observers.recorder)

@@ -6,7 +6,8 @@ import math
 import os
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -28,6 +29,8 @@ from vlagents_ray.errors import (
 from vlagents_ray.images.codecs import RAW, ImageCodec
 from vlagents_ray.interface import DEADLINE, Act, Agent, Obs, copied
 from vlagents_ray.protocol.messages import RANKS, RankName, Reply, Request
+from vlagents_ray.registry import require
+from vlagents_ray.tracing import TRACEPARENT, tracer
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -100,6 +103,7 @@ class RemoteAgent(Agent):
         self._rank: RankName = rank
         self._resume = resume
         self._session = ClientSession(connection, rank)
+        self._tracer = tracer()
 
     def sessions(self, n: int) -> list[Self]:
         """Open `n` more sessions on this agent's connection, for `reset_batch` and `act_batch`; close each of them."""
@@ -274,9 +278,32 @@ class RemoteAgent(Agent):
         return found
 
     def _call(self, sessions: Sequence[ClientSession], requests: Sequence[Request], timeout_s: float) -> list[Reply]:
+        if self._tracer is not None:
+            return self._traced(requests, lambda: self._send(sessions, requests, timeout_s))
+        return self._send(sessions, requests, timeout_s)
+
+    def _send(self, sessions: Sequence[ClientSession], requests: Sequence[Request], timeout_s: float) -> list[Reply]:
         if self._resume:
             return call_with_recovery(self._connection, sessions, requests, timeout_s)
         return self._connection.call(requests, timeout_s)
+
+    def _traced(self, requests: Sequence[Request], send: Callable[[], list[Reply]]) -> list[Reply]:
+        """Send one message within a span, below the caller's own if there is one; the server's spans belong to it."""
+        trace: Any = require("opentelemetry.trace", extra="otel")
+        context: Any = require("opentelemetry.trace.propagation.tracecontext", extra="otel")
+        about = {"server.url": self.url, "transport": self.transport, "requests": len(requests)}
+        name = f"vlagents {requests[0].op}"
+        with self._tracer.start_as_current_span(name, kind=trace.SpanKind.CLIENT, attributes=about) as span:  # type: ignore[union-attr]
+            carrier: dict[str, str] = {}
+            context.TraceContextTextMapPropagator().inject(carrier)
+            for request in requests:
+                if request.obs is not None:
+                    info = {**request.obs.info, TRACEPARENT: carrier[TRACEPARENT]}
+                    request.obs = replace(request.obs, info=info)
+            replies = send()
+            if failed := [reply.error for reply in replies if reply.error is not None]:
+                span.set_status(trace.StatusCode.ERROR, f"{failed[0].code}: {failed[0]}")
+            return replies
 
     def _take(self, session: ClientSession, obs: Obs, reply: Reply, round_trip_ms: float) -> Act | Exception:
         episode = session.episode

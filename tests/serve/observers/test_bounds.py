@@ -29,10 +29,11 @@ from vlagents_ray.robot.dataset import Dataset
 from vlagents_ray.serve.config.deployment import LiveArgs
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.observer import Observers
-from vlagents_ray.serve.observers import live, live_view, ring
+from vlagents_ray.serve.observers import live, live_view, ring, spans
 from vlagents_ray.serve.observers.live import LiveObserver
 from vlagents_ray.serve.observers.live_view import ReplicaView
 from vlagents_ray.serve.observers.ring import Ring
+from vlagents_ray.serve.observers.spans import RequestSpans
 
 LARGE = 2**20  # bytes of one part of a message; a server accepts up to 64 MiB
 BUDGET = 2**21  # of each kind of what is kept
@@ -172,6 +173,23 @@ def test_a_snapshot_and_what_is_sent_of_it_are_bounded(monkeypatch: pytest.Monke
         pictured |= {one["id"] for one in found.document["sessions"] if one["pictures"]}
     assert pictured == set(names)  # in turns
     view.close()
+
+
+class Tracer:
+    """OpenTelemetry that is never asked for a span."""
+
+
+@pytest.mark.library("opentelemetry")
+def test_requests_that_wait_for_their_spans_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(spans, "each_half_second", SimpleNamespace(add=lambda _: None))
+    traced = RequestSpans(Tracer(), "this")
+    with Kept() as kept:
+        for kind in sorted(MESSAGES) * 3:
+            obs, reply = MESSAGES[kind]()
+            obs.info["traceparent"] = "x" * LARGE
+            observe(traced, "s", Request("act", obs), reply)
+            del obs, reply
+        assert kept.bytes() < SLACK
 
 
 FILE = jpeg_png.encode_jpeg(np.zeros((1024, 1024, 3), np.uint8), 60, "420")

@@ -1,1 +1,1 @@
-"""Observers of the requests and answers of a replica: the live page, the last seconds, and recordings."""
+"""Observers of the requests and answers of a replica: the live page, recordings and traces."""

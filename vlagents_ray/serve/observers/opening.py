@@ -3,40 +3,61 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass
 from typing import Any
 
+from vlagents_ray import tracing
 from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.observer import Observer
 from vlagents_ray.serve.observers.live_view import ReplicaView
 from vlagents_ray.serve.observers.recording import SessionRecorder, open_recorder
+from vlagents_ray.serve.observers.spans import RequestSpans
 
 
+@dataclass(frozen=True, slots=True)
 class ReplicaObservers:
-    """The observers of one replica, from now on until `close`."""
+    """The open observers of one replica, until `close`."""
 
-    def __init__(
-        self, engine: Engine, args: ServerArgs, replica: str, node: str, metadata: Callable[[], Mapping[str, Any]]
-    ) -> None:
-        """Observe the requests of an engine.
-
-        `replica` is Ray's name of the replica, which no other has or will have. Viewers see the name of its `node`.
-
-        Raises:
-            ConfigError: A folder cannot be written to.
-            MissingDependency: The extra "record" is not installed.
-        """
-        self._observers = engine.observers
-        # What viewers see; its live observer is active only while something reads it.
-        self.view = ReplicaView(engine, engine.observers, replica.rpartition("#")[2], node, metadata, args.live)
-        self.recorder: SessionRecorder | None = None
-        if args.record is not None:
-            self.recorder = open_recorder(engine.sessions, args.record, replica, metadata)
-            engine.observers.add(self.recorder)
-        self.view.open()
+    view: ReplicaView  # what viewers see; the live observer is active only while something reads it
+    recorder: SessionRecorder | None
+    _opened: ExitStack
 
     def close(self) -> None:
-        """Close them, and let them write what they have kept; this may take seconds."""
-        if self.recorder is not None:
-            self._observers.remove(self.recorder)
-            self.recorder.close()
-        self.view.close()
+        """Close them, the last one first, and let them write what they have kept; this may take seconds."""
+        self._opened.close()
+
+
+def open_observers(
+    engine: Engine,
+    args: ServerArgs,
+    replica: str,
+    node: str,
+    metadata: Callable[[], Mapping[str, Any]],
+) -> ReplicaObservers:
+    """Observe the requests of an engine from now on.
+
+    `replica` is Ray's name of the replica, which no other has or will have. Viewers see the name of its `node`.
+
+    Raises:
+        ConfigError: A folder cannot be written to.
+        MissingDependency: An extra is not installed.
+    """
+    observers, name = engine.observers, replica.rpartition("#")[2]
+    with ExitStack() as opened:
+
+        def observe(observer: Observer) -> None:
+            opened.callback(observer.close)
+            opened.callback(observers.remove, observer)
+            observers.add(observer)
+
+        view = ReplicaView(engine, observers, name, node, metadata, args.live)
+        view.open()
+        opened.callback(view.close)
+        if (tracer := tracing.tracer()) is not None:
+            observe(RequestSpans(tracer, name))
+        recorder = None
+        if args.record is not None:
+            observe(recorder := open_recorder(engine.sessions, args.record, replica, metadata))
+        return ReplicaObservers(view, recorder, opened.pop_all())

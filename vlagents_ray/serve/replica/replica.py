@@ -44,7 +44,7 @@ from vlagents_ray.serve.engine.sender import Sender
 from vlagents_ray.serve.models.checkpoints import resolved
 from vlagents_ray.serve.observers.live_page import live_routes
 from vlagents_ray.serve.observers.live_view import Fleet
-from vlagents_ray.serve.observers.opening import ReplicaObservers
+from vlagents_ray.serve.observers.opening import open_observers
 from vlagents_ray.serve.ports import EVERYWHERE, HOST, LOOPBACK
 from vlagents_ray.serve.python_env.child_agent import make_agent, version_of
 from vlagents_ray.serve.queue.batch_queue import LoadMeter
@@ -109,7 +109,7 @@ class PolicyReplica(ClientApi, SiblingApi):
 
         # What is seen of it.
         node = ray.get_runtime_context().get_node_id()[:8]
-        self._observers = ReplicaObservers(self._engine, settings, self._peers.own_name, node, self.metadata)
+        self._observers = open_observers(self._engine, settings, self._peers.own_name, node, self.metadata)
         self._fleet = Fleet(self._observers.view, self._peers)
         self._meter = LoadMeter(self._engine.queue)
         self._metrics = Exporter(self._engine, tags_of(settings.policy), self._keys, self._observers.recorder)

@@ -1,0 +1,105 @@
+"""What a server writes for those who watch it: traces for OpenTelemetry."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+import numpy as np
+import pytest
+from eval_fakes import wait_for
+from opentelemetry.proto.collector.trace.v1.trace_service_pb2 import ExportTraceServiceRequest
+from opentelemetry.proto.trace.v1.trace_pb2 import Span
+from readme_blocks import ENV
+from serve_command import serving
+
+from vlagents_ray import Obs, RemoteAgent, tracing
+
+pytestmark = [pytest.mark.ray, pytest.mark.server]
+
+ACTS = 5
+
+
+class Collector(ThreadingHTTPServer):
+    """An OpenTelemetry collector that keeps all spans."""
+
+    spans: list[Span]
+
+
+class Handler(BaseHTTPRequestHandler):
+    server: Collector
+
+    def do_POST(self) -> None:
+        sent = ExportTraceServiceRequest.FromString(self.rfile.read(int(self.headers["Content-Length"])))
+        for resource in sent.resource_spans:
+            for scope in resource.scope_spans:
+                self.server.spans += scope.spans
+        self.send_response(200)
+        self.end_headers()
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+@pytest.fixture(scope="module")
+def collector() -> Iterator[Collector]:
+    with Collector(("127.0.0.1", 0), Handler) as server:
+        server.spans = []
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield server
+        server.shutdown()
+
+
+@pytest.fixture(scope="module")
+def address(collector: Collector, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    variables = {
+        "VLAGENTS_RAY_OTEL": "1",
+        "OTEL_EXPORTER_OTLP_ENDPOINT": f"http://127.0.0.1:{collector.server_port}",
+        "OTEL_BSP_SCHEDULE_DELAY": "200",  # ms
+    }
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in variables.items():
+            patch.setenv(name, value)
+            patch.setitem(ENV, name, value)
+        with serving("noop", tmp_path_factory.mktemp("log") / "serve.log") as address:
+            yield address
+        tracing._provider().shutdown()
+        tracing._provider.cache_clear()
+
+
+def act(address: str, transport: str) -> None:
+    obs = Obs({"front": np.zeros((16, 16, 3), np.uint8)}, state={"joints": np.zeros(3, np.float32)})
+    with RemoteAgent(f"http://{address}", transport=transport) as agent:
+        agent.reset(obs, "stack")
+        for _ in range(ACTS):
+            agent.act(obs)
+
+
+def batches_of_acts(collector: Collector) -> list[Span]:
+    """The spans of batches whose acts have arrived, too."""
+    acts = {one.span_id for one in collector.spans if one.name == "vlagents act"}
+    return [one for one in collector.spans if one.name == "batch" and one.parent_span_id in acts]
+
+
+@pytest.mark.parametrize("transport", ["shm", "websocket"])
+def test_client_and_replica_export_one_trace_of_each_request(
+    address: str, collector: Collector, transport: str
+) -> None:
+    collector.spans.clear()
+    act(address, transport)
+    tracing.flush()
+    wait_for(lambda: len(batches_of_acts(collector)) == ACTS)
+    by_id = {one.span_id: one for one in collector.spans}
+    batches = batches_of_acts(collector)
+    for batch in batches:
+        served = by_id[batch.parent_span_id]
+        sent = by_id[served.parent_span_id]
+        assert (served.name, served.kind) == ("vlagents act", Span.SPAN_KIND_SERVER)
+        assert (sent.name, sent.kind, sent.parent_span_id) == ("vlagents act", Span.SPAN_KIND_CLIENT, b"")
+        assert batch.trace_id == served.trace_id == sent.trace_id
+        about = {one.key: one.value.string_value for one in sent.attributes}
+        assert about["transport"] == transport
+        # One machine has one clock.
+        assert sent.start_time_unix_nano <= batch.start_time_unix_nano < batch.end_time_unix_nano
+    assert len({one.trace_id for one in batches}) == ACTS

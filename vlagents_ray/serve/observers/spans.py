@@ -1,0 +1,113 @@
+"""OpenTelemetry spans of the requests of a replica: from arrival to answer, decoding, queue, and batch."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+from vlagents_ray import tracing
+from vlagents_ray.protocol.messages import Reply, Request
+from vlagents_ray.registry import require
+from vlagents_ray.serve.engine.observer import Observer
+from vlagents_ray.serve.periodic import each_half_second
+from vlagents_ray.serve.requests import PendingRequest
+
+_KEPT = 4096  # most answers between two half seconds; older ones have no spans
+_STAGES = {"queue": "queue", "inference": "batch"}  # in their order from the end of decoding on; names of the spans
+_OPS = ("act", "reset")
+_TEXT = 200  # most characters of an error, or of what a client states
+
+
+class _ServedRequest(NamedTuple):
+    """What is kept of a request and its answer: nothing that its client may make large."""
+
+    session: str
+    op: str
+    rank: str
+    traceparent: str
+    decoded_ns: int  # since 1970: when the request was read
+    timing: Mapping[str, float] = MappingProxyType({})  # ms by stage; still completed when the answer was sent
+    error: str = ""
+    answered_ns: int = 0
+
+
+class RequestSpans(Observer):
+    """Makes the spans of the requests that it sees, twice a second and on a thread of its own, until `close`."""
+
+    def __init__(self, tracer: Any, replica: str) -> None:
+        """Trace requests by `tracer`, as those of the replica of this name."""
+        self._tracer = tracer
+        self._replica = replica
+        self._answered: deque[_ServedRequest] = deque(maxlen=_KEPT)
+        self._trace = require("opentelemetry.trace", extra="otel")
+        module = require("opentelemetry.trace.propagation.tracecontext", extra="otel")
+        self._propagator = module.TraceContextTextMapPropagator()
+        each_half_second.add(self.export)
+
+    def close(self) -> None:
+        """Export the last spans, and end."""
+        each_half_second.remove(self.export)
+        self.export()
+        tracing.flush()
+
+    def on_request(self, pending: PendingRequest) -> None:
+        """See `Observer`."""
+        request = pending.request
+        if request.op in _OPS:
+            session, parent = pending.session_id, _traceparent(request)
+            pending.kept[self] = _ServedRequest(session, request.op, request.rank, parent, time.time_ns())
+
+    def on_answer(self, pending: PendingRequest, reply: Reply) -> None:
+        """See `Observer`."""
+        served: _ServedRequest | None = pending.kept.pop(self, None)
+        if served is not None:
+            error = "" if reply.error is None else f"{reply.error.code}: {reply.error}"[:_TEXT]
+            self._answered.append(
+                served._replace(
+                    rank=pending.rank.name.lower(), timing=reply.timing, error=error, answered_ns=time.time_ns()
+                )
+            )
+
+    def export(self) -> None:
+        """Make the spans of the answers since the last call, whose timing is complete by now."""
+        while self._answered:
+            self._make(self._answered.popleft())
+
+    def _make(self, one: _ServedRequest) -> None:
+        timing = one.timing
+        begun_ns = one.decoded_ns - _ns(timing.get("decode_ms", 0.0))
+        about: dict[str, str | int] = {"replica": self._replica, "session": one.session, "rank": one.rank}
+        if "batch_size" in timing:
+            about["batch_size"] = int(timing["batch_size"])
+        parent = self._propagator.extract({tracing.TRACEPARENT: one.traceparent}) if one.traceparent else None
+        name, kind = f"vlagents {one.op}", self._trace.SpanKind.SERVER
+        whole = self._tracer.start_span(name, parent, kind=kind, attributes=about, start_time=begun_ns)
+        if one.error:
+            whole.set_status(self._trace.StatusCode.ERROR, one.error)
+        inside = self._trace.set_span_in_context(whole, parent)
+        self._stage("decode", inside, begun_ns, one.decoded_ns)
+        at_ns = one.decoded_ns
+        for stage, span in _STAGES.items():
+            if f"{stage}_ms" in timing:
+                ended_ns = at_ns + _ns(timing[f"{stage}_ms"])
+                self._stage(span, inside, at_ns, ended_ns)
+                at_ns = ended_ns
+        encoded_ns = one.answered_ns + _ns(timing.get("encode_ms", 0.0))
+        self._stage("encode", inside, one.answered_ns, encoded_ns)
+        whole.end(encoded_ns)
+
+    def _stage(self, name: str, inside: Any, begun_ns: int, ended_ns: int) -> None:
+        self._tracer.start_span(name, inside, start_time=begun_ns).end(ended_ns)
+
+
+def _traceparent(request: Request) -> str:
+    """Return the trace that a request states, which may come from anybody; "" if it states none."""
+    stated = "" if request.obs is None else request.obs.info.get(tracing.TRACEPARENT, "")
+    return stated[:_TEXT] if isinstance(stated, str) else ""
+
+
+def _ns(milliseconds: float) -> int:
+    return int(milliseconds * 1e6)

@@ -1,0 +1,48 @@
+"""OpenTelemetry: the tracer of this process, if the environment asks for traces; the extra "otel".
+
+`VLAGENTS_RAY_OTEL=1` turns tracing on, in a client's process and in a server's alike. A request carries its trace as
+the observation's `info["traceparent"]`, in the format of https://www.w3.org/TR/trace-context/, over every transport.
+The spans go to the program's own tracer provider if it has set one; otherwise to an OTLP exporter, which
+OpenTelemetry's own variables configure (`OTEL_EXPORTER_OTLP_ENDPOINT`, `OTEL_SERVICE_NAME`, `OTEL_TRACES_SAMPLER`).
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+from typing import Any
+
+from vlagents_ray.registry import require
+
+VARIABLE = "VLAGENTS_RAY_OTEL"
+TRACEPARENT = "traceparent"
+
+
+def tracer() -> Any | None:
+    """Return the tracer of this process; None unless the environment asks for traces.
+
+    Raises:
+        MissingDependency: The extra "otel" is not installed.
+    """
+    if os.environ.get(VARIABLE, "0") in {"", "0"}:
+        return None
+    return _provider().get_tracer("vlagents_ray")
+
+
+def flush() -> None:
+    """Export the spans that have ended."""
+    if hasattr(_provider(), "force_flush"):
+        _provider().force_flush()
+
+
+@functools.cache
+def _provider() -> Any:
+    own = require("opentelemetry.trace", extra="otel").get_tracer_provider()
+    sdk = require("opentelemetry.sdk.trace", extra="otel")
+    if isinstance(own, sdk.TracerProvider):
+        return own
+    export = require("opentelemetry.sdk.trace.export", extra="otel")
+    otlp = require("opentelemetry.exporter.otlp.proto.http.trace_exporter", extra="otel")
+    provider = sdk.TracerProvider()
+    provider.add_span_processor(export.BatchSpanProcessor(otlp.OTLPSpanExporter()))
+    return provider
