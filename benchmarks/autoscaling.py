@@ -212,7 +212,7 @@ def _sessions(replicas: Sequence[str]) -> Iterator[int]:
     asked = []
     for name in replicas:
         with contextlib.suppress(ValueError):  # it ended meanwhile
-            asked.append(call_replica(ray.get_actor(name, namespace="serve"), SiblingApi.load))
+            asked.append(call_replica(ray.get_actor(name, namespace="serve"), SiblingApi.peer, "Rebalancer.load"))
     ready, _ = ray.wait(asked, num_returns=len(asked), timeout=_ANSWER_S) if asked else ([], [])
     for reference in ready:
         with contextlib.suppress(ray.exceptions.RayError):

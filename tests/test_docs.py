@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import yaml
 from page_commands import PAGES, commands, read_as_typed
+from ray.serve.schema import ServeApplicationSchema
 
 from vlagents_ray.cli.evaluate import read_run
 from vlagents_ray.envs import aloha, calvin, metaworld, robocasa
@@ -22,7 +23,7 @@ from vlagents_ray.evaluate import EvalConfig
 from vlagents_ray.interface import Act
 from vlagents_ray.protocol import frame_layout, frames, json_messages, messages, values
 from vlagents_ray.protocol.messages import Limits, Reply
-from vlagents_ray.serve.config.deployment import EnvironmentArgs
+from vlagents_ray.serve.config.deployment import EnvironmentArgs, ServerArgs
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -46,11 +47,9 @@ BLOCKS = re.findall(r"```yaml\n(.*?)```", (DOCS / "environments.md").read_text()
 
 @pytest.mark.parametrize("block", BLOCKS)
 def test_an_environment_as_it_is_documented_is_accepted(block: str) -> None:
-    document = yaml.safe_load(block)
-    if "applications" in document:
-        [application] = document["applications"]
-        document = application["args"]
-    assert EnvironmentArgs(**document["environment"]) != EnvironmentArgs()
+    [application] = yaml.safe_load(block)["applications"]
+    ServeApplicationSchema.model_validate(application)
+    assert application.get("runtime_env") or ServerArgs(**application["args"]).environment != EnvironmentArgs()
 
 
 @pytest.mark.parametrize("page", sorted([ROOT / "SECURITY.md", *DOCS.rglob("*.md")]), ids=lambda page: page.name)

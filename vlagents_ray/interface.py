@@ -283,11 +283,6 @@ class Agent:
                 acts.append(error)
         return acts
 
-    @property
-    def reconnects(self) -> int:
-        """The number of times that the agent has connected again to its policy."""
-        return 0
-
     def interrupt(self) -> None:
         """Drop what is planned: the robot was stopped or moved, and did not execute the last action of `act`."""
 

@@ -114,9 +114,3 @@ def test_fixed_sizes_of_the_file_are_those_that_are_measured() -> None:
     assert [one.sessions for one in measured.measure()] == [2, 3]
     with pytest.raises(ConfigError, match="--max-batch: got 1"):
         tuner(batch={"sizes": [2, 3]}, max_batch=1).measure()
-
-
-def test_packages_that_only_ray_installs_are_refused() -> None:
-    args = ServerArgs(policy="noop", environment={"requirements": ["torch"]})
-    with pytest.raises(ConfigError, match=r"environment\.requirements"):
-        TunePlan(args, TuningGoal("throughput"))

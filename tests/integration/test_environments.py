@@ -29,6 +29,7 @@ from vlagents_ray.serve.python_env.create import make_environment
 pytestmark = pytest.mark.integration
 
 AGENT = "python_env_agents:Telling"
+INSTALLED = {"uv": ["six==1.16.0"], "env_vars": {"VARIABLE": "set"}}  # of an application
 VERSIONS = {"old": ("1.26.4", "1.15.0"), "new": (np.__version__, "1.16.0")}  # of numpy and six
 
 
@@ -58,7 +59,7 @@ def served(shared_ray: None, tmp_path_factory: pytest.TempPathFactory) -> Iterat
             "python": str(make_environment(requirements, home / "apart", light=True)),
             "env_vars": {"VARIABLE": "set"},
         },
-        "installed": {"requirements": ["six==1.16.0"], "installer": "uv", "env_vars": {"VARIABLE": "set"}},
+        "installed": {},
     }
     notes = {name: home / f"{name}.jsonl" for name in environments}
     file = home / "deployment.yaml"
@@ -72,6 +73,7 @@ def served(shared_ray: None, tmp_path_factory: pytest.TempPathFactory) -> Iterat
                 "config": {"needs": "six", "notes": str(notes[name])},
                 "environment": environment,
             },
+            **({"runtime_env": INSTALLED} if name == "installed" else {}),
         }
         for name, environment in environments.items()
     ]

@@ -19,10 +19,16 @@ from vlagents_ray.errors import MissingDependency, PolicyFailed
 from vlagents_ray.serve.access.key_store import new_key
 from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.launch.deployment_file import IMPORT_PATH
+from vlagents_ray.serve.observers.live_view import ReplicaView
 from vlagents_ray.serve.ports import HOST
 from vlagents_ray.serve.replica import replica as module
 from vlagents_ray.serve.replica.app import build
 from vlagents_ray.serve.replica.replica import PolicyReplica
+from vlagents_ray.serve.scaling.rebalancer import Rebalancer
+from vlagents_ray.serve.scaling.session_migration import HeldSessions
+from vlagents_ray.serve.scaling.sibling_replicas import PEER_METHODS
+from vlagents_ray.serve.scaling.weight_push import ThisReplica
+from vlagents_ray.serve.weights import WeightUpdates
 
 
 class Bare(PolicyReplica):
@@ -41,7 +47,7 @@ def replica(start: Any) -> Bare:
         _engine=engine,
         _configured=False,
         _gateway=None,
-        _rebalancer=SimpleNamespace(start=lambda: None),
+        _rebalancer=SimpleNamespace(run=lambda: asyncio.sleep(0)),
         _pusher=SimpleNamespace(catch_up=lambda: asyncio.sleep(0)),
         _watch_shutdown=lambda: asyncio.sleep(0),
         _keep_catching_up=lambda: asyncio.sleep(0),
@@ -146,6 +152,29 @@ def test_a_replica_warns_of_keys_that_come_unencrypted_unless_tls_ends_elsewhere
     assert ("host 0.0.0.0: API keys come unencrypted" in caplog.text) == (not plain)
 
 
+@pytest.mark.parametrize("method", PEER_METHODS)
+def test_what_other_replicas_call_reaches_the_part_that_has_it(monkeypatch: pytest.MonkeyPatch, method: str) -> None:
+    asked = PEER_METHODS[method]
+    parts = {part: SimpleNamespace() for part in (HeldSessions, WeightUpdates, ReplicaView, Rebalancer)}
+
+    async def later(part: object, *args: object) -> object:
+        return part, args
+
+    call = later if asked.part is HeldSessions else lambda part, *args: (part, args)
+    monkeypatch.setitem(PEER_METHODS, method, asked._replace(call=call))
+    one = object.__new__(Bare)
+    vars(one).update(
+        _migrator=SimpleNamespace(held=parts[HeldSessions]),
+        _weights=ThisReplica("this", parts[WeightUpdates]),  # type: ignore[arg-type]
+        _observers=SimpleNamespace(view=parts[ReplicaView]),
+        _rebalancer=parts[Rebalancer],
+    )
+    args = () if asked.part is Rebalancer else (1, "two")
+    part, given = asyncio.run(one.peer(method, *args))
+    assert part is parts[asked.part]
+    assert given == args
+
+
 def test_a_replica_answers_what_waits_before_its_observers_and_its_ways_in_close() -> None:
     closed: list[str] = []
 
@@ -161,11 +190,11 @@ def test_a_replica_answers_what_waits_before_its_observers_and_its_ways_in_close
             _tasks=[asyncio.ensure_future(asyncio.sleep(60))],
             _engine=part("engine", draining=True),
             _migrator=SimpleNamespace(hand_over=lambda: ended("sessions"), close=lambda: ended("migrator")),
-            **{f"_{name}": part(name) for name in ("rebalancer", "observers", "metrics", "local", "stream")},
+            **{f"_{name}": part(name) for name in ("observers", "metrics", "local", "stream")},
             _plasma=None,
         )
         await one.close()
         assert await asyncio.gather(*one._tasks, return_exceptions=True)
 
     asyncio.run(close())
-    assert closed == ["sessions", "rebalancer", "migrator", "engine", "observers", "metrics", "local", "stream"]
+    assert closed == ["sessions", "migrator", "engine", "observers", "metrics", "local", "stream"]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.interface import Agent
-from vlagents_ray.serve.weights import ModelWeights
+from vlagents_ray.serve.weights import ModelWeights, PushOptions
 from vlagents_ray.weights.trainable import own_copy
 
 
@@ -24,8 +24,8 @@ def check_pushed_weights(agent: Agent, act: Callable[[], np.ndarray]) -> None:
     before, loaded = act(), {name: own_copy(value) for name, value in agent.parameters().items()}
 
     def push(number: int, named: Mapping[str, Any]) -> np.ndarray:
-        weights.stage(number, named)
-        weights.commit(number, "keep", list)
+        weights.stage(number, named, PushOptions("keep"))
+        weights.commit(number, PushOptions("keep"), list)
         weights.use(weights.newest)
         return act()
 

@@ -50,13 +50,6 @@ class TunePlan:
     side: int = 224  # px, of random images of which the policy takes any size
     dims: Mapping[str, int] = field(default_factory=dict)  # of parts of the state for which it does not say
 
-    def __post_init__(self) -> None:
-        if self.args.environment.requirements is not None:
-            raise ConfigError(
-                "environment.requirements: only Ray installs them; tune with an environment of your own, "
-                "`environment: {python: ...}`, or in a Python that has them, without `environment`"
-            )
-
 
 @dataclass(slots=True)
 class TunedSize:

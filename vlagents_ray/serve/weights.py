@@ -44,6 +44,23 @@ _LARGEST = 2**53 - 1  # number of a version, which JSON carries exactly
 _FOLLOW, _PINNED = "follow", "pinned"
 
 
+@dataclass(frozen=True, slots=True)
+class PushOptions:
+    """The options of a push."""
+
+    mode: PushMode = "next_episode"  # when sessions change
+    partial: bool = False  # whether names may be missing, whose values stay
+    allow_same: bool = False  # whether all values may equal those of the newest version
+    pin: bool = False  # whether sessions that do not follow also get it, at their next reset
+    version: int | None = None  # its number, such as the step of training; None: the newest one's + 1
+
+    def __post_init__(self) -> None:
+        if self.version is not None and not 1 <= self.version <= _LARGEST:
+            raise InvalidInput(f"version: got {self.version}, want a number in [1, {_LARGEST}]")
+        if self.mode not in get_args(PushMode):
+            raise InvalidInput(f"mode: got {self.mode!r}, want one of {list(get_args(PushMode))}")
+
+
 class WeightsVersion:
     """One version of a model's weights."""
 
@@ -126,12 +143,12 @@ class ModelWeights:
         if self._in_place:
             version.values = None
 
-    def read_header(self, header: bytes, *, partial: bool = False) -> dict[str, ValueSpec]:
+    def read_header(self, header: bytes, options: PushOptions) -> dict[str, ValueSpec]:
         """Return types and shapes of values before they arrive, once they fit.
 
         Args:
             header: The header of a push, as `vlagents_ray.weights.safetensors.header_of` returns it.
-            partial: Whether names may be missing.
+            options: Those of the push.
 
         Raises:
             NotTrainable: The agent names no parameters.
@@ -152,10 +169,10 @@ class ModelWeights:
                 f"weights: got a header of {len(header)} bytes, want at most {most} for the policy's {len(held)} names"
             )
         announced = read_header(header)
-        require_fit(held, announced, partial=partial)
+        require_fit(held, announced, partial=options.partial)
         return announced
 
-    def stage(self, number: int, pushed: Mapping[str, Any], *, partial: bool = False, allow_same: bool = False) -> str:
+    def stage(self, number: int, pushed: Mapping[str, Any], options: PushOptions) -> str:
         """Check a new version and hold it, without acting with it; return its fingerprint.
 
         It is dropped unless it is committed within a minute, since its learner may have died.
@@ -163,8 +180,7 @@ class ModelWeights:
         Args:
             number: The number of the version, above that of the newest one.
             pushed: Its values, by name.
-            partial: Whether values of missing names are those of the newest version.
-            allow_same: Whether all values may equal those of the newest version.
+            options: Those of the push.
 
         Raises:
             NotTrainable: The agent names no parameters.
@@ -187,7 +203,8 @@ class ModelWeights:
             self._staged = placeholder
         try:
             with CAPTURES.pushes:
-                values = fitted(self._values(newest), pushed, partial=partial, allow_same=allow_same)
+                before = self._values(newest)
+                values = fitted(before, pushed, partial=options.partial, allow_same=options.allow_same)
                 staged = WeightsVersion(number, fingerprint(values), values)
         except BaseException:
             self.drop(number)
@@ -201,16 +218,13 @@ class ModelWeights:
             self._timer.start()
         return staged.fingerprint
 
-    def commit(
-        self, number: int, mode: PushMode, sessions: Callable[[], Iterable[FollowingSession]], *, pin: bool = False
-    ) -> None:
+    def commit(self, number: int, options: PushOptions, sessions: Callable[[], Iterable[FollowingSession]]) -> None:
         """Act with a staged version from now on. A commit of the newest version does nothing, so it can be repeated.
 
         Args:
             number: The number of the version.
-            mode: When sessions that follow change to it.
+            options: Those of the push.
             sessions: Returns the sessions of the replica, without a lock.
-            pin: Whether sessions that do not follow also get it, at their next reset.
 
         Raises:
             WeightsNotStaged: It is neither staged nor the newest.
@@ -223,22 +237,14 @@ class ModelWeights:
                     f"weights: version {number} is not staged here; push it again, and commit within {STAGED_S:g} s"
                 )
             self.newest = self._alive[number] = self._staged
-            if pin:
+            if options.pin:
                 self.pinned = self.newest
             self._forget_staged()
-            if mode == "keep":
-                for session in self._running(sessions):
-                    session.weights = self.newest
-
-    def _running(self, sessions: Callable[[], Iterable[FollowingSession]]) -> list[FollowingSession]:
-        """Return the sessions that follow and have an episode with a version of this model."""
-        return [
-            session
-            for session in sessions()
-            if session.follows
-            and (weights := session.weights) is not None
-            and self._alive.get(weights.number) is weights
-        ]
+            if options.mode == "keep":
+                for session in sessions():
+                    acts_with = session.weights  # of this model, or of another one
+                    if session.follows and acts_with is not None and self._alive.get(acts_with.number) is acts_with:
+                        session.weights = self.newest
 
     def drop(self, number: int) -> None:
         """Drop a staged version; the last committed one stays."""
@@ -265,23 +271,6 @@ class ModelWeights:
 
     def _copies(self) -> dict[str, Any]:
         return {name: own_copy(value) for name, value in self._agent.parameters().items()}
-
-
-@dataclass(frozen=True, slots=True)
-class PushOptions:
-    """The options of a push."""
-
-    mode: PushMode = "next_episode"  # when sessions change
-    partial: bool = False  # whether names may be missing, whose values stay
-    allow_same: bool = False  # whether all values may equal those of the newest version
-    pin: bool = False  # whether sessions that do not follow also get it, at their next reset
-    version: int | None = None  # its number, such as the step of training; None: the newest one's + 1
-
-    def __post_init__(self) -> None:
-        if self.version is not None and not 1 <= self.version <= _LARGEST:
-            raise InvalidInput(f"version: got {self.version}, want a number in [1, {_LARGEST}]")
-        if self.mode not in get_args(PushMode):
-            raise InvalidInput(f"mode: got {self.mode!r}, want one of {list(get_args(PushMode))}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -330,16 +319,16 @@ class WeightUpdates:
 
     def read_header(self, header: bytes, options: PushOptions) -> dict[str, ValueSpec]:
         """Check values before they arrive; see `ModelWeights.read_header`."""
-        return self._own().read_header(header, partial=options.partial)
+        return self._own().read_header(header, options)
 
     def stage(self, number: int, pushed: Mapping[str, Any] | SharedValues, options: PushOptions) -> str:
         """Check and hold a new version, and return its fingerprint; see `ModelWeights.stage`."""
         with opened(pushed) if isinstance(pushed, SharedValues) else nullcontext(pushed) as named:
-            return self._own().stage(number, named, partial=options.partial, allow_same=options.allow_same)
+            return self._own().stage(number, named, options)
 
     def commit(self, number: int, options: PushOptions) -> None:
         """Act with the staged version; see `ModelWeights.commit`."""
-        self._own().commit(number, options.mode, self._sessions, pin=options.pin)
+        self._own().commit(number, options, self._sessions)
 
     def held(self) -> list[HeldVersion]:
         """Return the pinned and the newest version, the older one first, unless that is the checkpoint itself."""

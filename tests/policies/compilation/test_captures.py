@@ -22,7 +22,7 @@ from vlagents_ray.policies.compilation import CAPTURES, Compilation, CudaGraph
 from vlagents_ray.policies.loading import report_device
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.weights import ModelWeights
+from vlagents_ray.serve.weights import ModelWeights, PushOptions
 from vlagents_ray.weights.shared_values import _GpuMemory
 
 pytestmark = pytest.mark.torch
@@ -180,7 +180,10 @@ def test_an_act_that_waits_for_the_device_waits_for_the_end_of_a_capture(cuda: F
 def test_a_push_waits_for_the_end_of_a_capture(cuda: FakeCuda) -> None:
     weights = ModelWeights(Waiting(), threading.Lock())
     pushed = {"w": np.zeros(2, np.float32)}
-    assert captured_beside(cuda, lambda: on_a_thread(lambda: weights.stage(1, pushed))) == weights._staged.fingerprint  # type: ignore[union-attr]
+    assert (
+        captured_beside(cuda, lambda: on_a_thread(lambda: weights.stage(1, pushed, PushOptions())))
+        == weights._staged.fingerprint
+    )  # type: ignore[union-attr]
     weights.drop(1)
 
 

@@ -35,7 +35,7 @@ from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.python_env.child_agent import Child, ChildAgent
 from vlagents_ray.serve.python_env.child_main import Settings
 from vlagents_ray.serve.queue.call_limits import CallLimits
-from vlagents_ray.serve.weights import ModelWeights
+from vlagents_ray.serve.weights import ModelWeights, PushOptions
 
 SUPPORT = Path(__file__).parents[2] / "support"
 ROOT = Path(__file__).parents[3]
@@ -326,7 +326,7 @@ def test_an_act_is_an_act(engine: Engine) -> None:
 def test_the_weights_of_a_policy_in_a_child_process_are_out_of_reach() -> None:
     weights = ModelWeights(agent(), threading.Lock(), "9f3c")
     with pytest.raises(NotTrainable, match=r"runs in a child process.* `environment: \{process: replica\}`"):
-        weights.stage(1, {"w": np.zeros(1)})
+        weights.stage(1, {"w": np.zeros(1)}, PushOptions())
     assert weights.newest.describe() == {"version": 0, "fingerprint": "9f3c"}
 
 

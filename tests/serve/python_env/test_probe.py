@@ -53,25 +53,9 @@ def test_an_interpreter_that_is_a_link_stays_one(tmp_path: Path) -> None:
     assert args(python=str(link)).python == str(link)
 
 
-def test_requirements_are_read_from_their_file(tmp_path: Path) -> None:
-    file = tmp_path / "some.txt"
-    file.write_text("# of a policy\nsix==1.16.0  # pinned\n\n  numpy<2\npack @ file:///x#egg=pack\n")
-    assert args(requirements=str(file)).requirements == ["six==1.16.0", "numpy<2", "pack @ file:///x#egg=pack"]
-
-
-def test_requirements_for_another_python_are_refused(tmp_path: Path) -> None:
-    file = tmp_path / "some.txt"
-    file.write_text("# python: 3.97\nsix==1.16.0\n")
-    with pytest.raises(ValidationError, match=r"wants Python 3\.97.*vlagents-ray env make"):
-        args(requirements=str(file))
-
-
 @pytest.mark.parametrize(
     ("environment", "said"),
     [
-        ({"python": "p", "requirements": ["six"]}, "exclude each other"),
-        ({"requirements": "no/such.txt"}, "no such file: got 'no/such.txt'"),
-        ({"requirements": []}, "got none"),
         ({"process": "child"}, "got 'child' without `python`"),
         ({"process": "thread", "python": "p"}, "'auto', 'replica' or 'child'"),
         ({"pythn": "p"}, "Extra inputs"),
@@ -89,8 +73,6 @@ def test_what_ray_is_told() -> None:
         "env_vars": {"A": "b"},
     }
     assert args(python="/p", process="child", env_vars={"A": "b"}).runtime_env() == {}
-    assert args(requirements=["six"]).runtime_env() == {"pip": ["six"]}
-    assert args(requirements=["six"], installer="uv").runtime_env() == {"uv": ["six"]}
 
 
 def test_no_environment_is_the_clusters() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import threading
+import asyncio
 import time
 from dataclasses import replace
 
@@ -117,15 +117,14 @@ class Beside:
     """Neighbours that hold what they are told to hold; counts how often they were asked."""
 
     def __init__(self, *loads: ReplicaLoad) -> None:
-        self.held, self.asked, self.answer = list(loads), 0, threading.Event()
-        self.answer.set()
+        self.held, self.asked = list(loads), 0
 
-    def loads(self) -> list[ReplicaLoad]:
+    async def loads(self) -> list[ReplicaLoad]:
         self.asked += 1
-        assert self.answer.wait(60)
+        await asyncio.sleep(0.01)
         return [replace(one) for one in self.held]
 
-    def announce_client(self, replica: str) -> str:
+    async def announce_client(self, replica: str) -> str:
         return replica
 
 
@@ -137,14 +136,14 @@ def balance(engine: Engine, *beside: ReplicaLoad) -> tuple[Rebalancer, Beside]:
 def test_clients_that_come_at_once_are_spread_evenly() -> None:
     engine = Engine(Counting())
     mine, neighbours = balance(engine, load("b", 3), load("c", 0))
-    neighbours.answer.clear()
-    waiting = [mine.place(ClientLocation()) for _ in range(15)]
-    neighbours.answer.set()
-    places = [one.result(60) for one in waiting]
+
+    async def place() -> list[str | None]:
+        return await asyncio.gather(*(mine.place(ClientLocation()) for _ in range(15)))
+
+    places = asyncio.run(place())
     assert {name: places.count(name) for name in (None, "b", "c")} == {None: 6, "b": 3, "c": 6}
     assert mine.load().sessions == 6
     assert neighbours.asked == 1
-    mine.close()
 
 
 def test_a_client_that_no_replica_is_near_to_gets_the_least_loaded_of_the_next_place() -> None:
@@ -153,10 +152,9 @@ def test_a_client_that_no_replica_is_near_to_gets_the_least_loaded_of_the_next_p
         ClientLocation(boot_id=machine, must_be_near=True)
         for machine in ("another machine", "none", load("b", 0).boot_id)
     ]
-    assert mine.place(near[0], near[2]).result(5) == "c"
-    assert mine.place(near[1], near[2]).result(5) in ("b", None)
-    assert mine.place(near[1]).result(5) is None
-    mine.close()
+    assert asyncio.run(mine.place(near[0], near[2])) == "c"
+    assert asyncio.run(mine.place(near[1], near[2])) in ("b", None)
+    assert asyncio.run(mine.place(near[1])) is None
 
 
 def test_a_client_is_expected_until_its_session_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -170,7 +168,6 @@ def test_a_client_is_expected_until_its_session_is_there(monkeypatch: pytest.Mon
     monkeypatch.setattr(balancing, "_EXPECTED_S", 0.0)
     time.sleep(0.01)
     assert mine.load().sessions == 1
-    mine.close()
 
 
 def test_surplus_connections_go_elsewhere_with_all_their_sessions() -> None:
@@ -185,9 +182,9 @@ def test_surplus_connections_go_elsewhere_with_all_their_sessions() -> None:
             session = engine.sessions.get(session_id)
             session.origin = replace(session.origin, transport="shm")
     mine, _ = balance(first, load("b", 0))
-    mine.compare()
+    asyncio.run(mine.compare())
     assert first.drain_list._marked == set(), "a surplus of one moment moves nobody"
-    mine.compare()
+    asyncio.run(mine.compare())
     served.prefer = 1
     for step in range(1, 5):
         for agents_of_one in groups:
@@ -200,7 +197,6 @@ def test_surplus_connections_go_elsewhere_with_all_their_sessions() -> None:
         for agent in agents_of_one:
             agent.close()
     assert (len(first.sessions), len(second.sessions)) == (0, 0)
-    mine.close()
     served.close()
 
 

@@ -22,7 +22,7 @@ from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import Sender
 from vlagents_ray.serve.scaling import session_migration
-from vlagents_ray.serve.scaling.session_migration import PEER_METHODS, Peer
+from vlagents_ray.serve.scaling.session_migration import HeldSessions, Peer
 
 
 class Counting(Agent):
@@ -90,7 +90,7 @@ def obeys(engine: Engine, name: str = "robot-1") -> tuple[str, int]:
 
 def serve(replicas: Replicas, number: int, method: str, *args: Any) -> Any:
     """As another replica asks."""
-    work = PEER_METHODS[method](replicas.migrators[number].held, *args)
+    work = getattr(HeldSessions, method)(replicas.migrators[number].held, *args)
     return asyncio.run_coroutine_threadsafe(work, replicas._loop).result(20)
 
 

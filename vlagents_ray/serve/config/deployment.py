@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import os
-import re
-import sys
 from collections.abc import Callable, Mapping
 from dataclasses import fields
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
@@ -22,7 +19,6 @@ from vlagents_ray.serve.models.checkpoints import Checkpoints
 from vlagents_ray.serve.queue.call_limits import CallLimits
 
 POLICY, GATEWAY = "Policy", "Gateway"  # the deployments of an application
-_PYTHON = re.compile(r"^# python: (3\.\d+)\s*$", re.MULTILINE)
 
 # Links are not followed: the interpreter of a virtual environment links to that of its creator.
 AbsolutePath = Annotated[str, AfterValidator(lambda path: os.path.abspath(os.path.expanduser(path)))]
@@ -45,12 +41,6 @@ class LiveArgs(_DeploymentModel):
     most_gb: float = Field(default=50.0, gt=0, description="size of the folder at which nothing more is saved, GB")
 
 
-def python_wanted_by(requirements: Path) -> str | None:
-    """Return the Python minor version that a requirements file names in a line `# python: 3.12`; None without one."""
-    found = _PYTHON.search(requirements.read_text())
-    return None if found is None else found[1]
-
-
 class EnvironmentArgs(_DeploymentModel):
     """The Python environment of a policy; by default the policy runs in the replica, in the cluster's environment."""
 
@@ -64,42 +54,14 @@ class EnvironmentArgs(_DeploymentModel):
         description="with `python`: is the replica itself to run there (same Python minor and Ray as the cluster's), "
         "or a child process behind it? auto: the replica where it can",
     )
-    requirements: list[str] | None = Field(
-        default=None, description="instead of `python`: what Ray installs on each node, once; a list, or a file's path"
-    )
-    installer: Literal["uv", "pip"] = Field(default="pip", description="of `requirements`")
     env_vars: dict[str, str] = Field(default_factory=dict, description="variables of the policy's process")
-
-    @field_validator("requirements", mode="before")
-    @classmethod
-    def _read(cls, requirements: Any) -> Any:
-        if not isinstance(requirements, str):
-            return requirements
-        file = Path(requirements)
-        if not file.is_file():
-            raise ValueError(f"no such file: got {requirements!r}, want a requirements file or a list of requirements")
-        wanted, ours = python_wanted_by(file), "{}.{}".format(*sys.version_info[:2])
-        if wanted not in (None, ours):
-            raise ValueError(
-                f"{requirements} wants Python {wanted}, and Ray installs requirements for the cluster's, {ours}; make "
-                f"an environment, `vlagents-ray env make {requirements}`, and name its Python in `python` instead"
-            )
-        lines = [line.partition(" #")[0].strip() for line in file.read_text().splitlines()]
-        return [line for line in lines if line and not line.startswith("#")]
 
     @model_validator(mode="after")
     def _one(self) -> EnvironmentArgs:
-        if self.python is not None and self.requirements is not None:
-            raise ValueError(
-                f"python {self.python!r} and requirements exclude each other; keep one, or install the requirements "
-                f"into that environment (`vlagents-ray env make`)"
-            )
         if self.python is None and self.process != "auto":
             raise ValueError(f"process: got {self.process!r} without `python`; name an interpreter, or leave it out")
         # The check covers a child process, too: Serve shows the deployment, and a child may become a replica.
-        require_no_secrets({"env_vars": self.env_vars, "requirements": self.requirements})
-        if self.requirements == []:
-            raise ValueError("requirements: got none; name some, or leave it out")
+        require_no_secrets({"env_vars": self.env_vars})
         return self
 
     def runtime_env(self) -> dict[str, Any]:
@@ -109,8 +71,6 @@ class EnvironmentArgs(_DeploymentModel):
         found: dict[str, Any] = {}
         if self.python is not None:
             found["py_executable"] = self.python
-        if self.requirements is not None:
-            found[self.installer] = self.requirements
         if self.env_vars:
             found["env_vars"] = self.env_vars
         return found

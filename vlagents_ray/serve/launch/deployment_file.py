@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from ray.serve.schema import ServeApplicationSchema, ServeDeploySchema
 
 from vlagents_ray.contract import Contract
-from vlagents_ray.errors import ConfigError, MissingDependency, UnknownPolicy, UnknownWrapper
+from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.base.checkpoint import STEP as STEP_PLACE
 from vlagents_ray.policies.wrapper import build_agent
 from vlagents_ray.ray_tools.runtime_env import require_no_secrets
@@ -169,8 +169,6 @@ def stated_contract(config: ServeDeploySchema) -> Contract | None:
         return None
     args, own = ServerArgs(**app.args), own_settings(app)
     environment = args.environment
-    if environment.requirements is not None:
-        return None
     offered = args.checkpoints.of(partial(build_agent, args.policy, wrappers=args.wrappers), own)
     settings = offered.settings(offered.examples()[0], offered.config)
     if environment.python is not None:
@@ -247,13 +245,8 @@ def _require_policy(args: ServerArgs, own: dict[str, Any], *, installed: bool, s
         settings = offered.settings(choice, offered.config)
         if step_follows and STEP_PLACE in str(settings.get(CHOICE)) and settings.get(STEP) is None:
             settings |= {STEP: 0}
-        try:
-            if environment.python is not None:
-                contract = check_policy(environment, args.policy, settings, args.wrappers)
-            else:
-                contract = unloaded_contract(offered.make(settings))
-        except (MissingDependency, UnknownPolicy, UnknownWrapper):
-            if environment.requirements is None:  # otherwise the requirements may install it
-                raise
+        if environment.python is not None:
+            contract = check_policy(environment, args.policy, settings, args.wrappers)
         else:
-            require_fit(args.dialects, contract)
+            contract = unloaded_contract(offered.make(settings))
+        require_fit(args.dialects, contract)

@@ -10,7 +10,6 @@ import logging
 import time
 from collections import Counter, deque
 from collections.abc import Awaitable, Callable, Collection, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Protocol
@@ -98,9 +97,15 @@ class ReplicaView:
         each_half_second.remove(self.live.expire)
         self.live.close()
 
-    def press(self, session: str, do: str, by: str) -> dict[str, Any]:
-        """Give a command to a session, see `CommandBoard.press`; its outcome is awaited for a while."""
-        pressed = self.commands.press(session, do, by)
+    def press(self, session: str, do: str, by: str) -> dict[str, Any] | None:
+        """Give a command to a session, see `CommandBoard.press`, and await its outcome for a while.
+
+        Returns None if the session is not here.
+        """
+        try:
+            pressed = self.commands.press(session, do, by)
+        except UnknownSession:
+            return None
         self.live.renew(TRACKED_S)
         return pressed
 
@@ -314,10 +319,9 @@ class Fleet:
 
     async def press(self, session: str, do: str, by: str) -> dict[str, Any]:
         """Give a command to a session of any replica, see `CommandBoard.press`, and return it."""
-        if self._own is not None:
-            with suppress(UnknownSession):
-                return self._own.press(session, do, by)
-        pressed = None if self._others is None else await self._others.press(session, do, by)
+        pressed = None if self._own is None else self._own.press(session, do, by)
+        if pressed is None and self._others is not None:
+            pressed = await self._others.press(session, do, by)
         if pressed is None:
             raise UnknownSession(f"session {session[:80]!r}: no replica has it; it has ended")
         return pressed

@@ -18,7 +18,6 @@ from pathlib import Path
 import vlagents_ray
 from vlagents_ray.errors import ConfigError, MissingDependency
 from vlagents_ray.policies.base import import_fixes
-from vlagents_ray.serve.config.deployment import python_wanted_by
 
 Progress = Callable[[str], None]
 
@@ -27,6 +26,7 @@ _FIXES = "vlagents_ray_import_fixes"  # a module and a .pth file in the environm
 _NOT_IN_A_WHEEL = {"RECORD", "INSTALLER", "REQUESTED", "direct_url.json"}  # an installer writes them
 _SHOWN = 2000  # last characters of uv's output that an error quotes
 _MINOR = "import sys; print('%d.%d' % sys.version_info[:2])"
+_PYTHON = re.compile(r"^# python: (3\.\d+)\s*$", re.MULTILINE)
 _CUDA = re.compile(r"^ \+ ((?:nvidia|cuda)-\S+)", re.MULTILINE)
 # pip's variables for package sources, and uv's, which take precedence.
 _PIP_VARIABLES = {
@@ -127,8 +127,8 @@ def make_environment(
     for file in files:
         if not file.is_file():
             raise ConfigError(f"no such file: got {str(file)!r}, want a requirements file")
-    if python is None and not python_in(folder).exists() and (version := python_wanted_by(requirements)) is not None:
-        python = find_python(version)
+    if python is None and not python_in(folder).exists() and (wanted := _PYTHON.search(requirements.read_text())):
+        python = find_python(wanted[1])
     made = create(folder, python, progress)
     if not light and _minor(made) != _minor(Path(sys.executable)):
         progress(
@@ -136,15 +136,15 @@ def make_environment(
         )
         light = True
     with tempfile.TemporaryDirectory() as scratch:
-        wanted = [*_ourselves(light, Path(scratch))]
-        wanted += [word for file in files for word in ("--requirement", str(file))]
+        asked = [*_ourselves(light, Path(scratch))]
+        asked += [word for file in files for word in ("--requirement", str(file))]
         if not _has_gpu():
             for override in _overrides(requirements, Path(scratch)):
-                wanted += ["--override", str(override)]
+                asked += ["--override", str(override)]
             if not cuda:
-                _require_no_cuda(made, wanted)
+                _require_no_cuda(made, asked)
         progress(f"installing {_US} {importlib.metadata.version(_US)} and {requirements}")
-        install(made, wanted)
+        install(made, asked)
     _install_import_fixes(made)
     return made
 

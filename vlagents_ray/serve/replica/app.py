@@ -67,7 +67,8 @@ def _options(args: ServerArgs) -> dict[str, Any]:
             "num_gpus": args.resources.num_gpus,
             "resources": args.resources.custom,
             **({} if args.resources.memory is None else {"memory": args.resources.memory}),
-            "runtime_env": args.environment.runtime_env(),
+            # Without one, Serve gives the deployment that of the application.
+            **({"runtime_env": environment} if (environment := args.environment.runtime_env()) else {}),
         },
     }
 

@@ -8,7 +8,7 @@ import importlib.metadata
 import logging
 import os
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from typing import Any
@@ -19,7 +19,7 @@ from ray.serve.exceptions import RayServeException
 from starlette.types import ASGIApp
 
 from vlagents_ray.client.transports.serve_handle import ClientApi
-from vlagents_ray.errors import PolicyFailed, PolicyUnavailable, UnknownSession, VLAgentsError
+from vlagents_ray.errors import PolicyFailed, PolicyUnavailable, VLAgentsError
 from vlagents_ray.policies.base.accelerator import VISIBLE
 from vlagents_ray.policies.base.program import loaded_code
 from vlagents_ray.protocol.frames import Decoded, decode_requests
@@ -43,7 +43,7 @@ from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import Sender
 from vlagents_ray.serve.models.checkpoints import resolved
 from vlagents_ray.serve.observers.live_page import live_routes
-from vlagents_ray.serve.observers.live_view import Fleet, Snapshot
+from vlagents_ray.serve.observers.live_view import Fleet
 from vlagents_ray.serve.observers.opening import open_observers
 from vlagents_ray.serve.ports import EVERYWHERE, HOST, LOOPBACK
 from vlagents_ray.serve.python_env.child_agent import make_agent, version_of
@@ -51,9 +51,9 @@ from vlagents_ray.serve.queue.batch_queue import LoadMeter
 from vlagents_ray.serve.replica.metrics import Exporter, tags_of
 from vlagents_ray.serve.scaling.autoscaling import SESSIONS, UTILISATION, WAITING
 from vlagents_ray.serve.scaling.rebalancer import ClientLocation, Rebalancer, ReplicaLoad
-from vlagents_ray.serve.scaling.session_migration import PEER_METHODS, SessionMigrator
-from vlagents_ray.serve.scaling.sibling_replicas import SiblingApi, SiblingReplicas
-from vlagents_ray.serve.scaling.weight_push import WEIGHT_METHODS, ThisReplica, Values, WeightPusher, WeightsReplica
+from vlagents_ray.serve.scaling.session_migration import HeldSessions, SessionMigrator
+from vlagents_ray.serve.scaling.sibling_replicas import PEER_METHODS, SiblingApi, SiblingReplicas
+from vlagents_ray.serve.scaling.weight_push import ThisReplica, Values, WeightPusher, WeightsReplica
 from vlagents_ray.serve.weights import NewestVersion, PushOptions, PushResult, WeightUpdates
 from vlagents_ray.weights.safetensors import ValueSpec
 
@@ -146,8 +146,7 @@ class PolicyReplica(ClientApi, SiblingApi):
         self._configured = True
         await self._load_policy()
         await self._catch_up()  # takes the others' versions before this replica is ready
-        self._rebalancer.start()
-        works = [self._watch_shutdown(), self._keep_catching_up()]
+        works = [self._watch_shutdown(), self._keep_catching_up(), self._rebalancer.run()]
         if self._gateway is not None:
             works.append(self._poll_gateways())
         self._tasks = [asyncio.ensure_future(work) for work in works]
@@ -171,7 +170,6 @@ class PolicyReplica(ClientApi, SiblingApi):
             task.cancel()
         if self._engine.draining:
             await self._migrator.hand_over()
-        self._rebalancer.close()
         await self._migrator.close()
         for part in (self._engine, self._observers, self._metrics):
             await asyncio.to_thread(part.close)
@@ -284,7 +282,7 @@ class PolicyReplica(ClientApi, SiblingApi):
 
     async def nodes(self) -> dict[str, int]:
         """Return the number of replicas that accept sessions by node, so that clients can be placed near them."""
-        loads = [self._rebalancer.load(), *await asyncio.to_thread(self._peers.loads)]
+        loads = [self._rebalancer.load(), *await self._peers.loads()]
         return dict(Counter(load.node for load in loads if load.accepts))
 
     def _connection_info(self) -> tuple[dict[str, Any], Any]:
@@ -300,17 +298,10 @@ class PolicyReplica(ClientApi, SiblingApi):
 
     async def _place_at_sibling(self, *places: ClientLocation) -> tuple[dict[str, Any], Any] | None:
         """Return metadata and actor of another replica if it suits the client better, see `Rebalancer.place`."""
-        reference = await asyncio.wrap_future(self._rebalancer.place(*places))
-        if reference is None:
-            return None
-        found: tuple[dict[str, Any], Any] | None = await asyncio.to_thread(self._peers.answer, reference)
+        found: tuple[dict[str, Any], Any] | None = await self._rebalancer.place(*places)
         return found
 
     # Other replicas: `SiblingApi`.
-
-    async def load(self) -> ReplicaLoad:
-        """Return this replica's load, which other replicas compare with theirs."""
-        return self._rebalancer.load()
 
     def _load_of(self, sessions: int) -> ReplicaLoad:
         accepts = self._engine.ready and not (self._engine.draining or replica_is_ending())
@@ -323,19 +314,15 @@ class PolicyReplica(ClientApi, SiblingApi):
         return self._connection_info()
 
     async def peer(self, method: str, *args: Any) -> Any:
-        """Call one of `PEER_METHODS` for another replica, about sessions that migrate."""
-        return await PEER_METHODS[method](self._migrator.held, *args)
-
-    async def live(self, since: int, shown: Collection[str]) -> Snapshot:
-        """Return what happened here since a snapshot, with pictures of the sessions `shown`."""
-        return await asyncio.to_thread(self._observers.view.read, since, shown)
-
-    async def press(self, session: str, do: str, by: str) -> dict[str, Any] | None:
-        """Give a command to a session; None if the session is not here."""
-        try:
-            return self._observers.view.press(session, do, by)
-        except UnknownSession:
-            return None
+        """Call one of `PEER_METHODS` for another replica."""
+        part, call, _ = PEER_METHODS[method]
+        if part is HeldSessions:
+            return await call(self._migrator.held, *args)
+        if part is Rebalancer:
+            return call(self._rebalancer)
+        if part is WeightUpdates:
+            return await self._weights.weights(call, *args)
+        return await asyncio.to_thread(call, self._observers.view, *args)
 
     # New weights: from learners, and from the replica that coordinates a push.
 
@@ -361,10 +348,6 @@ class PolicyReplica(ClientApi, SiblingApi):
             *(replica.weights(WeightUpdates.newest) for replica in replicas), return_exceptions=True
         )
         return [newest.number for newest in found if isinstance(newest, NewestVersion)]
-
-    async def weights(self, method: str, *args: Any) -> Any:
-        """Call one of `WEIGHT_METHODS` for another replica, which coordinates a push or has missed one."""
-        return await self._weights.weights(WEIGHT_METHODS[method], *args)
 
     # What the replica does by itself.
 

@@ -9,13 +9,12 @@ on the replica of HTTP sessions.
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import random
-import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from operator import attrgetter
 from typing import Any, Protocol
@@ -104,17 +103,17 @@ def _tolerated(sessions: float) -> float:
 class Siblings(Protocol):
     """The other replicas of the application: `vlagents_ray.serve.scaling.sibling_replicas.SiblingReplicas`."""
 
-    def loads(self) -> list[ReplicaLoad]:
+    async def loads(self) -> list[ReplicaLoad]:
         """Return the loads of the replicas that answer at once."""
         ...
 
-    def announce_client(self, replica: str) -> Any:
-        """Announce a client to that replica; return a reference to its answer, without waiting for it."""
+    async def announce_client(self, replica: str) -> Any:
+        """Announce a client to that replica; return its answer to the client, or None if it does not answer at once."""
         ...
 
 
 class Rebalancer:
-    """Compares the sessions of one replica with those of the others, and places new clients."""
+    """Compares the sessions of one replica with those of the others, and places new clients; on one event loop."""
 
     def __init__(self, engine: Engine, siblings: Siblings, own_load: Callable[[int], ReplicaLoad]) -> None:
         """Balance the sessions of `engine` with those of `siblings`; `own_load` makes a load of a session count."""
@@ -126,56 +125,55 @@ class Rebalancer:
         self._others: list[ReplicaLoad] = []
         self._asked_at = float("-inf")  # time at which the others were asked for their loads
         self._uneven = False  # whether the last comparison found too many sessions here
-        self._lock = threading.Lock()
-        self._placer = ThreadPoolExecutor(1, thread_name_prefix="balance")  # one thread, which places clients in turn
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._loop, name="rebalance", daemon=True)
+        self._placing = asyncio.Lock()  # clients are placed in turn
 
-    def start(self) -> None:
-        """Start the periodic comparisons."""
-        self._thread.start()
-
-    def close(self) -> None:
-        """Stop the comparisons."""
-        self._stop.set()
-        self._placer.shutdown(wait=False, cancel_futures=True)
+    async def run(self) -> None:
+        """Compare periodically, until cancelled."""
+        while True:
+            await asyncio.sleep(random.uniform(0.8, 1.2) * PERIOD_S)
+            try:
+                await self.compare()
+            except Exception:
+                logger.exception("sessions were not compared")
 
     def load(self) -> ReplicaLoad:
         """Return the current load of this replica, including the clients that were sent here."""
-        with self._lock:
-            opened = self._engine.sessions.opened
-            arrived, self._opened = opened - self._opened, opened
-            oldest = time.monotonic() - _EXPECTED_S
-            while self._expected and (arrived > 0 or self._expected[0] < oldest):
-                self._expected.popleft()
-                arrived -= 1
-            return self._own_load(len(self._engine.sessions) + len(self._expected))
+        opened = self._engine.sessions.opened
+        arrived, self._opened = opened - self._opened, opened
+        oldest = time.monotonic() - _EXPECTED_S
+        while self._expected and (arrived > 0 or self._expected[0] < oldest):
+            self._expected.popleft()
+            arrived -= 1
+        return self._own_load(len(self._engine.sessions) + len(self._expected))
 
     def expect_client(self) -> None:
         """Record that a client was sent here."""
         self.load()
-        with self._lock:
-            self._expected.append(time.monotonic())
+        self._expected.append(time.monotonic())
 
-    def place(self, *places: ClientLocation) -> Future[Any]:
+    async def place(self, *places: ClientLocation) -> Any:
         """Choose the replica for a new client, and announce the client there.
 
         Args:
             *places: Locations of the client in order of preference; the first one that any replica suits is used.
 
         Returns:
-            A future of the result of `Siblings.announce_client`; of None if the client stays here.
+            The result of `Siblings.announce_client`; None if the client stays here.
         """
-        return self._placer.submit(self._place, places, time.monotonic())
+        arrived = time.monotonic()
+        async with self._placing:
+            if arrived > self._asked_at:  # clients that arrived while the others were being asked use those answers
+                try:
+                    self._others = await self._siblings.loads()
+                except Exception:  # errors of the other replicas must not keep a client from connecting
+                    logger.exception("the other replicas could not be asked")
+                    self._others = []
+                self._asked_at = time.monotonic()
+            chosen = self._choose(places)
+        return None if chosen is None else await self._siblings.announce_client(chosen)
 
-    def _place(self, places: Sequence[ClientLocation], arrived: float) -> Any:
-        if arrived > self._asked_at:  # clients that arrived while the others were being asked use those answers
-            try:
-                self._others = self._siblings.loads()
-            except Exception:  # errors of the other replicas must not keep a client from connecting
-                logger.exception("the other replicas could not be asked")
-                self._others = []
-            self._asked_at = time.monotonic()
+    def _choose(self, places: Sequence[ClientLocation]) -> str | None:
+        """Return the name of the replica for a client, and count it there; None for this one."""
         mine = self.load()
         loads = [mine, *self._others]
         random.shuffle(loads)  # so that the choice among equally loaded replicas is random
@@ -186,16 +184,9 @@ class Rebalancer:
             self.expect_client()
             return None
         chosen.sessions += 1  # valid until that replica is asked again
-        return self._siblings.announce_client(chosen.replica)
+        return chosen.replica
 
-    def _loop(self) -> None:
-        while not self._stop.wait(random.uniform(0.8, 1.2) * PERIOD_S):
-            try:
-                self.compare()
-            except Exception:
-                logger.exception("sessions were not compared")
-
-    def compare(self) -> None:
+    async def compare(self) -> None:
         """Compare the loads, and mark connections to drain if there were too many sessions here twice in a row."""
         drain_list, sessions = self._engine.drain_list, self._engine.sessions
         drain_list.forget_older(_RECONNECT_S)
@@ -205,7 +196,7 @@ class Rebalancer:
         active = sessions.by_connection(MOVABLE, _ACTIVE_S)
         asked = drain_list.asked_within(_SETTLE_S)
         if mine.sessions > 1 and mine.accepts:  # a single session is never too many
-            others = [load for load in self._siblings.loads() if load.accepts]
+            others = [load for load in await self._siblings.loads() if load.accepts]
             if others and all(load.version == mine.version for load in others):
                 gone = sum(count for group, count in active.items() if group in asked)
                 too_many = excess_sessions(mine.sessions, [load.sessions for load in others], gone)

@@ -213,18 +213,7 @@ class Peer(ABC):
     async def ask(
         self, method: Callable[Concatenate[HeldSessions, P], Awaitable[T]], *args: P.args, **kwargs: P.kwargs
     ) -> T:
-        """Call `method`, one of `PEER_METHODS`, at the other replica, and return its result."""
-
-
-_PEER_METHODS = (
-    HeldSessions.held,
-    HeldSessions.copy,
-    HeldSessions.release,
-    HeldSessions.take_over,
-    HeldSessions.drop_older,
-)
-PEER_METHODS: dict[str, Callable[..., Awaitable[Any]]] = {method.__name__: method for method in _PEER_METHODS}
-"""The methods that a replica may call at another one, by name."""
+        """Call `method`, at the other replica, and return its result."""
 
 
 def _settle(answered: asyncio.Future[Reply], reply: Reply) -> None:

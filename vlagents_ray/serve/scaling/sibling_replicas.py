@@ -6,7 +6,8 @@ import asyncio
 import logging
 import time
 from collections.abc import Awaitable, Callable, Collection, Iterator
-from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar
+from functools import partial
+from typing import Any, Concatenate, NamedTuple, ParamSpec, Protocol, TypeVar
 
 import ray
 from ray import serve
@@ -14,8 +15,8 @@ from ray import serve
 from vlagents_ray.client.transports.serve_handle import call_replica
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.serve.config.deployment import POLICY
-from vlagents_ray.serve.observers.live_view import OtherReplicas, Snapshot, SnapshotReader
-from vlagents_ray.serve.scaling.rebalancer import ReplicaLoad
+from vlagents_ray.serve.observers.live_view import OtherReplicas, ReplicaView, SnapshotReader
+from vlagents_ray.serve.scaling.rebalancer import Rebalancer, ReplicaLoad
 from vlagents_ray.serve.scaling.session_migration import HeldSessions, Peer, PeerEnded, PeerUnreachable
 from vlagents_ray.serve.weights import WeightUpdates
 
@@ -25,41 +26,53 @@ T = TypeVar("T")
 logger = logging.getLogger(__name__)
 
 _NAMESPACE = "serve"
-_ANSWER_S = 3.0  # default time limit for an answer; a replica that still loads does not answer
+_ANSWER_S = 3.0  # time limit for an answer; a replica that still loads does not answer
 _TRANSFER_S = 600.0  # time limit for an answer that weights are sent with
 _QUICK_S = 0.3  # time limit for an answer while a client waits to connect
 _SILENT_S = 3.0  # time for which a replica that did not answer is not asked for its load again
 _VIEW_ANSWER_S = 0.3  # time limit for an answer; a replica that is late is asked again
-_PRESS_S = 3.0  # time limit for the answer to a command, which is not repeated
 _VIEW_S = 2.0  # time for which the replicas that were found are not looked up again
 
 
 class SiblingApi(Protocol):
     """The actor methods that the replicas of an application call at each other."""
 
-    async def load(self) -> ReplicaLoad:
-        """Return the replica's load, for comparison with that of others."""
-        ...
-
     async def expect_client(self) -> tuple[dict[str, Any], Any]:
         """Expect a client that is sent here; return the metadata for the client, and the actor."""
         ...
 
     async def peer(self, method: str, *args: Any) -> Any:
-        """Call the method of that name in `PEER_METHODS`, for moving sessions, and return its result."""
+        """Call the method of that name in `PEER_METHODS`, and return its result."""
         ...
 
-    async def weights(self, method: str, *args: Any) -> Any:
-        """Call the method of that name in `WEIGHT_METHODS`, for pushes of weights, and return its result."""
-        ...
 
-    async def live(self, since: int, shown: Collection[str]) -> Snapshot:
-        """Return what happened since a snapshot, with pictures of the sessions `shown`."""
-        ...
+class PeerMethod(NamedTuple):
+    """A method that replicas call at each other."""
 
-    async def press(self, session: str, do: str, by: str) -> dict[str, Any] | None:
-        """Give a command to a session from the live page; None if the session is not here."""
-        ...
+    part: type  # the part of the replica that has it
+    call: Callable[..., Any]
+    limit_s: float | None  # time limit for the answer
+
+
+PEER_METHODS = {
+    one.call.__qualname__: one
+    for one in (
+        PeerMethod(HeldSessions, HeldSessions.held, None),
+        PeerMethod(HeldSessions, HeldSessions.copy, None),
+        PeerMethod(HeldSessions, HeldSessions.release, None),
+        PeerMethod(HeldSessions, HeldSessions.take_over, None),
+        PeerMethod(HeldSessions, HeldSessions.drop_older, None),
+        PeerMethod(WeightUpdates, WeightUpdates.newest, _ANSWER_S),
+        PeerMethod(WeightUpdates, WeightUpdates.stage, _TRANSFER_S),
+        PeerMethod(WeightUpdates, WeightUpdates.commit, _ANSWER_S),
+        PeerMethod(WeightUpdates, WeightUpdates.drop, _ANSWER_S),
+        PeerMethod(WeightUpdates, WeightUpdates.held, _TRANSFER_S),
+        PeerMethod(Rebalancer, Rebalancer.load, _QUICK_S),
+        PeerMethod(ReplicaView, ReplicaView.read, _VIEW_ANSWER_S),
+        PeerMethod(ReplicaView, ReplicaView.press, _ANSWER_S),
+    )
+}
+"""What replicas call at each other, beside `SiblingApi`: moves of sessions, pushes of weights, loads, the live page."""
 
 
 class _Sibling(Peer):
@@ -73,38 +86,27 @@ class _Sibling(Peer):
         self, method: Callable[Concatenate[HeldSessions, P], Awaitable[T]], *args: P.args, **kwargs: P.kwargs
     ) -> T:
         try:
-            found: T = await self._call(None, SiblingApi.peer, method.__name__, *args)
+            found: T = await self.call(method, *args)
         except VLAgentsError as error:  # the server has another version
             raise PeerUnreachable(str(error)) from error
         return found
 
     async def weights(self, method: Callable[..., T], *args: Any) -> T:
-        transfers = method in (WeightUpdates.stage, WeightUpdates.held)
-        found: T = await self._call(_TRANSFER_S if transfers else _ANSWER_S, SiblingApi.weights, method.__name__, *args)
+        found: T = await self.call(method, *args)
         return found
 
-    async def live(self, since: int, shown: Collection[str]) -> Snapshot:
-        return await self._call(_VIEW_ANSWER_S, SiblingApi.live, since, shown)
-
-    async def press(self, session: str, do: str, by: str) -> dict[str, Any] | None:
-        return await self._call(_PRESS_S, SiblingApi.press, session, do, by)
-
-    async def _call(
-        self,
-        limit_s: float | None,
-        method: Callable[Concatenate[Any, P], Awaitable[T]],
-        *args: P.args,
-        **_: P.kwargs,
-    ) -> T:
+    async def call(self, method: Callable[..., Any], *args: Any) -> Any:
+        """Call one of `PEER_METHODS`; raises `PeerEnded` and `PeerUnreachable` beside its own errors."""
+        limit_s = PEER_METHODS[method.__qualname__].limit_s
         try:
-            found: T = await asyncio.wait_for(call_replica(self._actor, method, *args), limit_s)
+            asked = call_replica(self._actor, SiblingApi.peer, method.__qualname__, *args)
+            return await asyncio.wait_for(asked, limit_s)
         except ray.exceptions.ActorDiedError as error:
             raise PeerEnded(str(error)) from error
         except ray.exceptions.RayTaskError as error:  # the replica itself raised it
             raise error.cause if isinstance(error.cause, VLAgentsError) else PeerUnreachable(str(error)) from error
         except (ray.exceptions.RayError, TimeoutError, asyncio.TimeoutError) as error:  # or the network is partitioned
             raise PeerUnreachable(str(error) or f"no answer within {limit_s} s") from error
-        return found
 
 
 class ReplicasInCluster(OtherReplicas):
@@ -125,7 +127,7 @@ class ReplicasInCluster(OtherReplicas):
         """Return the reader of the snapshots of each, by name."""
         if time.monotonic() - self._found > _VIEW_S:
             self._found = time.monotonic()
-            self._views = {one.name: one.live for one in await self.others()}
+            self._views = {one.name: partial(one.call, ReplicaView.read) for one in await self.others()}
         return self._views
 
     async def press(self, session: str, do: str, by: str) -> dict[str, Any] | None:
@@ -134,9 +136,11 @@ class ReplicasInCluster(OtherReplicas):
         Raises:
             VLAgentsError: The replica that has the session refused the command.
         """
-        for answer in asyncio.as_completed([one.press(session, do, by) for one in await self.others()]):
+        for answer in asyncio.as_completed(
+            [one.call(ReplicaView.press, session, do, by) for one in await self.others()]
+        ):
             try:
-                pressed = await answer
+                pressed: dict[str, Any] | None = await answer
             except (PeerEnded, PeerUnreachable) as error:
                 logger.info("another replica does not answer: %s", error)
                 continue
@@ -165,35 +169,23 @@ class SiblingReplicas(ReplicasInCluster):
         super().__init__([context.app_name], but=self.own_name)
         self._silent: dict[str, float] = {}  # time until which a silent replica is not asked, by its name
 
-    def loads(self) -> list[ReplicaLoad]:
+    async def loads(self) -> list[ReplicaLoad]:
         """Return the loads of the replicas that answer within 0.3 s."""
         now = time.monotonic()
         self._silent = {name: until for name, until in self._silent.items() if until > now}
-        responsive = [(name, actor) for name, actor in self._actors() if name not in self._silent]
-        asked = {call_replica(actor, SiblingApi.load): name for name, actor in responsive}
-        if not asked:
-            return []
-        ready, late = ray.wait(list(asked), num_returns=len(asked), timeout=_QUICK_S)
-        for reference in late:
-            self._silent[asked[reference]] = now + _SILENT_S
-        return [load for reference in ready if (load := _result(reference)) is not None]
+        asked = [one for one in await self.others() if one.name not in self._silent]
+        answers = await asyncio.gather(*(one.call(Rebalancer.load) for one in asked), return_exceptions=True)
+        for one, answer in zip(asked, answers, strict=True):
+            if not isinstance(answer, ReplicaLoad):
+                logger.info("another replica does not answer: %s", answer)
+                self._silent[one.name] = now + _SILENT_S
+        return [answer for answer in answers if isinstance(answer, ReplicaLoad)]
 
-    def announce_client(self, replica: str) -> Any:
-        """Announce a client to another replica; return the reference for `answer`, or None if that replica ended."""
+    async def announce_client(self, replica: str) -> Any:
+        """Announce a client to another replica; return its answer to the client; None if there is none within 0.3 s."""
         try:
-            return call_replica(ray.get_actor(replica, namespace=_NAMESPACE), SiblingApi.expect_client)
-        except ValueError:  # the replica has ended meanwhile
+            actor = await asyncio.to_thread(ray.get_actor, replica, namespace=_NAMESPACE)
+            return await asyncio.wait_for(call_replica(actor, SiblingApi.expect_client), _QUICK_S)
+        except (ValueError, ray.exceptions.RayError, TimeoutError, asyncio.TimeoutError) as error:
+            logger.info("another replica does not answer: %s", error)  # it may have ended meanwhile
             return None
-
-    @staticmethod
-    def answer(reference: Any) -> Any:
-        """Wait for the other replica's answer to the client; None if it does not answer within 0.3 s."""
-        return _result(reference, _QUICK_S)
-
-
-def _result(reference: Any, timeout_s: float = _ANSWER_S) -> Any:
-    try:
-        return ray.get(reference, timeout=timeout_s)
-    except (ray.exceptions.RayError, TimeoutError) as error:
-        logger.info("another replica does not answer: %s", error)
-        return None

@@ -11,7 +11,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from typing import Any, Protocol, TypeVar
 
 from vlagents_ray.errors import InvalidInput, InvalidWeights, PolicyUnavailable, VLAgentsError
@@ -29,19 +29,6 @@ logger = logging.getLogger(__name__)
 
 _MOST_AHEAD = 10**9  # of a version that a learner numbers, such as by its step of training
 _ATTEMPTS = 3  # at the commit of a replica that cannot be reached
-
-
-WEIGHT_METHODS: dict[str, Callable[..., Any]] = {
-    method.__name__: method
-    for method in (
-        WeightUpdates.newest,
-        WeightUpdates.stage,
-        WeightUpdates.commit,
-        WeightUpdates.drop,
-        WeightUpdates.held,
-    )
-}
-"""The methods that a replica may call at another one, by name."""
 
 
 class WeightsReplica(Protocol):
@@ -126,7 +113,12 @@ class WeightPusher:
                 staged[replica] = await replica.weights(WeightUpdates.stage, number, values, options)
 
             try:
-                await self._all(newest, stage)
+                results = await asyncio.gather(*map(stage, newest), return_exceptions=True)
+                for replica, result in zip(newest, results, strict=True):
+                    if isinstance(result, PeerUnreachable):
+                        raise _unreachable(replica) from result
+                    if isinstance(result, BaseException) and not isinstance(result, PeerEnded):
+                        raise result
                 if len(found := set(staged.values())) > 1:
                     raise InvalidWeights(
                         f"weights: the replicas hold different values, {sorted(found)}; push them again"
@@ -195,24 +187,6 @@ class WeightPusher:
             elif not isinstance(answer, PeerEnded | PeerUnreachable | PolicyUnavailable):
                 raise answer
         self._known = {replica.name for replica in found}
-        return found
-
-    @staticmethod
-    async def _all(
-        replicas: Iterable[WeightsReplica], call: Callable[[WeightsReplica], Awaitable[T]]
-    ) -> dict[WeightsReplica, T]:
-        """Call all replicas, and return the results of those that have not ended; raises the first error after all."""
-        replicas = list(replicas)
-        results = await asyncio.gather(*map(call, replicas), return_exceptions=True)
-        found: dict[WeightsReplica, T] = {}
-        for replica, result in zip(replicas, results, strict=True):
-            if isinstance(result, PeerUnreachable):
-                raise _unreachable(replica) from result
-            if isinstance(result, BaseException):
-                if not isinstance(result, PeerEnded):
-                    raise result
-            else:
-                found[replica] = result
         return found
 
 

@@ -1,0 +1,135 @@
+"""What a replica makes of the answers and the errors of other replicas' actors."""
+
+from __future__ import annotations
+
+import asyncio
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import ray
+from ray import serve
+from ray.exceptions import ActorDiedError, ActorUnavailableError, RayTaskError
+
+from vlagents_ray.errors import InvalidInput, InvalidWeights, VLAgentsError
+from vlagents_ray.serve.scaling import sibling_replicas
+from vlagents_ray.serve.scaling.rebalancer import ReplicaLoad
+from vlagents_ray.serve.scaling.session_migration import PeerEnded, PeerUnreachable
+from vlagents_ray.serve.scaling.sibling_replicas import ReplicasInCluster, SiblingReplicas
+from vlagents_ray.serve.weights import PushOptions, WeightUpdates
+
+
+def raised(cause: Exception) -> RayTaskError:
+    return RayTaskError("peer", "a traceback", cause)
+
+
+@pytest.mark.parametrize(
+    ("error", "becomes"),
+    [
+        (raised(InvalidWeights("'w': unknown")).as_instanceof_cause(), InvalidWeights),
+        (raised(RuntimeError("no such method")), PeerUnreachable),
+        (ActorDiedError(), PeerEnded),
+        (ActorUnavailableError("the network is partitioned", None), PeerUnreachable),
+        (TimeoutError(), PeerUnreachable),
+    ],
+    ids=lambda one: getattr(one, "__name__", type(one).__name__),
+)
+def test_errors_of_another_replica(monkeypatch: pytest.MonkeyPatch, error: Exception, becomes: type[Exception]) -> None:
+    async def call(actor: Any, method: Any, *args: Any) -> Any:
+        assert (actor, method.__name__, args) == ("actor", "peer", ("WeightUpdates.stage", 1, {}, PushOptions()))
+        raise error
+
+    monkeypatch.setattr(sibling_replicas, "call_replica", call)
+    replica = sibling_replicas._Sibling("r1", "actor")
+    with pytest.raises(becomes) as found:
+        asyncio.run(replica.weights(WeightUpdates.stage, 1, {}, PushOptions()))
+    assert type(found.value) is becomes
+    assert str(found.value)
+
+
+class Cluster:
+    """Named actors that answer as a test says; those that have no answer never return."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, **answers: Any) -> None:
+        self.answers = {self.name(replica): answer for replica, answer in answers.items()}
+        self.asked: list[tuple[str, str]] = []
+        named = [{"name": name, "namespace": "serve"} for name in [*self.answers, "SERVE_REPLICA::other#Policy#x"]]
+        monkeypatch.setattr(ray.util, "list_named_actors", lambda **_: named)
+        monkeypatch.setattr(ray, "get_actor", self._actor)
+        monkeypatch.setattr(sibling_replicas, "call_replica", self._call)
+        monkeypatch.setattr(sibling_replicas, "_SILENT_S", 60.0)
+        context = SimpleNamespace(app_name="app", replica_id=SimpleNamespace(to_full_id_str=lambda: self.name("me")))
+        monkeypatch.setattr(serve, "get_replica_context", lambda: context)
+
+    @staticmethod
+    def name(replica: str) -> str:
+        return f"SERVE_REPLICA::app#Policy#{replica}"
+
+    def _actor(self, name: str, namespace: str) -> str:
+        if name not in self.answers:
+            raise ValueError("no such actor")
+        return name
+
+    async def _call(self, actor: str, method: Any, *args: Any) -> Any:
+        self.asked.append((actor.rpartition("#")[2], args[0] if args else method.__name__))
+        answer = self.answers[actor]
+        if answer is None:
+            await asyncio.sleep(3600)
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+
+def load(replica: str) -> ReplicaLoad:
+    return ReplicaLoad(replica, 3, True, "node", "boot", ("v", "f"))
+
+
+def test_loads_are_those_of_the_replicas_that_answer_and_the_others_are_left_alone_for_a_while(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    cluster = Cluster(monkeypatch, me=load("me"), a=load("a"), late=None, dead=ActorDiedError())
+    others = SiblingReplicas()
+    for _ in range(2):
+        assert [one.replica for one in asyncio.run(others.loads())] == ["a"]
+    assert sorted(cluster.asked) == [("a", "Rebalancer.load")] * 2 + [
+        ("dead", "Rebalancer.load"),
+        ("late", "Rebalancer.load"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("replica", "answer"), [("a", ({"policy": "noop"}, "actor")), ("late", None), ("dead", None), ("gone", None)]
+)
+def test_a_client_goes_where_it_was_announced_or_stays(
+    monkeypatch: pytest.MonkeyPatch, replica: str, answer: Any
+) -> None:
+    cluster = Cluster(monkeypatch, a=({"policy": "noop"}, "actor"), late=None, dead=ActorDiedError())
+    assert asyncio.run(SiblingReplicas().announce_client(cluster.name(replica))) == answer
+    assert cluster.asked == ([] if replica == "gone" else [(replica, "expect_client")])
+
+
+def test_a_command_reaches_the_replica_that_has_the_session(monkeypatch: pytest.MonkeyPatch) -> None:
+    refused = raised(InvalidInput("no such command")).as_instanceof_cause()
+    for answers, pressed in (
+        ({"dead": ActorDiedError(), "has": {"do": "stop"}}, {"do": "stop"}),
+        ({"dead": ActorDiedError()}, None),
+        ({"refuses": refused}, InvalidInput),
+    ):
+        Cluster(monkeypatch, **answers)  # type: ignore[arg-type]
+        pressing = ReplicasInCluster(["app"]).press("arm", "stop", "lab")
+        if isinstance(pressed, type):
+            with pytest.raises(VLAgentsError, match="no such command"):
+                asyncio.run(pressing)
+        else:
+            assert asyncio.run(pressing) == pressed
+
+
+def test_views_are_read_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    cluster = Cluster(monkeypatch, a="a snapshot", b="another")
+
+    async def read() -> list[Any]:
+        views = await ReplicasInCluster(["app"], but=cluster.name("b")).views()
+        return [(name, await view(7, ["arm"])) for name, view in views.items()]
+
+    assert asyncio.run(read()) == [(cluster.name("a"), "a snapshot")]
+    assert cluster.asked == [("a", "ReplicaView.read")]
