@@ -30,11 +30,12 @@ from vlagents_ray.protocol.frames import decode_reply, encode_request
 from vlagents_ray.protocol.messages import DEADLINE_HEADER, SESSION_HEADER, Limits, Reply, Request
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
+from vlagents_ray.serve.endpoints.connection import STAMP_SPACE, enable_timestamps, time_in_socket_s
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
-from vlagents_ray.serve.engine.arrival import SPACE, PauseDetector, enable_timestamps, waited_s
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.pauses import PauseDetector
 from vlagents_ray.serve.engine.sender import Sender
 
 DEADLINE_MS = 300.0
@@ -100,7 +101,7 @@ def timestamps() -> Iterator[None]:
             def stamped() -> bool:
                 sender.send(b"x")
                 time.sleep(0.01)
-                return waited_s(receiver.recvmsg(1, SPACE)[1]) > 0
+                return time_in_socket_s(receiver.recvmsg(1, STAMP_SPACE)[1]) > 0
 
             wait_for(stamped)
             yield

@@ -9,13 +9,17 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import logging
 import os
 import socket
+import struct
+import termios
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from array import array
+from collections.abc import Callable, Sequence
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, BinaryIO, ClassVar, Generic, TypeVar
@@ -37,6 +41,12 @@ POLICY_VIOLATION = 1008  # WebSocket close code
 # Reasons for which a connection is not polled.
 DECODING, THROTTLED = "a frame is decoded on another thread", "the key is over its rate"
 
+_TIMESTAMP = 35  # SO_TIMESTAMPNS of Linux, which Python's socket does not name
+_STAMP = struct.Struct("@qq")  # wall clock, s and ns
+STAMP_SPACE = socket.CMSG_SPACE(_STAMP.size)  # bytes of the time stamp in a message's control data
+LEAST_WAIT_S = 1e-3  # a shorter wait cannot be distinguished from the time to read a message
+
+Control = Sequence[tuple[int, int, bytes]]
 Admit = Callable[[str | None], Caller]  # returns the caller with that key; raises `Unauthorized` or `Forbidden`
 
 
@@ -282,3 +292,29 @@ class PolledServer(ABC, Generic[C]):
     def _serve(self, client: C, connection: socket.socket) -> None:
         self._clients.add(client)
         self.engine.queue.watch(connection, client.ready)
+
+
+# The time that a message has waited in its socket: the thread that reads it may do so seconds late.
+
+
+def enable_timestamps(connection: socket.socket) -> None:
+    """Let the kernel record when messages arrive, if it supports that for this kind of socket."""
+    with contextlib.suppress(OSError):
+        connection.setsockopt(socket.SOL_SOCKET, _TIMESTAMP, 1)
+
+
+def time_in_socket_s(control: Control) -> float:
+    """Return how long the message with this control data has waited, s; 0 if that is negligible or unknown."""
+    for level, kind, data in control:
+        if level == socket.SOL_SOCKET and kind == _TIMESTAMP and len(data) == _STAMP.size:
+            seconds, nanoseconds = _STAMP.unpack(data)
+            waited: float = time.time() - (seconds + nanoseconds * 1e-9)
+            return waited if waited > LEAST_WAIT_S else 0.0
+    return 0.0
+
+
+def has_unread(connection: socket.socket) -> bool:
+    """Return whether the socket has received data that was not read yet."""
+    waiting = array("i", [0])
+    fcntl.ioctl(connection, termios.FIONREAD, waiting)
+    return waiting[0] > 0
