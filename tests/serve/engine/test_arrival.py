@@ -128,7 +128,7 @@ def test_an_act_that_lay_in_the_socket_until_its_deadline_is_not_executed(transp
     if behind == "an act":  # the only thread that reads is busy with it
         slow.send(Request("act", Obs(info={"wait": True})))
     else:
-        engine.queue.call_soon(lambda: (Gated.entered.set(), Gated.gate.wait(20)))
+        engine.queue.poller.call_soon(lambda: (Gated.entered.set(), Gated.gate.wait(20)))
     assert Gated.entered.wait(20)
     hasty.send(Request("act", Obs(), deadline_ms=DEADLINE_MS))
     time.sleep(2 * DEADLINE_MS / 1e3)

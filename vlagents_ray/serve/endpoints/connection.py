@@ -100,7 +100,7 @@ class PolledConnection(ABC):
     """One connection of a client; its sessions end with it."""
 
     def __init__(self, server: PolledServer[Any], connection: socket.socket) -> None:
-        self._engine = server.engine
+        self._engine, self._poller = server.engine, server.engine.queue.poller
         self._remove = server.remove
         self._name = server.name
         self._connection = connection
@@ -143,7 +143,7 @@ class PolledConnection(ABC):
         self._unpolled_for.add(reason)
         if self._polled:
             self._polled = False
-            self._engine.queue.unwatch(self._connection)
+            self._poller.unwatch(self._connection)
 
     def _resume(self, reason: str) -> None:
         self._unpolled_for.discard(reason)
@@ -152,7 +152,7 @@ class PolledConnection(ABC):
     def _poll(self) -> None:
         if not (self._ended or self._polled or self._unpolled_for):
             self._polled = True
-            self._engine.queue.watch(self._connection, self.ready)
+            self._poller.watch(self._connection, self.ready)
 
     def _is_throttled(self) -> bool:
         """Return whether the client's key is over its rate; if so, the connection is read again later."""
@@ -161,7 +161,7 @@ class PolledConnection(ABC):
         if self._ended or self._sender is None or (wait_s := self._sender.throttled_s()) <= 0:
             return False
         self._pause(THROTTLED)
-        self._engine.queue.call_later(wait_s, self._unthrottle)
+        self._poller.call_later(wait_s, self._unthrottle)
         return True
 
     def _unthrottle(self) -> None:
@@ -182,8 +182,8 @@ class PolledConnection(ABC):
             decoded = read(admission)
         except NeedsDecodingThread:
             self._pause(DECODING)
-            then, queue = partial(self._decoded, message, submit), self._engine.queue
-            admission.decode_on_thread(read).add_done_callback(lambda done: queue.call_soon(lambda: then(done.result)))
+            then, poller = partial(self._decoded, message, submit), self._poller
+            admission.decode_on_thread(read).add_done_callback(lambda done: poller.call_soon(lambda: then(done.result)))
         else:
             submit(decoded)
 
@@ -223,7 +223,7 @@ class PolledConnection(ABC):
         """Stop polling the connection and close it; call it on the thread that polls."""
         if not self._ended:
             if self._polled:
-                self._engine.queue.unwatch(self._connection)
+                self._poller.unwatch(self._connection)
             self.release()
 
     def release(self) -> None:
@@ -264,7 +264,7 @@ class PolledServer(ABC, Generic[C]):
 
     def open(self) -> None:
         """Accept clients; call it before the engine starts."""
-        self.engine.queue.watch(self._listener, self._acceptor.accept)
+        self.engine.queue.poller.watch(self._listener, self._acceptor.accept)
         each_half_second.add(self.close_overdue)
 
     def close(self) -> None:
@@ -291,7 +291,7 @@ class PolledServer(ABC, Generic[C]):
 
     def _serve(self, client: C, connection: socket.socket) -> None:
         self._clients.add(client)
-        self.engine.queue.watch(connection, client.ready)
+        self.engine.queue.poller.watch(connection, client.ready)
 
 
 # The time that a message has waited in its socket: the thread that reads it may do so seconds late.

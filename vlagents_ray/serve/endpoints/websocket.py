@@ -334,7 +334,7 @@ class WebSocketConnection(PolledConnection):
             self.disconnect()
 
         if self._refused_for_s > 0:
-            self._engine.queue.call_later(min(self._refused_for_s, _REFUSED_S), refuse)
+            self._poller.call_later(min(self._refused_for_s, _REFUSED_S), refuse)
         else:
             refuse()
 
@@ -428,7 +428,7 @@ class WebSocketConnection(PolledConnection):
             resume = self._paused and not self._is_backlogged()
             self._paused = self._paused and not resume
         if resume:
-            self._engine.queue.call_soon(partial(self._resume, _BACKLOGGED))
+            self._poller.call_soon(partial(self._resume, _BACKLOGGED))
         self._send(message.frame())
 
     def _write(self, message: Message) -> None:
