@@ -12,7 +12,7 @@ import time
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Container, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Generic, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 from vlagents_ray.errors import PolicyUnavailable, TooManyRequests, UnknownSession
 from vlagents_ray.interface import Agent
@@ -69,6 +69,16 @@ class Session(Generic[M]):
             f"session {self.id!r}: is at step {self.steps} here, at {step} as its client knows; an answer was lost, "
             f"or this is another episode: reset it"
         )
+
+
+class SessionFinder(Protocol):
+    """Fetches sessions from other replicas: `vlagents_ray.serve.scaling.session_migration.SessionMigrator`."""
+
+    def fetch(self, session_id: str, then: Callable[[], None], caller: str = "") -> bool:
+        """Fetch a session, then call `then`, found or not; False without a call if `caller` has too many searches."""
+
+    def announce(self, session_id: str, step: int) -> None:
+        """Announce to the other replicas that the session began an episode here at that step, so theirs are older."""
 
 
 class SessionTable(Generic[M]):

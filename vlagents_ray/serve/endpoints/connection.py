@@ -108,7 +108,7 @@ class PolledConnection(ABC):
         self._sender: Sender | None = None  # None until then, too
         self._sending = threading.Lock()  # guards the sending: other threads send answers, or end the connection
         self._ended = False
-        self._polled = True  # whether the batch queue polls the connection
+        self._polled = True  # whether the poller watches the connection
         self._unpolled_for: set[str] = set()  # reasons for which it shall not
 
     @abstractmethod
@@ -123,7 +123,7 @@ class PolledConnection(ABC):
     def _discard(self) -> None:
         """Free the memory of a connection that is about to be closed; called with the lock held."""
 
-    def _take_leave(self, code: int, reason: str) -> None:  # noqa: B027 - not all protocols have close codes
+    def _send_close(self, code: int, reason: str) -> None:  # noqa: B027 - not all protocols have close codes
         """Send a close code and its reason, if the protocol has any; called with the lock held."""
 
     def _continue(self) -> None:
@@ -215,7 +215,7 @@ class PolledConnection(ABC):
         logger.info("%s: a client is cut off: %s", self._name, reason)
         with self._sending:
             if not self._ended:
-                self._take_leave(code, reason)
+                self._send_close(code, reason)
                 with contextlib.suppress(OSError):  # the client closed it already
                     self._connection.shutdown(socket.SHUT_RDWR)
 

@@ -300,7 +300,7 @@ class WebSocketConnection(PolledConnection):
                 self._quiet_since, self._part_since, cause = now, float("inf"), None
         return cause
 
-    def _take_leave(self, code: int, reason: str) -> None:
+    def _send_close(self, code: int, reason: str) -> None:
         self._ending = True
         if self._protocol.state is State.OPEN:
             self._protocol.send_close(code, reason[:120])

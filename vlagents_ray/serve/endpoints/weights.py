@@ -18,7 +18,7 @@ import time
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import fields
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from starlette.requests import Request as HttpRequest
 from starlette.responses import JSONResponse, Response
@@ -29,11 +29,8 @@ from vlagents_ray.errors import InvalidInput, MalformedMessage, MessageTooLarge,
 from vlagents_ray.protocol.json_messages import problem
 from vlagents_ray.serve.access.api_keys import Caller, ScopeCheck, current_caller
 from vlagents_ray.serve.endpoints.http_messages import deny, problem_response, request_id
-from vlagents_ray.serve.weights import PushOptions
-from vlagents_ray.weights.safetensors import MESSAGE_BYTES, ValuesReader
-
-if TYPE_CHECKING:
-    from vlagents_ray.serve.replica.replica import PolicyReplica
+from vlagents_ray.serve.weights import PushOptions, PushResult
+from vlagents_ray.weights.safetensors import MESSAGE_BYTES, ValueSpec, ValuesReader
 
 logger = logging.getLogger(__name__)
 
@@ -44,11 +41,27 @@ _DIGITS = 20  # most of a version's number
 _TRUTH = {"true": True, "false": False}
 
 
-def weights_routes(replicas: PolicyReplica, slow_s: float, *, open_to_network: bool) -> list[BaseRoute]:
+class ReceivesWeights(Protocol):
+    """The replicas of a policy, for which one of them receives new weights."""
+
+    def read_header(self, header: bytes, options: PushOptions) -> dict[str, ValueSpec]:
+        """Return types and shapes of the values to come; raise an error if they do not fit the policy."""
+        ...
+
+    async def push_received(self, named: Mapping[str, Any], options: PushOptions) -> PushResult:
+        """Let all replicas act with new weights."""
+        ...
+
+    async def versions_of_weights(self) -> list[int]:
+        """Return the newest version of each replica."""
+        ...
+
+
+def weights_routes(replicas: ReceivesWeights, slow_s: float, *, open_to_network: bool) -> list[BaseRoute]:
     """Return the routes for new weights.
 
     Args:
-        replicas: The replica that receives them, for all replicas of its policy.
+        replicas: The replicas that get them.
         slow_s: Time limit for the next part to arrive, s.
         open_to_network: Whether other machines reach this server without a key; none may then push.
     """
@@ -57,7 +70,7 @@ def weights_routes(replicas: PolicyReplica, slow_s: float, *, open_to_network: b
 
 
 class _WeightsEndpoint:
-    def __init__(self, replicas: PolicyReplica, slow_s: float, open_to_network: bool) -> None:
+    def __init__(self, replicas: ReceivesWeights, slow_s: float, open_to_network: bool) -> None:
         self._replicas = replicas
         self._slow_s = slow_s
         self._scopes = ScopeCheck("weights", open_to_network=open_to_network)

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import (
@@ -40,11 +40,8 @@ from vlagents_ray.serve.queue.call_limits import CallLimits, PolicyCall, PolicyC
 from vlagents_ray.serve.queue.poller import Poller
 from vlagents_ray.serve.queue.preparation import Preparations
 from vlagents_ray.serve.requests import Opening, PendingRequest, Rank
-from vlagents_ray.serve.sessions import DrainList, Session, SessionTable
+from vlagents_ray.serve.sessions import DrainList, Session, SessionFinder, SessionTable
 from vlagents_ray.serve.weights import WeightsVersion, WeightUpdates, follows
-
-if TYPE_CHECKING:
-    from vlagents_ray.serve.scaling.session_migration import SessionMigrator
 
 logger = logging.getLogger(__name__)
 
@@ -71,7 +68,7 @@ class Engine:
         clock: Callable[[], float] = time.perf_counter,
         wall_clock: Callable[[], int] = time.time_ns,
         poller: Poller | None = None,
-        finder: SessionMigrator | None = None,
+        finder: SessionFinder | None = None,
     ) -> None:
         """With `batch_sizes`, batches are padded to the next of these sizes; the largest is `max_batch_size`.
         Without, a compiled policy that names no sizes is compiled for 1, 2, 4, … `max_batch_size`.

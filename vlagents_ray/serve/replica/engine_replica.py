@@ -23,7 +23,7 @@ from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import Sender
 from vlagents_ray.serve.python_env.child_agent import make_agent, version_of
 from vlagents_ray.serve.requests import Message
-from vlagents_ray.serve.scaling.session_migration import SessionMigrator
+from vlagents_ray.serve.sessions import SessionFinder
 
 logger = logging.getLogger(__name__)
 
@@ -44,7 +44,7 @@ class ReplicaEngine:
 
     @classmethod
     def from_args(
-        cls, args: ServerArgs, check: Callable[[Contract | None], None], finder: SessionMigrator | None = None
+        cls, args: ServerArgs, check: Callable[[Contract | None], None], finder: SessionFinder | None = None
     ) -> ReplicaEngine:
         """Make the engine, without loading the policy; see `Engine` for the last two arguments."""
         if VISIBLE not in args.environment.env_vars:
