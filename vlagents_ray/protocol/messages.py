@@ -82,6 +82,10 @@ class Reply:
     draining: bool = False  # the replica stops or is overloaded: connect again, and the session is moved
     timing: dict[str, float] = field(default_factory=dict)  # ms, by stage
 
+    def answers(self, request: Request) -> bool:
+        """Whether this is the reply to that request, not to an earlier one. An unreadable frame has no id."""
+        return self.request_id in ("", request.request_id)
+
     @property
     def identity(self) -> dict[str, Any]:
         """The checkpoint, the digest of its weights and their commit, as far as the info of a reset names them."""

@@ -37,7 +37,6 @@ TOKENS = {
     "lab": {},
     "other": {"apps": ("pi0",)},
     "slow": {"rate": 3},
-    "sim": {"rank": "simulation"},
     "leaver": {},
     "goer": {},
     "ending": {},
@@ -138,10 +137,6 @@ def test_a_request_id_of_the_callers_own_comes_back_with_the_refusal(endpoint: E
     assert json.loads(body)["request_id"] == "mine"
 
 
-def test_health_alone_needs_no_key_and_tells_nothing(endpoint: Endpoint) -> None:
-    assert endpoint.get("/healthz")[0::2] == (200, b"OK\n")
-
-
 def test_a_right_key_is_let_in_by_each_header(endpoint: Endpoint) -> None:
     token = endpoint.tokens["lab"]
     for headers in (bearer(token), {"authorization": f"Api-Key {token}"}, {"x-api-key": token}):
@@ -222,26 +217,6 @@ def test_too_many_requests_are_told_when_to_come_again(endpoint: Endpoint) -> No
             except TooManyRequests as error:
                 errors.append(error)
         assert errors
-
-
-def test_a_simulations_key_makes_all_its_requests_simulations(endpoint: Endpoint) -> None:
-    ranks = []
-    queue = endpoint.engine.queue
-    put = queue.put
-
-    def watched(*tickets: object) -> None:
-        ranks.extend(ticket.rank.name for ticket in tickets)  # type: ignore[attr-defined]
-        put(*tickets)  # type: ignore[arg-type]
-
-    queue.put = watched  # type: ignore[method-assign]
-    try:
-        for name in ("sim", "lab"):
-            with endpoint.agent(name, rank="robot") as agent:
-                agent.reset(Obs(), "x")
-                agent.act(Obs())
-    finally:
-        queue.put = put  # type: ignore[method-assign]
-    assert ranks == ["SIMULATION"] * 3 + ["ROBOT"] * 3  # reset, act, close
 
 
 def test_a_revoked_key_hangs_up_its_websockets_and_no_others(endpoint: Endpoint) -> None:

@@ -9,7 +9,6 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import suppress
-from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -36,8 +35,7 @@ from vlagents_ray.protocol.messages import (
     Reply,
     Request,
 )
-from vlagents_ray.serve.access.api_keys import Keys, NoKey
-from vlagents_ray.serve.access.key_store import new_key
+from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints import websocket
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.engine import Engine
@@ -302,23 +300,3 @@ def test_an_endpoint_takes_a_free_port_of_those_it_may() -> None:
         assert port < endpoint.address.port <= port + 20
         endpoint.close()
     engine.close()
-
-
-def test_where_there_are_keys_the_path_alone_is_not_enough(tmp_path: Path) -> None:
-    token, other = (new_key(tmp_path / "keys.json", name, apps=apps) for name, apps in (("arm", ()), ("x", ("pi0",))))
-    keys = Keys.from_file(tmp_path / "keys.json")
-    engine = Engine(Echo())
-    endpoint = WebSocketServer(engine, Limits(), "127.0.0.1", None, lambda key: keys.check(key, "noop"))
-    endpoint.open()
-    engine.start()
-    where = (BASE, endpoint.address.port, endpoint.address.path, 5)
-    for headers, status in (({}, 401), ({"x-api-key": "wrong"}, 401), ({"x-api-key": other}, 403)):
-        with pytest.raises(InvalidStatus) as refused:
-            Stream(*where, headers)
-        assert refused.value.response.status_code == status
-    client = Stream(*where, {"Authorization": f"Bearer {token}"})
-    assert ask(client, "reset").error is None
-    assert [name.partition("/")[0] for name in engine.sessions.ids()] == ["arm"]
-    client.close()
-    engine.close()
-    endpoint.close()

@@ -30,11 +30,12 @@ from vlagents_ray.protocol.frames import decode_reply, encode_request
 from vlagents_ray.protocol.messages import DEADLINE_HEADER, SESSION_HEADER, Limits, Reply, Request
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
+from vlagents_ray.serve.endpoints.connection import STAMP_SPACE, enable_timestamps, time_in_socket_s
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
-from vlagents_ray.serve.engine.arrival import SPACE, PauseDetector, enable_timestamps, waited_s
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.pauses import PauseDetector
 from vlagents_ray.serve.engine.sender import Sender
 
 DEADLINE_MS = 300.0
@@ -100,7 +101,7 @@ def timestamps() -> Iterator[None]:
             def stamped() -> bool:
                 sender.send(b"x")
                 time.sleep(0.01)
-                return waited_s(receiver.recvmsg(1, SPACE)[1]) > 0
+                return time_in_socket_s(receiver.recvmsg(1, STAMP_SPACE)[1]) > 0
 
             wait_for(stamped)
             yield
@@ -127,7 +128,7 @@ def test_an_act_that_lay_in_the_socket_until_its_deadline_is_not_executed(transp
     if behind == "an act":  # the only thread that reads is busy with it
         slow.send(Request("act", Obs(info={"wait": True})))
     else:
-        engine.queue.call_soon(lambda: (Gated.entered.set(), Gated.gate.wait(20)))
+        engine.queue.poller.call_soon(lambda: (Gated.entered.set(), Gated.gate.wait(20)))
     assert Gated.entered.wait(20)
     hasty.send(Request("act", Obs(), deadline_ms=DEADLINE_MS))
     time.sleep(2 * DEADLINE_MS / 1e3)

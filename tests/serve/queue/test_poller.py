@@ -119,7 +119,7 @@ def test_messages_are_heard_beside_a_batch_and_never_on_two_threads_at_once(slow
         threads.append(threading.current_thread().name)
         inside.release()
 
-    one.queue.watch(ours, ready)
+    one.queue.poller.watch(ours, ready)
     one.start()
     one.learn("a", "b")
     theirs.send(b"x")
@@ -152,18 +152,20 @@ def test_timers_run_in_order_on_the_thread_that_polls_even_beside_a_batch(slow: 
 
     def set_timers(*delays: float) -> None:
         for delay_s in delays:
-            one.queue.call_later(delay_s, lambda s=delay_s: ran.append((f"{s:g}", threading.current_thread().name)))
+            one.queue.poller.call_later(
+                delay_s, lambda s=delay_s: ran.append((f"{s:g}", threading.current_thread().name))
+            )
 
     one.start()
-    one.queue.call_soon(lambda: set_timers(0.1, 0.05))
+    one.queue.poller.call_soon(lambda: set_timers(0.1, 0.05))
     wait_for(lambda: ran == [("0.05", "policy"), ("0.1", "policy")])
     one.learn("a", "b")
     one.hold("a", "b")
-    one.queue.call_soon(lambda: set_timers(0.2))
+    one.queue.poller.call_soon(lambda: set_timers(0.2))
     wait_for(lambda: ran[2:] == [("0.2", "policy-reader")])
     one.open.set()
     wait_for(lambda: one.called("answer a", "answer b"))
-    one.queue.call_soon(lambda: set_timers(0.5))  # set before the reader is lent the poller again
+    one.queue.poller.call_soon(lambda: set_timers(0.5))  # set before the reader is lent the poller again
     one.hold("a", "b")
     wait_for(lambda: len(ran) == 4)
     one.open.set()
@@ -175,11 +177,11 @@ def test_a_callback_may_end_its_watch_beside_a_batch(slow: Callable[..., Slow]) 
     ended = threading.Event()
 
     def ready() -> None:
-        one.queue.unwatch(ours)
+        one.queue.poller.unwatch(ours)
         ours.close()
         ended.set()
 
-    one.queue.watch(ours, ready)
+    one.queue.poller.watch(ours, ready)
     one.start()
     one.learn("a", "b")
     one.hold("a", "b")
@@ -317,19 +319,19 @@ def test_only_other_threads_wake_the_queue(slow: Callable[..., Slow], monkeypatc
     one = slow()
     ours, theirs = socket.socketpair()
     woken: list[str] = []
-    wake = one.queue._poller.wake
+    wake = one.queue.poller.wake
 
     def by_whom() -> None:
         woken.append(threading.current_thread().name)
         wake()
 
-    monkeypatch.setattr(one.queue._poller, "wake", by_whom)
+    monkeypatch.setattr(one.queue.poller, "wake", by_whom)
 
     def ready() -> None:
         ours.recv(1)
         one.put("heard")
 
-    one.queue.watch(ours, ready)
+    one.queue.poller.watch(ours, ready)
     one.start()
     woken.clear()
     theirs.send(b"x")

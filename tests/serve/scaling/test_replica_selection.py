@@ -12,7 +12,6 @@ from in_process_replicas import Replicas
 
 from vlagents_ray import Act, Agent, Obs
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.engine.session_transfer import DrainList
 from vlagents_ray.serve.scaling import rebalancer as balancing
 from vlagents_ray.serve.scaling.rebalancer import (
     ClientLocation,
@@ -22,6 +21,7 @@ from vlagents_ray.serve.scaling.rebalancer import (
     choose_replica,
     excess_sessions,
 )
+from vlagents_ray.serve.sessions import DrainList
 
 
 def load(replica: str, sessions: int, node: str = "n1", *, accepts: bool = True) -> ReplicaLoad:

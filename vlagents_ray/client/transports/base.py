@@ -87,11 +87,6 @@ def left_s(deadline: float) -> float:
     return max(1e-3, deadline - time.monotonic())
 
 
-def is_answer(replies: Sequence[Reply], requests: Sequence[Request]) -> bool:
-    """Whether these replies belong to these requests, not to earlier ones. An unreadable frame has no id."""
-    return replies[0].request_id in ("", requests[0].request_id)
-
-
 class CodecChoice:
     """The codec of a connection's cameras: the one that the user names, or one that depends on where the server is.
 

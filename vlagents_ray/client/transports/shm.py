@@ -21,7 +21,6 @@ from typing import Any, ClassVar
 import numpy as np
 
 from vlagents_ray.client.credentials import ANONYMOUS, Credentials
-from vlagents_ray.client.transports.base import is_answer
 from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, PolicyUnavailable
 from vlagents_ray.images.codecs import RAW
 from vlagents_ray.protocol import shm_layout
@@ -125,7 +124,7 @@ class UnixTransport(ABC):
                 else:
                     _wait(connection, select.POLLIN, deadline)
             replies = self._receive(connection)
-            if is_answer(replies, requests):
+            if replies[0].answers(requests[0]):
                 if not replies[0].request_id:  # refused before it was parsed
                     self._writer = shm_layout.ShmWriter()
                 self._answers_fast = time.perf_counter() - begun < _FAST_S

@@ -27,7 +27,7 @@ from websockets.sync.client import connect
 from websockets.uri import parse_uri
 
 from vlagents_ray.client.credentials import ANONYMOUS, WEBSOCKET_LOG, Credentials, require_plain, tls_failure
-from vlagents_ray.client.transports.base import CodecChoice, first_timeout_s, is_answer, left_s
+from vlagents_ray.client.transports.base import CodecChoice, first_timeout_s, left_s
 from vlagents_ray.client.transports.http import HttpTransport, http_url, refusal
 from vlagents_ray.errors import (
     ConnectionLost,
@@ -306,7 +306,7 @@ class WebSocketTransport:
             connection.send_pieces(pieces, left_s(deadline))
             while True:
                 replies = decode_replies(connection.recv(max(0.0, deadline - time.monotonic())))
-                if is_answer(replies, requests):
+                if replies[0].answers(requests[0]):
                     return replies
         except TimeoutError as error:
             raise DeadlineExceeded(f"{self._url}: no answer within {timeout_s:g} s") from error

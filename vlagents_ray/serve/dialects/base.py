@@ -364,19 +364,17 @@ class ImplicitSession:
         self._rank: RankName = rank
         self._name = name
 
-    async def act(self, message: Message, obs: Obs, instruction: str | None, request_id: str, **kwargs: Any) -> Reply:
+    async def act(self, message: Message, obs: Obs, instruction: str | None, request_id: str) -> Reply:
         """Return the policy's action; see `act_together`."""
-        (reply,) = await act_together(message, [SessionObs(self, obs, instruction)], request_id, **kwargs)
+        (reply,) = await act_together(message, [SessionObs(self, obs, instruction)], request_id)
         return reply
 
     async def close(self) -> None:
         """End the session."""
-        await self._sender.ask(self._sender.message("close"), Decoded([self._request("close", None, None, "", {})], {}))
+        await self._sender.ask(self._sender.message("close"), Decoded([self._request("close", None, None, "")], {}))
 
-    def _request(
-        self, op: Op, obs: Obs | None, instruction: str | None, request_id: str, kwargs: dict[str, Any]
-    ) -> Request:
-        return Request(op, obs, instruction, kwargs, session=self._name, rank=self._rank, request_id=request_id)
+    def _request(self, op: Op, obs: Obs | None, instruction: str | None, request_id: str) -> Request:
+        return Request(op, obs, instruction, session=self._name, rank=self._rank, request_id=request_id)
 
 
 class SessionObs(NamedTuple):
@@ -387,29 +385,29 @@ class SessionObs(NamedTuple):
     instruction: str | None
 
 
-async def act_together(message: Message, seen: Sequence[SessionObs], request_id: str, **kwargs: Any) -> list[Reply]:
+async def act_together(message: Message, seen: Sequence[SessionObs], request_id: str) -> list[Reply]:
     """Return the policy's action for each observation in a client's message; their acts are queued at once.
 
-    A session whose episode begins is reset first, with `kwargs`. One that was removed because it was idle is reset
-    again, which is safe since the observation was not acted on.
+    A session whose episode begins is reset first. One that was removed because it was idle is reset again, which is
+    safe since the observation was not acted on.
 
     Raises:
         VLAgentsError: The first error among the replies.
     """
-    await _reset([one for one in seen if one.session.episode.begins(one.instruction)], request_id, kwargs)
-    replies = await _ask(message, "act", seen, [None] * len(seen), request_id, {})
+    await _reset([one for one in seen if one.session.episode.begins(one.instruction)], request_id)
+    replies = await _ask(message, "act", seen, [None] * len(seen), request_id)
     if forgotten := [i for i, reply in enumerate(replies) if isinstance(reply.error, UnknownSession)]:
         logger.info("%s: a session was forgotten; it begins again (request %s)", message.transport, request_id)
         again = [seen[i] for i in forgotten]
-        await _reset(again, request_id, kwargs)
-        repeated = await _ask(seen[0].session._sender.message(), "act", again, [None] * len(again), request_id, {})
+        await _reset(again, request_id)
+        repeated = await _ask(seen[0].session._sender.message(), "act", again, [None] * len(again), request_id)
         for i, reply in zip(forgotten, repeated, strict=True):
             replies[i] = reply
     _raise_first(replies)
     return replies
 
 
-async def _reset(seen: Sequence[SessionObs], request_id: str, kwargs: dict[str, Any]) -> None:
+async def _reset(seen: Sequence[SessionObs], request_id: str) -> None:
     if not seen:
         return
     openings = [one.session.episode.opening(one.instruction, one.session._engine.contract) for one in seen]
@@ -417,7 +415,7 @@ async def _reset(seen: Sequence[SessionObs], request_id: str, kwargs: dict[str, 
         session.episode.end()
     resets = seen[0].session._sender.message("reset", seen[0].session._rank)
     resets.decoded_alike(len(seen))
-    replies = await _ask(resets, "reset", seen, openings, request_id, kwargs)
+    replies = await _ask(resets, "reset", seen, openings, request_id)
     resets.written(lambda: None)
     for one, opening, reply in zip(seen, openings, replies, strict=True):
         if reply.error is None:
@@ -431,11 +429,10 @@ async def _ask(
     seen: Sequence[SessionObs],
     instructions: Sequence[str | None],
     request_id: str,
-    kwargs: dict[str, Any],
 ) -> list[Reply]:
     names = [request_id] if len(seen) == 1 else [f"{request_id}-{place}" for place in range(len(seen))]
     requests = [
-        one.session._request(op, one.obs, instruction, name, kwargs)
+        one.session._request(op, one.obs, instruction, name)
         for one, instruction, name in zip(seen, instructions, names, strict=True)
     ]
     return await seen[0].session._sender.ask(message, Decoded(requests, {}))

@@ -27,7 +27,7 @@ from vlagents_ray.serve.access.api_keys import (
 )
 from vlagents_ray.serve.access.origin_check import require_own_page
 from vlagents_ray.serve.endpoints.http_messages import headers_of, named, problem_response
-from vlagents_ray.serve.engine.arrival import note_connection
+from vlagents_ray.serve.engine.pauses import note_connection
 
 logger = logging.getLogger(__name__)
 

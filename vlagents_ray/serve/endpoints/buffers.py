@@ -12,7 +12,7 @@ from collections.abc import Generator
 from websockets.protocol import Protocol
 from websockets.streams import StreamReader
 
-from vlagents_ray.serve.engine import arrival
+from vlagents_ray.serve.endpoints.connection import STAMP_SPACE, Control
 
 logger = logging.getLogger(__name__)
 
@@ -97,7 +97,7 @@ class ReceiveBuffer(StreamReader):
         self.buffer, self._start = bytearray(), 0
 
 
-def receive(connection: socket.socket, size: int) -> tuple[bytes | memoryview, arrival.Control]:
+def receive(connection: socket.socket, size: int) -> tuple[bytes | memoryview, Control]:
     """Read at most `size` bytes from a connection, which has some or has ended.
 
     Returns:
@@ -105,7 +105,7 @@ def receive(connection: socket.socket, size: int) -> tuple[bytes | memoryview, a
         control data.
     """
     view = _read_buffer.view
-    count, control, _, _ = connection.recvmsg_into([view[:size]], arrival.SPACE)
+    count, control, _, _ = connection.recvmsg_into([view[:size]], STAMP_SPACE)
     return view[:count], control
 
 

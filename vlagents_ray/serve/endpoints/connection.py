@@ -9,13 +9,17 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import logging
 import os
 import socket
+import struct
+import termios
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from array import array
+from collections.abc import Callable, Sequence
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, BinaryIO, ClassVar, Generic, TypeVar
@@ -37,6 +41,12 @@ POLICY_VIOLATION = 1008  # WebSocket close code
 # Reasons for which a connection is not polled.
 DECODING, THROTTLED = "a frame is decoded on another thread", "the key is over its rate"
 
+_TIMESTAMP = 35  # SO_TIMESTAMPNS of Linux, which Python's socket does not name
+_STAMP = struct.Struct("@qq")  # wall clock, s and ns
+STAMP_SPACE = socket.CMSG_SPACE(_STAMP.size)  # bytes of the time stamp in a message's control data
+LEAST_WAIT_S = 1e-3  # a shorter wait cannot be distinguished from the time to read a message
+
+Control = Sequence[tuple[int, int, bytes]]
 Admit = Callable[[str | None], Caller]  # returns the caller with that key; raises `Unauthorized` or `Forbidden`
 
 
@@ -90,7 +100,7 @@ class PolledConnection(ABC):
     """One connection of a client; its sessions end with it."""
 
     def __init__(self, server: PolledServer[Any], connection: socket.socket) -> None:
-        self._engine = server.engine
+        self._engine, self._poller = server.engine, server.engine.queue.poller
         self._remove = server.remove
         self._name = server.name
         self._connection = connection
@@ -98,7 +108,7 @@ class PolledConnection(ABC):
         self._sender: Sender | None = None  # None until then, too
         self._sending = threading.Lock()  # guards the sending: other threads send answers, or end the connection
         self._ended = False
-        self._polled = True  # whether the batch queue polls the connection
+        self._polled = True  # whether the poller watches the connection
         self._unpolled_for: set[str] = set()  # reasons for which it shall not
 
     @abstractmethod
@@ -113,7 +123,7 @@ class PolledConnection(ABC):
     def _discard(self) -> None:
         """Free the memory of a connection that is about to be closed; called with the lock held."""
 
-    def _take_leave(self, code: int, reason: str) -> None:  # noqa: B027 - not all protocols have close codes
+    def _send_close(self, code: int, reason: str) -> None:  # noqa: B027 - not all protocols have close codes
         """Send a close code and its reason, if the protocol has any; called with the lock held."""
 
     def _continue(self) -> None:
@@ -133,7 +143,7 @@ class PolledConnection(ABC):
         self._unpolled_for.add(reason)
         if self._polled:
             self._polled = False
-            self._engine.queue.unwatch(self._connection)
+            self._poller.unwatch(self._connection)
 
     def _resume(self, reason: str) -> None:
         self._unpolled_for.discard(reason)
@@ -142,7 +152,7 @@ class PolledConnection(ABC):
     def _poll(self) -> None:
         if not (self._ended or self._polled or self._unpolled_for):
             self._polled = True
-            self._engine.queue.watch(self._connection, self.ready)
+            self._poller.watch(self._connection, self.ready)
 
     def _is_throttled(self) -> bool:
         """Return whether the client's key is over its rate; if so, the connection is read again later."""
@@ -151,7 +161,7 @@ class PolledConnection(ABC):
         if self._ended or self._sender is None or (wait_s := self._sender.throttled_s()) <= 0:
             return False
         self._pause(THROTTLED)
-        self._engine.queue.call_later(wait_s, self._unthrottle)
+        self._poller.call_later(wait_s, self._unthrottle)
         return True
 
     def _unthrottle(self) -> None:
@@ -172,8 +182,8 @@ class PolledConnection(ABC):
             decoded = read(admission)
         except NeedsDecodingThread:
             self._pause(DECODING)
-            then, queue = partial(self._decoded, message, submit), self._engine.queue
-            admission.decode_on_thread(read).add_done_callback(lambda done: queue.call_soon(lambda: then(done.result)))
+            then, poller = partial(self._decoded, message, submit), self._poller
+            admission.decode_on_thread(read).add_done_callback(lambda done: poller.call_soon(lambda: then(done.result)))
         else:
             submit(decoded)
 
@@ -205,7 +215,7 @@ class PolledConnection(ABC):
         logger.info("%s: a client is cut off: %s", self._name, reason)
         with self._sending:
             if not self._ended:
-                self._take_leave(code, reason)
+                self._send_close(code, reason)
                 with contextlib.suppress(OSError):  # the client closed it already
                     self._connection.shutdown(socket.SHUT_RDWR)
 
@@ -213,7 +223,7 @@ class PolledConnection(ABC):
         """Stop polling the connection and close it; call it on the thread that polls."""
         if not self._ended:
             if self._polled:
-                self._engine.queue.unwatch(self._connection)
+                self._poller.unwatch(self._connection)
             self.release()
 
     def release(self) -> None:
@@ -254,7 +264,7 @@ class PolledServer(ABC, Generic[C]):
 
     def open(self) -> None:
         """Accept clients; call it before the engine starts."""
-        self.engine.queue.watch(self._listener, self._acceptor.accept)
+        self.engine.queue.poller.watch(self._listener, self._acceptor.accept)
         each_half_second.add(self.close_overdue)
 
     def close(self) -> None:
@@ -281,4 +291,30 @@ class PolledServer(ABC, Generic[C]):
 
     def _serve(self, client: C, connection: socket.socket) -> None:
         self._clients.add(client)
-        self.engine.queue.watch(connection, client.ready)
+        self.engine.queue.poller.watch(connection, client.ready)
+
+
+# The time that a message has waited in its socket: the thread that reads it may do so seconds late.
+
+
+def enable_timestamps(connection: socket.socket) -> None:
+    """Let the kernel record when messages arrive, if it supports that for this kind of socket."""
+    with contextlib.suppress(OSError):
+        connection.setsockopt(socket.SOL_SOCKET, _TIMESTAMP, 1)
+
+
+def time_in_socket_s(control: Control) -> float:
+    """Return how long the message with this control data has waited, s; 0 if that is negligible or unknown."""
+    for level, kind, data in control:
+        if level == socket.SOL_SOCKET and kind == _TIMESTAMP and len(data) == _STAMP.size:
+            seconds, nanoseconds = _STAMP.unpack(data)
+            waited: float = time.time() - (seconds + nanoseconds * 1e-9)
+            return waited if waited > LEAST_WAIT_S else 0.0
+    return 0.0
+
+
+def has_unread(connection: socket.socket) -> bool:
+    """Return whether the socket has received data that was not read yet."""
+    waiting = array("i", [0])
+    fcntl.ioctl(connection, termios.FIONREAD, waiting)
+    return waiting[0] > 0

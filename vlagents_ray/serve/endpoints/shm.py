@@ -37,11 +37,14 @@ from vlagents_ray.serve.endpoints.connection import (
     BACKLOG,
     DECODING,
     POLICY_VIOLATION,
+    STAMP_SPACE,
     Admit,
     PolledConnection,
     PolledServer,
+    enable_timestamps,
+    has_unread,
+    time_in_socket_s,
 )
-from vlagents_ray.serve.engine import arrival
 from vlagents_ray.serve.engine.admission import MessageAdmission
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import REFUSED, Sender
@@ -50,7 +53,7 @@ from vlagents_ray.serve.requests import Message
 logger = logging.getLogger(__name__)
 
 _MESSAGE_BYTES = 256 * 1024
-_CONTROL = socket.CMSG_SPACE(struct.calcsize("i")) + arrival.SPACE  # room for one descriptor and the time stamp
+_CONTROL = socket.CMSG_SPACE(struct.calcsize("i")) + STAMP_SPACE  # room for one descriptor and the time stamp
 _INLINE = 64 * 1024  # a longer reply travels in a memory file
 _KEY_S = 5.0  # time within which a client must send its key
 _KEY_BYTES = 4096  # maximum size of a key
@@ -126,7 +129,7 @@ class UnixConnection(PolledConnection):
         super().__init__(server, connection)
         self._admit, self._limits, self._ops = server.admit, server.limits, server.ops
         self._payload = server.payload()
-        arrival.enable_timestamps(connection)
+        enable_timestamps(connection)
         self._reader = shm_layout.ShmReader(server.limits)
         self._connected_at = time.monotonic()
         self._key: bytes | None = None  # the key as sent
@@ -158,7 +161,7 @@ class UnixConnection(PolledConnection):
                 return
             sender = self._sender or self._authenticate(bytes(buffer[: min(size, _KEY_BYTES)]))
             if sender is not None:
-                self._receive(sender, message, arrival.waited_s(control), memoryview(buffer)[:size], descriptors)
+                self._receive(sender, message, time_in_socket_s(control), memoryview(buffer)[:size], descriptors)
         except VLAgentsError as error:
             message.refuse(error)
             self._write(message)
@@ -219,7 +222,7 @@ class UnixConnection(PolledConnection):
             return super().overdue(now, refusal)
         with self._sending:
             late = now - self._connected_at > _KEY_S and not self._ended
-            return ("no key", POLICY_VIOLATION) if late and not arrival.has_unread(self._connection) else None
+            return ("no key", POLICY_VIOLATION) if late and not has_unread(self._connection) else None
 
     def _discard(self) -> None:
         self._payload.free()

@@ -48,13 +48,16 @@ from vlagents_ray.serve.endpoints.buffers import READ_BYTES, ReceiveBuffer, Send
 from vlagents_ray.serve.endpoints.connection import (
     BACKLOG,
     DECODING,
+    LEAST_WAIT_S,
     POLICY_VIOLATION,
     THROTTLED,
     Admit,
     PolledConnection,
     PolledServer,
+    enable_timestamps,
+    has_unread,
+    time_in_socket_s,
 )
-from vlagents_ray.serve.engine import arrival
 from vlagents_ray.serve.engine.admission import MessageAdmission, image_bytes
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import REFUSED, Sender
@@ -117,7 +120,7 @@ class WebSocketServer(PolledServer["WebSocketConnection"]):
 
     def open(self) -> None:
         """Accept clients; call it before the engine starts."""
-        arrival.enable_timestamps(self._listener)  # accepted connections inherit it; the kernel takes a moment to begin
+        enable_timestamps(self._listener)  # accepted connections inherit it; the kernel takes a moment to begin
         super().open()
 
     def identify(self, client: WebSocketConnection, request: Handshake) -> Identity:
@@ -195,7 +198,7 @@ class WebSocketConnection(PolledConnection):
             return
         try:
             data, control = receive(self._connection, _HANDSHAKE_BYTES if self._sender is None else READ_BYTES)
-            self._arrived = time.perf_counter() - arrival.waited_s(control)
+            self._arrived = time.perf_counter() - time_in_socket_s(control)
         except BlockingIOError:
             return
         except OSError as error:
@@ -293,11 +296,11 @@ class WebSocketConnection(PolledConnection):
         elif now - self._quiet_since > self._server.idle_s:
             cause = "silent for too long", _GOING_AWAY
         with self._sending:
-            if cause is not None and not self._ended and arrival.has_unread(self._connection):
+            if cause is not None and not self._ended and has_unread(self._connection):
                 self._quiet_since, self._part_since, cause = now, float("inf"), None
         return cause
 
-    def _take_leave(self, code: int, reason: str) -> None:
+    def _send_close(self, code: int, reason: str) -> None:
         self._ending = True
         if self._protocol.state is State.OPEN:
             self._protocol.send_close(code, reason[:120])
@@ -331,7 +334,7 @@ class WebSocketConnection(PolledConnection):
             self.disconnect()
 
         if self._refused_for_s > 0:
-            self._engine.queue.call_later(min(self._refused_for_s, _REFUSED_S), refuse)
+            self._poller.call_later(min(self._refused_for_s, _REFUSED_S), refuse)
         else:
             refuse()
 
@@ -415,7 +418,7 @@ class WebSocketConnection(PolledConnection):
             decoded,
             partial(self._answer, size),
             admission=admission,
-            waited_s=waited_s if waited_s > arrival.LEAST_S else 0.0,
+            waited_s=waited_s if waited_s > LEAST_WAIT_S else 0.0,
         )
 
     def _answer(self, size: int, message: Message) -> None:
@@ -425,7 +428,7 @@ class WebSocketConnection(PolledConnection):
             resume = self._paused and not self._is_backlogged()
             self._paused = self._paused and not resume
         if resume:
-            self._engine.queue.call_soon(partial(self._resume, _BACKLOGGED))
+            self._poller.call_soon(partial(self._resume, _BACKLOGGED))
         self._send(message.frame())
 
     def _write(self, message: Message) -> None:

@@ -27,11 +27,11 @@ from vlagents_ray.errors import (
 from vlagents_ray.interface import Act, Agent
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Reply
 from vlagents_ray.serve.engine.admission import Admission
-from vlagents_ray.serve.engine.arrival import PauseDetector
 from vlagents_ray.serve.engine.metrics_buffer import MetricsBuffer
 from vlagents_ray.serve.engine.observer import Observers
+from vlagents_ray.serve.engine.pauses import PauseDetector
 from vlagents_ray.serve.engine.responses import build_reply, public_error, raised_at, require_serializable, timing
-from vlagents_ray.serve.engine.session_transfer import DrainList, SessionTransfer
+from vlagents_ray.serve.engine.session_transfer import SessionTransfer
 from vlagents_ray.serve.models.checkpoints import Checkpoints
 from vlagents_ray.serve.models.loaded_model import LoadedModel, Loader
 from vlagents_ray.serve.models.model_manager import ModelManager, too_late
@@ -40,7 +40,7 @@ from vlagents_ray.serve.queue.call_limits import CallLimits, PolicyCall, PolicyC
 from vlagents_ray.serve.queue.poller import Poller
 from vlagents_ray.serve.queue.preparation import Preparations
 from vlagents_ray.serve.requests import Opening, PendingRequest, Rank
-from vlagents_ray.serve.sessions import Session, SessionFinder, SessionTable
+from vlagents_ray.serve.sessions import DrainList, Session, SessionFinder, SessionTable
 from vlagents_ray.serve.weights import WeightsVersion, WeightUpdates, follows
 
 logger = logging.getLogger(__name__)

@@ -167,34 +167,33 @@ class Sender:
             for pending in sent:
                 pending.files, pending.kept = (admission and admission.files) or {}, {}
                 engine.observers.on_request(pending)
-        engine.submit(self._admitted(sent, admission is not None or self._counted))
+        if self._caller is None:
+            engine.submit(sent)
+        else:
+            engine.submit(self._admitted(self._caller, sent, admission is not None or self._counted))
         for place, reply in refused.items():
             message.put(place, reply)
         return sent
 
-    def _admitted(self, requests: list[PendingRequest], counted: bool) -> list[PendingRequest]:
-        """Return the requests that the caller's key allows; the others are finished with their error."""
-        if self._caller is None:
-            return requests
-        allowed = []
-        for pending in requests:
-            try:
-                self._admit(self._caller, pending, counted=counted or self._paid)
-                self._paid = False
-                allowed.append(pending)
-            except VLAgentsError as error:
-                pending.fail(error)
-        return allowed
-
-    def _admit(self, caller: Caller, pending: PendingRequest, *, counted: bool) -> None:
-        """Apply the limits and the class of the caller's key to a request.
+    def _admitted(self, caller: Caller, requests: list[PendingRequest], counted: bool) -> list[PendingRequest]:
+        """Return the requests that the caller's key allows, with its class; the others are finished with their error.
 
         The guard of the HTTP server has already counted the first request of a message.
         """
-        if not self._count(caller, pending.request.op, counted):
-            pending.rank = Rank.SIMULATION
-        if pending.request.op == "reset":
-            caller.note("reset session", repr(pending.request.session or self._session_id))
+        allowed = []
+        for pending in requests:
+            request = pending.request
+            try:
+                if not self._count(caller, request.op, counted or self._paid):
+                    pending.rank = Rank.SIMULATION
+            except VLAgentsError as error:
+                pending.fail(error)
+                continue
+            if request.op == "reset":
+                caller.note("reset session", repr(request.session or self._session_id))
+            self._paid = False
+            allowed.append(pending)
+        return allowed
 
     def _answered(
         self, then: Answered, admission: MessageAdmission | None, watched: Sequence[PendingRequest], message: Message

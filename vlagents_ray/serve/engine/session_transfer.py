@@ -1,4 +1,4 @@
-"""Sessions that move between replicas: the connections that are asked to, and export, release and adoption of state.
+"""Sessions that move between replicas: export, release and adoption of their state.
 
 The state of a session is bytes and settings.
 """
@@ -6,7 +6,6 @@ The state of a session is bytes and settings.
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -96,37 +95,3 @@ class SessionTransfer:
             "follows": session.follows,
             "instruction": session.instruction,
         }
-
-
-class DrainList:
-    """The connections that shall move to another replica; the next reply of each asks for that once. Thread-safe.
-
-    `vlagents_ray.serve.scaling.rebalancer` marks them.
-    """
-
-    def __init__(self) -> None:
-        self._marked: set[str] = set()
-        self._asked: dict[str, float] = {}
-
-    def mark(self, connections: set[str]) -> None:
-        """Replace the set of connections asked to reconnect."""
-        self._marked = connections
-
-    def ask(self, connection: str) -> bool:
-        """Return whether the current reply asks the connection to reconnect; if so, record that it was asked."""
-        if not self._marked or connection not in self._marked:
-            return False
-        self._marked.discard(connection)
-        self._asked[connection] = time.monotonic()
-        return True
-
-    def asked_within(self, seconds: float) -> set[str]:
-        """Return the connections that were asked to reconnect within the last `seconds`."""
-        since = time.monotonic() - seconds
-        return {connection for connection, when in list(self._asked.items()) if when >= since}
-
-    def forget_older(self, seconds: float) -> None:
-        """Forget the connections that were asked to reconnect more than `seconds` ago."""
-        lately = self.asked_within(seconds)
-        for connection in list(self._asked.keys() - lately):
-            self._asked.pop(connection, None)

@@ -20,7 +20,7 @@ from typing import NamedTuple
 from vlagents_ray.errors import PolicyUnavailable
 from vlagents_ray.serve.queue.batch_window import BatchWindow
 from vlagents_ray.serve.queue.fair_queue import FairQueue
-from vlagents_ray.serve.queue.poller import HasFileno, Poller
+from vlagents_ray.serve.queue.poller import Poller
 from vlagents_ray.serve.requests import PendingRequest, Rank
 
 _SPIN_S = 100e-6  # time for which the thread polls for a next request before it sleeps
@@ -38,7 +38,7 @@ class BatchQueue:
     """The waiting requests, and the files that bring new ones.
 
     One thread, the policy's, calls `bind`, then in turns `next`, `begin` and `end`, and at last `release`. It waits on
-    file descriptors, so that a local client's socket can be one of them (`watch`): its request then reaches the policy
+    file descriptors, so that a local client's socket can be one of them: its request then reaches the policy
     without a thread switch. While batches take milliseconds and are not all for one session, a second thread polls
     these files, so that the next batch is already decoded when the current one ends.
 
@@ -73,7 +73,7 @@ class BatchQueue:
         self._asleep = False
         self._driven = False  # whether a caller of `take` drives the queue; each new request wakes it up
         self._dense = False  # whether requests arrive in quick succession
-        self._poller = poller or Poller()
+        self.poller = poller or Poller()
         self.window = BatchWindow(patience, max_batch_size, is_open)
         self._gathering = False
         self._wait_over = threading.Event()
@@ -132,7 +132,7 @@ class BatchQueue:
         self._begun = self._clock()
         self._running = batch
         if self.window.overlaps:
-            self._poller.hand_to_reader()
+            self.poller.hand_to_reader()
 
     def end(self) -> None:
         """Note that the batch has ended."""
@@ -140,7 +140,7 @@ class BatchQueue:
         with self._lock:
             self._running = ()  # its observations may lie in memory that their sender needs back
             self.window.record_end(ended, ended - self._begun)
-        self._poller.reclaim()
+        self.poller.reclaim()
 
     def clear(self) -> tuple[Sequence[PendingRequest], list[PendingRequest]]:
         """Return the running batch, and the waiting requests, which no longer wait. May be called on any thread.
@@ -150,28 +150,8 @@ class BatchQueue:
         with self._lock:
             self._load_timer.count(self._waiting.size, self._clock())
             if self._running:
-                self._poller.hand_to_reader()
+                self.poller.hand_to_reader()
             return self._running, self._waiting.clear()
-
-    def watch(self, file: HasFileno, ready: Callable[[], None]) -> None:
-        """Call `ready` whenever `file` can be read; two such callbacks never run at once.
-
-        Callbacks run on the policy's thread or, while a batch runs, on the reader thread. May only be called before
-        `bind` or in a callback.
-        """
-        self._poller.watch(file, ready)
-
-    def unwatch(self, file: HasFileno) -> None:
-        """Stop watching `file`. May only be called in a callback."""
-        self._poller.unwatch(file)
-
-    def call_soon(self, call: Callable[[], None]) -> None:
-        """Schedule `call` to run as the callback of a watched file does. May be called on any thread."""
-        self._poller.call_soon(call)
-
-    def call_later(self, seconds: float, call: Callable[[], None]) -> None:
-        """Schedule `call` as `call_soon` does, after `seconds`. May only be called in a callback."""
-        self._poller.call_later(seconds, call)
 
     def full_batch_waits(self) -> bool:
         """Return whether a full batch waits, so that replies to simulations can be sent while that one runs."""
@@ -205,12 +185,12 @@ class BatchQueue:
 
     def release(self) -> None:
         """Close the poller, when no thread takes batches any more."""
-        self._poller.close()
+        self.poller.close()
 
     def _wake(self) -> None:
         if self._asleep and threading.get_ident() != self._thread:  # the policy's thread is awake if it calls
             self._asleep = False
-            self._poller.wake()
+            self.poller.wake()
 
     def _wait_for_request(self) -> bool:
         """Poll the watched files until a request waits or the queue is closed; False after `idle_s` without events."""
@@ -218,7 +198,7 @@ class BatchQueue:
             with self._lock:
                 ready = self._closed or self._waiting.size > 0
                 self._asleep = not ready
-            had_event = self._poller.poll(0.0) if ready else self._wait_for_event()
+            had_event = self.poller.poll(0.0) if ready else self._wait_for_event()
             self._asleep = False
             if ready or self._waiting.size > 0 or self._closed:
                 return True
@@ -233,11 +213,11 @@ class BatchQueue:
         """
         begun = self._load_timer.mark_idle()
         while self._dense and time.perf_counter() - begun < _SPIN_S:
-            if self._poller.poll(0.0):
+            if self.poller.poll(0.0):
                 self._load_timer.mark_busy()
                 return True
             os.sched_yield()
-        had_event = self._poller.poll(self._idle_s)
+        had_event = self.poller.poll(self._idle_s)
         self._dense = self._load_timer.mark_busy() - begun < _DENSE_S
         return had_event
 
@@ -249,11 +229,11 @@ class BatchQueue:
                 return
             self._wait_over.clear()
             self._gathering = True
-        self._poller.hand_to_reader()  # an epoll waits for whole milliseconds, the event below for exact times
+        self.poller.hand_to_reader()  # an epoll waits for whole milliseconds, the event below for exact times
         complete = self._wait_over.wait(wait_s)
-        self._poller.reclaim()
+        self.poller.reclaim()
         if not complete:
-            self._poller.poll(0)
+            self.poller.poll(0)
         with self._lock:
             self._gathering = False
 

@@ -14,21 +14,13 @@ import logging
 import math
 import os
 import select
+import socket
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import Protocol
 
 logger = logging.getLogger(__name__)
-
-
-class HasFileno(Protocol):
-    """A file that a selector can wait for, such as a socket or a pipe."""
-
-    def fileno(self) -> int:
-        """Return the file descriptor."""
-        ...
 
 
 class Poller:
@@ -51,11 +43,11 @@ class Poller:
         self._timers: list[tuple[float, int, Callable[[], None]]] = []  # a heap of times (s), numbers and callbacks
         self._timer_numbers = itertools.count()  # so that no two callbacks are compared
 
-    def watch(self, file: HasFileno, ready: Callable[[], None]) -> None:
+    def watch(self, file: socket.socket, ready: Callable[[], None]) -> None:
         """Call `ready` whenever `file` can be read. Called before the owner's first `poll`, or in a callback."""
         self._watch(file.fileno(), ready)
 
-    def unwatch(self, file: HasFileno) -> None:
+    def unwatch(self, file: socket.socket) -> None:
         """Stop watching `file`. Called in a callback, before the file is closed."""
         del self._ready[file.fileno()]
         self._poll.unregister(file)

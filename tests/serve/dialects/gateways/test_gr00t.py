@@ -248,24 +248,6 @@ def test_a_keys_sessions_hold_wherever_the_replica_is(limited: Limited, replicas
         assert rows(one.get_action(seen(1))[0])[-1] == 2
 
 
-@pytest.mark.parametrize(("allowed", "rank"), [({"rank": "simulation"}, "SIMULATION"), ({}, "ROBOT")])
-def test_a_keys_class_holds_wherever_the_replica_is(
-    limited: Limited, replicas: Replicas, allowed: dict[str, Any], rank: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    ranks: set[str] = set()
-    put = replicas.engines[0].queue.put
-    monkeypatch.setattr(
-        replicas.engines[0].queue, "put", lambda *tickets: (ranks.update(t.rank.name for t in tickets), put(*tickets))
-    )
-    with limited.client("one", **allowed) as client:
-        client.get_action(seen(1))
-        assert ranks == {rank}
-        limited.known.change("one", rank="simulation")
-        ranks.clear()
-        client.get_action(seen(1))
-        assert "SIMULATION" in ranks
-
-
 def test_sessions_of_a_revoked_key_end_by_themselves(limited: Limited, replicas: Replicas) -> None:
     with limited.client("leaver") as client, limited.client("lab") as other:
         client.get_action(seen(1))

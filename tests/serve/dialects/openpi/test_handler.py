@@ -22,19 +22,6 @@ from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.wire import openpi as openpi_codec
 
-METADATA_TOLD = {"policy": "mirror", "checkpoint": None, "version": "0", "reset_pose": [0.5]}
-
-
-def test_openpi_gets_metadata_then_actions_with_its_timing(context: tuple[TestClient, Engine]) -> None:
-    with context[0].websocket_connect("/openpi") as socket:
-        assert openpi_codec.decode(socket.receive_bytes()) == METADATA_TOLD
-        first = call(socket, libero(7))
-        # Its state's first part sums to 1; open is 1 in the policy and -1 in LIBERO.
-        assert first["actions"].tolist() == [[7, 1, 1, 1, 0, 0, -1], [7, 1, 1, 1, 1, 0, -1]]
-        assert first["policy_timing"].keys() == {"infer_ms"}
-        assert first["server_timing"].keys() == {"infer_ms"}
-        assert call(socket, libero(8))["server_timing"].keys() == {"infer_ms", "prev_total_ms"}
-
 
 def test_an_episode_begins_with_the_connection_and_with_each_new_prompt(context: tuple[TestClient, Engine]) -> None:
     with context[0].websocket_connect("/openpi") as one, context[0].websocket_connect("/openpi") as two:

@@ -74,7 +74,7 @@ def test_who_leaves_before_hearing_that_the_replica_is_full_keeps_nobody_out(ser
     engine.sessions.limit = 1
     one, busy = client(endpoint), threading.Event()
     call(one, request("reset"), 5)
-    engine.queue.call_soon(lambda: busy.wait(10) and None)  # the endpoint opens when all of them are gone
+    engine.queue.poller.call_soon(lambda: busy.wait(10) and None)  # the endpoint opens when all of them are gone
     for _ in range(3):
         with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as gone:
             gone.connect(f"\0{endpoint.address.socket}")

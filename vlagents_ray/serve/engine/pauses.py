@@ -1,61 +1,27 @@
-"""Time that a message has waited in a socket before it was read: the policy's thread may read it seconds late.
+"""Pauses of the process, in which messages wait in sockets.
 
-Deadlines begin when a message arrives, and the kernel records that time for each message. Serve's HTTP server and Ray's
-own calls do not pass the record on. After a pause of the whole process, it is therefore looked up for HTTP requests;
-messages of the server's WebSockets and Ray's calls are assumed to have waited since the pause began.
+Deadlines begin when a message arrives, and the kernel records that time for each message (see
+`vlagents_ray.serve.endpoints.connection`). Serve's HTTP server and Ray's own calls do not pass the record on. After a
+pause of the whole process, it is therefore looked up for HTTP requests; messages of the server's WebSockets and Ray's
+calls are assumed to have waited since the pause began.
 """
 
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import os
 import socket
 import struct
-import termios
-import time
-from array import array
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextvars import ContextVar
 from typing import Any
 
 from vlagents_ray.serve.periodic import Periodic
 
-_TIMESTAMP = 35  # SO_TIMESTAMPNS of Linux, which Python's socket does not name
-_STAMP = struct.Struct("@qq")  # wall clock, s and ns
 _LAST_DATA = struct.Struct("@52xI")  # in TCP_INFO: time since data was received last, ms
-SPACE = socket.CMSG_SPACE(_STAMP.size)  # bytes of the timestamp in a message's control data
-
-LEAST_S = 1e-3  # a shorter wait cannot be distinguished from the time to read a message
 _CHECK_S = 0.1  # interval of the checks for a pause
 _PAUSE_S = 0.3  # time without a check above which the process was paused, rather than merely busy
 _BACKLOG_S = (0.5, 5.0)  # shortest and longest time to read the backlog of a pause; it is half as long as the pause
-
-Control = Sequence[tuple[int, int, bytes]]
-
-
-def enable_timestamps(connection: socket.socket) -> None:
-    """Let the kernel record when messages arrive, if it supports that for this kind of socket."""
-    with contextlib.suppress(OSError):
-        connection.setsockopt(socket.SOL_SOCKET, _TIMESTAMP, 1)
-
-
-def waited_s(control: Control) -> float:
-    """Return how long the message with this control data has waited, s; 0 if that is negligible or unknown."""
-    for level, kind, data in control:
-        if level == socket.SOL_SOCKET and kind == _TIMESTAMP and len(data) == _STAMP.size:
-            seconds, nanoseconds = _STAMP.unpack(data)
-            waited: float = time.time() - (seconds + nanoseconds * 1e-9)
-            return waited if waited > LEAST_S else 0.0
-    return 0.0
-
-
-def has_unread(connection: socket.socket) -> bool:
-    """Return whether the socket has received data that was not read yet."""
-    waiting = array("i", [0])
-    fcntl.ioctl(connection, termios.FIONREAD, waiting)
-    return waiting[0] > 0
-
 
 # Ports of both ends of the TCP connection on which the current HTTP request came, the server's first.
 _PORTS: ContextVar[tuple[int, int] | None] = ContextVar("vlagents_ray_ports", default=None)
