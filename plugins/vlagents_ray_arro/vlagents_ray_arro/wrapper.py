@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -15,7 +16,7 @@ from vlagents_ray.contract import CameraSpec, Contract
 from vlagents_ray.errors import ConfigError, InvalidObservation, MissingCamera, NotReset, VLAgentsError
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.policies.base.checkpoint import used_checkpoints
-from vlagents_ray.policies.base.checkpoint_files import weights_of, with_parts
+from vlagents_ray.policies.base.checkpoint_files import METHOD, digest, weights_of
 from vlagents_ray.policies.wrapper import Wrapper
 from vlagents_ray_arro.parts import (
     Detection,
@@ -388,3 +389,12 @@ class Arro(Wrapper):
         if self.tracks is None:
             raise NotReset("arro: act before reset; call reset(obs, instruction) first")
         return self.tracks
+
+
+def with_parts(policy: dict[str, Any] | None, parts: Sequence[Path]) -> dict[str, Any] | None:
+    """Return the `Agent.weights_id` of a policy that acts with files and folders of other models beside its own."""
+    if not parts:
+        return policy
+    own = policy or {"digest": None, "revision": None}
+    both = hashlib.sha256(f"{own['digest']} {digest(parts)}".encode()).hexdigest()
+    return {**own, "digest": f"{METHOD}:{both}"}

@@ -19,12 +19,14 @@ from vlagents_ray.contract import CameraSpec, Contract
 from vlagents_ray.envs.tabletop import Tabletop
 from vlagents_ray.errors import ConfigError, InvalidObservation, MissingCamera, NotReset, UnknownWrapper
 from vlagents_ray.policies.base.checkpoint import find_checkpoint
+from vlagents_ray.policies.base.checkpoint_files import digest
 from vlagents_ray.policies.wrapper import build_agent
 from vlagents_ray.registry import wrapper_class
 from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.testing import check_agent
 from vlagents_ray_arro import Arro, ArroConfig
 from vlagents_ray_arro.parts import Detection
+from vlagents_ray_arro.wrapper import with_parts
 
 ROOT = Path(__file__).parents[3]
 BACKGROUND = (0, 0, 60)
@@ -305,3 +307,15 @@ def test_the_weights_are_those_of_the_policy_and_of_the_parts(
     assert found[0] == found[1] != found[2]
     assert (found[0] == found[3]) == (stated is not None)  # the policy's own word counts
     assert {**found[0], "digest": ""} == {"revision": None, **(stated or {}), "digest": ""}
+
+
+def test_other_parts_beside_a_policy_are_other_weights(tmp_path: Path) -> None:
+    for name in "ab":
+        (tmp_path / name).write_text(name)
+    own = {"digest": digest([tmp_path]), "revision": "c0ffee"}
+    assert with_parts(own, []) == own
+    both = with_parts(own, [tmp_path / "a"])
+    assert both is not None
+    assert both["digest"] not in (own["digest"], digest([tmp_path / "a"]))
+    assert both["revision"] == "c0ffee"
+    assert with_parts(None, [tmp_path / "a"]) != with_parts(None, [tmp_path / "b"])

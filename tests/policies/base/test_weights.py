@@ -14,7 +14,7 @@ import pytest
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.base.checkpoint import find_checkpoint, used_checkpoints
-from vlagents_ray.policies.base.checkpoint_files import digest, revision, weights_of, with_parts
+from vlagents_ray.policies.base.checkpoint_files import digest, revision, weights_of
 
 TENSORS, LENGTH = 40, 300_000  # bytes of each: 12 MB together, more than is read from end to end
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
@@ -132,17 +132,6 @@ def test_the_commit_is_that_of_the_policy_and_not_of_an_encoder_beside_it(folder
     snapshot.mkdir(parents=True)
     assert weights_of([folder, snapshot]) == {"digest": digest([folder, snapshot]), "revision": None}
     assert weights_of([snapshot, folder]) == {"digest": digest([snapshot, folder]), "revision": COMMIT}
-
-
-def test_other_parts_beside_a_policy_are_other_weights(folder: Path) -> None:
-    own = weights_of([folder])
-    assert own is not None
-    assert with_parts(own, []) == own
-    both = with_parts({**own, "revision": COMMIT}, [folder / "sub"])
-    assert both is not None
-    assert both["digest"] not in (own["digest"], digest([folder / "sub"]))
-    assert both["revision"] == COMMIT
-    assert with_parts(None, [folder]) != with_parts(None, [folder / "sub"])
 
 
 class RevisionNotFoundError(Exception):

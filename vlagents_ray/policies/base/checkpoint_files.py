@@ -16,7 +16,7 @@ import re
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 # The names that trainers give to files in progress: orbax' folders, and the usual suffixes.
 TEMPORARY = ("*.orbax-checkpoint-tmp*", "*.tmp", "*.tmp-*", "*.part", "*.partial", "*.incomplete", "tmp-*", ".tmp*")
@@ -128,15 +128,6 @@ def weights_of(paths: Sequence[Path]) -> dict[str, str | None] | None:
     repository's.
     """
     return {"digest": digest(paths), "revision": revision(paths[0])} if paths else None
-
-
-def with_parts(policy: dict[str, Any] | None, parts: Sequence[Path]) -> dict[str, Any] | None:
-    """Return the `Agent.weights_id` of a policy that acts with files and folders of other models beside its own."""
-    if not parts:
-        return policy
-    own = policy or {"digest": None, "revision": None}
-    both = hashlib.sha256(f"{own['digest']} {digest(parts)}".encode()).hexdigest()
-    return {**own, "digest": f"{METHOD}:{both}"}
 
 
 def digest(paths: Iterable[Path]) -> str:

@@ -340,9 +340,9 @@ class ModelPolicy(Agent, abc.ABC):
     def _size(self, rows: int) -> int:
         return next((size for size in self.config.batch_sizes or () if size >= rows), rows)
 
-    def padded(self, items: Sequence[T]) -> list[T]:
+    def padded(self, items: list[T]) -> list[T]:
         """Return the items of a batch, with its last one again up to the next of `batch_sizes`."""
-        return [*items, *list(items[-1:]) * (self._size(len(items)) - len(items))]
+        return items + items[-1:] * (self._size(len(items)) - len(items))
 
     def _passes(self, rows: list[Row]) -> list[Prediction | Exception]:
         found: list[Prediction | Exception] = []
