@@ -21,7 +21,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := setup
-.PHONY: setup demo bench check test integrations families docs verified extras locks dist sbom fmt lint type clean
+.PHONY: setup demo bench check quick test integrations families docs verified extras locks dist sbom fmt lint type clean
 
 VENV ?= .venv
 TORCH ?= torch==2.13.0
@@ -71,14 +71,18 @@ bench: setup
 	$(BIN)/python -m benchmarks.evaluation --peers all --report benchmarks/latest.json
 	$(BIN)/python -m benchmarks.report --from-json
 
-check: lint type
+# Lint and types beside the tests, as each of them takes one core.
+check: $(TOOLS)/.installed
+	@$(MAKE) --no-print-directory --jobs=3 lint type quick
+
+quick: $(TOOLS)/.installed
 	@echo '== quick tests'
 	$(TOOLS)/bin/pytest -n $(CHECK_PROCESSES) --dist loadfile --no-loadscope-reorder --hypothesis-profile=quick \
 	  -m 'not ($(NOT_QUICK))'
 
 # Lint and types in another make: this one chose their environment before there was a whole one.
 test: setup
-	@$(MAKE) --no-print-directory lint type
+	@$(MAKE) --no-print-directory --jobs=2 lint type
 	@echo '== tests'
 	$(call PLAY,not (integration))
 

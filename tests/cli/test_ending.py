@@ -61,7 +61,7 @@ def test_it_ends_with_one_sentence(body: str, leave_s: float) -> None:
 
 
 def test_its_sentence_is_the_last_line_whatever_rays_native_threads_say_of_it() -> None:
-    native = "[os.write(2, b'E native\\n') or time.sleep(0.001) for _ in iter(int, 1)]"
+    native = "[os.write(2, b'E native\\n') and time.sleep(0.001) for _ in iter(int, 1)]"
     body = f"import os, threading; threading.Thread(target=lambda: {native}, daemon=True).start(); loss.wait()"
     ended = run(COMMAND.format(body=body, leave_s=30))
     assert ended.returncode == 1

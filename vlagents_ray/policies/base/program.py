@@ -64,8 +64,12 @@ def code_of_class(target: str) -> Program:
         if file.suffix == ".py":
             waiting += _imports(content, inside)
     if not found and top != "__main__":
-        found = {name: f"version {version(name)}" for name in sorted(set(packages_distributions().get(top, ())))}
+        found = {name: f"version {version(name)}" for name in sorted(set(_distributions().get(top, ())))}
     return found
+
+
+# Half a second, as it reads the list of files of each installed package; an evaluation looks for each of its envs.
+_distributions = functools.cache(packages_distributions)
 
 
 loaded_code = functools.cache(code_of_class)

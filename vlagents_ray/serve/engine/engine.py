@@ -162,6 +162,7 @@ class Engine:
                     unsent, self._unsent = self._unsent, []
                     self._answers.submit(_send, unsent)
                 self.run(taken)
+                del taken  # its observations may lie in memory that their sender needs back
             _send(self._unsent)
             self._answers.shutdown()
             self.queue.release()
