@@ -15,7 +15,7 @@ from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.serve.models import agent_copies
 from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.serve.requests import Origin
-from vlagents_ray.serve.sessions import SessionTable
+from vlagents_ray.serve.sessions import Session, SessionTable
 
 torch = pytest.importorskip("torch")
 pytestmark = pytest.mark.torch
@@ -235,3 +235,12 @@ def test_a_connection_ends_its_own_sessions_only() -> None:
     table.open("c")
     table.close_owned("left", ["a", "b", "c", "d"])
     assert table.ids() == ["b", "c"]
+
+
+def test_an_episode_begins_above_all_earlier_steps_of_its_session_though_the_clock_is_behind() -> None:
+    table: SessionTable[object] = SessionTable(limit=10, idle_s=60, clock=lambda: 0)
+    earlier = 2**40
+    table.enter(Session("a", steps=earlier))  # from a replica whose clock is ahead
+    assert table.begin(table.get("a"), None) > earlier
+    table.close("a")
+    assert table.begin(table.open("a"), None) > earlier

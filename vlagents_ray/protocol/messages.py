@@ -208,7 +208,6 @@ class Budget:
 
     def parse(self, size: int) -> None:
         """Count what the values of `size` bytes of JSON take, before they are parsed; raises as `hold`."""
-        self._left = self.limits.decoded_bytes
         self.hold(_JSON_FACTOR * size)
 
     def begin(self, op: object, rank: object = "robot") -> None:

@@ -20,9 +20,10 @@ from eval_fakes import wait_for
 from in_flight import send
 
 from vlagents_ray import Obs
-from vlagents_ray.errors import ConfigError, Forbidden, TooManyRequests, Unauthorized
+from vlagents_ray.errors import ConfigError, Forbidden, PolicyUnavailable, TooManyRequests, Unauthorized
 from vlagents_ray.policies.noop import Noop
-from vlagents_ray.protocol.messages import Reply, Request
+from vlagents_ray.protocol.frames import Decoded, decode_requests, encode_requests
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Reply, Request
 from vlagents_ray.serve.access import api_keys, audit, key_store
 from vlagents_ray.serve.access.api_keys import (
     Keys,
@@ -302,6 +303,28 @@ def test_a_rate_is_kept_by_name_over_all_connections(file: Path, monkeypatch: py
     callers[1].admit()
     with pytest.raises(TooManyRequests):
         callers[2].admit()
+
+
+@pytest.mark.parametrize("compact", [True, False])
+def test_each_request_of_a_message_is_charged_to_the_key_once(
+    file: Path, monkeypatch: pytest.MonkeyPatch, compact: bool
+) -> None:
+    monkeypatch.setattr(api_keys.time, "monotonic", lambda: 1000.0)
+    token = new_key(file, "arm", rate=3)
+    caller = Keys.from_file(file).check(token, "noop")
+    engine, requests = Engine(Noop.from_config({})), [Request("reset", Obs())] * 3
+    sender, decoded, admission = Sender(engine, "any", caller=caller), Decoded(requests, {}), None
+    if compact:
+        sender.count_message()
+    else:
+        admission = sender.admission(DEFAULT_LIMITS)
+        decoded = decode_requests(encode_requests(requests), admission)
+    message = sender.message()
+    sender.send(message, decoded, lambda _: None, admission=admission)
+    engine.close()
+    assert [type(reply.error) for reply in message.replies] == [PolicyUnavailable] * 3  # the engine is not started
+    with pytest.raises(TooManyRequests):
+        caller.admit()
 
 
 def test_the_file_holds_hashes_for_its_owner_alone(file: Path) -> None:

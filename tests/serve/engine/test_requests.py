@@ -101,6 +101,15 @@ def test_a_close_that_comes_too_late_leaves_the_session_to_the_end_of_its_connec
     assert "other" not in served.engine.sessions
 
 
+@pytest.mark.parametrize("for_good", [True, False])
+def test_a_connection_to_a_draining_replica_leaves_its_sessions_to_another_one(served: Served, for_good: bool) -> None:
+    other = served.sender("other")
+    served.ask(other, "reset")
+    served.engine.drain()
+    other.release(for_good=for_good)
+    assert ("other" in served.engine.sessions) is not for_good
+
+
 @pytest.mark.parametrize("began", [True, False])
 def test_a_reset_whose_caller_is_gone_is_as_if_it_had_never_been(served: Served, began: bool) -> None:
     other = served.sender("other", connected=False)

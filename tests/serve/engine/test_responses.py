@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import re
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -13,7 +16,7 @@ from vlagents_ray.protocol.frames import decode_replies, encode_replies
 from vlagents_ray.protocol.messages import Limits, Reply, Request
 from vlagents_ray.serve.config.deployment import LimitArgs
 from vlagents_ray.serve.engine import responses
-from vlagents_ray.serve.engine.responses import build_reply, require_serializable
+from vlagents_ray.serve.engine.responses import build_reply, raised_at, require_serializable
 from vlagents_ray.serve.requests import PendingRequest
 from vlagents_ray.serve.sessions import Session
 
@@ -101,3 +104,10 @@ def test_a_deployment_sets_the_limit_as_far_as_clients_read() -> None:
     assert LimitArgs(reply_bytes=2000).limits().reply_bytes == 2000
     with pytest.raises(ValueError, match="reply_bytes"):
         LimitArgs(reply_bytes=Limits().body_bytes + 1)
+
+
+@pytest.mark.parametrize("fail", [lambda: json.loads("{"), lambda: np.linalg.inv(np.zeros((2, 2)))])
+def test_an_error_that_a_library_raised_names_the_line_of_the_caller(fail: Callable[[], Any]) -> None:
+    with pytest.raises(ValueError) as caught:  # noqa: PT011 - both libraries' errors are of this type
+        fail()
+    assert re.fullmatch(r" \(test_responses\.py:\d+\)", raised_at(caught.value))
