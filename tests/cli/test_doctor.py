@@ -87,13 +87,16 @@ def test_an_old_python_fails() -> None:
     assert doctor.python((3, 10, 0)).status == "ok"
 
 
-def test_another_ray_than_the_pinned_one_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_ray_than_those_that_are_tested_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
     assert doctor.ray().status == "ok"
+    monkeypatch.setattr("importlib.metadata.requires", lambda _: ["numpy", 'ray[serve]<2.61,>=2.59; extra == "serve"'])
+    for version in ("2.59.0", "2.60.1"):
+        monkeypatch.setattr("importlib.metadata.version", lambda _, version=version: version)
+        assert doctor.ray().status == "ok"
     monkeypatch.setattr("importlib.metadata.version", lambda _: "2.1.0")
     row = doctor.ray()
     assert row.status == "warn"
-    assert "2.1.0" in row.detail
-    assert "2.60.0" in row.detail
+    assert row.detail == "2.1.0; this package is tested with <2.61,>=2.59"
 
 
 def test_haproxy_really_starts() -> None:

@@ -30,7 +30,7 @@ class Lost:
     def answers(self):
         raise ClusterLost(f"the raylet has ended; {{self.cure}}")
 
-head_monitor.PERIOD_S, head_monitor.HeadMonitor, head_monitor.keep_from_printing_last_words = 0.05, Lost, lambda: None
+head_monitor.PERIOD_S, head_monitor.HeadMonitor = 0.05, Lost
 nodes = ["a node"]
 ray_session.node_of_this_process = lambda: nodes[0]
 ray_session._LEAVE_S, ray_session._EXIT_S = {leave_s}, 0.2

@@ -6,11 +6,12 @@ import logging
 import stat
 import threading
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
 
 import pytest
-from ray._private import worker
+from eval_fakes import wait_for
 
+from vlagents_ray.cli import ray_session
 from vlagents_ray.cli.ray_session import quiet_ray
 from vlagents_ray.cli.serve import connection_lines
 from vlagents_ray.errors import ConfigError
@@ -21,38 +22,64 @@ INFO = "INFO 2026-11-21 17:02:51,406 proxy 127.0.0.1 -- HAProxy starting on node
 MEANT = "WARNING 2026-11-21 17:02:48,881 controller 3438 -- HTTPOptions.host='127.0.0.1' won't accept connections from HAProxy on other nodes; cross-node routing will fail"  # fmt: skip  # noqa: E501
 PROBLEM = "ERROR 2026-11-21 17:02:51,406 controller 3438 -- Deploying app 'x' failed"
 PRINTED = "INFO: loading the weights"  # by a policy
+HAPROXY = "HAProxyManager pid=7"
+
+
+class Processes:
+    """The processes of a Ray that this process started, and what they write to its log files."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def say(self, *lines: str, pid: int = 1) -> None:
+        with (self.folder / f"worker-0a-01000000-{pid}.err").open("a") as file:
+            file.write("".join(f"{line}\n" for line in lines))
 
 
 @pytest.fixture
-def printed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """The lines of other processes that Ray's own function prints."""
-    lines: list[str] = []
-    monkeypatch.setattr(worker, "print_to_stdstream", lambda data, **_: lines.extend(data["lines"]))
-    return lines
-
-
-def say(*lines: str, **of: Any) -> None:
-    worker.print_to_stdstream({"pid": 1, "is_err": True, "lines": list(lines), **of}, ignore_prefix=False)
+def ray(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Processes:
+    logs, kept = tmp_path / "logs", tmp_path / "kept"
+    logs.mkdir()
+    kept.mkdir()
+    node = SimpleNamespace(is_head=lambda: True, get_logs_dir_path=lambda: str(logs))
+    monkeypatch.setattr(ray_session, "node_of_this_process", lambda: node)
+    monkeypatch.setattr(ray_session, "_FOLLOW_S", 0.01)
+    monkeypatch.setattr("tempfile.tempdir", str(kept))
+    return Processes(logs)
 
 
 def test_only_problems_and_what_a_policy_prints_are_shown_and_the_rest_is_in_the_file(
-    printed: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    ray: Processes, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     with quiet_ray("serve-8000") as file:
-        say(INFO, MEANT, PROBLEM, PRINTED, actor_name="HAProxyManager")
-        say(INFO)
-    assert printed == [PROBLEM, PRINTED]
+        ray.say(INFO, ":job_id:01000000", ":actor_name:HAProxyManager", INFO, MEANT, PROBLEM, PRINTED, pid=7)
+        wait_for(lambda: file is not None and MEANT in file.read_text())
+        ray.say(INFO)
+    assert capsys.readouterr().err.splitlines() == [f"({HAPROXY}) {line}" for line in (PROBLEM, PRINTED)]
     assert file is not None
     assert file.name.startswith("serve-8000-")
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
-    assert file.read_text().splitlines() == [
-        f"(HAProxyManager pid=1) {INFO}",
-        f"(HAProxyManager pid=1) {MEANT}",
-        f"(ray pid=1) {INFO}",
-    ]
-    say(INFO)
-    assert printed == [PROBLEM, PRINTED, INFO]
+    expected = [f"(ray pid=7) {INFO}", f"({HAPROXY}) {INFO}", f"({HAPROXY}) {MEANT}", f"(ray pid=1) {INFO}"]
+    assert file.read_text().splitlines() == expected
+
+
+def test_a_line_is_read_when_it_is_complete_and_a_rotated_file_from_its_beginning(
+    ray: Processes, capsys: pytest.CaptureFixture[str]
+) -> None:
+    [name, said] = "worker-0a-01000000-1.err", []
+
+    def shown() -> list[str]:
+        said.extend(capsys.readouterr().err.splitlines())
+        return said
+
+    with quiet_ray("serve"):
+        (ray.folder / name).write_text("the first\nthe sec")
+        wait_for(lambda: shown() == ["(ray pid=1) the first"])
+        ray.say("ond")
+        wait_for(lambda: shown()[1:] == ["(ray pid=1) the second"])
+        (ray.folder / name).rename(ray.folder / f"{name}.1")
+        ray.say("the third")
+        wait_for(lambda: shown()[2:] == ["(ray pid=1) the third"])
 
 
 def test_the_same_holds_for_what_ray_logs_in_this_process(
@@ -82,36 +109,40 @@ LOAD_FAILURE = [
 
 
 def test_the_traceback_of_a_policy_that_does_not_load_is_in_the_file_until_the_server_serves(
-    printed: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+    ray: Processes, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     started = threading.Event()
+    said: list[str] = []
+
+    def shown() -> list[str]:
+        said.extend(line.partition(") ")[2] for line in capsys.readouterr().err.splitlines())
+        return said
+
     with pytest.raises(ConfigError), quiet_ray("serve", started) as file:  # noqa: PT012
-        for line in LOAD_FAILURE:  # Ray hands on a few lines at a time
-            say(line)
-            say(PRINTED, pid=2)
-        say(PROBLEM)
-        assert printed == [PRINTED] * len(LOAD_FAILURE) + [PROBLEM]
+        for count in range(len(LOAD_FAILURE)):  # a few lines are read at a time
+            ray.say(LOAD_FAILURE[count])
+            ray.say(PRINTED, pid=2)
+            wait_for(lambda: len(shown()) > count)  # noqa: B023 - called at once
+        ray.say(PROBLEM)
+        wait_for(lambda: shown() == [PRINTED] * len(LOAD_FAILURE) + [PROBLEM])
         started.set()
-        say(*LOAD_FAILURE)
-        assert printed[-len(LOAD_FAILURE) :] == LOAD_FAILURE
+        ray.say(*LOAD_FAILURE)
+        wait_for(lambda: shown()[-len(LOAD_FAILURE) :] == LOAD_FAILURE)
         raise ConfigError("the policy did not load")
     assert file is not None
     assert [line.partition(") ")[2] for line in file.read_text().splitlines()] == LOAD_FAILURE
     assert str(file) in capsys.readouterr().err
 
 
-def test_an_empty_file_does_not_stay(printed: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+def test_an_empty_file_does_not_stay(ray: Processes, tmp_path: Path) -> None:
     with pytest.raises(ConfigError), quiet_ray("serve"):
         raise ConfigError("the port is taken")
-    assert list(tmp_path.iterdir()) == []
+    assert list((tmp_path / "kept").iterdir()) == []
 
 
-def test_without_a_name_there_is_no_file(printed: list[str]) -> None:
+def test_without_a_name_there_is_no_file() -> None:
     with quiet_ray(None) as file:
-        say(INFO, PROBLEM)
-    assert (file, printed) == (None, [PROBLEM])
+        assert file is None
 
 
 def test_a_server_says_its_policy_its_page_and_where_each_kind_of_client_connects() -> None:

@@ -10,7 +10,6 @@ from contextlib import ExitStack, closing
 import numpy as np
 import pytest
 from live_server import ask
-from websockets.sync.client import connect
 
 from tests.integration.conftest import serving
 from vlagents_ray import Obs, RemoteAgent
@@ -77,11 +76,3 @@ def test_a_command_reaches_the_session_whichever_replica_it_is_at(server: Server
         for agent in agents:
             agent.act(Obs())
         assert [[one.do for one in inbox.waiting] for inbox in inboxes] == [["stop"]] * 4
-
-
-def test_its_messages_are_not_compressed_again(server: Server) -> None:
-    with connect(f"{server.url.replace('http', 'ws')}/v1/live", proxy=None, compression="deflate") as socket:
-        assert socket.request is not None
-        assert "permessage-deflate" in socket.request.headers["sec-websocket-extensions"]
-        assert socket.response is not None
-        assert "sec-websocket-extensions" not in socket.response.headers

@@ -86,17 +86,6 @@ def test_a_head_that_this_process_started_is_not_waited_for(
         own.answers()
 
 
-def test_the_last_words_of_a_daemon_are_not_printed_twice(monkeypatch: pytest.MonkeyPatch) -> None:
-    said: list[str] = []
-    worker = pytest.importorskip("ray._private.worker")
-    monkeypatch.setattr(worker, "print_to_stdstream", lambda data, **_: said.extend(data["lines"]))
-    head_monitor.keep_from_printing_last_words()
-    head_monitor.keep_from_printing_last_words()
-    for line in ("Raylet is terminated. Last 20 lines of its log: …", "a worker was killed, for want of memory"):
-        worker.print_to_stdstream({"lines": [line]}, ignore_prefix=False)
-    assert said == ["a worker was killed, for want of memory"]
-
-
 def test_a_process_that_is_still_being_connected_has_no_node_yet(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ray has its record before, and starts a second Ray for whoever asks it for anything then."""
     worker = SimpleNamespace(node="a node", connected=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import importlib.metadata
 import os
@@ -21,6 +22,7 @@ from vlagents_ray.errors import MissingDependency
 from vlagents_ray.registry import require
 
 if TYPE_CHECKING:
+    from packaging.specifiers import SpecifierSet
     from rich.console import Console
 
     from vlagents_ray.envs.render_probe import RenderProbe
@@ -28,7 +30,7 @@ if TYPE_CHECKING:
 
 GB = 1e9
 SHM = Path("/dev/shm")  # noqa: S108 - where Linux has its shared memory, not a temporary file
-# Ray 2.60's own rules (ray/_private/ray_constants.py, utils.py, worker.py).
+# Ray's own rules (ray/_private/ray_constants.py, utils.py, worker.py).
 _STORE_SHARE, _STORE_MAX, _STORE_UNCAPPED = 0.3, 200 * GB, 10 * GB
 _FILES_WANTED, _FILES_RAISED_TO, _FILES_ENOUGH = 8192, 65536, 4096
 _SOCKET_PATH_MAX = 107  # bytes of a Unix socket's path, without its final NUL
@@ -210,8 +212,8 @@ def ray() -> Check:
         version = importlib.metadata.version("ray")
     except importlib.metadata.PackageNotFoundError:
         return Check("fail", "not installed: robots can do without, servers and evaluations cannot", cure)
-    wanted = _pinned("ray")
-    if wanted not in (None, version):
+    wanted = _required("ray")
+    if version not in wanted:
         return Check("warn", f"{version}; this package is tested with {wanted}", cure)
     return Check("ok", version)
 
@@ -285,17 +287,16 @@ def _rendered(simulator: str, probe: RenderProbe) -> Check:
     return Check("warn", f"{simulator} cannot render: {probe.error}", probe.cure or "")
 
 
-def _pinned(package: str) -> str | None:
-    """Return the version of `package` that our metadata requires, if it requires exactly one."""
-    try:
-        requirements = importlib.metadata.requires("vlagents-ray") or []
-    except importlib.metadata.PackageNotFoundError:
-        return None  # run from a source tree that is not installed
-    for requirement in requirements:
-        pin = re.match(rf"{re.escape(package)}(?:\[[^]]*\])?\s*==\s*([\w.]+)", requirement)
-        if pin:
-            return pin[1]
-    return None
+def _required(package: str) -> SpecifierSet:
+    """Return the versions of `package` that our metadata allows."""
+    from packaging.requirements import Requirement
+    from packaging.specifiers import SpecifierSet
+
+    with contextlib.suppress(importlib.metadata.PackageNotFoundError):  # run from a source tree that is not installed
+        for one in map(Requirement, importlib.metadata.requires("vlagents-ray") or []):
+            if one.name == package:
+                return one.specifier
+    return SpecifierSet()
 
 
 def _output(command: list[str], timeout_s: float = 60) -> subprocess.CompletedProcess[str]:

@@ -11,14 +11,13 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from logging.handlers import RotatingFileHandler
 from pathlib import Path
-from typing import Any
 
 from vlagents_ray.cli.console import err, say_error
 from vlagents_ray.errors import ClusterLost, ConfigError
-from vlagents_ray.ray_tools.private import LOGGERS, node_of_this_process, output_printer, set_output_printer
+from vlagents_ray.ray_tools.private import LOGGERS, node_of_this_process
 from vlagents_ray.ray_tools.signals import raise_dropped_interrupt
 
 log = logging.getLogger(__name__)
@@ -31,6 +30,10 @@ RESTART = "start it again"
 RESUME = "what was played is kept: go on with --resume when there is a cluster again"
 
 _FILE_BYTES = 10_000_000  # Serve logs each request; twice as much is kept
+_FOLLOW_S = 0.3  # period at which the log files of Ray's processes are read
+_LOG_FILES = ("worker-*.out", "worker-*.err", "raylet*.err")  # names in the folder of Ray's logs
+_ACTOR = ":actor_name:"  # begins the line by which Ray names the actor that writes to the file
+_TITLES = (_ACTOR, ":task_name:", ":job_id:")
 _LOAD_FAILURES = ("Exception in Replica(", "Failed to update the deployments", "the policy did not load")
 _SERVES_LINE = re.compile(r"[A-Z]+ \d{4}-\d\d-\d\d \d\d:")
 _SERVES_INFO = re.compile(r"(INFO|DEBUG) \d{4}-\d\d-\d\d \d\d:")  # as each line of Serve's processes begins
@@ -57,11 +60,14 @@ def quiet_ray(name: str | None, started: threading.Event | None = None) -> Itera
         The log file, which stays unless it is empty and which this user alone can read; None without one.
     """
     file, kept = _file(name) if name is not None else (None, None)
-    terminal = _Terminal(output_printer(), kept, started)
-    set_output_printer(terminal.print_lines)
+    terminal = _Terminal(kept, started)
     loggers = [logging.getLogger(one) for one in LOGGERS]
     for logger in loggers:
         logger.addFilter(terminal.is_shown)
+    ended = threading.Event()
+    follower = threading.Thread(target=_follow, args=(terminal, ended), name="ray-logs", daemon=True)
+    if name is not None:
+        follower.start()
     try:
         yield file
     except ConfigError:
@@ -71,8 +77,9 @@ def quiet_ray(name: str | None, started: threading.Event | None = None) -> Itera
     finally:
         for logger in loggers:
             logger.removeFilter(terminal.is_shown)
-        set_output_printer(terminal.printed)
+        ended.set()
         if file is not None and kept is not None:
+            follower.join()
             kept.close()
             if file.stat().st_size == 0:  # as when the port is taken
                 file.unlink()
@@ -81,11 +88,8 @@ def quiet_ray(name: str | None, started: threading.Event | None = None) -> Itera
 class _Terminal:
     """The lines of the logs of Ray and Serve that go to the terminal; `kept` gets the rest."""
 
-    def __init__(
-        self, printed: Callable[..., None], kept: logging.Handler | None, started: threading.Event | None
-    ) -> None:
-        self.printed = printed
-        self.failing: set[Any] = set()  # processes in the middle of a policy's traceback
+    def __init__(self, kept: logging.Handler | None, started: threading.Event | None) -> None:
+        self.failing: set[str] = set()  # processes in the middle of a policy's traceback
         self._kept = kept
         self._started = started
 
@@ -97,19 +101,16 @@ class _Terminal:
             self._note(text)
         return shown
 
-    def print_lines(self, data: dict[str, Any], *args: Any, **kwargs: Any) -> None:
-        """Print lines of another process, as Ray's own function does."""
-        shown = []
-        for line in data["lines"]:
-            level = logging.INFO if _SERVES_INFO.match(line) else logging.WARNING
-            if self._is_load_failure(data.get("pid"), line) or not _is_problem(line, level):
-                self._note(f"({data.get('actor_name') or data.get('task_name') or 'ray'} pid={data.get('pid')}) {line}")
-            else:
-                shown.append(line)
-        if shown:
-            self.printed({**data, "lines": shown}, *args, **kwargs)
+    def print_line(self, actor: str, process: str, line: str) -> None:
+        """Print a line of another process, or keep it."""
+        level = logging.INFO if _SERVES_INFO.match(line) else logging.WARNING
+        text = f"({actor} pid={process}) {line}"
+        if self._is_load_failure(process, line) or not _is_problem(line, level):
+            self._note(text)
+        else:
+            sys.stderr.write(f"{text}\n")
 
-    def _is_load_failure(self, process: Any, line: str) -> bool:
+    def _is_load_failure(self, process: str, line: str) -> bool:
         if any(one in line for one in _LOAD_FAILURES):
             self.failing.add(process)
         elif _SERVES_LINE.match(line):
@@ -119,6 +120,52 @@ class _Terminal:
     def _note(self, text: str) -> None:
         if self._kept is not None:
             self._kept.emit(logging.LogRecord("ray", logging.INFO, "", 0, text, None, None))
+
+
+def _follow(terminal: _Terminal, ended: threading.Event) -> None:
+    """Hand on what the processes of the Ray that this process started write, until `ended`. Runs on its own thread.
+
+    Ray's own way, `log_to_driver`, has no filter.
+    """
+    files: dict[Path, _LogFile] = {}
+    over = False
+    while not over:
+        over = ended.wait(_FOLLOW_S)
+        node = node_of_this_process()
+        if node is not None and node.is_head():
+            folder = Path(node.get_logs_dir_path())
+            for path in (one for pattern in _LOG_FILES for one in folder.glob(pattern) if one not in files):
+                files[path] = _LogFile(path)
+        for file in files.values():
+            for line in file.new_lines():
+                terminal.print_line(file.actor, file.process, line)
+
+
+class _LogFile:
+    """A log file of a process of Ray, which is read as it grows."""
+
+    def __init__(self, path: Path) -> None:
+        self.actor = "ray"
+        self.process = path.stem.rpartition("-")[2]  # the end of "worker-WORKER-JOB-PID", or "raylet"
+        self._path = path
+        self._offset = 0
+
+    def new_lines(self) -> Iterator[str]:
+        """Yield the complete lines since the last call, without those by which Ray names the process."""
+        try:
+            if self._path.stat().st_size < self._offset:  # rotated
+                self._offset = 0
+            with self._path.open("rb") as file:
+                file.seek(self._offset)
+                text, end, _ = file.read().rpartition(b"\n")
+        except OSError:  # it has been removed
+            return
+        self._offset += len(text) + len(end)
+        for line in text.decode(errors="replace").split("\n"):
+            if line.startswith(_ACTOR):
+                self.actor = line.removeprefix(_ACTOR)
+            elif line and not line.startswith(_TITLES):
+                yield line
 
 
 def _is_problem(text: str, level: int) -> bool:
@@ -197,7 +244,7 @@ class RayLoss:
 
     def _watch_ray(self) -> None:
         """Watch the Ray that this process is in, until it leaves it or that Ray is lost."""
-        from vlagents_ray.ray_tools.head_monitor import PERIOD_S, HeadMonitor, keep_from_printing_last_words
+        from vlagents_ray.ray_tools.head_monitor import PERIOD_S, HeadMonitor
 
         head: HeadMonitor | None = None
         while not self.left.wait(PERIOD_S):
@@ -207,7 +254,6 @@ class RayLoss:
             try:
                 if head is None:
                     head = HeadMonitor(self._cure)
-                    keep_from_printing_last_words()
                 head.answers()
             except ClusterLost as error:
                 if node_of_this_process() is node:  # it is not being left just now

@@ -100,7 +100,7 @@ def serve_command(options: ServeOptions) -> None:
         with (
             quiet_ray(f"vlagents-ray-serve-{port}", started := threading.Event()) as log,
             exit_if_ray_is_lost(RESTART) as loss,
-            running_server(config, host=host, port=port, address=address, show_logs=True, **access) as server,
+            running_server(config, host=host, port=port, address=address, **access) as server,
         ):
             started.set()
             for line in connection_lines(with_gateways_at(config, host), server.apps, host, keys, insecure=insecure):

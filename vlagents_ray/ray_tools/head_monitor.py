@@ -12,12 +12,11 @@ import os
 import socket
 from pathlib import Path
 from time import monotonic
-from typing import Any
 
 import ray
 
 from vlagents_ray.errors import ClusterLost
-from vlagents_ray.ray_tools.private import node_of_this_process, output_printer, set_output_printer
+from vlagents_ray.ray_tools.private import node_of_this_process
 
 log = logging.getLogger(__name__)
 
@@ -26,7 +25,6 @@ ANSWER_S = 1.0  # timeout of a check, which blocks the driver
 _RAY_TIMEOUT = "RAY_gcs_rpc_server_reconnect_timeout_s"  # time after which Ray kills a process without a head
 _RAY_TIMEOUT_S = 60.0  # its default
 _SHARE = 0.4  # of Ray's timeout; the rest is for an orderly end
-_LAST_WORDS = "Raylet is terminated."
 _SOCKETS = Path("/proc/net/unix")
 
 
@@ -90,19 +88,6 @@ def head_is_gone() -> bool:
 def _address() -> tuple[str, int]:
     host, _, port = ray.get_runtime_context().gcs_address.rpartition(":")
     return host.strip("[]"), int(port)
-
-
-def keep_from_printing_last_words() -> None:
-    """Suppress the log of a daemon that died, which Ray prints twice beside the error that is raised here."""
-    printed = output_printer()
-    if printed.__module__ == __name__:
-        return
-
-    def print_to_stdstream(data: dict[str, Any], *args: Any, **kwargs: Any) -> None:
-        if not str(data["lines"][0]).startswith(_LAST_WORDS):
-            printed(data, *args, **kwargs)
-
-    set_output_printer(print_to_stdstream)
 
 
 def _exists(unix_socket: str) -> bool:

@@ -1,20 +1,20 @@
 """The private names of Ray and of Ray Serve that this package uses, all in one place.
 
-They were read in Ray 2.60; read them again before another version is allowed. Ray is imported inside the functions, as
-clients without Ray import this module. Only `vlagents_ray.serve.scaling.router` uses others, as its class overrides
-private methods of Serve's, and Serve sends that module by value to processes that need not have this package.
+They were read in Ray 2.59 and 2.60; read them again before another version is allowed (`tests/support/ray_names.py`
+lists those that it lacks). Ray is imported inside the functions, as clients without Ray import this module. Only
+`vlagents_ray.serve.scaling.router` uses others, as its class overrides private methods of Serve's, and Serve sends that
+module by value to processes that need not have this package.
 """
 
 from __future__ import annotations
 
 import contextlib
 import functools
-import inspect
 import logging
 import pickle
 import sys
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -44,21 +44,6 @@ def node_of_this_process() -> Any:
     if worker is None or not worker.global_worker.connected:
         return None
     return worker.global_worker.node
-
-
-def output_printer() -> Callable[..., None]:
-    """Return the function by which Ray prints the output of other processes: of batches with "lines", and "pid"."""
-    import ray
-
-    printer: Callable[..., None] = ray._private.worker.print_to_stdstream
-    return printer
-
-
-def set_output_printer(printer: Callable[..., None]) -> None:
-    """Replace the function that `output_printer` returns."""
-    import ray
-
-    ray._private.worker.print_to_stdstream = printer
 
 
 def use_loopback(on: bool) -> bool:
@@ -290,20 +275,6 @@ def http_options() -> Any:
     from ray.serve.context import _get_global_client
 
     return _get_global_client().http_config
-
-
-def compress_no_websockets() -> None:
-    """Let the HTTP server that Serve starts in this process compress no messages of WebSockets, as browsers offer.
-
-    Pictures are compressed already, and the work would be done on the event loop that robots wait for. Serve passes no
-    such option on to uvicorn, which compresses by default.
-    """
-    import uvicorn
-
-    defaults = inspect.signature(uvicorn.Config.__init__).parameters
-    if defaults["ws_per_message_deflate"].default:
-        without = functools.partialmethod(uvicorn.Config.__init__, ws_per_message_deflate=False)
-        uvicorn.Config.__init__ = without  # type: ignore[assignment, method-assign]
 
 
 def replica_is_ending() -> bool:

@@ -25,7 +25,6 @@ from vlagents_ray.evaluate.robot.trial import PlayedTrial, Trial, WatchedRobot, 
 from vlagents_ray.evaluate.robot.trial_log import LoggedTrial, TrialLog, logged_plan
 from vlagents_ray.evaluate.run import conclude
 from vlagents_ray.evaluate.workers.rollout import AgentFactory, agents
-from vlagents_ray.ray_tools.private import output_printer, set_output_printer
 from vlagents_ray.registry import require
 from vlagents_ray.robot.loop import ROBOT, Robot, import_class
 
@@ -264,11 +263,9 @@ def result_of(trial: Trial, logged: LoggedTrial) -> EpisodeResult:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep what this package, Ray and its processes log off the terminal: it may name the policy."""
+    """Keep the logs of this package and of Ray off the terminal: they may name the policy."""
     loggers = {name: logging.getLogger(name) for name in _LOGGERS}
     levels = {name: logger.level for name, logger in loggers.items()}
-    printer = output_printer()
-    set_output_printer(lambda *_, **__: None)
     for logger in loggers.values():
         logger.setLevel(logging.CRITICAL + 1)
     try:
@@ -276,7 +273,6 @@ def _quiet() -> Iterator[None]:
     finally:
         for name, logger in loggers.items():
             logger.setLevel(levels[name])
-        set_output_printer(printer)
 
 
 def _write_results(config: EvalConfig, planned: Sequence[EvalCase], log: TrialLog, state: str) -> Summary:

@@ -134,7 +134,6 @@ def running_server(
     port: int = 0,
     address: str | None = None,
     num_cpus: int | None = None,
-    show_logs: bool = False,
     timeout_s: float | None = None,
     keys_file: Path | None = None,
     insecure: bool = False,
@@ -173,7 +172,7 @@ def running_server(
     with contextlib.ExitStack() as stack:
         ingress = ingress or not own or len(our_apps(config)) < len(config.applications)
         public = port or free_port(host)
-        http = stack.enter_context(_ray(address, host, public, tls, num_cpus, show_logs, ingress))
+        http = stack.enter_context(_ray(address, host, public, tls, num_cpus, ingress))
         location = "Disabled" if not ingress else "HeadOnly" if address is None else "EveryNode"
         client, proxies = start_serve(http, location)
         if running := sorted(serve.status().applications):
@@ -302,14 +301,13 @@ def _ray(
     port: int,
     tls: Tls | None,
     num_cpus: int | None,
-    show_logs: bool,
     ingress: bool,
 ) -> Iterator[dict[str, Any]]:
     """Connect to a Ray or start one; yield Serve's options for its host, port and certificate."""
     import ray
 
     if not ray.is_initialized() and address is None:
-        with own_ray(host, port, tls=tls, num_cpus=num_cpus, show_logs=show_logs, ingress=ingress) as listener:
+        with own_ray(host, port, tls=tls, num_cpus=num_cpus, ingress=ingress) as listener:
             yield _serve_address(listener, host, port, tls)
         return
     if tls is not None:
@@ -323,7 +321,7 @@ def _ray(
             f"host {host}: with HAProxy Serve would find no replica at a single address; "
             f"use {EVERYWHERE} (or {LOOPBACK}), or leave ray.init() to this function"
         )
-    with joined(address, log_to_driver=show_logs):
+    with joined(address):
         yield {"host": host, "port": port}
 
 
@@ -353,7 +351,6 @@ def own_ray(
     *,
     tls: Tls | None = None,
     num_cpus: int | None = None,
-    show_logs: bool = False,
     ingress: bool = True,
 ) -> Iterator[PublicListener | None]:
     """Run a private Ray for the length of the context, which no other machine and no other user can reach.
@@ -402,7 +399,7 @@ def own_ray(
         start_ray(
             num_cpus=num_cpus,
             include_dashboard=False,
-            log_to_driver=show_logs,
+            log_to_driver=False,
             logging_level="WARNING",
             _temp_dir=str(folder / FILES),
         )

@@ -3,6 +3,9 @@
 The first checkpoint is loaded on the policy's thread. A loading thread then loads and evicts the others, one at a time,
 while sessions of loaded checkpoints act. `ModelCache` decides which one is next.
 
+Ray's `serve.multiplexed` counts models alone: at its limit it unloads the one that was requested least recently, also
+while sessions act with it, and it never waits for them. Hence this cache, which knows the sessions.
+
 A deployment's own settings can change (`ModelManager.configure`): the new checkpoint is loaded beside the old one. New
 episodes then use the new checkpoint, and the old one is evicted when its last episode has ended.
 """

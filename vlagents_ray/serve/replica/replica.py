@@ -25,7 +25,7 @@ from vlagents_ray.policies.base.program import loaded_code
 from vlagents_ray.protocol.frames import Decoded, decode_requests
 from vlagents_ray.protocol.messages import PROTOCOL_VERSION, SERVERS_MACHINE, Limits, boot_id
 from vlagents_ray.ray_tools.git_state import code_of
-from vlagents_ray.ray_tools.private import compress_no_websockets, gpus_here, http_options, replica_is_ending
+from vlagents_ray.ray_tools.private import gpus_here, http_options, replica_is_ending
 from vlagents_ray.registry import names
 from vlagents_ray.serve.access.api_keys import NoKey, require_access, warn_of_plain_http
 from vlagents_ray.serve.access.audit import write_audit
@@ -116,7 +116,6 @@ class PolicyReplica(ClientApi, SiblingApi):
         self._metrics.start()
 
         # The ways in.
-        compress_no_websockets()
         has_files = hasattr(os, "memfd_create")
         self._local = ShmServer(self._engine, self._limits, self._admit()) if has_files else None
         self._plasma = PlasmaServer(self._engine, self._limits) if has_files else None
