@@ -125,7 +125,7 @@ WRAPPERS: dict[str, Adapter] = {
 ENVS: dict[str, Adapter] = {
     "libero": Adapter(
         "vlagents_ray.envs.libero:Libero",
-        "LIBERO's five suites, 130 tasks; LIBERO-PRO's",
+        "LIBERO's five suites, 130 tasks",
         needs=("libero",),
         extra="libero",
         requirements=("libero",),

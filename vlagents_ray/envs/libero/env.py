@@ -15,7 +15,6 @@ from vlagents_ray.envs.libero.package import assets_digest, find_assets
 from vlagents_ray.envs.libero.tasks import (
     LiberoProtocol,
     LiberoTask,
-    files_digest,
     find_task,
     read_states,
     require_suite,
@@ -29,7 +28,7 @@ from vlagents_ray.registry import require
 
 
 class Libero(SimulatorEnv):
-    """One environment of one LIBERO task, e.g. "libero_spatial/0", or of one that varies it, "libero_goal_swap/0".
+    """One environment of one LIBERO task, e.g. "libero_spatial/0".
 
     Observation: cameras "front" (LIBERO's agentview) and "wrist" (its eye in hand), turned as policies
     expect it, see `LiberoProtocol`; in `state` what policies for LIBERO take: `xyz_axis_angle` (6,), the end
@@ -64,7 +63,6 @@ class Libero(SimulatorEnv):
         gripper_closed: float | None = None,
         instruction: str | None = None,
         assets: str | None = None,
-        files: str | None = None,
     ) -> None:
         """Make the environment; raises the errors of `make_env`. Other options are those of most `SimulatorEnv`s.
 
@@ -77,13 +75,11 @@ class Libero(SimulatorEnv):
                 says 1, and 0 to close, which openvla's evaluation turns into LIBERO's as this does.
             gripper_closed: The one that closes it; None is LIBERO's 1.
             assets: The folder with LIBERO's meshes and textures; None is what LIBERO_ASSETS names.
-            files: The folder with `bddl_files` and `init_files` of suites that vary LIBERO's, such as LIBERO-PRO's;
-                None is what LIBERO_FILES names.
         """
         super().__init__(f"libero/{task}", width=width, height=height, max_steps=max_steps)
         if (settling_steps or 0) < 0:
             raise ConfigError(f"libero/{task}: settling_steps is {settling_steps}, want 0 or more")
-        self._task = find_task(task, files)
+        self._task = find_task(task)
         self._name = f"libero/{self._task.full_name}"
         self._assets = find_assets(assets)
         self._rules = LiberoProtocol.of(
@@ -130,17 +126,13 @@ class Libero(SimulatorEnv):
         return None
 
     def describe(self) -> dict[str, Any]:
-        protocol = self._rules.to_json(self._task.suite)
-        if self._task.passes_for_own:
-            protocol["deviations"].append(f"files: those of {self._task.name}, the protocol says LIBERO's own")
-        facts = super().describe() | {
+        return super().describe() | {
             "name": self._task.name,
             "language": self._task.language,
             "init_states": self.init_states,
-            "protocol": protocol,
+            "protocol": self._rules.to_json(self._task.suite),
             "assets": assets_digest(self._assets),
         }
-        return facts | ({"files": files_digest(self._task.problem, self._task.states)} if self._task.varied else {})
 
     def _begin(self, seed: int, state: int) -> tuple[Obs, dict[str, Any]]:
         seen = self._env.begin(self._states[state])
