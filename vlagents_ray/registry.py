@@ -201,7 +201,7 @@ ENVS: dict[str, Adapter] = {
         tasks="/<task>",
     ),
     "pusht": Adapter(
-        "vlagents_ray.envs.gymnasium.env:PushT",
+        "vlagents_ray.envs.gymnasium:PushT",
         "PushT, with images or keypoints",
         needs=("gym_pusht", "shapely"),
         extra="pusht",

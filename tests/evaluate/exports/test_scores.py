@@ -13,7 +13,7 @@ from eval_fakes import LINE
 from pydantic import ValidationError
 from recorded_results import record, runs
 
-from vlagents_ray.envs.libero.tasks import SUITES, LiberoProtocol
+from vlagents_ray.envs.libero import SUITES, LiberoProtocol
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig, Results
 from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult
