@@ -151,7 +151,7 @@ def test_the_command_drives_an_arm_from_its_topics_and_stops_it_where_it_is(
     with policy_server(agent) as url, rosbridge_double() as double:
         (tmp_path / "arm.yaml").write_text(yaml.safe_dump(ros_arm.settings(double.url)))
         with RosArm(double.publish, lambda: double.on(COMMANDS)) as arm:
-            options = f"--ros {tmp_path / 'arm.yaml'} --hz 30 --mode open_loop --restart auto --baseline 0".split()
+            options = f"--ros {tmp_path / 'arm.yaml'} --hz 30 --mode open_loop --restart auto".split()
             said = ["--instruction", "stack the cups", "--measure", "joints", "--max-step", str(MAX_STEP)]
             status = command.main([url, *options, *said])
     assert status != 2, capsys.readouterr().out  # a busy machine may be late at a tick
@@ -321,7 +321,7 @@ def test_a_killed_server_stops_the_arm(tmp_path: Path, capsys: pytest.CaptureFix
         with RosArm(double.publish, lambda: double.on(COMMANDS)) as arm:
             options = f"--ros {tmp_path / 'arm.yaml'} --hz 30 --seconds 4 --silent-s 1".split()
             status: list[int] = []
-            options += ["--timeout-s", "1", "--restart", "auto", "--baseline", "0"]  # a busy machine may stop it before
+            options += ["--timeout-s", "1", "--restart", "auto"]  # a busy machine may stop it before
             run = [url, *options, "--measure", "joints", "--max-step", str(MAX_STEP)]
             thread = threading.Thread(target=lambda: status.append(command.main(run)))
             thread.start()
@@ -378,7 +378,7 @@ def test_a_policy_for_another_robot_is_refused(tmp_path: Path, capsys: pytest.Ca
         with RosArm(double.publish, lambda: double.on(COMMANDS)):
             cameras = {"cameras": {"top": {"topic": CAMERA}}}
             (tmp_path / "arm.yaml").write_text(yaml.safe_dump(ros_arm.settings(double.url, **cameras)))
-            assert command.main([url, "--ros", str(tmp_path / "arm.yaml"), "--baseline", "0"]) == 2
+            assert command.main([url, "--ros", str(tmp_path / "arm.yaml")]) == 2
         assert double.on(COMMANDS) == []
     assert "camera 'front': the policy needs it, the env gives ['top']" in capsys.readouterr().err
 

@@ -416,7 +416,7 @@ class Simulator:
 
     def renderer(self) -> Renderer | None:
         found = vulkan_device(on_gpu=self.alive().backend.render_device.is_cuda())
-        return None if found is None else vulkan_renderer(found.name, found.cuda, asked_for=self._asked_for)
+        return None if found is None else vulkan_renderer(*found, asked_for=self._asked_for)
 
     def describe(self) -> dict[str, Any]:
         env = self.alive()
