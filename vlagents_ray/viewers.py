@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 __all__ = ["EpisodeViewer", "RerunRecordings", "ViewerFrame", "is_live", "open_viewer"]
 
 logger = logging.getLogger(__name__)
-APPLICATION = "vlagents_ray"
 LIVE = "rerun+http://127.0.0.1:9876/proxy"  # where `rerun`, the viewer, listens by default
 _PORT = 9876
 CLOSING_S = 2.0  # within which a live viewer takes what is left
@@ -84,11 +83,6 @@ def numbers_of(info: Mapping[str, Any]) -> dict[str, float]:
     return {**timing, **{name: float(info[name]) for name in (AGE, SILENT) if name in info}}
 
 
-def note_of(info: Mapping[str, Any]) -> str:
-    """Return why the action of an `Act` is a safe one; "" if it is the policy's."""
-    return str(info.get(SAFE, ""))
-
-
 class RerunRecordings:
     """Writes a recording of each episode, on the timelines `tick` and `time`.
 
@@ -112,7 +106,7 @@ class RerunRecordings:
             self._folder.mkdir(parents=True, exist_ok=True)
 
     def begin(self, name: str, instruction: str) -> RerunEpisode:
-        recording = self._rerun.RecordingStream(APPLICATION, recording_id=uuid4())
+        recording = self._rerun.RecordingStream("vlagents_ray", recording_id=uuid4())
         if self._folder is None:
             recording.connect_grpc(self.target)
         else:
@@ -319,7 +313,7 @@ class LoopView:
             viewer.dropped += 1
             return
         info = act.info
-        rows, note = info.get(PLANNED), stop or note_of(info)
+        rows, note = info.get(PLANNED), stop or str(info.get(SAFE, ""))
         spells = {"safe": SAFE in info, "intervention": INTERVENTION in info, "stopped": bool(stop)}
         frame = ViewerFrame.of(
             obs,

@@ -447,13 +447,13 @@ def test_a_person_restarts_the_command_by_a_signal() -> None:
     with Watchdog(lambda _: stopped.set(), {"loop": 0.05}) as watchdog, restarting(watchdog, said.append):
         assert stopped.wait(30)
         os.kill(os.getpid(), signal.SIGUSR1)
-        assert watchdog.stopped  # it hangs still
+        assert watchdog.control.stopped  # it hangs still
         watchdog._limits["loop"] = 60.0
         watchdog.heard("loop")
-        assert watchdog.stopped
+        assert watchdog.control.stopped
         watchdog.control.pause("paused from the live page")
         os.kill(os.getpid(), signal.SIGUSR1)
-        assert not watchdog.stopped
+        assert not watchdog.control.stopped
         assert watchdog.control.reason is None
     assert signal.getsignal(signal.SIGUSR1) == signal.SIG_DFL
 
@@ -477,7 +477,7 @@ with Watchdog(lambda _: stopped.set(), {"loop": 0.05}) as watchdog, _restarting(
     watchdog.heard("loop")
     print("stopped", flush=True)
     assert restarted.wait(30)
-    assert not watchdog.stopped
+    assert not watchdog.control.stopped
 """
     with at_a_terminal(code) as (process, type_keys, lines):
         assert next(lines) == "stopped"

@@ -217,9 +217,9 @@ def _restarting(watchdog: Watchdog, say: Callable[[str], None]) -> Iterator[None
     def typed(key: str) -> bool:
         if key not in RESTART_KEYS:
             return False
-        stood = watchdog.stopped or watchdog.control.reason is not None
+        stood = watchdog.control.stopped or watchdog.control.reason is not None
         if not restarted():
-            say(f"not restarted: still no signal from the {' and the '.join(watchdog.silent)}")
+            say(f"not restarted: still no signal from the {' and the '.join(watchdog.control.silent)}")
         elif stood:
             say("restarted")
         return True

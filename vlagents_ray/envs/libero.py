@@ -442,11 +442,6 @@ class LiberoSimulation:
             name: np.array(states[name].get_geom_state()["pos"], np.float64) for name in sorted(named & set(states))
         }
 
-    def flat_state(self) -> np.ndarray:
-        """MuJoCo's time, qpos and qvel, (D,) float64, as the initial states are written."""
-        state: np.ndarray = self._env.get_sim_state()
-        return state
-
     def close(self) -> None:
         self._cameras.make_current()
         self._env.close()

@@ -193,7 +193,7 @@ def test_a_hanging_camera_holds_the_arm_still_until_it_goes_on() -> None:
         beats = len(drive.double.on(BEAT))
         wait_for(lambda: len(drive.double.on(BEAT)) > beats + 5)  # the loop goes on
         assert len(drive.commands) == still
-        assert not drive.watchdog.stopped
+        assert not drive.watchdog.control.stopped
         drive.arm.broken = set()
         drive.moves()
         wait_for(lambda: drive.alive)
@@ -211,12 +211,12 @@ def test_a_topic_that_is_silent_for_long_stops_the_arm_until_a_person_starts_it(
     limits = {"topic": CAMERA, "max_age_s": 0.5, "silent_s": 1.0}
     with driving(Ahead(), cameras={"front": limits}) as drive:
         drive.arm.broken = {CAMERA}
-        wait_for(lambda: drive.watchdog.stopped)
+        wait_for(lambda: drive.watchdog.control.stopped)
         assert drive.watchdog.barks[0].startswith(f"{CAMERA}: silent for")
         assert not drive.watchdog.restart()  # it is still silent
         still = len(drive.commands)
         drive.arm.broken = set()
-        wait_for(lambda: drive.robot.holds is None and not drive.watchdog.silent)
+        wait_for(lambda: drive.robot.holds is None and not drive.watchdog.control.silent)
         beats = len(drive.double.on(BEAT))
         wait_for(lambda: len(drive.double.on(BEAT)) > beats + 5)
         assert len(drive.commands) <= still + 1
