@@ -127,11 +127,6 @@ class LiberoTask:
     problem: Path  # its BDDL file
     states: Path  # its initial states
 
-    @property
-    def full_name(self) -> str:
-        """The task's name in `Libero.tasks()`, e.g. "libero_object/7"."""
-        return f"{self.suite}/{self.number}"
-
 
 def task_names() -> list[str]:
     """Every task, e.g. "libero_spatial/0"; needs no simulator."""
@@ -245,7 +240,7 @@ class Libero(SimulatorEnv):
         if (settling_steps or 0) < 0:
             raise ConfigError(f"libero/{task}: settling_steps is {settling_steps}, want 0 or more")
         self._task = find_task(task)
-        self._name = f"libero/{self._task.full_name}"
+        self._name = f"libero/{self._task.suite}/{self._task.number}"
         self._assets = find_assets(assets)
         self._rules = LiberoProtocol.of(
             self._task.suite,

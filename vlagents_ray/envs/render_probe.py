@@ -86,12 +86,6 @@ def without(modules: Sequence[str], cure: str) -> str | None:
     return None if missing is None else f"{missing} is not installed; {cure}"
 
 
-def without_egl(simulator: str) -> str | None:
-    """Say why a simulator cannot render here; the first call in a process renders one frame in a child."""
-    probe = egl_probe()
-    return None if probe.ok else f"{simulator} cannot render without a display ({probe.error}); {probe.cure}"
-
-
 @contextlib.contextmanager
 def failing(env: str, doing: str) -> Iterator[None]:
     """Turn the errors of a simulator that renders through EGL into `EnvFailed`; this package's own errors pass."""
