@@ -183,12 +183,6 @@ def is_live(target: str) -> bool:
     return target == "live" or target.startswith("rerun+")
 
 
-@dataclass(frozen=True, slots=True)
-class _Beginning:
-    name: str
-    instruction: str
-
-
 class EpisodeViewer:
     """Shows episodes on its own thread.
 
@@ -211,7 +205,7 @@ class EpisodeViewer:
         self.error: Exception | None = None  # the first one
         self._recordings = target
         self._frames = frames
-        self._queue: queue.SimpleQueue[ViewerFrame | _Beginning | None] = queue.SimpleQueue()
+        self._queue: queue.SimpleQueue[ViewerFrame | tuple[str, str] | None] = queue.SimpleQueue()
         self._put = 0  # frames added, counted by the caller's thread
         self._got = 0  # frames written, counted by the writing thread
         self._closed = False
@@ -231,7 +225,7 @@ class EpisodeViewer:
             name: The name of the episode, and of its file.
             instruction: The task in words.
         """
-        self._queue.put(_Beginning(name, instruction))
+        self._queue.put((name, instruction))
         try:
             yield
         finally:
@@ -268,18 +262,18 @@ class EpisodeViewer:
     def _run(self) -> None:
         with contextlib.suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
-        while isinstance(item := self._queue.get(), _Beginning):
-            self._show(item)
+        while isinstance(item := self._queue.get(), tuple):
+            self._show(*item)
 
-    def _show(self, beginning: _Beginning) -> None:
+    def _show(self, name: str, instruction: str) -> None:
         frames = self._until_the_end()
         try:
-            with contextlib.closing(self._recordings.begin(beginning.name, beginning.instruction)) as writer:
+            with contextlib.closing(self._recordings.begin(name, instruction)) as writer:
                 for frame in frames:
                     writer.write(frame)
             self.episodes += 1
         except Exception as error:  # noqa: BLE001 - what is shown goes on without the viewer
-            logger.warning("rerun: episode %s is not shown: %s", beginning.name, error)
+            logger.warning("rerun: episode %s is not shown: %s", name, error)
             self.error = self.error or error
         for _ in frames:
             pass
