@@ -29,7 +29,7 @@ from vlagents_ray.registry import require
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-__all__ = ["EpisodeViewer", "RerunRecordings", "ViewerFrame", "is_live", "open_viewer"]
+__all__ = ["EpisodeViewer", "ViewerFrame", "open_viewer"]
 
 logger = logging.getLogger(__name__)
 LIVE = "rerun+http://127.0.0.1:9876/proxy"  # where `rerun`, the viewer, listens by default
@@ -106,6 +106,7 @@ class RerunRecordings:
             self._folder.mkdir(parents=True, exist_ok=True)
 
     def begin(self, name: str, instruction: str) -> RerunEpisode:
+        """Begin an episode; `name` is also that of its file, and an empty `instruction` is not shown."""
         recording = self._rerun.RecordingStream("vlagents_ray", recording_id=uuid4())
         if self._folder is None:
             recording.connect_grpc(self.target)
