@@ -26,7 +26,7 @@ from vlagents_ray.interface import Agent, Obs
 from vlagents_ray.policies.wrapper import build_agent
 from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.launch.deployment_file import server_args
-from vlagents_ray.testing.observations import random_observation
+from vlagents_ray.testing.agents import random_observation
 
 
 @dataclass(frozen=True, slots=True)

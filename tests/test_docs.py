@@ -15,7 +15,7 @@ from ray.serve.schema import ServeApplicationSchema
 
 from vlagents_ray.cli.evaluate import read_run
 from vlagents_ray.envs import aloha, calvin, metaworld, robocasa
-from vlagents_ray.envs.gymnasium.env import known
+from vlagents_ray.envs.gymnasium import known
 from vlagents_ray.envs.robosuite import TASKS
 from vlagents_ray.envs.simulator import BenchmarkProtocol
 from vlagents_ray.errors import BY_CODE, Overloaded, VLAgentsError

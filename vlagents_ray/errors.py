@@ -1,4 +1,4 @@
-"""The errors of vlagents_ray, in one tree, and the warning of what will be removed.
+"""The errors of vlagents_ray, in one tree.
 
     VLAgentsError
     ├── InvalidInput (also ValueError)      the request is wrong; sending it again will not help

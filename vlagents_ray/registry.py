@@ -115,7 +115,7 @@ POLICIES: dict[str, Adapter] = {
 ENVS: dict[str, Adapter] = {
     "libero": Adapter(
         "vlagents_ray.envs.libero:Libero",
-        "LIBERO's five suites, 130 tasks; LIBERO-PRO's",
+        "LIBERO's five suites, 130 tasks",
         needs=("libero",),
         extra="libero",
         requirements=("libero",),
@@ -191,7 +191,7 @@ ENVS: dict[str, Adapter] = {
         tasks="/<task>",
     ),
     "pusht": Adapter(
-        "vlagents_ray.envs.gymnasium.env:PushT",
+        "vlagents_ray.envs.gymnasium:PushT",
         "PushT, with images or keypoints",
         needs=("gym_pusht", "shapely"),
         extra="pusht",

@@ -29,10 +29,9 @@ from vlagents_ray.registry import require
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-__all__ = ["EpisodeViewer", "RerunRecordings", "ViewerFrame", "is_live", "open_viewer"]
+__all__ = ["EpisodeViewer", "ViewerFrame", "open_viewer"]
 
 logger = logging.getLogger(__name__)
-APPLICATION = "vlagents_ray"
 LIVE = "rerun+http://127.0.0.1:9876/proxy"  # where `rerun`, the viewer, listens by default
 _PORT = 9876
 CLOSING_S = 2.0  # within which a live viewer takes what is left
@@ -84,11 +83,6 @@ def numbers_of(info: Mapping[str, Any]) -> dict[str, float]:
     return {**timing, **{name: float(info[name]) for name in (AGE, SILENT) if name in info}}
 
 
-def note_of(info: Mapping[str, Any]) -> str:
-    """Return why the action of an `Act` is a safe one; "" if it is the policy's."""
-    return str(info.get(SAFE, ""))
-
-
 class RerunRecordings:
     """Writes a recording of each episode, on the timelines `tick` and `time`.
 
@@ -112,7 +106,8 @@ class RerunRecordings:
             self._folder.mkdir(parents=True, exist_ok=True)
 
     def begin(self, name: str, instruction: str) -> RerunEpisode:
-        recording = self._rerun.RecordingStream(APPLICATION, recording_id=uuid4())
+        """Begin an episode; `name` is also that of its file, and an empty `instruction` is not shown."""
+        recording = self._rerun.RecordingStream("vlagents_ray", recording_id=uuid4())
         if self._folder is None:
             recording.connect_grpc(self.target)
         else:
@@ -189,12 +184,6 @@ def is_live(target: str) -> bool:
     return target == "live" or target.startswith("rerun+")
 
 
-@dataclass(frozen=True, slots=True)
-class _Beginning:
-    name: str
-    instruction: str
-
-
 class EpisodeViewer:
     """Shows episodes on its own thread.
 
@@ -217,7 +206,7 @@ class EpisodeViewer:
         self.error: Exception | None = None  # the first one
         self._recordings = target
         self._frames = frames
-        self._queue: queue.SimpleQueue[ViewerFrame | _Beginning | None] = queue.SimpleQueue()
+        self._queue: queue.SimpleQueue[ViewerFrame | tuple[str, str] | None] = queue.SimpleQueue()
         self._put = 0  # frames added, counted by the caller's thread
         self._got = 0  # frames written, counted by the writing thread
         self._closed = False
@@ -237,7 +226,7 @@ class EpisodeViewer:
             name: The name of the episode, and of its file.
             instruction: The task in words.
         """
-        self._queue.put(_Beginning(name, instruction))
+        self._queue.put((name, instruction))
         try:
             yield
         finally:
@@ -274,18 +263,18 @@ class EpisodeViewer:
     def _run(self) -> None:
         with contextlib.suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
-        while isinstance(item := self._queue.get(), _Beginning):
-            self._show(item)
+        while isinstance(item := self._queue.get(), tuple):
+            self._show(*item)
 
-    def _show(self, beginning: _Beginning) -> None:
+    def _show(self, name: str, instruction: str) -> None:
         frames = self._until_the_end()
         try:
-            with contextlib.closing(self._recordings.begin(beginning.name, beginning.instruction)) as writer:
+            with contextlib.closing(self._recordings.begin(name, instruction)) as writer:
                 for frame in frames:
                     writer.write(frame)
             self.episodes += 1
         except Exception as error:  # noqa: BLE001 - what is shown goes on without the viewer
-            logger.warning("rerun: episode %s is not shown: %s", beginning.name, error)
+            logger.warning("rerun: episode %s is not shown: %s", name, error)
             self.error = self.error or error
         for _ in frames:
             pass
@@ -319,7 +308,7 @@ class LoopView:
             viewer.dropped += 1
             return
         info = act.info
-        rows, note = info.get(PLANNED), stop or note_of(info)
+        rows, note = info.get(PLANNED), stop or str(info.get(SAFE, ""))
         spells = {"safe": SAFE in info, "intervention": INTERVENTION in info, "stopped": bool(stop)}
         frame = ViewerFrame.of(
             obs,

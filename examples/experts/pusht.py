@@ -36,7 +36,7 @@ class _Step(NamedTuple):
 
 
 class PushTExpert:
-    """Needs `info["sim_state"]`, as `vlagents_ray.envs.gymnasium.env` gives it; actions are (2,) in [0, 512] px.
+    """Needs `info["sim_state"]`, as `vlagents_ray.envs.gymnasium` gives it; actions are (2,) in [0, 512] px.
 
     A push goes straight towards the block, from one of some places around it, at one of three speeds. The expert
     chooses the push, and the step at which it ends, that brings the block's corners nearest to the target's.

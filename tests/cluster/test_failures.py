@@ -85,7 +85,7 @@ def test_a_robot_outside_of_the_cluster_keeps_its_loop_beside_an_evaluation(tmp_
     ):
         robot.limit("1gbit")
         robot.environment |= {KEY_VARIABLE: token}
-        loop = ["--hz", "50", "--seconds", "20", "--transport", "websocket", "--baseline", "0", "--safe", "hold"]
+        loop = ["--hz", "50", "--seconds", "20", "--transport", "websocket", "--safe", "hold"]
         code = "from vlagents_ray.cli import main; main()"
         command = [sys.executable, "-c", code, "robot", f"http://{head.name}:8000", *loop]
         for attempt in (1, 2, 3):  # a machine that stands still for a second spoils one

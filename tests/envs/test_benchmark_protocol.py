@@ -13,7 +13,7 @@ from vlagents_ray.registry import ENVS
 from vlagents_ray.testing.comparing import require_wireable
 
 PAGES = Path(__file__).parents[2] / "docs" / "benchmarks"
-ANY_PROTOCOL = {"tabletop", "gymnasium", "hub"}  # our own example, and environments of others by their ids
+ANY_PROTOCOL = {"tabletop", "gymnasium"}  # our own example, and environments of others by their ids
 
 PROTOCOL = BenchmarkProtocol(
     name="Shelf",

@@ -19,7 +19,7 @@ from vlagents_ray.envs.graphics import (
     fitting,
     require_own,
 )
-from vlagents_ray.envs.render_probe import VulkanDevice, usable_devices
+from vlagents_ray.envs.render_probe import usable_devices
 from vlagents_ray.envs.robosuite import importing_robosuite
 from vlagents_ray.errors import ConfigError, EnvFailed
 
@@ -127,8 +127,8 @@ def test_drawing_on_anything_but_the_gpu_that_was_given_is_an_error_with_its_cur
 
 def test_sapiens_devices_are_read_from_its_summary() -> None:
     assert usable_devices(SUMMARY) == [
-        VulkanDevice("NVIDIA H200", 0),
-        VulkanDevice("llvmpipe (LLVM 15.0.6, 256 bits)", None),
+        ("NVIDIA H200", 0),
+        ("llvmpipe (LLVM 15.0.6, 256 bits)", None),
     ]
 
 
@@ -151,7 +151,7 @@ def test_libero_without_a_gpu_and_without_software_says_so(monkeypatch: pytest.M
 DRAW = """
 from vlagents_ray.envs import make_env
 from vlagents_ray.envs import graphics
-assert graphics.drawing() is None
+assert graphics.opengl_renderer() is None
 with make_env("gymnasium/Hopper-v5") as env:
     env.reset(seed=0)
     renderer = env.renderer()

@@ -10,8 +10,7 @@ import pytest
 
 from vlagents_ray import Act
 from vlagents_ray.envs import make_env
-from vlagents_ray.envs.gymnasium import Gymnasium
-from vlagents_ray.envs.gymnasium.view import Pick, as_image, plain
+from vlagents_ray.envs.gymnasium import Gymnasium, Pick, as_image, plain
 from vlagents_ray.errors import ConfigError, EnvFailed, InvalidAction, MissingDependency, NotReset, UnknownEnv
 from vlagents_ray.testing import ContractViolation, check_env
 

@@ -21,7 +21,7 @@ from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.cli.robot import main
 from vlagents_ray.client.transports.select import TransportName
 from vlagents_ray.robot import Watchdog, run_loop
-from vlagents_ray.robot.pacing import empty_loop
+from vlagents_ray.robot.pacing import Pacer, jitter, undisturbed
 
 HZ = 50.0
 ROWS = 50
@@ -105,6 +105,15 @@ def witness(address: str, transport: TransportName) -> Iterator[Witness]:
         yield Witness(player, robot)
 
 
+def empty_loop() -> dict[str, float]:
+    """The jitter of two seconds of a loop that does nothing, as the best that this machine can do."""
+    with undisturbed():
+        pacer = Pacer(HZ)
+        while pacer.wait() < 2 * HZ:
+            pass
+    return jitter(pacer.late_s, pacer.missed, pacer.ticks)
+
+
 @pytest.mark.parametrize("transport", ["websocket", "shm"])
 def test_no_tick_is_without_an_action_though_an_answer_takes_ten_ticks(
     server: contextlib.ExitStack, address: str, transport: TransportName
@@ -112,7 +121,7 @@ def test_no_tick_is_without_an_action_though_an_answer_takes_ten_ticks(
     for _ in range(ATTEMPTS):
         with witness(address, transport) as seen:
             report = run_loop(seen.robot, seen, hz=HZ, seconds=5)
-        machine = empty_loop(HZ, 2)
+        machine = empty_loop()
         if report.safe_ticks == 0 and report.jitter["on_time"] > 0.9 * machine["on_time"]:
             break
     else:
@@ -125,12 +134,11 @@ def test_the_command_drives_records_and_reports(
 ) -> None:
     for attempt in range(ATTEMPTS):
         folder = tmp_path / str(attempt)
-        options = ["--seconds", "2", "--baseline", "0.5", "--record", str(folder), "--instruction", "stack the cups"]
+        options = ["--seconds", "2", "--record", str(folder), "--instruction", "stack the cups"]
         status, said = main([f"http://{address}", *options]), capsys.readouterr().out
         if status == 0:
             break
     assert status == 0, said
-    assert "empty loop" in said
     assert "ticks without an action of the policy: 0" in said
     assert f"recorded: 1 episodes in {folder}" in said
     info = json.loads((folder / "meta/info.json").read_text())

@@ -104,15 +104,15 @@ class Barks:
 def test_what_was_stopped_stays_so_until_a_restart_after_the_silence() -> None:
     barks = Barks()
     with Watchdog(barks, {"server": 0.05}) as watchdog:
-        assert not watchdog.stopped
+        assert not watchdog.control.stopped
         barks.next()
-        assert watchdog.stopped
+        assert watchdog.control.stopped
         assert not watchdog.restart()  # while it is silent
         watchdog._limits["server"] = 60.0
         watchdog.heard("server")
-        assert watchdog.stopped
+        assert watchdog.control.stopped
         assert watchdog.restart()
-        assert not watchdog.stopped
+        assert not watchdog.control.stopped
 
 
 def test_silence_calls_the_stop_hook_once_from_a_thread_of_its_own() -> None:

@@ -127,7 +127,7 @@ def test_a_protective_stop_outlives_the_run(stop: str) -> None:
     def over() -> bool:
         if stop == "trip" and arm.ticks == 5:
             dog.trip("a person is in the way")
-        return dog.stopped
+        return dog.control.stopped
 
     run_loop(arm, Commanding(inbox, {}), hz=200, watchdog=dog, until=over)
     dog._limits["camera"] = 60.0
@@ -137,7 +137,7 @@ def test_a_protective_stop_outlives_the_run(stop: str) -> None:
         assert len(applied(arm)) == before
     assert dog.restart() is (stop == "trip")
     dog.heard("camera")
-    assert dog.stopped is (stop == "bark")
+    assert dog.control.stopped is (stop == "bark")
     assert dog.restart()
     run_loop(arm, Commanding(inbox, {}), hz=200, watchdog=dog, seconds=0.05)
     assert len(applied(arm)) > before

@@ -7,8 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from vlagents_ray.envs.libero import Libero
-from vlagents_ray.envs.libero.env import LiberoSimulation
+from vlagents_ray.envs.libero import Libero, LiberoSimulation
 from vlagents_ray.interface import Act, Obs
 
 STILL = Act(np.array([0, 0, 0, 0, 0, 0, -1], np.float32))

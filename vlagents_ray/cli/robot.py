@@ -23,7 +23,6 @@ from vlagents_ray.client.commands import CommandInbox
 from vlagents_ray.contract import Contract, require_match
 from vlagents_ray.errors import ConfigError, VLAgentsError
 from vlagents_ray.robot.loop import ROBOT, LoopReport, Restart, Robot, import_class, run_loop
-from vlagents_ray.robot.pacing import empty_loop
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.ros import RosRobot, read_settings
 from vlagents_ray.robot.safety import Guard, Watchdog, measured_state
@@ -143,9 +142,6 @@ def _run(options: argparse.Namespace) -> LoopReport:
             require_match(contract, topics.contract)
             topics.watchdog = watchdog
         stack.enter_context(_restarting(watchdog, say))
-        if options.baseline > 0:
-            say(_line(_HEADER))
-            say(_row("empty loop", empty_loop(hz, options.baseline, real_time=options.real_time)))
         report = run_loop(
             robot,
             player,
@@ -161,8 +157,7 @@ def _run(options: argparse.Namespace) -> LoopReport:
         )
         if report.outcome:
             say(f"marked as a {report.outcome} on the live page")
-        if options.baseline <= 0:
-            say(_line(_HEADER))
+        say(_line(_HEADER))
         say(_row(f"{options.mode}, {agent.transport}", report.jitter))
         _say_outcome(report, say, led=leader is not None)
     if recorder is not None:  # closed, so everything is written
@@ -222,9 +217,9 @@ def _restarting(watchdog: Watchdog, say: Callable[[str], None]) -> Iterator[None
     def typed(key: str) -> bool:
         if key not in RESTART_KEYS:
             return False
-        stood = watchdog.stopped or watchdog.control.reason is not None
+        stood = watchdog.control.stopped or watchdog.control.reason is not None
         if not restarted():
-            say(f"not restarted: still no signal from the {' and the '.join(watchdog.silent)}")
+            say(f"not restarted: still no signal from the {' and the '.join(watchdog.control.silent)}")
         elif stood:
             say("restarted")
         return True
@@ -306,8 +301,6 @@ def command_parser() -> tuple[argparse.ArgumentParser, list[argparse.Action], li
     buttons = "obey the buttons of the server's live page: pause, stop, success, failure"
     real("--operate", action="store_true", help=buttons)
     real("--real-time", action="store_true", help="ask for SCHED_FIFO in place of a nice value")
-    empty = "first measure an empty loop for this long (%(default)s)"
-    real("--baseline", type=_number(), default=5.0, metavar="S", help=empty)
     groups[1].add_argument("--env", metavar="NAME", help="the environment: tabletop, maniskill/PickCube-v1, …")
     settings: dict[str, Any] = {"action": "append", "metavar": "KEY=VALUE", "default": []}
     simulated("--env-set", **settings, help="an option of the environment: width=256")

@@ -388,15 +388,9 @@ class SequentialBatch(BatchEnv):
         shown = seen[min(moved)].cameras
         if not shown:
             return seen
-        return images_in_rows(
-            [obs if i in moved else replace(obs, cameras={**shown, **obs.cameras}) for i, obs in enumerate(seen)]
-        )
-
-
-def images_in_rows(seen: Sequence[Obs]) -> list[Obs]:
-    """Return observations with the images of each camera, which all of them have, as rows of one array."""
-    images = {name: np.stack([obs.cameras[name] for obs in seen]) for name in seen[0].cameras}
-    return [replace(obs, cameras={name: rows[i] for name, rows in images.items()}) for i, obs in enumerate(seen)]
+        cameras = [obs.cameras if i in moved else {**shown, **obs.cameras} for i, obs in enumerate(seen)]
+        images = {name: np.stack([one[name] for one in cameras]) for name in cameras[0]}
+        return [replace(obs, cameras={name: rows[i] for name, rows in images.items()}) for i, obs in enumerate(seen)]
 
 
 def _begun(env: EvalEnv, seed: int, options: Options | None) -> Obs:

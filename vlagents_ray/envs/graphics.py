@@ -35,30 +35,10 @@ class EglDevice:
     cuda: int | None  # its number among the CUDA devices that this process may use; None if CUDA does not know it
 
 
-@dataclass(frozen=True, slots=True)
-class Drawing:
-    """The device and driver of an OpenGL context."""
-
-    renderer: str  # the driver's name of it: "llvmpipe (LLVM 15.0.6, 256 bits)"
-    device: EglDevice
-
-
 def devices() -> list[EglDevice]:
     """List all devices in EGL's order; empty if EGL is missing, or too old."""
     functions = _functions()
     return [] if functions is None else [device for _, device in functions.devices()]
-
-
-def drawing() -> Drawing | None:
-    """Return the device of the current OpenGL context of this thread; None if there is none, or it is not EGL's."""
-    functions = _functions()
-    display = None if functions is None else functions.library.eglGetCurrentDisplay()
-    if functions is None or not display:
-        return None
-    handle = functions.value(functions.display_attribute, display, _DEVICE)
-    device = next((device for pointer, device in functions.devices() if pointer == handle), None)
-    name = functions.gl_string(_GL_RENDERER)
-    return None if device is None or name is None else Drawing(name.decode(errors="replace"), device)
 
 
 class _Functions:
@@ -173,11 +153,17 @@ def choose_devices() -> None:
 
 def opengl_renderer() -> Renderer | None:
     """Return the renderer of this thread's OpenGL context; None if there is none, or it is not EGL's."""
-    found = drawing()
-    if found is None:
+    functions = _functions()
+    display = None if functions is None else functions.library.eglGetCurrentDisplay()
+    if functions is None or not display:
         return None
-    named = os.environ.get(EGL_DEVICE) == str(found.device.number)
-    return Renderer(found.renderer, found.device.software, found.device.cuda, named)
+    handle = functions.value(functions.display_attribute, display, _DEVICE)
+    device = next((device for pointer, device in functions.devices() if pointer == handle), None)
+    name = functions.gl_string(_GL_RENDERER)
+    if device is None or name is None:
+        return None
+    named = os.environ.get(EGL_DEVICE) == str(device.number)
+    return Renderer(name.decode(errors="replace"), device.software, device.cuda, named)
 
 
 def vulkan_renderer(name: str, cuda: int | None, *, asked_for: bool = False) -> Renderer:

@@ -18,7 +18,7 @@ import numpy as np
 
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, Rotation, StateSpec
 from vlagents_ray.envs.base import require_known
-from vlagents_ray.envs.gymnasium.view import plain
+from vlagents_ray.envs.gymnasium import plain
 from vlagents_ray.envs.simulator import BenchmarkProtocol, SimulatorEnv, Size, require_cameras
 from vlagents_ray.errors import ConfigError, MissingDependency, UnknownEnv
 from vlagents_ray.interface import Obs

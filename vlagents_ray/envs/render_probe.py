@@ -71,37 +71,19 @@ class RenderProbe:
 @functools.cache
 def render_probe(timeout_s: float = TIMEOUT_S) -> RenderProbe:
     """Render one frame with SAPIEN, which needs a Vulkan device."""
-    if importlib.util.find_spec("sapien") is None:
-        return RenderProbe(
-            "vulkan",
-            ok=False,
-            seconds=0.0,
-            error="sapien is not installed",
-            cure="pip install 'vlagents-ray[maniskill]'",
-        )
-    return _run_child("vulkan", vulkan_cure(), timeout_s)
+    return _probed("vulkan", "sapien", "maniskill", vulkan_cure(), timeout_s)
 
 
 @functools.cache
 def egl_probe(timeout_s: float = TIMEOUT_S) -> RenderProbe:
     """Render one frame with MuJoCo through EGL, i.e. without a display."""
-    if importlib.util.find_spec("mujoco") is None:
-        return RenderProbe(
-            "egl", ok=False, seconds=0.0, error="mujoco is not installed", cure="pip install 'vlagents-ray[metaworld]'"
-        )
-    return _run_child("egl", EGL_CURE, timeout_s)
+    return _probed("egl", "mujoco", "metaworld", EGL_CURE, timeout_s)
 
 
 def without(modules: Sequence[str], cure: str) -> str | None:
     """Say which of these modules is not installed, with the cure; None if all are."""
     missing = next((module for module in modules if importlib.util.find_spec(module) is None), None)
     return None if missing is None else f"{missing} is not installed; {cure}"
-
-
-def without_egl(simulator: str) -> str | None:
-    """Say why a simulator cannot render here; the first call in a process renders one frame in a child."""
-    probe = egl_probe()
-    return None if probe.ok else f"{simulator} cannot render without a display ({probe.error}); {probe.cure}"
 
 
 @contextlib.contextmanager
@@ -123,36 +105,36 @@ def vulkan_cure() -> str:
     return VULKAN_CURE_NVIDIA if nvidia else VULKAN_CURE
 
 
-@dataclass(frozen=True, slots=True)
-class VulkanDevice:
-    """A device on which SAPIEN can render."""
-
-    name: str  # "llvmpipe (LLVM 15.0.6, 256 bits)"
-    cuda: int | None  # its number among the CUDA devices of this process; None if CUDA does not know it
-
-
-def vulkan_device(*, on_gpu: bool) -> VulkanDevice | None:
-    """Return the device on which SAPIEN renders in this process."""
+def vulkan_device(*, on_gpu: bool) -> tuple[str, int | None] | None:
+    """Return the device on which SAPIEN renders in this process, as `usable_devices` does."""
     import sapien.render
 
     usable = usable_devices(sapien.render.get_device_summary())
-    usable.sort(key=lambda device: (device.cuda is not None) != on_gpu)  # stable: otherwise SAPIEN's order
+    usable.sort(key=lambda device: (device[1] is not None) != on_gpu)  # stable: otherwise SAPIEN's order
     return usable[0] if usable else None
 
 
-def usable_devices(summary: str) -> list[VulkanDevice]:
-    """List the devices that SAPIEN's `summary` calls supported, in its order."""
+def usable_devices(summary: str) -> list[tuple[str, int | None]]:
+    """List the devices that SAPIEN's `summary` calls supported, in its order.
+
+    Of each the name, "llvmpipe (LLVM 15.0.6, 256 bits)", and its number among the CUDA devices of this process; None if
+    CUDA does not know it.
+    """
     found = []
     for block in summary.split("GPU:")[1:]:
         name, *lines = block.splitlines()
         facts = {key.strip(): value.strip() for key, _, value in (line.partition(":") for line in lines)}
         if facts.get("Supported") == "1":
             cuda = int(facts.get("cudaId", "-1"))
-            found.append(VulkanDevice(name.strip(), cuda if cuda >= 0 else None))
+            found.append((name.strip(), cuda if cuda >= 0 else None))
     return found
 
 
-def _run_child(api: Literal["vulkan", "egl"], cure: str, timeout_s: float) -> RenderProbe:
+def _probed(api: Literal["vulkan", "egl"], module: str, extra: str, cure: str, timeout_s: float) -> RenderProbe:
+    """Render one frame in a child by `module`, which an extra installs."""
+    if importlib.util.find_spec(module) is None:
+        error, cure = f"{module} is not installed", f"pip install 'vlagents-ray[{extra}]'"
+        return RenderProbe(api, ok=False, seconds=0.0, error=error, cure=cure)
     root = str(Path(vlagents_ray.__file__).parents[1])
     path = os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")]))
     variables = {**os.environ, "PYTHONPATH": path}
@@ -202,7 +184,7 @@ def _render_vulkan() -> str | None:
     camera.take_picture()
     _require_contrast(np.asarray(camera.get_picture("Color"))[..., :3])
     found = vulkan_device(on_gpu=device.is_cuda())
-    return None if found is None else found.name
+    return None if found is None else found[0]
 
 
 def _render_egl() -> str | None:

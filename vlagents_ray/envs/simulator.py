@@ -15,7 +15,7 @@ import numpy as np
 from vlagents_ray.contract import Contract
 from vlagents_ray.envs.base import EvalEnv, Options, one_row, require_known
 from vlagents_ray.envs.graphics import prepare_rendering
-from vlagents_ray.envs.render_probe import failing, without, without_egl
+from vlagents_ray.envs.render_probe import egl_probe, failing, without
 from vlagents_ray.errors import ConfigError, EnvFailed, NotReset
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.registry import require
@@ -75,9 +75,7 @@ class SimulatorEnv(EvalEnv):
     def __init__(self, name: str, **sizes: int | None) -> None:
         """Check the options, of which `sizes` are at least 1 or None; set what drivers read when they are loaded."""
         self._name = name
-        for option, value in sizes.items():
-            if value is not None and value < 1:
-                raise ConfigError(f"{name}: {option} is {value}, want at least 1")
+        require_sizes(name, **sizes)
         self._resources = ExitStack()  # what `close` calls, the last first
         prepare_rendering()
 
@@ -97,7 +95,10 @@ class SimulatorEnv(EvalEnv):
     @classmethod
     def missing(cls) -> str | None:
         """Say why the simulator cannot run here; the first call in a process renders one frame in a child."""
-        return without(cls.packages, cls.cure) or cls._missing_assets() or without_egl(cls.title)
+        if lacks := without(cls.packages, cls.cure) or cls._missing_assets():
+            return lacks
+        probe = egl_probe()
+        return None if probe.ok else f"{cls.title} cannot render without a display ({probe.error}); {probe.cure}"
 
     def reset(self, *, seed: int, options: Options | None = None) -> tuple[Obs, dict[str, Any]]:
         """Begin the episode of `seed`, taken modulo 2^32.
@@ -213,6 +214,13 @@ class MujocoCameras:
         self._renderer.update_scene(data, camera=camera)
         image: np.ndarray = self._renderer.render()
         return np.ascontiguousarray(image[::-1, ::-1]) if camera in self._upside_down else image
+
+
+def require_sizes(env: str, **sizes: int | None) -> None:
+    """Raise `ConfigError` unless each option is at least 1, or None."""
+    for option, value in sizes.items():
+        if value is not None and value < 1:
+            raise ConfigError(f"{env}: {option} is {value}, want at least 1")
 
 
 def camera_names(model: Any) -> list[str]:

@@ -34,15 +34,7 @@ UNFINISHED = "unfinished"  # folder of the running episodes
 class Dataset:
     """A dataset to which episodes are added; opening an existing one continues it, with the columns that it has."""
 
-    def __init__(
-        self,
-        root: Path,
-        fps: float,
-        robot_type: str | None = None,
-        *,
-        interventions: bool = False,
-        lossless: bool = False,
-    ) -> None:
+    def __init__(self, root: Path, fps: float, *, interventions: bool = False, lossless: bool = False) -> None:
         """Open or begin a dataset of frames at `fps` Hz; `lossless` videos keep each pixel.
 
         Raises:
@@ -58,7 +50,7 @@ class Dataset:
         rate = int(fps) if float(fps).is_integer() else fps
         self.info: dict[str, Any] = {
             "codebase_version": VERSION,
-            "robot_type": robot_type,
+            "robot_type": None,
             "total_episodes": 0,
             "total_frames": 0,
             "total_tasks": 0,

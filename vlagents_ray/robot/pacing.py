@@ -93,18 +93,6 @@ def jitter(late_s: Sequence[float], missed: int, ticks: int | None = None) -> di
     }
 
 
-def empty_loop(hz: float, seconds: float, *, real_time: bool = False) -> dict[str, float]:
-    """Measure the jitter of a loop that does nothing, as the best that this machine can do."""
-    with undisturbed(real_time=real_time):
-        pacer = Pacer(hz)
-        ticks = pacer.ticks_in(seconds)
-        while (tick := pacer.wait()) < ticks - 1:
-            pass
-        if tick >= ticks:
-            pacer.forget(ticks)
-    return jitter(pacer.late_s, pacer.missed, pacer.ticks)
-
-
 @contextlib.contextmanager
 def undisturbed(*, real_time: bool = False) -> Iterator[list[str]]:
     """Reduce the delays of the calling thread by its own process; yields the measures taken, in words.

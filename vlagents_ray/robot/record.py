@@ -55,7 +55,6 @@ class Recorder:
     Args:
         root: The dataset's folder, which is created or continued.
         fps: The rate of the frames, Hz.
-        robot_type: The robot's name, for the dataset's `info.json`.
         frames: The largest number of frames in the queue.
         interventions: Whether a human may take over: frames then also have `intervention` (bool), `policy_action`, what
             the policy wanted, and `policy_known` (bool), and episodes a label. A dataset that has these columns gets
@@ -71,13 +70,12 @@ class Recorder:
         root: str | Path,
         fps: float,
         *,
-        robot_type: str | None = None,
         frames: int = 100,
         interventions: bool = False,
     ) -> None:
         self.dropped = 0
         self.error: Exception | None = None  # the first error in writing
-        self._dataset = Dataset(Path(root), fps, robot_type, interventions=interventions)
+        self._dataset = Dataset(Path(root), fps, interventions=interventions)
         self._label: Label | None = None
         self._frames = frames
         # A text begins an episode: its instruction.

@@ -153,8 +153,9 @@ class Watchdog:
         Watchdog(robot.stop, {"server": 1.0, "loop": 0.2})  # s
 
     `stop` is called once for each silence, on the watchdog's own thread, so that a control loop that hangs is noticed.
-    The time limits begin to run at `start` (or `with`). After a stop, `stopped` is true until `restart` is called, also
-    in later runs of the control loop. If `stop` raises an exception, it is kept in `error`, and the watchdog continues.
+    The time limits begin to run at `start` (or `with`). After a stop, `control.stopped` is true until `restart` is
+    called, also in later runs of the control loop. If `stop` raises an exception, it is kept in `error`, and the
+    watchdog continues.
 
     Args:
         stop: Stops the robot; it gets the reason as text, which is also appended to `barks`.
@@ -170,7 +171,8 @@ class Watchdog:
                 raise ConfigError(f"watchdog: got {limit_s} s for {name!r}, want above 0")
         self.barks: list[str] = []  # the reasons given to `stop`
         self.error: Exception | None = None
-        self._control = Control()
+        self.control = Control()
+        """The state of the robot, which `run_loop` lets it share with a chunk player."""
         self._stop = stop
         self._limits = dict(silent_s)
         self._heard = dict.fromkeys(silent_s, 0.0)
@@ -195,36 +197,21 @@ class Watchdog:
             return
         with self._changed:
             self._heard[name] = at
-            if name in self._control.silent and ago_s < self._limits[name]:
-                self._control.heard(name)
+            if name in self.control.silent and ago_s < self._limits[name]:
+                self.control.heard(name)
                 self._changed.notify_all()
-
-    @property
-    def control(self) -> Control:
-        """The state of the robot, which `run_loop` lets it share with a chunk player."""
-        return self._control
-
-    @property
-    def silent(self) -> list[str]:
-        """The sources whose silence stopped the robot and that are still silent, by name."""
-        return self._control.silent
-
-    @property
-    def stopped(self) -> bool:
-        """Whether the robot was stopped and motion has not been restarted since."""
-        return self._control.stopped
 
     def share(self, control: Control) -> None:
         """Use the state of a chunk player, which gets the stops of before."""
         with self._changed:
-            if control is not self._control:
-                control.adopt(self._control)
-                self._control = control
+            if control is not self.control:
+                control.adopt(self.control)
+                self.control = control
 
     def trip(self, reason: str) -> None:
         """Stop the robot now, on the caller's thread; motion is restarted by `restart` alone."""
         with self._changed:
-            self._control.stop(reason)
+            self.control.stop(reason)
         self.barks.append(reason)
         self._stop(reason)
 
@@ -232,10 +219,10 @@ class Watchdog:
         """Allow motion again after a stop; may be called from any thread and from a signal handler.
 
         Returns:
-            Whether motion is allowed. It is not while a source is silent (see `silent`); call this again afterwards.
+            Whether motion is allowed. It is not while a source is silent (`control.silent`); call this again later.
         """
         with self._changed:
-            return self._control.restart()
+            return self.control.restart()
 
     def start(self) -> None:
         """Start the thread and the time limits of all sources; does nothing if they run. Stops and silences last."""
@@ -243,8 +230,8 @@ class Watchdog:
             if self._thread is not None:
                 return
             self._heard = dict.fromkeys(self._limits, time.monotonic())
-            for name in set(self._control.silent) - self._limits.keys():
-                self._control.heard(name)  # no later sign of life would end its silence
+            for name in set(self.control.silent) - self._limits.keys():
+                self.control.heard(name)  # no later sign of life would end its silence
             self._thread = threading.Thread(target=self._watch, name="vlagents-ray-watchdog", daemon=True)
         self._thread.start()
 
@@ -272,12 +259,12 @@ class Watchdog:
                     if self._thread is not me:
                         return
                     now = time.monotonic()
-                    silent = self._control.silent
+                    silent = self.control.silent
                     waiting = {n: self._heard[n] + s - now for n, s in self._limits.items() if n not in silent}
                     name = min(waiting, key=lambda n: waiting[n]) if waiting else None
                     if name is not None and waiting[name] <= 0:
                         reason = f"{name}: silent for {now - self._heard[name]:.2f} s"
-                        self._control.stop(reason, silent=name)
+                        self.control.stop(reason, silent=name)
                     else:
                         self._changed.wait(None if name is None else waiting[name])
             self.barks.append(reason)

@@ -8,8 +8,9 @@ import select
 import sys
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -28,20 +29,24 @@ _FULLY_OPEN = 0.9  # below this opening, a gripper may hold something
 _SPEED = 0.5
 
 
-class AxesDevice(Protocol):
-    """The interface of a device with axes; its methods return at once."""
+class AxesDevice(ABC):
+    """A device with axes; its methods return at once."""
 
+    _presses = 0  # of the gripper's button
+    _taken = False  # whether the human has taken over
+
+    @abstractmethod
     def engaged(self) -> bool:
         """Read the device, and return whether the human wants to move the robot."""
-        ...
 
+    @abstractmethod
     def axes(self) -> np.ndarray:
         """Return x, y, z, roll, pitch and yaw as read last, (6,), each in [-1, 1]."""
-        ...
 
     def gripper_presses(self) -> int:
         """Return how often the gripper's button has been pressed since the last call."""
-        ...
+        presses, self._presses = self._presses, 0
+        return presses
 
 
 class AxesLeader:
@@ -148,7 +153,7 @@ HELP = (
 )
 
 
-class Keyboard:
+class Keyboard(AxesDevice):
     """The keys of a terminal as six axes; any of them takes over, Enter takes over or gives back.
 
         with Keyboard() as device:
@@ -168,8 +173,6 @@ class Keyboard:
             raise ConfigError(f"keyboard: {taken} move the robot, so they cannot do something else")
         self._terminal = Terminal(terminal)
         self._until = np.zeros((6, 2))  # s of `time.monotonic`: until when a key counts, for each axis and direction
-        self._presses = 0
-        self._taken = False
         self._open = contextlib.ExitStack()
 
     def __enter__(self) -> Self:
@@ -190,11 +193,6 @@ class Keyboard:
         """Return the axes whose keys are pressed, (6,), each -1, 0 or 1."""
         pressed = self._until > time.monotonic()
         return pressed[:, 0].astype(np.float32) - pressed[:, 1]
-
-    def gripper_presses(self) -> int:
-        """Return how often the gripper's key has been pressed since the last call."""
-        presses, self._presses = self._presses, 0
-        return presses
 
     def _press(self, key: str) -> bool:
         if key in AXES:
@@ -222,7 +220,7 @@ _DEAD = 0.1  # of the range: the cap never rests exactly in the middle
 _REPORTS = 64  # the device sends more reports than a loop has ticks; so many are read at one
 
 
-class SpaceMouse:
+class SpaceMouse(AxesDevice):
     """The cap of a SpaceMouse as six axes: pushed forward, left and up is +x, +y, +z, as ROS has them (REP 103).
 
     Moving it takes over, its first button opens and closes the gripper, and its last one takes over or gives back.
@@ -243,8 +241,6 @@ class SpaceMouse:
             ) from error
         self._axes = np.zeros(6, np.float32)
         self._buttons: list[int] = []
-        self._presses = 0
-        self._taken = False
 
     def __enter__(self) -> Self:
         return self
@@ -270,11 +266,6 @@ class SpaceMouse:
         """Return the axes as read last, (6,), each in [-1, 1]."""
         return self._axes
 
-    def gripper_presses(self) -> int:
-        """Return how often the gripper's button has been pressed since the last call."""
-        presses, self._presses = self._presses, 0
-        return presses
-
     def _note(self, buttons: list[int]) -> None:
         before = self._buttons or [0] * len(buttons)
         pressed = [now > then for now, then in zip(buttons, before, strict=True)]
@@ -297,13 +288,11 @@ class TeleoperatedAgent(Agent):
         contract: What the robot gives and takes, for the loop's guard.
     """
 
-    def __init__(self, leader: Leader, contract: Contract | None = None) -> None:
-        self._leader, self._contract = leader, contract
+    contract: Contract | None = None
 
-    @property
-    def contract(self) -> Contract | None:
-        """The contract of the robot, as it was given."""
-        return self._contract
+    def __init__(self, leader: Leader, contract: Contract | None = None) -> None:
+        self._leader = leader
+        self.contract = contract
 
     def act(self, obs: Obs) -> Act:
         """Return the human's action, (D,) float32, with `info["intervention"]`."""

@@ -14,13 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.contract import Contract
+from vlagents_ray.contract import CameraSpec, Contract, StateSpec
 from vlagents_ray.errors import InvalidAction
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.testing.comparing import ContractViolation, require_same, require_wireable
-from vlagents_ray.testing.observations import random_observation
+from vlagents_ray.testing.comparing import ContractViolation, check_close, require_same, require_wireable
 from vlagents_ray.validation import check_action
 
+_SIDE = 64  # px, of a random image whose size no contract states
+_DIM = 7  # of such a part of the state
 _SESSIONS = 3
 _THREADS = 4  # as many prepare observations in a server
 _ROUNDS = 20  # acts beside those threads, each after `_RESETS` resets
@@ -68,50 +69,29 @@ def check_agent(
     suite = _Suite(agent, contract, views, instructions, dict(reset_kwargs or {}))
 
     alone = [suite.play_alone(i, steps) for i in range(_SESSIONS)]
+    because = "the same observations, instruction and seed must give the same actions"
     for i, again in enumerate([suite.play_alone(i, steps) for i in range(_SESSIONS)]):
-        require_same(
-            alone[i],
-            again,
-            f"act of session {i}",
-            "the same observations, instruction and seed must give the same actions",
-        )
+        require_same(alone[i], again, f"act of session {i}", because)
+    because = "it depends on other sessions: keep what belongs to an episode in self, and out of `shared`"
     sessions = [suite.begin(i) for i in range(_SESSIONS)]
     for step in range(steps):
         for i, session in enumerate(sessions):
-            require_same(
-                alone[i][step],
-                suite.act(i, session),
-                f"act {step} of session {i}",
-                "it depends on other sessions: keep what belongs to an episode in self, and out of `shared`",
-            )
+            require_same(alone[i][step], suite.act(i, session), f"act {step} of session {i}", because)
     if type(agent).prepare is not Agent.prepare:
+        because = "`prepare` must compute what `act` computes without it"
         for i, session in enumerate([suite.begin(i) for i in range(_SESSIONS)]):
             for step in range(steps):
-                require_same(
-                    alone[i][step],
-                    suite.act(i, session, prepared=True),
-                    f"act {step} of session {i} on a prepared observation",
-                    "`prepare` must compute what `act` computes without it",
-                )
+                where = f"act {step} of session {i} on a prepared observation"
+                require_same(alone[i][step], suite.act(i, session, prepared=True), where, because)
         _check_threads(suite, [acts[0] for acts in alone])
+    because = "act_batch must give each session what act gives it alone"
     for size in range(1, _SESSIONS + 1):
         batch = [suite.begin(i) for i in range(size)]
         for step in range(steps):
             for i, act in enumerate(suite.act_batch(batch)):
-                require_same(
-                    alone[i][step],
-                    act,
-                    f"act {step} of session {i} in a batch of {size}",
-                    "act_batch must give each session what act gives it alone",
-                    atol,
-                )
-    for attempt in ("first", "second"):
-        try:
-            agent.close()
-        except Exception as error:
-            raise ContractViolation(
-                f"close: the {attempt} call raised {error!r}; it must be safe to call twice"
-            ) from error
+                where = f"act {step} of session {i} in a batch of {size}"
+                require_same(alone[i][step], act, where, because, atol)
+    check_close(agent)
 
 
 def _check_threads(suite: _Suite, first: list[Act]) -> None:
@@ -252,3 +232,28 @@ class _Suite:
             raise ContractViolation(f"{where}: done is {type(act.done).__name__}, want a bool")
         require_wireable(act.info, f"{where}: info")
         return act
+
+
+def random_observation(
+    contract: Contract | None, seed: int, *, side: int = _SIDE, dims: Mapping[str, int] | None = None
+) -> Obs:
+    """Make a random observation that fits a contract.
+
+    Returns:
+        The observation; equal seeds give equal observations.
+    """
+    rng = np.random.default_rng(seed)
+    cameras: Mapping[str, CameraSpec] = {"front": CameraSpec()}
+    state: Mapping[str, StateSpec] = {"joints": StateSpec()}
+    if contract is not None:
+        cameras = cameras if contract.cameras is None else contract.cameras
+        state = state if contract.state is None else contract.state
+    sizes = {name: part.dim or (dims or {}).get(name, _DIM) for name, part in state.items()}
+    return Obs(
+        cameras={
+            name: rng.integers(0, 256, (camera.height or side, camera.width or side, 3), dtype=np.uint8)
+            for name, camera in cameras.items()
+        },
+        gripper=float(rng.uniform()),
+        state={name: rng.uniform(-1, 1, size).astype(np.float32) for name, size in sizes.items()},
+    )

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from vlagents_ray.envs.base import EvalEnv
 from vlagents_ray.errors import VLAgentsError
-from vlagents_ray.interface import Act, Obs
+from vlagents_ray.interface import Act, Agent, Obs
 
 _SCALARS = (bool, int, float, str, bytes)
 
@@ -95,3 +96,14 @@ def require_same(a: Any, b: Any, where: str, because: str, atol: float = 0.0) ->
     found = difference(a, b, where, atol)
     if found:
         raise ContractViolation(f"{found}; {because}")
+
+
+def check_close(made: Agent | EvalEnv) -> None:
+    """Close an agent or an environment twice, which must be safe."""
+    for attempt in ("first", "second"):
+        try:
+            made.close()
+        except Exception as error:
+            raise ContractViolation(
+                f"close: the {attempt} call raised {error!r}; it must be safe to call twice"
+            ) from error

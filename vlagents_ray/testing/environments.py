@@ -13,7 +13,7 @@ from vlagents_ray.contract import Contract
 from vlagents_ray.envs.base import EvalEnv
 from vlagents_ray.errors import InvalidAction, InvalidObservation
 from vlagents_ray.interface import Act, Obs
-from vlagents_ray.testing.comparing import ContractViolation, require_same, require_wireable
+from vlagents_ray.testing.comparing import ContractViolation, check_close, require_same, require_wireable
 from vlagents_ray.validation import check_observation
 
 
@@ -42,11 +42,11 @@ def check_env(
     Raises:
         ContractViolation: The environment does not implement the interface; the message says where.
     """
-    contract = _check_static(env)
-    actions = _random_actions(contract, steps)
-    first = _rollout(env, contract, seeds[0], options, actions)
-    other = _rollout(env, contract, seeds[1], options, actions)
-    again = _rollout(env, contract, seeds[0], options, actions)
+    suite = _Suite(env, _check_static(env), options)
+    actions = suite.random_actions(steps)
+    first = suite.play(seeds[0], actions)
+    other = suite.play(seeds[1], actions)
+    again = suite.play(seeds[0], actions)
     because = "an episode must be a pure function of its seed and options, whatever was played before"
     require_same(first.instruction, again.instruction, "instruction", because)
     require_same(first.seen[0], again.seen[0], "the first observation", because)
@@ -54,25 +54,15 @@ def check_env(
         for i, (a, b) in enumerate(zip(first.seen, again.seen, strict=False)):
             require_same(a, b, f"the observation after step {i}", because)
         require_same(first.outcomes, again.outcomes, "[reward, terminated, truncated, success] of the steps", because)
-        _check_unseen(env, contract, seeds[0], options, actions, first)
+        suite.check_unseen(seeds[0], actions, first)
+    because = "a later step or reset changed it: give new arrays each time"
     for rollout in (first, other, again):
         for i, (given, kept) in enumerate(zip(rollout.given, rollout.seen, strict=True)):
-            require_same(
-                kept,
-                given,
-                f"the observation after step {i}",
-                "a later step or reset changed it: give new arrays each time",
-            )
-    _check_invalid_actions(env, contract, seeds[0], options)
+            require_same(kept, given, f"the observation after step {i}", because)
+    suite.check_invalid_actions(seeds[0])
     if step_limit:
-        _check_step_limit(env, contract, seeds[0], options)
-    for attempt in ("first", "second"):
-        try:
-            env.close()
-        except Exception as error:
-            raise ContractViolation(
-                f"close: the {attempt} call raised {error!r}; it must be safe to call twice"
-            ) from error
+        suite.check_step_limit(seeds[0])
+    check_close(env)
 
 
 @dataclass(slots=True)
@@ -97,66 +87,110 @@ def _check_static(env: EvalEnv) -> Contract:
     return contract
 
 
-def _random_actions(contract: Contract, count: int) -> list[np.ndarray]:
-    spec = contract.action
-    low = -1.0 if spec.low is None else spec.low
-    high = 1.0 if spec.high is None else spec.high
-    actions = np.random.default_rng(0).uniform(low, high, (count, spec.dim or 1))
-    return list(actions.astype(np.float32))
+@dataclass(slots=True)
+class _Suite:
+    """Plays episodes, and checks what the environment returns."""
 
+    _env: EvalEnv
+    _contract: Contract
+    _options: Mapping[str, Any] | None
 
-def _rollout(
-    env: EvalEnv, contract: Contract, seed: int, options: Mapping[str, Any] | None, actions: list[np.ndarray]
-) -> _Rollout:
-    obs = _reset(env, contract, seed, options)
-    rollout = _Rollout(env.instruction, [obs], [copy.deepcopy(obs)], [])
-    for action in actions:
-        obs, outcome = _step(env, contract, action)
-        rollout.given.append(obs)
-        rollout.seen.append(copy.deepcopy(obs))
-        rollout.outcomes.append(outcome)
-        if outcome[1] or outcome[2]:
-            break
-    return rollout
+    def random_actions(self, count: int) -> list[np.ndarray]:
+        spec = self._contract.action
+        low = -1.0 if spec.low is None else spec.low
+        high = 1.0 if spec.high is None else spec.high
+        actions = np.random.default_rng(0).uniform(low, high, (count, spec.dim or 1))
+        return list(actions.astype(np.float32))
 
+    def play(self, seed: int, actions: list[np.ndarray]) -> _Rollout:
+        obs = self.reset(seed)
+        rollout = _Rollout(self._env.instruction, [obs], [copy.deepcopy(obs)], [])
+        for action in actions:
+            obs, outcome = self.step(action)
+            rollout.given.append(obs)
+            rollout.seen.append(copy.deepcopy(obs))
+            rollout.outcomes.append(outcome)
+            if outcome[1] or outcome[2]:
+                break
+        return rollout
 
-def _reset(env: EvalEnv, contract: Contract, seed: int, options: Mapping[str, Any] | None) -> Obs:
-    result = env.reset(seed=seed, options=options)
-    if not isinstance(result, tuple) or len(result) != 2:
-        raise ContractViolation(f"reset: got {_kind(result)}, want (Obs, info)")
-    obs, info = result
-    _check_obs(obs, contract, "reset")
-    if not isinstance(info, dict):
-        raise ContractViolation(f"reset: info is {_kind(info)}, want a dict")
-    require_wireable(info, "reset: info")
-    if not isinstance(env.instruction, str):
-        raise ContractViolation(f"instruction: got {_kind(env.instruction)}, want a str")
-    if contract.instruction and not env.instruction:
-        raise ContractViolation("instruction: is empty, but the contract states that the env has one")
-    return obs
+    def reset(self, seed: int) -> Obs:
+        result = self._env.reset(seed=seed, options=self._options)
+        if not isinstance(result, tuple) or len(result) != 2:
+            raise ContractViolation(f"reset: got {_kind(result)}, want (Obs, info)")
+        obs, info = result
+        _check_obs(obs, self._contract, "reset")
+        if not isinstance(info, dict):
+            raise ContractViolation(f"reset: info is {_kind(info)}, want a dict")
+        require_wireable(info, "reset: info")
+        instruction = self._env.instruction
+        if not isinstance(instruction, str):
+            raise ContractViolation(f"instruction: got {_kind(instruction)}, want a str")
+        if self._contract.instruction and not instruction:
+            raise ContractViolation("instruction: is empty, but the contract states that the env has one")
+        return obs
 
+    def step(self, action: np.ndarray) -> tuple[Obs, list[Any]]:
+        """Return the observation, and reward, terminated, truncated and success."""
+        sent = action.copy()
+        result = self._env.step(Act(sent))
+        require_same(action, sent, "the action", "step must leave the caller's array as it is")
+        if not isinstance(result, tuple) or len(result) != 5:
+            raise ContractViolation(f"step: got {_kind(result)}, want (Obs, reward, terminated, truncated, info)")
+        obs, *outcome, info = result
+        _check_obs(obs, self._contract, "step")
+        kinds = (("reward", float), ("terminated", bool), ("truncated", bool))
+        for (name, kind), value in zip(kinds, outcome, strict=True):
+            if type(value) is not kind:
+                raise ContractViolation(f"step: {name} is {_kind(value)}, want a {kind.__name__}")
+        if not isinstance(info, dict):
+            raise ContractViolation(f"step: info is {_kind(info)}, want a dict")
+        if type(info.get("success")) is not bool:
+            raise ContractViolation(f"step: info['success'] is {_kind(info.get('success'))}, want a bool")
+        require_wireable(info, "step: info")
+        return obs, [*outcome, info["success"]]
 
-def _step(env: EvalEnv, contract: Contract, action: np.ndarray) -> tuple[Obs, list[Any]]:
-    sent = action.copy()
-    result = env.step(Act(sent))
-    require_same(action, sent, "the action", "step must leave the caller's array as it is")
-    if not isinstance(result, tuple) or len(result) != 5:
-        raise ContractViolation(f"step: got {_kind(result)}, want (Obs, reward, terminated, truncated, info)")
-    obs, reward, terminated, truncated, info = result
-    _check_obs(obs, contract, "step")
-    for name, value, kind in (
-        ("reward", reward, float),
-        ("terminated", terminated, bool),
-        ("truncated", truncated, bool),
-    ):
-        if type(value) is not kind:
-            raise ContractViolation(f"step: {name} is {_kind(value)}, want a {kind.__name__}")
-    if not isinstance(info, dict):
-        raise ContractViolation(f"step: info is {_kind(info)}, want a dict")
-    if type(info.get("success")) is not bool:
-        raise ContractViolation(f"step: info['success'] is {_kind(info.get('success'))}, want a bool")
-    require_wireable(info, "step: info")
-    return obs, [reward, terminated, truncated, info["success"]]
+    def check_unseen(self, seed: int, actions: list[np.ndarray], seen: _Rollout) -> None:
+        """Repeat the episode `seen` with `looked_at` False before the last step; only images may be absent."""
+        self.reset(seed)
+        last = len(seen.outcomes) - 1
+        because = "`looked_at` may omit images and must change nothing else"
+        for i, (action, expected) in enumerate(zip(actions, seen.seen[1:], strict=False)):
+            self._env.looked_at = i == last
+            obs, reward, terminated, truncated, info = self._env.step(Act(action.copy()))
+            a, b = (one if i == last else Obs({}, one.gripper, one.state) for one in (expected, obs))
+            require_same(a, b, f"the observation after step {i}", because)
+            outcome = [reward, terminated, truncated, info["success"]]
+            require_same(seen.outcomes[i], outcome, f"[reward, terminated, truncated, success] of step {i}", because)
+
+    def check_invalid_actions(self, seed: int) -> None:
+        self.reset(seed)
+        [good] = self.random_actions(1)
+        dim = len(good)
+        for what, action in (
+            (f"of shape ({dim + 1},)", np.append(good, good[0])),
+            ("that holds NaN", np.full(dim, np.nan, np.float32)),
+        ):
+            try:
+                self._env.step(Act(action))
+            except InvalidAction:
+                continue
+            except Exception as error:
+                raise ContractViolation(f"step: an action {what} raised {error!r}, want InvalidAction") from error
+            raise ContractViolation(f"step: an action {what} was executed, want InvalidAction")
+        self.step(good)
+
+    def check_step_limit(self, seed: int) -> None:
+        self.reset(seed)
+        [action] = self.random_actions(1)
+        limit = self._env.max_steps
+        for count in range(1, limit + 1):
+            _, (_, terminated, truncated, _) = self.step(action)
+            if terminated:
+                return
+            if truncated != (count == limit):
+                state = "is" if truncated else "is not"
+                raise ContractViolation(f"step {count} {state} truncated, but max_steps is {limit}")
 
 
 def _check_obs(obs: object, contract: Contract, where: str) -> None:
@@ -175,57 +209,6 @@ def _check_obs(obs: object, contract: Contract, where: str) -> None:
     if contract.gripper is False and obs.gripper is not None:
         raise ContractViolation(f"{where}: gripper is {obs.gripper}, the contract states that there is none")
     require_wireable(obs.info, f"{where}: Obs.info")
-
-
-def _check_unseen(
-    env: EvalEnv,
-    contract: Contract,
-    seed: int,
-    options: Mapping[str, Any] | None,
-    actions: list[np.ndarray],
-    seen: _Rollout,
-) -> None:
-    """Repeat the episode `seen` with `looked_at` False before the last step; only images may be absent."""
-    _reset(env, contract, seed, options)
-    last = len(seen.outcomes) - 1
-    for i, (action, expected) in enumerate(zip(actions, seen.seen[1:], strict=False)):
-        env.looked_at = i == last
-        obs, reward, terminated, truncated, info = env.step(Act(action.copy()))
-        because = "`looked_at` may omit images and must change nothing else"
-        a, b = (one if i == last else Obs({}, one.gripper, one.state) for one in (expected, obs))
-        require_same(a, b, f"the observation after step {i}", because)
-        outcome = [reward, terminated, truncated, info["success"]]
-        require_same(seen.outcomes[i], outcome, f"[reward, terminated, truncated, success] of step {i}", because)
-
-
-def _check_invalid_actions(env: EvalEnv, contract: Contract, seed: int, options: Mapping[str, Any] | None) -> None:
-    _reset(env, contract, seed, options)
-    dim = contract.action.dim or 1
-    good = _random_actions(contract, 1)[0]
-    for what, action in (
-        (f"of shape ({dim + 1},)", np.append(good, good[0])),
-        ("that holds NaN", np.full(dim, np.nan, np.float32)),
-    ):
-        try:
-            env.step(Act(action))
-        except InvalidAction:
-            continue
-        except Exception as error:
-            raise ContractViolation(f"step: an action {what} raised {error!r}, want InvalidAction") from error
-        raise ContractViolation(f"step: an action {what} was executed, want InvalidAction")
-    _step(env, contract, good)
-
-
-def _check_step_limit(env: EvalEnv, contract: Contract, seed: int, options: Mapping[str, Any] | None) -> None:
-    _reset(env, contract, seed, options)
-    action = _random_actions(contract, 1)[0]
-    for count in range(1, env.max_steps + 1):
-        _, (_, terminated, truncated, _) = _step(env, contract, action)
-        if terminated:
-            return
-        if truncated != (count == env.max_steps):
-            state = "is" if truncated else "is not"
-            raise ContractViolation(f"step {count} {state} truncated, but max_steps is {env.max_steps}")
 
 
 def _kind(value: object) -> str:

@@ -19,7 +19,7 @@ import numpy as np
 
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge, shown
 from vlagents_ray.protocol.frame_layout import Buffer, read_array
-from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
+from vlagents_ray.protocol.messages import Limits
 
 _PROTOCOLS = (4, 5)
 _INTEGER = 9  # maximum number of bytes of an integer
@@ -407,11 +407,3 @@ NUMPY_CALLS: dict[Name, Call | None] = {Name("numpy", "dtype"): _dtype, Name("nu
         ("numeric", "_frombuffer", _frombuffer),
     )
 }
-
-
-def read_pickled_array(data: bytes) -> np.ndarray:
-    """Return the numpy array that a pickle consists of, which views `data`."""
-    found = read_pickle(data, DEFAULT_LIMITS, {}, NUMPY_CALLS)
-    if not isinstance(found, np.ndarray):
-        raise MalformedMessage(f"pickle: got {type(found).__name__}, want a numpy array")
-    return found

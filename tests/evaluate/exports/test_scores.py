@@ -12,7 +12,7 @@ from eval_fakes import LINE
 from pydantic import ValidationError
 from recorded_results import record, runs
 
-from vlagents_ray.envs.libero.tasks import LiberoProtocol
+from vlagents_ray.envs.libero import LiberoProtocol
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig, Results
 from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult

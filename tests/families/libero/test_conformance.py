@@ -48,7 +48,7 @@ def test_an_episode_begins_with_a_reset_and_then_the_files_state(bowl: Libero, m
         def noted(*args: object) -> object:
             calls.append(name)
             result = real(*args)
-            states.append(world(bowl).flat_state())
+            states.append(np.array(world(bowl)._env.get_sim_state()))
             return result
 
         monkeypatch.setattr(owner, name, noted)

@@ -14,8 +14,7 @@ from unseen_images import require_same_without_unseen_images
 
 from vlagents_ray.contract import CameraSpec
 from vlagents_ray.envs.base import known_contract
-from vlagents_ray.envs.libero import Libero
-from vlagents_ray.envs.libero.tasks import SUITES, find_task
+from vlagents_ray.envs.libero import SUITES, Libero, find_task
 from vlagents_ray.errors import ConfigError, EnvFailed, InvalidAction, NotReset, UnknownEnv
 from vlagents_ray.interface import Act
 from vlagents_ray.testing import check_env

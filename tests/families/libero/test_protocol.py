@@ -7,10 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vlagents_ray.envs.libero import Libero
-from vlagents_ray.envs.libero.env import to_simulator
-from vlagents_ray.envs.libero.package import find_assets
-from vlagents_ray.envs.libero.tasks import SUITES, LiberoProtocol
+from vlagents_ray.envs.libero import SUITES, Libero, LiberoProtocol, find_assets, to_simulator
 from vlagents_ray.errors import EnvFailed, UnknownEnv
 
 

@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vlagents_ray.envs.libero.env import axis_angle
-from vlagents_ray.envs.libero.tasks import find_task, read_states
+from vlagents_ray.envs.libero import axis_angle, find_task, read_states
 
 pytestmark = pytest.mark.assets("libero")
 

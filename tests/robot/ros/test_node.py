@@ -151,7 +151,7 @@ def test_the_command_drives_an_arm_from_its_topics_and_stops_it_where_it_is(
     with policy_server(agent) as url, rosbridge_double() as double:
         (tmp_path / "arm.yaml").write_text(yaml.safe_dump(ros_arm.settings(double.url)))
         with RosArm(double.publish, lambda: double.on(COMMANDS)) as arm:
-            options = f"--ros {tmp_path / 'arm.yaml'} --hz 30 --mode open_loop --restart auto --baseline 0".split()
+            options = f"--ros {tmp_path / 'arm.yaml'} --hz 30 --mode open_loop --restart auto".split()
             said = ["--instruction", "stack the cups", "--measure", "joints", "--max-step", str(MAX_STEP)]
             status = command.main([url, *options, *said])
     assert status != 2, capsys.readouterr().out  # a busy machine may be late at a tick
@@ -193,7 +193,7 @@ def test_a_hanging_camera_holds_the_arm_still_until_it_goes_on() -> None:
         beats = len(drive.double.on(BEAT))
         wait_for(lambda: len(drive.double.on(BEAT)) > beats + 5)  # the loop goes on
         assert len(drive.commands) == still
-        assert not drive.watchdog.stopped
+        assert not drive.watchdog.control.stopped
         drive.arm.broken = set()
         drive.moves()
         wait_for(lambda: drive.alive)
@@ -211,12 +211,12 @@ def test_a_topic_that_is_silent_for_long_stops_the_arm_until_a_person_starts_it(
     limits = {"topic": CAMERA, "max_age_s": 0.5, "silent_s": 1.0}
     with driving(Ahead(), cameras={"front": limits}) as drive:
         drive.arm.broken = {CAMERA}
-        wait_for(lambda: drive.watchdog.stopped)
+        wait_for(lambda: drive.watchdog.control.stopped)
         assert drive.watchdog.barks[0].startswith(f"{CAMERA}: silent for")
         assert not drive.watchdog.restart()  # it is still silent
         still = len(drive.commands)
         drive.arm.broken = set()
-        wait_for(lambda: drive.robot.holds is None and not drive.watchdog.silent)
+        wait_for(lambda: drive.robot.holds is None and not drive.watchdog.control.silent)
         beats = len(drive.double.on(BEAT))
         wait_for(lambda: len(drive.double.on(BEAT)) > beats + 5)
         assert len(drive.commands) <= still + 1
@@ -321,7 +321,7 @@ def test_a_killed_server_stops_the_arm(tmp_path: Path, capsys: pytest.CaptureFix
         with RosArm(double.publish, lambda: double.on(COMMANDS)) as arm:
             options = f"--ros {tmp_path / 'arm.yaml'} --hz 30 --seconds 4 --silent-s 1".split()
             status: list[int] = []
-            options += ["--timeout-s", "1", "--restart", "auto", "--baseline", "0"]  # a busy machine may stop it before
+            options += ["--timeout-s", "1", "--restart", "auto"]  # a busy machine may stop it before
             run = [url, *options, "--measure", "joints", "--max-step", str(MAX_STEP)]
             thread = threading.Thread(target=lambda: status.append(command.main(run)))
             thread.start()
@@ -378,7 +378,7 @@ def test_a_policy_for_another_robot_is_refused(tmp_path: Path, capsys: pytest.Ca
         with RosArm(double.publish, lambda: double.on(COMMANDS)):
             cameras = {"cameras": {"top": {"topic": CAMERA}}}
             (tmp_path / "arm.yaml").write_text(yaml.safe_dump(ros_arm.settings(double.url, **cameras)))
-            assert command.main([url, "--ros", str(tmp_path / "arm.yaml"), "--baseline", "0"]) == 2
+            assert command.main([url, "--ros", str(tmp_path / "arm.yaml")]) == 2
         assert double.on(COMMANDS) == []
     assert "camera 'front': the policy needs it, the env gives ['top']" in capsys.readouterr().err
 

@@ -17,7 +17,7 @@ from eval_fakes import wait_for
 
 from vlagents_ray.errors import ConnectionLost, MalformedMessage
 from vlagents_ray.robot.ros import messages
-from vlagents_ray.robot.ros.rosbridge import Rosbridge, decoded
+from vlagents_ray.robot.ros.links import Rosbridge, decoded
 
 RECORDED = [json.loads(line) for line in (Path(__file__).parent / "recorded_rosbridge.jsonl").read_text().splitlines()]
 STAMP = 1_700_000_000.25
@@ -94,7 +94,7 @@ def test_a_link_that_is_lost_publishes_nothing_and_comes_back_with_its_topics() 
 @pytest.mark.parametrize("busy", [True, False])
 def test_a_silent_sensor_is_subscribed_to_again(busy: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """A real server that subscribed before it knew the publisher may have chosen a quality that does not match it."""
-    monkeypatch.setattr("vlagents_ray.robot.ros.rosbridge._SILENT_S", 0.2)
+    monkeypatch.setattr("vlagents_ray.robot.ros.links._SILENT_S", 0.2)
     with rosbridge_double.rosbridge_double() as double:
         link = Rosbridge(double.url)
         for topic in ("/silent", "/busy"):

@@ -221,7 +221,7 @@ def test_nothing_that_comes_over_the_network_lets_a_paused_robot_go_on(server: L
 
 
 def test_a_marked_episode_ends_the_robots_command(server: LiveServer, capsys: pytest.CaptureFixture[str]) -> None:
-    options = ["--hz", "50", "--seconds", "30", "--baseline", "0", "--instruction", "fold", "--operate"]
+    options = ["--hz", "50", "--seconds", "30", "--instruction", "fold", "--operate"]
     status: list[int] = []
     thread = threading.Thread(target=lambda: status.append(main([server.url, *options])))
     thread.start()

@@ -11,9 +11,9 @@ import numpy as np
 from vlagents_ray.contract import Contract
 from vlagents_ray.envs.base import BatchEnv, Options, Steps, episodes_of, one_row
 from vlagents_ray.envs.graphics import Renderer
-from vlagents_ray.envs.maniskill.simulator import INSTRUCTIONS, Simulator, registered_limit, sensor_settings, step_limit
+from vlagents_ray.envs.maniskill.simulator import INSTRUCTIONS, Simulator, registered_limit, step_limit
 from vlagents_ray.envs.render_probe import render_probe, without
-from vlagents_ray.envs.simulator import SimulatorEnv
+from vlagents_ray.envs.simulator import SimulatorEnv, require_sizes
 from vlagents_ray.errors import ConfigError, NotReset
 from vlagents_ray.interface import Act, Obs
 
@@ -232,7 +232,8 @@ def _simulator(
     task: str, *, width: int = 224, height: int = 224, shader: str | None = None, **options: Any
 ) -> Simulator:
     name = f"maniskill/{task}"
-    sensors = sensor_settings(name, width, height, shader)
+    require_sizes(name, width=width, height=height)
+    sensors = {"width": width, "height": height} | ({"shader_pack": shader} if shader else {})
     return Simulator(name, task, obs_mode="rgb+state", sensors=sensors, **options)
 
 

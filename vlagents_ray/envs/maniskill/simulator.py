@@ -21,7 +21,7 @@ import numpy as np
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.envs.graphics import Renderer, prepare_rendering, vulkan_renderer
 from vlagents_ray.envs.render_probe import failing, vulkan_cure, vulkan_device
-from vlagents_ray.envs.simulator import require_cameras
+from vlagents_ray.envs.simulator import require_cameras, require_sizes
 from vlagents_ray.errors import ConfigError, EnvFailed, UnknownEnv
 from vlagents_ray.interface import Obs
 from vlagents_ray.registry import require
@@ -70,17 +70,8 @@ def step_limit(env: str, wanted: int | None, own: int | None) -> int:
     limit = own if wanted is None else wanted
     if limit is None:
         raise ConfigError(f"{env} has no step limit of its own; set max_steps")
-    if limit < 1:
-        raise ConfigError(f"{env}: max_steps is {limit}, want at least 1")
+    require_sizes(env, max_steps=limit)
     return limit
-
-
-def sensor_settings(env: str, width: int, height: int, shader: str | None) -> dict[str, Any]:
-    """ManiSkill's settings of all cameras; a shader of None is the task's own."""
-    for name, value in (("width", width), ("height", height)):
-        if value < 1:
-            raise ConfigError(f"{env}: {name} is {value}, want at least 1")
-    return {"width": width, "height": height} | ({"shader_pack": shader} if shader else {})
 
 
 def chosen_backend(wanted: str) -> str:
@@ -416,7 +407,7 @@ class Simulator:
 
     def renderer(self) -> Renderer | None:
         found = vulkan_device(on_gpu=self.alive().backend.render_device.is_cuda())
-        return None if found is None else vulkan_renderer(found.name, found.cuda, asked_for=self._asked_for)
+        return None if found is None else vulkan_renderer(*found, asked_for=self._asked_for)
 
     def describe(self) -> dict[str, Any]:
         env = self.alive()

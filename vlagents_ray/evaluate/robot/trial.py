@@ -192,7 +192,7 @@ def play(
     def until() -> bool:
         nonlocal stopped
         stopped = stopped or operator.stops()
-        return stopped or watchdog.stopped
+        return stopped or watchdog.control.stopped
 
     with contextlib.ExitStack() as stack:
         stack.callback(setattr, robot, "stats", None)

@@ -7,7 +7,7 @@ import math
 import threading
 import time
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -16,8 +16,7 @@ from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.errors import ConfigError, InvalidAction, VLAgentsError
 from vlagents_ray.interface import CAPTURED, Obs
 from vlagents_ray.robot.ros import messages
-from vlagents_ray.robot.ros.ros2 import Ros2
-from vlagents_ray.robot.ros.rosbridge import Rosbridge
+from vlagents_ray.robot.ros.links import Link, Ros2, Rosbridge
 from vlagents_ray.robot.ros.settings import (
     ARRAY,
     BOOL,
@@ -37,28 +36,6 @@ from vlagents_ray.robot.safety import Watchdog
 
 logger = logging.getLogger(__name__)
 _POLL_S = 0.01
-
-
-class Link(Protocol):
-    """A way to the topics: `Ros2` or `Rosbridge`."""
-
-    name: str
-
-    @property
-    def up(self) -> bool: ...
-
-    @property
-    def connections(self) -> int: ...
-
-    def subscribe(self, topic: str, kind: str, take: Callable[[Any], None]) -> None: ...
-
-    def advertise(self, topic: str, kind: str) -> None: ...
-
-    def open(self) -> None: ...
-
-    def publish(self, topic: str, message: dict[str, Any]) -> bool: ...
-
-    def close(self) -> None: ...
 
 
 class TopicReader:
@@ -283,7 +260,7 @@ class RosRobot:
         if beat is None or (alive and now - self._beat_at < 1 / beat.hz):
             return
         self._beat_at = now
-        stopped = self.watchdog is not None and self.watchdog.stopped
+        stopped = self.watchdog is not None and self.watchdog.control.stopped
         self._link.publish(beat.topic, {"data": alive and not stopped and self.holds is None})
 
     def _value(self, reading: InputTopic) -> Any:

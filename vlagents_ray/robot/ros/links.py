@@ -1,6 +1,7 @@
-"""ROS topics through a rosbridge: version 2 of its protocol, over a WebSocket.
+"""The two ways to topics of ROS 2: rclpy, where ROS 2 is installed, and a rosbridge.
 
-The protocol is specified in ROSBRIDGE_PROTOCOL.md of https://github.com/RobotWebTools/rosbridge_suite.
+A rosbridge speaks version 2 of its protocol over a WebSocket, as specified in ROSBRIDGE_PROTOCOL.md of
+https://github.com/RobotWebTools/rosbridge_suite.
 """
 
 from __future__ import annotations
@@ -11,14 +12,16 @@ import logging
 import struct
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from importlib import import_module
 from socket import SHUT_RDWR, SO_SNDTIMEO, SOL_SOCKET
-from typing import Any
+from typing import Any, Protocol
 
 from websockets.exceptions import ConnectionClosed, WebSocketException
 from websockets.sync.client import ClientConnection, connect
 
-from vlagents_ray.errors import ConnectionLost, MalformedMessage, VLAgentsError, shown
+from vlagents_ray.errors import ConfigError, ConnectionLost, MalformedMessage, VLAgentsError, shown
+from vlagents_ray.registry import require
 
 logger = logging.getLogger(__name__)
 _OPEN_S = 5.0
@@ -27,6 +30,115 @@ _SILENT_S = 2.0
 # The kernel's limit of a send, which websockets has none for: a dead link would hold up the control loop for minutes.
 _SEND_LIMIT = struct.pack("@ll", 0, 200_000)
 _LARGEST = 64 << 20  # bytes of a frame; a 4K image in base64 has 34 million
+
+
+class Link(Protocol):
+    """A way to the topics: `Ros2` or `Rosbridge`."""
+
+    name: str
+
+    @property
+    def up(self) -> bool: ...
+
+    @property
+    def connections(self) -> int: ...
+
+    def subscribe(self, topic: str, kind: str, take: Callable[[Any], None]) -> None: ...
+
+    def advertise(self, topic: str, kind: str) -> None: ...
+
+    def open(self) -> None: ...
+
+    def publish(self, topic: str, message: dict[str, Any]) -> bool: ...
+
+    def close(self) -> None: ...
+
+
+class Ros2:
+    """A node of ROS 2, which a thread spins; raises `MissingDependency` without rclpy, or if ROS was not sourced."""
+
+    name = "ros2"
+    up = True  # there is no connection to be lost; a peer that is gone is silent
+    connections = 1
+
+    def __init__(self, node: str = "vlagents_ray") -> None:
+        rclpy: Any = require("rclpy")
+        self._context: Any = rclpy.context.Context()
+        self._context.init()
+        self._node: Any = rclpy.create_node(node, context=self._context)
+        self._publishers: dict[str, tuple[Any, type[Any]]] = {}
+        self._executor: Any = None
+        self._thread: threading.Thread | None = None
+
+    def subscribe(self, topic: str, kind: str, take: Callable[[Any], None]) -> None:
+        """Have messages of a topic given to `take`, on the link's thread; before `open`.
+
+        The newest message is wanted and a lost one is not sent again; such a subscription also matches a reliable
+        publisher.
+        """
+        qos = require("rclpy.qos")
+        newest = qos.QoSProfile(depth=1, reliability=qos.ReliabilityPolicy.BEST_EFFORT)
+        self._node.create_subscription(message_class(kind), topic, take, newest)
+
+    def advertise(self, topic: str, kind: str) -> None:
+        """Say that messages of this type will be published; before `open`."""
+        made = message_class(kind)
+        self._publishers[topic] = self._node.create_publisher(made, topic, 1), made
+
+    def open(self) -> None:
+        """Let messages come."""
+        self._executor = require("rclpy.executors").SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        self._thread = threading.Thread(target=self._spin, name="vlagents-ray-ros2", daemon=True)
+        self._thread.start()
+
+    def publish(self, topic: str, message: Mapping[str, Any]) -> bool:
+        """Publish a message; returns True."""
+        publisher, made = self._publishers[topic]
+        publisher.publish(filled(made(), message))
+        return True
+
+    def close(self) -> None:
+        """End the node, and its thread."""
+        self._context.try_shutdown()
+        if self._thread is not None:
+            self._thread.join()
+        self._node.destroy_node()
+
+    def _spin(self) -> None:
+        with contextlib.suppress(require("rclpy.executors").ExternalShutdownException):
+            self._executor.spin()
+
+
+def message_class(kind: str) -> type[Any]:
+    """Return the class of a message type, "sensor_msgs/msg/Image"; raises `ConfigError` if it is not installed."""
+    package, _, name = kind.split("/")
+    try:
+        found: type[Any] = getattr(import_module(f"{package}.msg"), name)
+    except (ImportError, AttributeError) as error:
+        raise ConfigError(
+            f"{kind}: ROS has no such message here ({error}); install the package {package} of this ROS"
+        ) from error
+    return found
+
+
+def filled(instance: Any, message: Mapping[str, Any]) -> Any:
+    """Fill in fields of a message, of which the others keep their values, and return it.
+
+    Lists of mappings are lists of the messages that the type of the field names.
+    """
+    for name, value in message.items():
+        if isinstance(value, Mapping):
+            filled(getattr(instance, name), value)
+        elif isinstance(value, list) and value and isinstance(value[0], Mapping):
+            # "sequence<trajectory_msgs/JointTrajectoryPoint>"
+            kind = instance.get_fields_and_field_types()[name].partition("<")[2].removesuffix(">")
+            package, part = kind.partition(",")[0].split("/")
+            made = message_class(f"{package}/msg/{part}")
+            setattr(instance, name, [filled(made(), one) for one in value])
+        else:
+            setattr(instance, name, value)
+    return instance
 
 
 class Rosbridge:

@@ -1,35 +1,194 @@
-"""A LIBERO task as an environment for evaluations."""
+"""LIBERO: 130 table-top tasks of a Panda arm in MuJoCo, as the literature evaluates policies in them.
+
+    with Libero("libero_spatial/0") as env:
+        obs, _ = env.reset(seed=0, options={"init_state": 3})
+        obs, reward, terminated, truncated, info = env.step(Act(action=np.zeros(7, np.float32)))
+
+The scenes' meshes and textures are in no package: `Libero.missing()` says how to download them; nothing here does.
+"""
 
 from __future__ import annotations
 
+import codecs
+import contextlib
+import functools
+import hashlib
+import importlib.util
+import json
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+import os
+import tempfile
+import warnings
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
-from vlagents_ray.envs.libero.package import assets_digest, find_assets
-from vlagents_ray.envs.libero.tasks import (
-    LiberoProtocol,
-    LiberoTask,
-    files_digest,
-    find_task,
-    read_states,
-    require_suite,
-    task_names,
-)
-from vlagents_ray.envs.robosuite import CameraRenderer, gripper_opening, seeded
+from vlagents_ray.envs.graphics import prepare_rendering
+from vlagents_ray.envs.render_probe import failing
+from vlagents_ray.envs.robosuite import CameraRenderer, gripper_opening, importing_robosuite, seeded
 from vlagents_ray.envs.simulator import SimulatorEnv
-from vlagents_ray.errors import ConfigError, EnvFailed
+from vlagents_ray.errors import ConfigError, EnvFailed, MissingDependency, UnknownEnv
 from vlagents_ray.interface import Obs
+from vlagents_ray.naming import did_you_mean
 from vlagents_ray.registry import require
+
+_CONFIG = "LIBERO_CONFIG_PATH"
+VARIABLE = "LIBERO_ASSETS"
+_DATASET = "lerobot/libero-assets"  # hf-libero's own source of them
+_CACHE = Path(".cache") / "libero" / "assets"  # in the home, where hf-libero's own download puts them
+_NEEDED = ("articulated_objects", "scenes", "stable_hope_objects", "stable_scanned_objects", "turbosquid_objects")
+
+CURE = (
+    f"download them once: hf download {_DATASET} --repo-type dataset --local-dir libero-assets; then "
+    f"set {VARIABLE} to that folder on every node, or the env's option `assets`"
+)
+CONTROL_HZ = 20.0  # robosuite's default, and the rate of the demonstrations
+_ATTEMPTS = 1000  # to place the scene's objects; one is enough nearly always
+
+
+@dataclass(frozen=True, slots=True)
+class Suite:
+    """One of LIBERO's five suites."""
+
+    tasks: int
+    max_steps: int  # openpi, examples/libero/main.py; openvla, run_libero_eval.py: above the longest demonstration
+
+
+SUITES: Mapping[str, Suite] = {
+    "libero_spatial": Suite(10, 220),  # longest demonstration: 193
+    "libero_object": Suite(10, 280),  # 254
+    "libero_goal": Suite(10, 300),  # 270
+    "libero_10": Suite(10, 520),  # 505
+    "libero_90": Suite(90, 400),  # 373
+}
+
+
+@dataclass(frozen=True, slots=True)
+class LiberoProtocol:
+    """The conventions of an episode; comments say where openpi and OpenVLA differ.
+
+    `max_steps` counts the policy's actions alone: peers count to `max_steps` plus the settling ones.
+
+    The simulator draws whatever an initial state does not determine, such as the place of a cabinet, from
+    `simulator_seed`. It is seeded again for each episode, so that an episode does not depend on those
+    before it; openpi (7) and OpenVLA (0) seed once a task, so that their scenes shift a little from
+    episode to episode.
+
+    MuJoCo's images are upside down. The demonstrations' were turned by 180 degrees for training (OpenVLA,
+    regenerate_libero_dataset.py; openpi takes them over), not flipped: they are upright, and mirrored left
+    to right. Policies expect that.
+    """
+
+    max_steps: int
+    settling_steps: int = 10  # openpi and OpenVLA: the objects fall into place
+    settling_action: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0)  # still, gripper open
+    image_size: tuple[int, int] = (256, 256)  # height, width: rendered so by both; policies resize
+    cameras: Mapping[str, str] = field(default_factory=lambda: {"front": "agentview", "wrist": "robot0_eye_in_hand"})
+    turned_180: Literal[True] = True
+    simulator_seed: int = 7  # openpi's
+    begins: tuple[str, ...] = ("seed", "reset", "set_init_state", "settle")  # in this order, for every episode
+    control_hz: float = CONTROL_HZ
+    controller: str = "OSC_POSE"  # LIBERO's default: 0.05 m and 0.5 rad a unit, in the robot base's axes
+    gripper_open: float = -1.0  # of a policy's action: robosuite's, openpi's; OpenVLA's are 1 and 0
+    gripper_closed: float = 1.0
+    success: str = "the goal predicates hold after a step"  # LIBERO's `done`
+    stop_at_success: bool = True  # both end the episode there
+
+    @classmethod
+    def of(cls, suite: str, **changes: Any) -> LiberoProtocol:
+        """Return the protocol of a suite with the changes that are not None."""
+        changed = {name: value for name, value in changes.items() if value is not None}
+        return cls(**{"max_steps": SUITES[suite].max_steps} | changed)
+
+    def to_json(self, suite: str) -> dict[str, Any]:
+        """Return plain JSON values; `deviations` lists the differences from the published protocol of `suite`."""
+        published = LiberoProtocol.of(suite)
+        deviations = [
+            f"{f.name}: {getattr(self, f.name)}, the protocol says {getattr(published, f.name)}"
+            for f in fields(self)
+            if getattr(self, f.name) != getattr(published, f.name)
+        ]
+        plain: dict[str, Any] = json.loads(json.dumps(asdict(self) | {"deviations": deviations}))
+        return plain
+
+
+@dataclass(frozen=True, slots=True)
+class LiberoTask:
+    """A task of a suite of LIBERO."""
+
+    suite: str
+    number: int  # in the suite, as openpi and OpenVLA count
+    name: str  # LIBERO's, e.g. "pick_up_the_milk_and_place_it_in_the_basket"
+    language: str  # the instruction that policies are given: LIBERO takes it from the name
+    problem: Path  # its BDDL file
+    states: Path  # its initial states
+
+
+def task_names() -> list[str]:
+    """Every task, e.g. "libero_spatial/0"; needs no simulator."""
+    return [f"{name}/{number}" for name, suite in SUITES.items() for number in range(suite.tasks)]
+
+
+def require_suite(name: str) -> tuple[str, str]:
+    """Suite and task of "SUITE/NUMBER" or "SUITE/NAME"; `UnknownEnv` for an unknown suite, or too large a number."""
+    suite, _, which = name.partition("/")
+    if suite not in SUITES:
+        raise UnknownEnv(
+            f"libero has no suite {suite!r}: want one of {sorted(SUITES)}, as in 'libero_spatial/0'"
+            f"{did_you_mean(suite, SUITES)}"
+        )
+    if not which or (which.isdecimal() and int(which) >= SUITES[suite].tasks):
+        raise UnknownEnv(f"libero: {suite} has no task {which!r}: want 0 to {SUITES[suite].tasks - 1}, or a name")
+    return suite, which
+
+
+def find_task(name: str) -> LiberoTask:
+    """The task `name`, "SUITE/NUMBER" or "SUITE/NAME"; imports LIBERO; raises `UnknownEnv` if there is none."""
+    suite, which = require_suite(name)
+    root = import_libero()
+    known = require("libero.libero.benchmark").task_maps[suite]
+    names = list(known)
+    if not which.isdecimal() and which not in names:
+        raise UnknownEnv(
+            f"libero: {suite} has no task {which!r}: want 0 to {len(names) - 1}, or a name such as {names[0]!r}"
+        )
+    number = int(which) if which.isdecimal() else names.index(which)
+    found = known[names[number]]
+    return LiberoTask(
+        suite=suite,
+        number=number,
+        name=found.name,
+        language=found.language,
+        problem=root / "bddl_files" / found.problem_folder / found.bddl_file,
+        states=root / "init_files" / found.problem_folder / found.init_states_file,
+    )
+
+
+def read_states(path: Path) -> np.ndarray:
+    """The initial states in a file, (N, D) float64: time, qpos and qvel of MuJoCo.
+
+    They are pickled numpy arrays, in torch's archives. LIBERO loads them as any pickle; here nothing but such an array
+    is let in.
+    """
+    torch = require("torch")
+    numpys: list[Any] = [
+        (np.empty(0).__reduce__()[0], "numpy.core.multiarray._reconstruct"),  # where numpy 1 had it, and wrote it down
+        (codecs.encode, "_codecs.encode"),
+        np.ndarray,
+        np.dtype,
+        type(np.dtype(np.float64)),
+    ]
+    with torch.serialization.safe_globals(numpys):
+        states: np.ndarray = torch.load(path, weights_only=True)
+    return states
 
 
 class Libero(SimulatorEnv):
-    """One environment of one LIBERO task, e.g. "libero_spatial/0", or of one that varies it, "libero_goal_swap/0".
+    """One environment of one LIBERO task, e.g. "libero_spatial/0".
 
     Observation: cameras "front" (LIBERO's agentview) and "wrist" (its eye in hand), turned as policies
     expect it, see `LiberoProtocol`; in `state` what policies for LIBERO take: `xyz_axis_angle` (6,), the end
@@ -64,7 +223,6 @@ class Libero(SimulatorEnv):
         gripper_closed: float | None = None,
         instruction: str | None = None,
         assets: str | None = None,
-        files: str | None = None,
     ) -> None:
         """Make the environment; raises the errors of `make_env`. Other options are those of most `SimulatorEnv`s.
 
@@ -77,14 +235,12 @@ class Libero(SimulatorEnv):
                 says 1, and 0 to close, which openvla's evaluation turns into LIBERO's as this does.
             gripper_closed: The one that closes it; None is LIBERO's 1.
             assets: The folder with LIBERO's meshes and textures; None is what LIBERO_ASSETS names.
-            files: The folder with `bddl_files` and `init_files` of suites that vary LIBERO's, such as LIBERO-PRO's;
-                None is what LIBERO_FILES names.
         """
         super().__init__(f"libero/{task}", width=width, height=height, max_steps=max_steps)
         if (settling_steps or 0) < 0:
             raise ConfigError(f"libero/{task}: settling_steps is {settling_steps}, want 0 or more")
-        self._task = find_task(task, files)
-        self._name = f"libero/{self._task.full_name}"
+        self._task = find_task(task)
+        self._name = f"libero/{self._task.suite}/{self._task.number}"
         self._assets = find_assets(assets)
         self._rules = LiberoProtocol.of(
             self._task.suite,
@@ -130,17 +286,13 @@ class Libero(SimulatorEnv):
         return None
 
     def describe(self) -> dict[str, Any]:
-        protocol = self._rules.to_json(self._task.suite)
-        if self._task.passes_for_own:
-            protocol["deviations"].append(f"files: those of {self._task.name}, the protocol says LIBERO's own")
-        facts = super().describe() | {
+        return super().describe() | {
             "name": self._task.name,
             "language": self._task.language,
             "init_states": self.init_states,
-            "protocol": protocol,
+            "protocol": self._rules.to_json(self._task.suite),
             "assets": assets_digest(self._assets),
         }
-        return facts | ({"files": files_digest(self._task.problem, self._task.states)} if self._task.varied else {})
 
     def _begin(self, seed: int, state: int) -> tuple[Obs, dict[str, Any]]:
         seen = self._env.begin(self._states[state])
@@ -221,9 +373,6 @@ def axis_angle(quaternion: np.ndarray) -> np.ndarray:
     return turned
 
 
-_ATTEMPTS = 1000  # to place the scene's objects; one is enough nearly always
-
-
 @dataclass(frozen=True, slots=True)
 class SimulatorObs:
     """The simulator's observation after a step."""
@@ -288,11 +437,6 @@ class LiberoSimulation:
             name: np.array(states[name].get_geom_state()["pos"], np.float64) for name in sorted(named & set(states))
         }
 
-    def flat_state(self) -> np.ndarray:
-        """MuJoCo's time, qpos and qvel, (D,) float64, as the initial states are written."""
-        state: np.ndarray = self._env.get_sim_state()
-        return state
-
     def close(self) -> None:
         self._cameras.make_current()
         self._env.close()
@@ -310,3 +454,71 @@ class LiberoSimulation:
 
     def _use_assets(self) -> None:
         self._package._assets_path_cache = str(self._assets)  # global in the process: another env may have set it
+
+
+def package_folder() -> Path:
+    """The package's folder with its problems and initial states; raises `MissingDependency`."""
+    require("libero")
+    spec = importlib.util.find_spec("libero.libero")
+    if spec is None or spec.origin is None:
+        raise MissingDependency("'libero' is another package; pip install 'vlagents-ray[libero]' brings hf-libero")
+    return Path(spec.origin).parent
+
+
+@functools.cache
+def import_libero() -> Path:
+    """Import LIBERO and robosuite, once a process; returns `package_folder()`."""
+    prepare_rendering()
+    folder = package_folder()
+    with (
+        failing("libero", "import its package"),
+        _own_config(folder),
+        importing_robosuite("libero"),
+        warnings.catch_warnings(),
+    ):
+        warnings.simplefilter("ignore")  # warnings of upstream code; LIBERO itself changes the filters
+        require("libero.libero.benchmark")
+        require("libero.libero.envs")
+    return folder
+
+
+@contextlib.contextmanager
+def _own_config(folder: Path) -> Iterator[None]:
+    """A configuration of this process alone.
+
+    LIBERO reads one from the home, asks on stdin where there is none, and writes it there. Its paths are
+    wanted nowhere but in helpers that are not used here, so it goes with the import.
+    """
+    parts = {"assets": "assets", "bddl_files": "bddl_files", "datasets": "datasets", "init_states": "init_files"}
+    paths = {"benchmark_root": str(folder)} | {key: str(folder / name) for key, name in parts.items()}
+    before = os.environ.get(_CONFIG)
+    with tempfile.TemporaryDirectory(prefix="libero-config-") as own:
+        Path(own, "config.yaml").write_text(json.dumps(paths))  # JSON is YAML
+        os.environ[_CONFIG] = own
+        try:
+            yield
+        finally:
+            if before is None:
+                del os.environ[_CONFIG]
+            else:
+                os.environ[_CONFIG] = before
+
+
+def find_assets(chosen: str | None = None) -> Path:
+    """Return the assets' folder: `chosen`, that of `LIBERO_ASSETS`, or hf-libero's own; raises `EnvFailed`."""
+    named = chosen or os.environ.get(VARIABLE)
+    places = [Path(named)] if named else [package_folder() / "assets", Path.home() / _CACHE]
+    folder = next((place for place in places if place.is_dir()), None)
+    if folder is None:
+        looked = " and ".join(str(place) for place in places)
+        raise EnvFailed(f"libero: no assets (meshes and textures) in {looked}; {CURE}")
+    lacks = [part for part in _NEEDED if not (folder / part).is_dir()]
+    if lacks:
+        raise EnvFailed(f"libero: the assets in {folder} lack {lacks}; {CURE}")
+    return folder.resolve()
+
+
+def assets_digest(folder: Path) -> str:
+    """Return a digest of a folder, which is equal if relative paths and sizes of all files are."""
+    files = sorted((str(path.relative_to(folder)), path.stat().st_size) for path in folder.rglob("*") if path.is_file())
+    return hashlib.sha256(repr(files).encode()).hexdigest()[:16]
