@@ -26,7 +26,8 @@ from vlagents_ray import (
     RemoteAgent,
     UnknownSession,
 )
-from vlagents_ray.client import connection, session
+from vlagents_ray.client import agent as client_agent
+from vlagents_ray.client import connection
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import NoReplica, UnknownApp, VLAgentsError
 from vlagents_ray.serve.scaling import session_migration
@@ -41,6 +42,8 @@ class Clock:
     def monotonic(self) -> float:
         return self.now
 
+    perf_counter = monotonic
+
     def sleep(self, seconds: float) -> None:
         self.now += seconds
 
@@ -49,7 +52,7 @@ class Clock:
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     """The client's."""
     clock = Clock()
-    for module in (connection, session):
+    for module in (connection, client_agent):
         monkeypatch.setattr(module, "time", clock)
     return clock
 
