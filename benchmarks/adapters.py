@@ -21,8 +21,8 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from benchmarks.console import Json
-from vlagents_ray.cli.console import errors, save
+from benchmarks.console import Json, save
+from vlagents_ray.cli.console import errors
 from vlagents_ray.cli.options import parse_dims
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.policies.base import ModelPolicy

@@ -22,11 +22,11 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 import typer
 
-from benchmarks.console import Json
+from benchmarks.console import Json, save
 from benchmarks.environments import ACTION_DIM, SLEEPING_ENV
 from benchmarks.robots import RobotBurst
 from vlagents_ray.bench.line_process import LineProcess, ProcessFailed, our_environment
-from vlagents_ray.cli.console import errors, out, progress, save, table
+from vlagents_ray.cli.console import errors, out, progress, table
 from vlagents_ray.client.transports.serve_handle import call_replica
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig, Results, SuiteConfig, evaluate

@@ -17,11 +17,11 @@ from typing import Annotated
 
 import typer
 
-from benchmarks.console import Json, show_round_trips
+from benchmarks.console import Json, save, show_round_trips
 from benchmarks.drivers import ClientProcess, Driver
 from benchmarks.own_clients import OwnClient, connected, observation
 from benchmarks.round_trips import POLICY, RoundTripsOfAll, in_turns
-from vlagents_ray.cli.console import errors, progress, save
+from vlagents_ray.cli.console import errors, progress
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Obs
 from vlagents_ray.serve.launch.deployment_file import deployment

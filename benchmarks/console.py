@@ -1,7 +1,8 @@
-"""Options that several measurements have, and the table of round trips."""
+"""Options that several measurements have, the table of round trips, and the file of figures."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
@@ -10,6 +11,8 @@ import typer
 from rich.text import Text
 
 from vlagents_ray.cli.console import out, table
+from vlagents_ray.cli.options import parse_list
+from vlagents_ray.errors import ConfigError
 
 Calls = Annotated[int, typer.Option(min=1, help="Round trips by each way.")]
 Seconds = Annotated[float, typer.Option(min=0.1, help="Of each measurement.")]
@@ -42,3 +45,20 @@ def show_skipped(found: Mapping[str, Any]) -> None:
     """Print what could not be measured, and why."""
     for name, reason in found["skipped"].items():
         out.print(Text.assemble((f"skipped {name}", "yellow"), f": {reason}"))
+
+
+def parse_counts(text: str, option: str) -> list[int]:
+    """Parse numbers from 1 on with commas between them, and return them in ascending order."""
+    try:
+        counts = sorted({int(one) for one in parse_list(text)})
+    except ValueError as error:
+        raise ConfigError(f"{option}: got {text!r}, want numbers with commas between them") from error
+    if not counts or counts[0] < 1:
+        raise ConfigError(f"{option}: got {text!r}, want numbers from 1 on")
+    return counts
+
+
+def save(found: Any, file: Path | None) -> None:
+    """Write figures as JSON, if a file was asked for."""
+    if file is not None:
+        file.write_text(json.dumps(found, indent=1) + "\n")

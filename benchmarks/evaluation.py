@@ -33,12 +33,12 @@ from typing import Annotated, Any, NamedTuple
 import typer
 
 import vlagents_ray
-from benchmarks.console import Json, show_skipped
+from benchmarks.console import Json, save, show_skipped
 from benchmarks.environments import TIMED_TABLETOP, read_episode_times
 from benchmarks.peers import PYTHON, SCRIPTS, PeersPython, peer_clients
 from benchmarks.report import evaluation_outcomes, show_outcomes
 from vlagents_ray.bench.line_process import LineProcess, ProcessFailed, our_environment
-from vlagents_ray.cli.console import errors, out, progress, save, table
+from vlagents_ray.cli.console import errors, out, progress, table
 from vlagents_ray.cli.options import parse_list
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.results.summary import FILE as SUMMARY

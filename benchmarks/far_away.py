@@ -18,13 +18,13 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from benchmarks.console import Json
+from benchmarks.console import Json, save
 from benchmarks.far_carrier import Conditions
 from benchmarks.far_link import FarLink
 from benchmarks.far_robot import HZ, MODES
 from benchmarks.hosts import Host, hosts
 from vlagents_ray.bench.line_process import LineProcess, our_environment
-from vlagents_ray.cli.console import errors, out, progress, save, table
+from vlagents_ray.cli.console import errors, out, progress, table
 from vlagents_ray.errors import ConfigError
 
 PORT = 8000

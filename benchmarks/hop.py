@@ -10,10 +10,10 @@ from typing import Annotated, Any
 
 import typer
 
-from benchmarks.console import Json, show_round_trips
+from benchmarks.console import Json, save, show_round_trips
 from benchmarks.own_clients import observation
 from benchmarks.round_trips import RoundTripsOfAll, in_turns
-from vlagents_ray.cli.console import errors, progress, save
+from vlagents_ray.cli.console import errors, progress
 from vlagents_ray.interface import Agent
 from vlagents_ray.policies.noop import Noop
 from vlagents_ray.serve.models.agent_copies import AgentCopies

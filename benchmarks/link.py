@@ -23,13 +23,13 @@ from typing import Annotated, Any
 import typer
 
 from benchmarks import peers as others
-from benchmarks.console import Calls, Json, show_round_trips
+from benchmarks.console import Calls, Json, save, show_round_trips
 from benchmarks.figures import measured_on
 from benchmarks.own_clients import OwnClient
 from benchmarks.round_trips import measure
 from vlagents_ray.bench.line_client import die_with_parent, own_stdout
 from vlagents_ray.bench.line_process import LineProcess, our_environment
-from vlagents_ray.cli.console import errors, progress, save
+from vlagents_ray.cli.console import errors, progress
 from vlagents_ray.cli.options import parse_list
 from vlagents_ray.errors import ConfigError, VLAgentsError
 

@@ -28,12 +28,12 @@ import numpy as np
 import typer
 from websockets.sync.client import connect
 
-from benchmarks.console import Json
+from benchmarks.console import Json, save
 from benchmarks.drivers import START_S
 from benchmarks.own_clients import observation
 from vlagents_ray.bench.line_client import die_with_parent, own_stdout
 from vlagents_ray.bench.line_process import LineProcess, our_environment
-from vlagents_ray.cli.console import errors, out, progress, save, table
+from vlagents_ray.cli.console import errors, out, progress, table
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.transports.select import TransportName
 from vlagents_ray.errors import ConfigError

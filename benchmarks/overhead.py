@@ -27,8 +27,8 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 import typer
 
-from benchmarks.console import Json
-from vlagents_ray.cli.console import errors, out, progress, save, table
+from benchmarks.console import Json, save
+from vlagents_ray.cli.console import errors, out, progress, table
 from vlagents_ray.cli.options import parse_settings
 from vlagents_ray.envs import make_env
 from vlagents_ray.errors import EnvFailed

@@ -15,11 +15,11 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from benchmarks.console import Json, Rounds, Seconds
+from benchmarks.console import Json, Rounds, Seconds, parse_counts, save
 from benchmarks.figures import measured_on
 from vlagents_ray.bench.measured_policy import WARM, MeasuredPolicy, QueuedTurn, device_name, forget_peak, peak_mib
-from vlagents_ray.cli.console import errors, out, progress, save, table
-from vlagents_ray.cli.options import Set, StateDims, parse_counts, parse_dims, parse_settings
+from vlagents_ray.cli.console import errors, out, progress, table
+from vlagents_ray.cli.options import Set, StateDims, parse_dims, parse_settings
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Agent, Obs

@@ -15,9 +15,9 @@ import ray
 import typer
 from pydantic import BaseModel
 
-from benchmarks.console import Json
+from benchmarks.console import Json, save
 from vlagents_ray import RemoteAgent
-from vlagents_ray.cli.console import out, save
+from vlagents_ray.cli.console import out
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.learn import Publisher

@@ -9,11 +9,11 @@ from typing import Any
 import typer
 
 from benchmarks import peers as others
-from benchmarks.console import Calls, Json, Transports, show_round_trips
+from benchmarks.console import Calls, Json, Transports, save, show_round_trips
 from benchmarks.figures import measured_on
 from benchmarks.own_clients import own_clients
 from benchmarks.round_trips import measure
-from vlagents_ray.cli.console import errors, progress, save
+from vlagents_ray.cli.console import errors, progress
 from vlagents_ray.cli.options import parse_list
 
 

@@ -25,12 +25,11 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from benchmarks.console import Json
+from benchmarks.console import Json, parse_counts, save
 from benchmarks.hosts import hosts, ray_cluster
 from benchmarks.scaling_driver import Fleet, PlayedEpisodes, ScalingRound
 from vlagents_ray.bench.line_process import LineProcess, our_environment
-from vlagents_ray.cli.console import errors, out, progress, save, table
-from vlagents_ray.cli.options import parse_counts
+from vlagents_ray.cli.console import errors, out, progress, table
 from vlagents_ray.errors import ConfigError
 
 OWN, SHARED, CHUNKS = "own", "shared", "chunks"  # applications: a replica a worker; one a node, acts and chunks

@@ -24,10 +24,10 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 import typer
 
-from benchmarks.console import Json
+from benchmarks.console import Json, save
 from benchmarks.environments import TIMED_TABLETOP, EpisodeTimes, read_episode_times
 from benchmarks.report import Outcome, show_outcomes, unmeasured
-from vlagents_ray.cli.console import errors, out, progress, save
+from vlagents_ray.cli.console import errors, out, progress
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig, Progress, Results, SuiteConfig, evaluate
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.cases import EvalCase, cells

@@ -19,14 +19,14 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from benchmarks.console import Json, Rounds, Seconds, show_skipped
+from benchmarks.console import Json, Rounds, Seconds, parse_counts, save, show_skipped
 from benchmarks.drivers import START_S
 from benchmarks.figures import measured_on
 from benchmarks.own_clients import ROBOT, SIMULATION, Call, LoadGenerator, OwnClient, own_clients
 from vlagents_ray.bench.line_process import LineProcess, our_environment
 from vlagents_ray.bench.measured_policy import rate_of
-from vlagents_ray.cli.console import errors, out, progress, save, table
-from vlagents_ray.cli.options import Set, parse_counts, parse_list, parse_settings
+from vlagents_ray.cli.console import errors, out, progress, table
+from vlagents_ray.cli.options import Set, parse_list, parse_settings
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.serve.launch.server import running_server

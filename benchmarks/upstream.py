@@ -18,9 +18,9 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 from websockets.sync.server import serve
 
-from benchmarks.console import Json, show_round_trips
+from benchmarks.console import Json, save, show_round_trips
 from benchmarks.round_trips import RoundTripsOfAll, in_turns
-from vlagents_ray.cli.console import errors, progress, save
+from vlagents_ray.cli.console import errors, progress
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.upstream import Upstream

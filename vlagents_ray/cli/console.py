@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import sys
 from collections.abc import Iterator
@@ -107,9 +106,3 @@ def fresh(folder: Path) -> Path:
 
 def progress(text: str) -> None:
     out.print(text)
-
-
-def save(found: Any, file: Path | None) -> None:
-    """Write figures as JSON, if a file was asked for."""
-    if file is not None:
-        file.write_text(json.dumps(found, indent=1) + "\n")

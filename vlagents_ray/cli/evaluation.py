@@ -239,10 +239,8 @@ def forecasts(planned: Sequence[EvalCase], results: Results | None) -> list[Fore
     found = []
     for cell in planned:
         same = next((one for one in earlier if (one.contender, one.suite, one.env) == cell.name), None)
-        recorded = () if same is None else same.episodes
-        done = {
-            (one.result.key.episode, one.result.key.seed) for one in recorded if one.result.status != "infra_failed"
-        }
+        recorded = [] if same is None else [one.result for one in same.episodes]
+        done = {(one.key.episode, one.key.seed) for one in recorded if one.status != "infra_failed"}
         finished = sum((job.key.episode, job.key.seed) in done for job in plan([cell]))
         has_stopped = same is not None and same.stopped_at is not None
         alike = [one for one in earlier if (one.policy, one.env) == (cell.policy.name, cell.env)]

@@ -105,17 +105,6 @@ def parse_list(text: str) -> list[str]:
     return [one.strip() for one in text.split(",") if one.strip()]
 
 
-def parse_counts(text: str, option: str) -> list[int]:
-    """Parse numbers from 1 on with commas between them, and return them in ascending order."""
-    try:
-        counts = sorted({int(one) for one in parse_list(text)})
-    except ValueError as error:
-        raise ConfigError(f"{option}: got {text!r}, want numbers with commas between them") from error
-    if not counts or counts[0] < 1:
-        raise ConfigError(f"{option}: got {text!r}, want numbers from 1 on")
-    return counts
-
-
 def parse_time(text: str, option: str) -> float:
     """Parse seconds since 1970, or a date and time of day (local unless it says otherwise), to seconds since 1970."""
     try:

@@ -149,9 +149,8 @@ class RobotRun:
             viewer=self._viewer,
             until=ended,
         )
-        out.print(
-            f"  {label()}: {robot.steps} steps, {report.interventions} of them a human's; {report.paused} ticks paused"
-        )
+        counts = f"{robot.steps} steps, {report.interventions} of them a human's; {report.paused} ticks paused"
+        out.print(f"  {label()}: {counts}")
 
     def _leader(self, contract: Contract, stack: contextlib.ExitStack) -> Leader | None:
         if self.options.leader is None:
@@ -197,9 +196,8 @@ class RobotRun:
         reason = None if self._control is None else self._control.reason
         if self._control is None or not (begun or reason):
             return
-        now = (
-            f"{reason}; p continues" if reason is not None else _MOVES.get(self._control.state, "the robot is stopped")
-        )
+        moves = _MOVES.get(self._control.state, "the robot is stopped")
+        now = moves if reason is None else f"{reason}; p continues"
         if now != self._said:
             if reason is not None:
                 out.bell()

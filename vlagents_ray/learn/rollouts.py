@@ -291,9 +291,8 @@ class Rollouts:
         self._attempts.note_played()
         versions = transitions.column("version").to_numpy()
         episode.oldest, self._version = int(versions.min()), max(self._version, int(versions.max()))
-        if (
-            self._settings.max_lag is not None and episode.pushed - episode.oldest > self._settings.max_lag
-        ):  # so it would be forever
+        most = self._settings.max_lag
+        if most is not None and episode.pushed - episode.oldest > most:  # so it would be forever
             raise WeightsLost(
                 f"version: {job.key} began when rollouts.version had been set to {episode.pushed}, but its acts name "
                 f"{episode.oldest}; set it to what a push returned, after it has (a policy that names none has 0), and "

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import shlex
@@ -38,7 +37,6 @@ _OURS = {
 BODY = Path(__file__).with_name("job.sh")
 _LINE_ENDS = "\x7f\x85\u2028\u2029"
 UNFINISHED = 75  # exit status of `vlagents-ray eval` when its time is over (EX_TEMPFAIL of sysexits.h)
-RECORD = "job.json"
 _KEPT = {"SLURM_CONF", "SLURM_CLUSTERS"}  # the location of Slurm; the others belong to this process's own job
 _SBATCH_S = 120.0
 
@@ -175,7 +173,7 @@ class SubmissionFailed(VLAgentsError):
 
 
 def submit(script: Script) -> str:
-    """Write a script, submit it, and record the job in `job.json` beside the script.
+    """Write a script, and submit it.
 
     Returns:
         The job's number.
@@ -194,11 +192,7 @@ def submit(script: Script) -> str:
         raise SubmissionFailed(f"sbatch {file}: no answer in {_SBATCH_S:g} s; look with `squeue --me`") from error
     if done.returncode:
         raise SubmissionFailed(f"sbatch {file}: {done.stderr.strip() or done.stdout.strip()}")
-    job = done.stdout.strip().partition(";")[0]
-    log = script.log.replace("%j", job)
-    record = {"job": job, "script": str(file), "log": log, "logs": str(file.parent / job)}
-    (file.parent / RECORD).write_text(json.dumps(record, indent=2) + "\n")
-    return job
+    return done.stdout.strip().partition(";")[0]
 
 
 def write(script: Script) -> Path:

@@ -138,15 +138,11 @@ def _check_cells(results: Results) -> Finding:
     """Check that the cells and the keys of their episodes are those of their settings."""
     odd = []
     for cell in results.cells:
-        settings = cell.settings
-        if fingerprint(settings) != cell.cell or (settings.get("env"), settings.get("policy")) != (
-            cell.env,
-            cell.policy,
-        ):
+        named = cell.settings.get("env"), cell.settings.get("policy")
+        if fingerprint(cell.settings) != cell.cell or named != (cell.env, cell.policy):
             odd.append(f"{cell.contender} in {cell.task}: its settings are not those of its key")
-        odd += [
-            f"{one.result.key}: is of another cell or env" for one in cell.episodes if one.result.key.env != cell.env
-        ]
+        found = [one.result.key for one in cell.episodes]
+        odd += [f"{key}: is of another cell or env" for key in found if key.env != cell.env]
     stated = {str(one.result.key) for cell in results.cells for one in cell.episodes}
     with reading(results.out) as db:
         keys = {row["key"] for row in table(db, "episodes")}
@@ -200,9 +196,8 @@ def _contradictions(episode: Episode, trajectory: Trajectory) -> Iterator[str]:
         return
     if hashlib.sha256(np.ascontiguousarray(trajectory.actions, "<f4").tobytes()).hexdigest() != result.actions_sha256:
         yield "the recorded actions are not those of the table's digest"
-    if not math.isclose(
-        float(sum(trajectory.rewards.tolist())), result.episode_return, rel_tol=_TOLERANCE, abs_tol=1e-12
-    ):
+    total = float(sum(trajectory.rewards.tolist()))
+    if not math.isclose(total, result.episode_return, rel_tol=_TOLERANCE, abs_tol=1e-12):
         yield "the recorded rewards have another sum"
     success = trajectory.success.astype(bool).tolist()
     first = next((number for number, solved in enumerate(success, 1) if solved), None)

@@ -39,9 +39,8 @@ class Score:
     @property
     def metric(self) -> Metric:
         """The success that the benchmark's protocol counts: after some step, unless it says after the last."""
-        return (
-            "success_at_end" if any(_protocol(one).get("success") == _AT_END for one in self.cells) else "success_once"
-        )
+        at_end = any(_protocol(one).get("success") == _AT_END for one in self.cells)
+        return "success_at_end" if at_end else "success_once"
 
     @property
     def rate(self) -> Rate:

@@ -120,9 +120,7 @@ class Gallery:
     def link(self, video: str) -> str | None:
         """Where the page finds the file; None if it has none to link to."""
         path = self._file(video)
-        if path is None:
-            return None
-        return quote(Path(os.path.relpath(path, self._page.parent.resolve())).as_posix())
+        return None if path is None else quote(Path(os.path.relpath(path, self._page.parent.resolve())).as_posix())
 
     def _card(self, cell: CellResults, episode: Episode) -> Card | None:
         label = f"{cell.task}, episode {episode.result.key.episode}, {cell.contender}"
