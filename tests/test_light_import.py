@@ -80,9 +80,10 @@ def test_a_heavy_import_would_be_seen() -> None:
     assert "pydantic" in loaded_by("import vlagents_ray, pydantic") & HEAVY
 
 
-# Imports each module by itself, in a fork of an interpreter that has the package: that comes before any of its modules.
+# Imports each module by itself, in a fork of an interpreter that has what comes before most of them: the package, and
+# what a robot installs.
 EACH_IN_A_FORK = """
-import os, sys, vlagents_ray
+import os, sys, numpy, simplejpeg, vlagents_ray, websockets.sync.client
 for module in sys.argv[1:]:
     if os.fork() == 0:
         __import__(module)

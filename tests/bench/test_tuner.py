@@ -14,6 +14,8 @@ from vlagents_ray.bench.tuning_choice import TuningGoal, choose
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.config.deployment import ServerArgs
 
+pytestmark = pytest.mark.slow  # each variant is measured in a process of its own
+
 SUPPORT = str(Path(__file__).parents[1] / "support")
 
 

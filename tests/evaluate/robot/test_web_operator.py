@@ -65,6 +65,16 @@ class Person:
 def operator() -> Iterator[PageOperator]:
     with PageOperator(say=lambda _: None) as made:
         yield made
+        watching = threading.Thread(target=watch_to_the_end, args=[Person(made.url)])
+        watching.start()
+    watching.join()
+
+
+def watch_to_the_end(person: Person) -> None:
+    """Poll as an open page does: the operator waits for one that is open to show how the evaluation ended."""
+    with contextlib.suppress(OSError):  # it has ended already
+        while person.state()["phase"] != "end":
+            time.sleep(0.01)
 
 
 def test_a_whole_evaluation_over_the_page_shows_no_policy(tmp_path: Path, operator: PageOperator) -> None:

@@ -38,6 +38,8 @@ from vlagents_ray.serve.launch.haproxy import (
 )
 from vlagents_ray.serve.ports import free_port
 
+pytestmark = pytest.mark.slow  # HAProxy's own timeouts have to pass
+
 UP, DOWN = "http-app,SERVE_REPLICA::1,UP", "http-app,SERVE_REPLICA::1,DOWN"
 
 
