@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import os
 import re
-import socket
-from contextlib import suppress
 from pathlib import Path
 
 import psutil
 import pytest
 import ray
+from eval_fakes import wait_for
 from flat_config import flat_config
-from ray._private.ray_constants import DEFAULT_DASHBOARD_AGENT_LISTEN_PORT
 from ray_processes import processes, words
 from ray_processes import ray_folder as ray_folder_of_test
 from secret_leaks import leaked
@@ -95,7 +93,7 @@ def test_a_machine_that_is_slow_to_start_ray_gets_another_attempt(
 ) -> None:
     asked = slow_helpers(tmp_path, monkeypatch, 1)
     before = set(psutil.Process().children(recursive=True))
-    with joined("local", num_cpus=1, include_dashboard=False):
+    with joined("local", num_cpus=1):
         assert ray.get(ray.put(5)) == 5
         assert len(ray.nodes()) == 1
     assert asked.read_text() in ("xx", "xxx")  # the third where the machine is as slow as that by itself
@@ -127,7 +125,7 @@ def test_a_ray_that_does_not_start_leaves_nothing(
     monkeypatch.setattr("ray._private.services.get_node", fail)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))  # where the logs stay
     before = set(psutil.Process().children(recursive=True))
-    with pytest.raises(ValueError, match=said), joined("local", num_cpus=1, include_dashboard=False):
+    with pytest.raises(ValueError, match=said), joined("local", num_cpus=1):
         pytest.fail("started")
     assert len(failures) == attempts
     assert not ray.is_initialized()
@@ -144,32 +142,25 @@ def test_a_folder_that_ray_may_not_write_is_said_as_it_is(monkeypatch: pytest.Mo
         raise PermissionError("/tmp/ray")
 
     monkeypatch.setattr("ray._private.node.Node._init_temp", refuse)
-    with pytest.raises(PermissionError, match="/tmp/ray"), joined("local", num_cpus=1, include_dashboard=False):
+    with pytest.raises(PermissionError, match="/tmp/ray"), joined("local", num_cpus=1):
         pytest.fail("started")
     assert len(tries) == 1
     assert not ray.is_initialized()
 
 
 @pytest.mark.ray
-def test_a_helper_of_ray_leaves_the_port_alone_that_every_ray_has_for_it() -> None:
-    """The second Ray on a machine would try for seconds, and go without."""
-    with socket.socket() as taken:
-        taken.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        with suppress(OSError):  # another Ray's: as well
-            taken.bind(("127.0.0.1", DEFAULT_DASHBOARD_AGENT_LISTEN_PORT))
-            taken.listen()
-        with joined("local", num_cpus=1, include_dashboard=False):
-            (file,) = session().glob("dashboard_agent_listen_*")
-            assert int(file.read_text()) > 0
+def test_a_ray_of_ones_own_has_no_autoscaler_no_log_monitor_and_no_dashboard(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with joined("local", num_cpus=1):
+        assert {"gcs_server", "raylet"} <= programs()
+        wait_for(lambda: not {"monitor.py", "log_monitor.py", "dashboard.py"} & programs())
+    assert "occupied" not in "".join(capsys.readouterr())
 
 
-@pytest.mark.ray
-def test_a_ray_of_ones_own_starts_neither_an_autoscaler_nor_the_dashboard_that_nobody_asked_for() -> None:
-    """They take two seconds of a processor each, at every start. The autoscaler's metrics have a port of their own."""
-    with joined("local", num_cpus=1, include_dashboard=False):
-        started = {Path(word).name for one in psutil.Process().children() for word in words(one)}
-    assert {"gcs_server", "raylet"} <= started
-    assert not {"monitor.py", "dashboard.py"} & started
+def programs() -> set[str]:
+    """The words of the command lines of this process's children, without folders."""
+    return {Path(word).name for one in psutil.Process().children() for word in words(one)}
 
 
 def session() -> Path:

@@ -8,37 +8,26 @@ module by value to processes that need not have this package.
 
 from __future__ import annotations
 
-import contextlib
-import functools
-import logging
 import pickle
 import sys
 import traceback
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-log = logging.getLogger(__name__)
-
 # The loggers of what Ray and Serve say in the process that started them.
 LOGGERS = ("ray.serve", "ray._private.worker", "ray._private.authentication.authentication_token_setup")
-
-_ANSWER_S = 10.0  # of Ray's daemon
+START_LOGGER = "ray._private.services"  # of the start of Ray's processes
 
 # The connection of this process.
-
-
-def is_connected() -> bool:
-    """Whether this process is a driver or a worker of a cluster; with a Ray client (ray://) it is none."""
-    import ray
-
-    return bool(ray._private.worker.global_worker.connected)
 
 
 def node_of_this_process() -> Any:
     """Return Ray's record of the local daemons; None if this process is not connected, or did not import Ray.
 
-    The record exists before the connection does; a call of Ray from another thread would then start a second cluster.
+    It has what no public function says: the daemons' sockets, the folder of their logs, whether this process started
+    them. The record exists before the connection does; a call of Ray from another thread would then start a second
+    cluster.
     """
     worker: Any = sys.modules.get("ray._private.worker")
     if worker is None or not worker.global_worker.connected:
@@ -69,7 +58,10 @@ def reread_authentication_mode() -> None:
 
 
 def address_of_ray_start() -> str | None:
-    """Return the address of the cluster that `ray start` started last on this machine; None if there is none."""
+    """Return the address of the cluster that `ray start` started last on this machine; None if there is none.
+
+    With `ray.init("auto")` one would find out only after a wait of ten minutes.
+    """
     from ray._private.utils import read_ray_address
 
     address: str | None = read_ray_address()
@@ -79,32 +71,23 @@ def address_of_ray_start() -> str | None:
 # The start of a cluster.
 
 
-@contextlib.contextmanager
-def only_needed_processes(options: Mapping[str, Any]) -> Iterator[None]:
-    """Let `ray.init(**options)` start only the processes that a local cluster needs, as each costs a second of a core.
+def end_unneeded_processes() -> None:
+    """End the helpers of Ray that a cluster of one machine does not need: autoscaler and log monitor, 90 MB together.
 
-    It starts no autoscaler, as there are no machines to add; without a dashboard, no dashboard server, which Ray starts
-    even then for usage statistics; and no log monitor if the driver gets no logs. The dashboard agent gets a free port:
-    by default every Ray on a machine uses 52365, and a second one would wait for 3.4 s.
+    `ray.init` has no option for them.
     """
-    from ray._private import parameter
-    from ray._private.node import Node
+    import ray
 
-    params, start_api_server = parameter.RayParams, Node.start_api_server
-    logs = options.get("log_to_driver", True)
-    parameter.RayParams = functools.partial(
-        params, dashboard_agent_listen_port=0, no_monitor=True, include_log_monitor=logs
-    )
-    if options.get("include_dashboard") is False:
-        Node.start_api_server = lambda *_, **__: None
-    try:
-        yield
-    finally:
-        parameter.RayParams, Node.start_api_server = params, start_api_server
+    node = ray._private.worker.global_worker.node
+    node.kill_monitor(check_alive=False)
+    node.kill_log_monitor(check_alive=False)
 
 
 def node_that_failed(error: BaseException) -> Any:
-    """Return the node that was being started when `error` was raised; None if there was none."""
+    """Return the node that was being started when `error` was raised; None if there was none.
+
+    `ray.init` leaves its processes running, and the error does not say which they are.
+    """
     from ray._private.node import Node
 
     found = (frame.f_locals.get("self") for frame, _ in traceback.walk_tb(error.__traceback__))
@@ -144,7 +127,7 @@ def create_channel(size: int) -> Any:
 
 
 def register_writer(channel: Any) -> None:
-    """Let this process write to a channel."""
+    """Let this process write to a channel, which Ray's `Channel` does only together with pickling."""
     import ray
 
     ray._private.worker.global_worker.core_worker.experimental_channel_register_writer(channel, {})
@@ -225,29 +208,21 @@ def start_serve(http: dict[str, Any], location: str) -> tuple[Any, list[Any]]:
 
 
 def proxies_now(client: Any) -> list[Any]:
-    """Return the refs of the proxies that Serve has now, in place of those that `start_serve` returned."""
+    """Return the refs of the proxies that Serve has now, in place of those that `start_serve` returned.
+
+    `serve.status` says that a proxy failed, but not why.
+    """
     import ray
 
     handles = ray.get(client._controller.get_proxies.remote())
     return [handle.ready.remote() for handle in handles.values()]
 
 
-def proxy_timeout_s() -> float:
-    """Return the time in which Serve's proxies have to listen."""
-    from ray.serve._private.constants import HTTP_PROXY_TIMEOUT
-
-    return float(HTTP_PROXY_TIMEOUT)
-
-
-def build_app(app: Any, **options: Any) -> Any:
-    """Build an application, of which Serve's client deploys several at once."""
-    from ray.serve._private import build_app as serves
-
-    return serves.build_app(app, **options)
-
-
 def long_polls(client: Any) -> Iterator[Any]:
-    """Yield the long polls of the controller by the handles of Serve's client, each with `stop`."""
+    """Yield the long polls of the controller by the handles of Serve's client, each with `stop`.
+
+    `serve.shutdown` leaves them open, and Ray reports them as failed tasks.
+    """
     from ray.serve._private.router import SharedRouterLongPollClient
 
     for handle in client.handle_cache.values():
@@ -271,7 +246,7 @@ def forget_serve(client: Any) -> None:
 
 
 def http_options() -> Any:
-    """Return Serve's HTTP options: `host`, `port`, `ssl_certfile`, ..."""
+    """Return Serve's HTTP options: `host`, `port`, `ssl_certfile`, ... `serve.status` does not state them."""
     from ray.serve.context import _get_global_client
 
     return _get_global_client().http_config

@@ -7,8 +7,10 @@ import json
 import logging
 import os
 import shutil
+import socket
 import tempfile
 import time
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -16,7 +18,12 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from vlagents_ray.errors import ClusterLost, ConfigError
-from vlagents_ray.ray_tools.private import address_of_ray_start, node_that_failed, only_needed_processes
+from vlagents_ray.ray_tools.private import (
+    START_LOGGER,
+    address_of_ray_start,
+    end_unneeded_processes,
+    node_that_failed,
+)
 from vlagents_ray.ray_tools.reaper import MARK, reaped
 from vlagents_ray.ray_tools.signals import own_sigterm
 
@@ -25,6 +32,8 @@ log = logging.getLogger(__name__)
 _ATTEMPTS = 3
 # A driver whose head has ended would wait for 5 s to send its last events, of which nothing here makes use.
 _CONFIG = {"task_events_shutdown_flush_timeout_ms": 300}
+# Options of every cluster that is started here. What its processes print is in the log files of the cluster's folder.
+_OPTIONS: dict[str, Any] = {"include_dashboard": False, "log_to_driver": False, "_system_config": _CONFIG}
 _FAILED = "Check failed: "  # in the log of a daemon that ended
 FILES = "ray"  # the folder of Ray's files in a `ray_folder`
 _SHORT = "/tmp"  # noqa: S108 - used if the names of Ray's sockets would be too long elsewhere
@@ -149,8 +158,8 @@ def start_ray(**options: Any) -> None:
 
     for attempt in range(1, _ATTEMPTS + 1):
         try:
-            with own_sigterm(), only_needed_processes(options):  # "local" starts one even if RAY_ADDRESS is set
-                ray.init("local", _system_config=_CONFIG, **options)
+            with own_sigterm(), _taken_port() as port:  # "local" starts one even if RAY_ADDRESS is set
+                ray.init("local", dashboard_port=port, **(options | _OPTIONS))
         except Exception as error:  # Ray raises a plain Exception
             node = node_that_failed(error)
             if node is None or not node.all_processes:  # nothing was started, so time is not the cause
@@ -167,7 +176,31 @@ def start_ray(**options: Any) -> None:
                 ) from error
             log.warning("Ray did not start, trying again (attempt %d of %d): %s", attempt + 1, _ATTEMPTS, reason)
         else:
+            end_unneeded_processes()
             return
+
+
+@contextlib.contextmanager
+def _taken_port() -> Iterator[int]:
+    """Yield a port on which nothing else can listen, as the port of the dashboard that nobody needs.
+
+    Even without a dashboard Ray starts its server, for usage statistics, and waits for it for 2 s, unless the port is
+    taken. Then it logs an error, which is dropped here.
+    """
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port: int = taken.getsockname()[1]
+
+        def is_shown(record: logging.LogRecord) -> bool:
+            return f":{port} " not in record.getMessage()
+
+        logger = logging.getLogger(START_LOGGER)
+        logger.addFilter(is_shown)
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", ResourceWarning)  # Ray does not close the socket of its attempt
+                yield port
+        finally:
+            logger.removeFilter(is_shown)
 
 
 def _kept_logs(node: Any) -> Path:

@@ -25,7 +25,7 @@ def cluster() -> Iterator[str]:
     """Ray's id of its node."""
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
-        start_ray(num_cpus=2, num_gpus=1, include_dashboard=False, log_to_driver=False, logging_level="ERROR")
+        start_ray(num_cpus=2, num_gpus=1, logging_level="ERROR")
         yield ray.get_runtime_context().get_node_id()
         ray.shutdown()
 

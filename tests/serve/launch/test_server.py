@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from ray import serve
 from ray.serve.schema import ServeDeploySchema
 
 from vlagents_ray.errors import PolicyUnavailable
@@ -18,15 +19,13 @@ from vlagents_ray.serve.launch.server import deploy, wait_for_proxies
 class FakeClient:
     """Serve's client: remembers what it was to deploy."""
 
-    def __init__(self) -> None:
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.by_serve: list[ServeDeploySchema] = []
-        self.built_here: list[Any] = []
+        self.built_here: list[serve.RunTarget] = []
+        monkeypatch.setattr(serve, "run_many", lambda targets, **_: self.built_here.extend(targets))
 
     def deploy_apps(self, config: ServeDeploySchema) -> None:
         self.by_serve.append(config)
-
-    def deploy_applications(self, built: list[Any], **_: bool) -> None:
-        self.built_here += built
 
 
 def changed(app: dict[str, Any], **beside: Any) -> ServeDeploySchema:
@@ -37,14 +36,16 @@ def changed(app: dict[str, Any], **beside: Any) -> ServeDeploySchema:
 
 
 @pytest.mark.parametrize("ends_at_once", [True, False])
-def test_a_server_on_its_own_ray_builds_its_applications_itself(ends_at_once: bool) -> None:
+def test_a_server_on_its_own_ray_builds_its_applications_itself(
+    ends_at_once: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """For a file Serve starts a process that imports everything once more, which takes a second."""
-    client = FakeClient()
+    client = FakeClient(monkeypatch)
     two = together({"a": deployment("noop", replicas=2), "b": with_settings(deployment("noop"), {"action_dim": 3})})
     deploy(client, two, own=True, ingress=not ends_at_once)
     assert client.by_serve == []
     assert [(app.name, app.route_prefix) for app in client.built_here] == [("a", "/a"), ("b", "/b")]
-    parts = [part for app in client.built_here for part in app.deployments]
+    parts = [app.target._bound_deployment for app in client.built_here]
     assert [(part.name, part.num_replicas) for part in parts] == [("Policy", 2), ("Policy", 1)]
     waits = {part._deployment_config.graceful_shutdown_wait_loop_s for part in parts}
     assert waits == ({0.1} if ends_at_once else {2.0})
@@ -60,16 +61,16 @@ def test_a_server_on_its_own_ray_builds_its_applications_itself(ends_at_once: bo
         changed({}, logging_config={"log_level": "DEBUG"}),
     ],
 )
-def test_what_serve_must_apply_is_deployed_by_serve(config: ServeDeploySchema) -> None:
+def test_what_serve_must_apply_is_deployed_by_serve(config: ServeDeploySchema, monkeypatch: pytest.MonkeyPatch) -> None:
     """So that another deployment of the file changes it without new replicas."""
-    client = FakeClient()
+    client = FakeClient(monkeypatch)
     deploy(client, config, own=True, ingress=True)
     assert (client.by_serve, client.built_here) == ([config], [])
 
 
-def test_a_cluster_of_others_keeps_the_file() -> None:
+def test_a_cluster_of_others_keeps_the_file(monkeypatch: pytest.MonkeyPatch) -> None:
     """There others may deploy it again."""
-    client, config = FakeClient(), deployment("noop")
+    client, config = FakeClient(monkeypatch), deployment("noop")
     deploy(client, config, own=False, ingress=True)
     assert (client.by_serve, client.built_here) == ([config], [])
 
@@ -99,7 +100,7 @@ def test_proxies_that_never_listen_are_an_error(monkeypatch: pytest.MonkeyPatch,
         raise getattr(ray.exceptions, late)
 
     monkeypatch.setattr(ray, "get", get)
-    monkeypatch.setattr("vlagents_ray.serve.launch.server.proxy_timeout_s", lambda: 0.0)
+    monkeypatch.setattr("vlagents_ray.serve.launch.server._PROXIES_S", 0.0)
     with pytest.raises(PolicyUnavailable, match="proxies do not listen within 0 s"):
         wait_for_proxies([], list)
 

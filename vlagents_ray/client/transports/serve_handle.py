@@ -21,7 +21,7 @@ from vlagents_ray.protocol.frames import decode_replies, encode_requests, reques
 from vlagents_ray.protocol.messages import LocalAddress, PlasmaAddress, Reply, Request, boot_id
 from vlagents_ray.ray_tools.private import (
     channel_content,
-    is_connected,
+    node_of_this_process,
     register_writer,
     replica_request,
     write_channel,
@@ -305,7 +305,7 @@ def this_node() -> str | None:
     """Return the id of the Ray node that this process runs on; None for a Ray client, and without Ray."""
     import ray
 
-    if not is_connected():
+    if node_of_this_process() is None:
         return None
     node: str = ray.get_runtime_context().get_node_id()
     return node

@@ -51,7 +51,7 @@ def ray_cluster(config: EvalConfig) -> Iterator[None]:
             # The number of CPUs is only an account: the user's number of workers must fit.
             cpus = max(os.cpu_count() or 1, ceil(config.workers * most_cpus(config)))
             with withheld():  # workers get the key when they are ready; Ray's daemons do not need it
-                stack.enter_context(joined("local", num_cpus=cpus, include_dashboard=False))
+                stack.enter_context(joined("local", num_cpus=cpus))
         yield
 
 

@@ -23,14 +23,12 @@ from ray.serve.schema import ServeDeploySchema
 
 from vlagents_ray.errors import ConfigError, PolicyUnavailable
 from vlagents_ray.ray_tools.private import (
-    build_app,
     end_controller,
     forget_serve,
     gpus_here,
     long_polls,
     node_of_this_process,
     proxies_now,
-    proxy_timeout_s,
     start_serve,
     use_loopback,
 )
@@ -62,9 +60,9 @@ from vlagents_ray.serve.ports import EVERYWHERE, HOST, LOOPBACK, free_port, is_f
 log = logging.getLogger(__name__)
 
 _SHUTDOWN_S = 30.0
+_PROXIES_S = 60.0  # for Serve's proxies to listen; the first ones may be replaced
 _LOOK_S = 0.2  # between two looks at the proxies that Serve has
 _START_S, _GROW_S = 600.0, 3600.0  # time for a policy to get ready: here; on a cluster that may add a machine first
-_END_S = 0.1  # period at which a replica that ends checks for remaining requests; Serve's own is 2 s
 # Keys of a deployment file, and of an application in it, that Serve does not have to apply.
 _OUR_KEYS = {"applications", "http_options", "proxy_location"}
 _OUR_APP_KEYS = {"name", "route_prefix", "import_path", "args"}
@@ -78,14 +76,13 @@ def wait_for_proxies(proxies: list[Any], look_again: Callable[[], list[Any]]) ->
     """
     import ray
 
-    timeout_s = proxy_timeout_s()
-    deadline = time.monotonic() + timeout_s
+    deadline = time.monotonic() + _PROXIES_S
     while True:
         try:
             ray.get(proxies, timeout=max(deadline - time.monotonic(), 0.0))
         except (ray.exceptions.GetTimeoutError, ray.exceptions.RayActorError) as error:
             if time.monotonic() >= deadline:
-                raise PolicyUnavailable(f"Serve's proxies do not listen within {timeout_s:g} s") from error
+                raise PolicyUnavailable(f"Serve's proxies do not listen within {_PROXIES_S:g} s") from error
             time.sleep(_LOOK_S)
             proxies = look_again()
         else:
@@ -226,6 +223,8 @@ def deploy(client: Any, config: ServeDeploySchema, *, own: bool, ingress: bool) 
     deployed again, and Serve would replace all replicas of an application that it did not build.
     Without `ingress` replicas end without a wait for requests: their clients have ended before.
     """
+    from ray import serve
+
     from vlagents_ray.serve.replica.app import build
 
     stated = [app.model_dump(exclude_defaults=True).keys() for app in config.applications]
@@ -234,13 +233,11 @@ def deploy(client: Any, config: ServeDeploySchema, *, own: bool, ingress: bool) 
     if not plain or not own:
         client.deploy_apps(config)
         return
-    changes = {} if ingress else {"graceful_shutdown_wait_loop_s": _END_S}
-    built = []
-    for app in config.applications:
-        one = build_app(build(ServerArgs(**app.args)), name=app.name, route_prefix=app.route_prefix)
-        one.deployments[:] = [part.options(**changes) for part in one.deployments]
-        built.append(one)
-    client.deploy_applications(built, wait_for_ingress_deployment_creation=False, wait_for_applications_running=False)
+    targets = [
+        serve.RunTarget(build(ServerArgs(**app.args), drains=ingress), name=app.name, route_prefix=app.route_prefix)
+        for app in config.applications
+    ]
+    serve.run_many(targets, wait_for_ingress_deployment_creation=False, wait_for_applications_running=False)
 
 
 def _require_gpus(config: ServeDeploySchema, here: float | None = None) -> None:
@@ -398,8 +395,6 @@ def own_ray(
             listener.require()
         start_ray(
             num_cpus=num_cpus,
-            include_dashboard=False,
-            log_to_driver=False,
             logging_level="WARNING",
             _temp_dir=str(folder / FILES),
         )

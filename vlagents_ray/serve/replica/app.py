@@ -19,10 +19,19 @@ _LEAST_ANSWER_S = 5.0  # minimum time limit of a health check, for a busy machin
 _HEAD = "node:__internal_head__"  # a resource that Ray assigns to the head node of any cluster
 # A replica gets neither these settings nor the dialects of the gateway, and does not restart when they change.
 _OUTSIDE: Any = {"replicas": True, "autoscaling": True, "resources": True}
+_AT_ONCE: Any = {"graceful_shutdown_wait_loop_s": 0.1}  # period at which remaining requests are counted; Serve's: 2 s
 
 
-def build(args: ServerArgs) -> Application:
-    """Build the Serve application of one policy; raises `ConfigError` if its environment cannot run it."""
+def build(args: ServerArgs, *, drains: bool = True) -> Application:
+    """Build the Serve application of one policy.
+
+    Args:
+        args: The settings of the policy.
+        drains: Whether replicas that end wait for requests over HTTP.
+
+    Raises:
+        ConfigError: The policy's environment cannot run it.
+    """
     args = args.model_copy(update={"environment": with_process(args.environment)})
     options: dict[str, Any] = {
         **_options(args),
@@ -30,6 +39,7 @@ def build(args: ServerArgs) -> Application:
         # batches. It is no protection against overload, since requests wait in the batch queue.
         "max_ongoing_requests": args.sessions.limit + 2 * args.batch.max_size,
         "graceful_shutdown_timeout_s": 20,
+        **({} if drains else _AT_ONCE),
     }
     if args.autoscaling is not None:
         options["autoscaling_config"] = args.autoscaling.options()
@@ -78,9 +88,8 @@ def _gateway(args: ServerArgs) -> Application:
     options: dict[str, Any] = {
         "name": GATEWAY,
         "num_replicas": 1,
-        # No Serve request waits for it: its clients use its own ports.
         "graceful_shutdown_timeout_s": 10,
-        "graceful_shutdown_wait_loop_s": 0.1,
+        **_AT_ONCE,  # no Serve request waits for it: its clients use its own ports
         "health_check_period_s": 5,
         "ray_actor_options": {"num_cpus": 0, "resources": {_HEAD: 0.001}},
     }
