@@ -89,7 +89,6 @@ def test_a_server_gets_haproxy_back_and_ends_without_ray_leaving_nothing(tmp_pat
         said = log.read_text()
         cause = "Ray's daemon on this machine, the raylet, has ended; start it again"
         assert any(line.endswith(cause) for line in said.splitlines()), said  # Ray's own threads may log after it
-        assert "Raylet is terminated" not in said
 
 
 @pytest.mark.slow
