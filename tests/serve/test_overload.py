@@ -335,6 +335,17 @@ def test_what_a_request_names_is_counted_each_time_and_taken_once() -> None:
     assert held.held == 0
 
 
+def test_an_array_is_counted_each_time_it_is_named() -> None:
+    def named(times: int) -> dict[str, Any]:
+        return {"op": "reset", "obs": {"info": {str(n): {"$": ["nd", 0, "|u1", [1000]]} for n in range(times)}}}
+
+    limits = Limits(decoded_bytes=4000)
+    good, bad = read_requests(frame(named(4), named(5), files=[bytes(1000)]), Budget(limits))
+    assert isinstance(good, Request)
+    assert isinstance(bad, Reply)
+    assert isinstance(bad.error, MessageTooLarge)
+
+
 def test_what_images_declare_is_refused_before_the_first_is_decoded(decoded: list[str]) -> None:
     with pytest.raises(MessageTooLarge):
         decode_files([JPEG, JPEG, JPEG], Budget(Limits(decoded_bytes=2 * DECODED)))
