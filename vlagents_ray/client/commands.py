@@ -1,4 +1,4 @@
-"""Commands from the live page to a robot, which come in the answers to its requests; they can only make it stop."""
+"""Commands from the live page to a robot, which arrive in the replies to its requests; they can only make it stop."""
 
 from __future__ import annotations
 
@@ -67,11 +67,11 @@ class CommandInbox:
 
     @property
     def waiting(self) -> list[Command]:
-        """The commands that have come and were not obeyed yet, oldest first."""
+        """The commands received but not yet obeyed, oldest first."""
         return list(self._waiting)
 
     def obey(self, control: Control) -> list[Command]:
-        """Give the commands that have come since the last call to the state of the robot, and return them."""
+        """Apply the commands received since the last call to the state of the robot, and return them."""
         done = []
         while self._waiting:
             command = self._waiting.popleft()

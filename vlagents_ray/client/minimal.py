@@ -73,7 +73,7 @@ class Policy(ExitStack):
 
 
 def _value(blobs: list[bytes], node: dict[str, Any]) -> Any:
-    """Return what an object of a reply stands for: an array, bytes or a number if it is a reference."""
+    """Decode one object of a reply: an array, bytes or a number if it is a reference."""
     kind, i, *form = node.get("$", ("object", 0))
     if kind == "nd":
         return np.frombuffer(blobs[i], form[0]).reshape(form[1])

@@ -207,7 +207,7 @@ class Budget:
         """Count the message for its sender, before any of it is parsed; raises the error that refuses it."""
 
     def parse(self, size: int) -> None:
-        """Count what the values of `size` bytes of JSON take, before they are parsed; raises as `hold`."""
+        """Count the memory for the values of `size` bytes of JSON before they are parsed; raises as `hold`."""
         self.hold(_JSON_FACTOR * size)
 
     def begin(self, op: object, rank: object = "robot") -> None:

@@ -82,7 +82,7 @@ class ValueReader:
         self._fresh: set[int] = set()  # blobs that were decoded in advance and not referred to yet
 
     def begin(self) -> None:
-        """Begin another request, with limits of its own."""
+        """Begin another request and reset its limits."""
         self._items = 0
 
     def decode_images(self, nodes: Mapping[str, Any]) -> None:

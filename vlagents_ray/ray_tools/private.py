@@ -238,7 +238,7 @@ def end_controller(client: Any) -> Any:
 
 
 def forget_serve(client: Any) -> None:
-    """Let this process have no Serve any more, after `end_controller`."""
+    """Clear this process's reference to Serve, after `end_controller`."""
     from ray.serve.context import _set_global_client
 
     client._shutdown = True

@@ -80,14 +80,14 @@ def portable(value: Any) -> np.ndarray:
 
 
 def own_copy(value: Any) -> Any:
-    """Return a copy of a value that nobody else writes into."""
+    """Return a private copy of a value."""
     if _is_tensor(value):
         return value.detach().clone()
     return np.array(value) if isinstance(value, np.ndarray) else value  # JAX arrays never change
 
 
 def converted(value: Any, held: Any) -> Any:
-    """Return `value` as the type, precision and device of `held`, in memory that nobody else writes into.
+    """Return `value` as the type, precision and device of `held`, in memory that is not shared.
 
     Read-only numpy arrays that own read-only memory, such as Ray's objects, are not copied where `held` is on the CPU.
     """

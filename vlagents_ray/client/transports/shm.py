@@ -198,14 +198,14 @@ def _wait(connection: socket.socket, event: int, deadline: float) -> None:
 
 
 def _require_same_user(connection: socket.socket) -> None:
-    """Raise `PermissionError` if the server is another user's: anybody may take the name of a server that has ended."""
+    """Raise `PermissionError` if the server is another user's: any user may take the name of an ended server."""
     if (uid := peer_uid(connection)) != os.getuid():
         raise PermissionError(f"it belongs to the user with the number {uid}, want {os.getuid()}, this process's own")
 
 
 @dataclass(slots=True)
 class _Memory:
-    """A memory file of this client that the server maps, too."""
+    """A memory file of this client that the server also maps."""
 
     number: int
     map: mmap.mmap

@@ -234,7 +234,7 @@ class Stream:
             raise ConnectionResetError(f"the server closes the connection ({self._protocol.close_rcvd})")
 
     def _limit(self, deadline: float) -> None:
-        """Let the next call on the socket end at a deadline, s of `time.monotonic`."""
+        """Set the deadline of the next call on the socket, s of `time.monotonic`."""
         if (left_s := deadline - time.monotonic()) <= 0:
             raise TimeoutError
         self._socket.settimeout(left_s)

@@ -246,7 +246,7 @@ class _TimedWebSocket:
 
 
 def _cancel_again(over: bool) -> None:
-    """Cancel whoever wants to receive more once it is over, and has missed its cancellation.
+    """Cancel the receiver again if it missed its cancellation.
 
     Before Python 3.12, `asyncio.wait_for` drops a cancellation that comes together with what it waits for, such as
     the message of a client whose key has just been revoked.

@@ -49,7 +49,7 @@ class ReceivesWeights(Protocol):
         ...
 
     async def push_received(self, named: Mapping[str, Any], options: PushOptions) -> PushResult:
-        """Let all replicas act with new weights."""
+        """Make all replicas act with new weights."""
         ...
 
     async def versions_of_weights(self) -> list[int]:

@@ -113,7 +113,7 @@ class LiveObserver(Observer):
         self._lock = threading.Lock()
 
     def renew(self, lease_s: float = LEASE_S) -> None:
-        """Keep what happens for `lease_s` more seconds."""
+        """Keep recording events for `lease_s` more seconds."""
         self._until = max(self._until, self._clock() + lease_s)
         if not self._active:
             self._active = True
@@ -173,7 +173,7 @@ class LiveObserver(Observer):
         return self._observations.get(session)
 
     def forget_others(self, sessions: Collection[str]) -> None:
-        """Drop what is kept of all sessions but these, since those have ended."""
+        """Drop the records of all sessions but these; the others have ended."""
         with self._lock:
             for session in self._observations.keys() - set(sessions):
                 self._observation_bytes -= self._observations.pop(session).counted

@@ -104,7 +104,7 @@ class RequestSpans(Observer):
 
 
 def _traceparent(request: Request) -> str:
-    """Return the trace that a request states, which may come from anybody; "" if it states none."""
+    """Return the trace in a request, which is untrusted; "" if there is none."""
     stated = "" if request.obs is None else request.obs.info.get(tracing.TRACEPARENT, "")
     return stated[:_TEXT] if isinstance(stated, str) else ""
 

@@ -73,7 +73,7 @@ class WeightPusher:
         self._known: set[str] = set()  # names of replicas that have answered
 
     async def push(self, values: Values, options: PushOptions) -> PushResult:
-        """Let all replicas act with new weights.
+        """Make all replicas act with new weights.
 
         Args:
             values: The values: numpy arrays, as `vlagents_ray.weights.trainable.portable` returns them, or on a GPU.
