@@ -275,7 +275,7 @@ class ConnectionLost(PolicyUnavailable):
 
 
 class DeadlineExceeded(VLAgentsError, TimeoutError):
-    """No answer came within the caller's deadline; a request that a server answers with this was not executed."""
+    """No answer arrived within the caller's deadline; a request that a server answers with this was not executed."""
 
     code = "deadline_exceeded"
     status = 504
@@ -294,7 +294,7 @@ class ConfigError(VLAgentsError, ValueError):
 
 
 class WeightsLost(ConfigError):
-    """The policy acts with other weights than a learner says: it was restarted since the push, or not pushed to."""
+    """The policy acts with other weights than the learner's: it was restarted since the push, or not pushed to."""
 
     code = "weights_lost"
 

@@ -284,7 +284,7 @@ class Agent:
         return acts
 
     def interrupt(self) -> None:
-        """Drop what is planned: the robot was stopped or moved, and did not execute the last action of `act`."""
+        """Drop the planned actions: the robot was stopped or moved, and did not execute the last action of `act`."""
 
     def check_health(self) -> None:
         """Raise an exception if this agent can never act again, e.g. after the loss of its GPU.

@@ -41,7 +41,7 @@ _NICE = 5  # the writing thread runs after the loop's
 
 @dataclass(frozen=True, slots=True)
 class ViewerFrame:
-    """An observation, what was planned from it and executed after it. The caller does not change its arrays later."""
+    """An observation, the chunk planned from it and the action executed next; its arrays do not change later."""
 
     tick: int  # of the episode
     time: float  # s since 1970, of the observation
@@ -78,7 +78,7 @@ class ViewerFrame:
 
 
 def numbers_of(info: Mapping[str, Any]) -> dict[str, float]:
-    """Return what the info of an `Act` says in numbers that viewers show: its timing, and that of a chunk player."""
+    """Return the numbers in the info of an `Act` that viewers show: its timing, and that of a chunk player."""
     timing = info.get("timing") or {}
     return {**timing, **{name: float(info[name]) for name in (AGE, SILENT) if name in info}}
 
@@ -250,7 +250,7 @@ class EpisodeViewer:
                 self.error = self.error or TimeoutError(f"nothing at {self._recordings.target} takes what is left")
 
     def report(self) -> str:
-        """Return a line that says what was shown."""
+        """Return a line with the number of episodes shown and frames dropped."""
         line = f"rerun: {self.episodes} episodes in {self._recordings.target}, {self.dropped} frames dropped"
         return line if self.error is None else f"{line}; stopped by {type(self.error).__name__}: {self.error}"
 
@@ -280,7 +280,7 @@ class EpisodeViewer:
             pass
 
     def _until_the_end(self) -> Iterator[ViewerFrame]:
-        """Yield the frames of an episode as they come."""
+        """Yield the frames of an episode as they arrive."""
         while isinstance(frame := self._queue.get(), ViewerFrame):
             yield frame
             self._got += 1
@@ -296,7 +296,7 @@ class LoopView:
         self._note = ""
 
     def episode(self, instruction: str) -> contextlib.AbstractContextManager[None]:
-        """Show what is added within the context as one episode."""
+        """Show the frames added within the context as one episode."""
         return contextlib.nullcontext() if self._viewer is None else self._viewer.episode(dated_name(), instruction)
 
     def add(self, obs: Obs, act: Act, executed: np.ndarray | None, tick: int, work_s: float, stop: str = "") -> None:

@@ -133,7 +133,7 @@ class Connection:
             self._next = None
 
     def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
-        """Send requests in one message and return their replies; an error on the way stands in place of a reply."""
+        """Send requests in one message and return their replies; an error on the way takes the place of a reply."""
         begun = time.monotonic()
         try:
             self._move()
@@ -204,7 +204,7 @@ class Connection:
 
 
 class _NextTransport:
-    """A transport that connects in a thread of its own, once."""
+    """A transport that connects once, on its own thread."""
 
     def __init__(self, transport: Transport) -> None:
         self.transport = transport

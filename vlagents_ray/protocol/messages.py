@@ -64,7 +64,7 @@ class Request:
     deadline_ms: float | None = None  # how long the reply is of use, counted from the arrival of the request
 
     def drop_observations(self) -> None:
-        """Let go of the observations, which were used, and may lie in memory that their sender wants back."""
+        """Drop the observations after use, as they may lie in memory that their sender needs back."""
         self.obs = None
         if self.history:
             self.history = []

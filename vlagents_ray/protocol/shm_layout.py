@@ -232,7 +232,7 @@ def _is_plain(request: Request, obs: Obs) -> bool:
 
 
 def _key(request: Request) -> tuple[Any, ...] | None:
-    """Return what determines the layout; None if the request must travel as a frame."""
+    """Return the key of the layout; None if the request must travel as a frame."""
     obs = request.obs
     if obs is None or not _is_plain(request, obs):
         return None

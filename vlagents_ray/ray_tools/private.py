@@ -51,7 +51,7 @@ def use_loopback(on: bool) -> bool:
 
 
 def reread_authentication_mode() -> None:
-    """Let Ray read `RAY_AUTH_MODE` again, as it does when it is imported."""
+    """Make Ray read `RAY_AUTH_MODE` again, as it does when it is imported."""
     import ray
 
     ray._raylet.Config.initialize("")
@@ -127,7 +127,7 @@ def create_channel(size: int) -> Any:
 
 
 def register_writer(channel: Any) -> None:
-    """Let this process write to a channel, which Ray's `Channel` does only together with pickling."""
+    """Register this process as the writer of a channel, which Ray's `Channel` does only together with pickling."""
     import ray
 
     ray._private.worker.global_worker.core_worker.experimental_channel_register_writer(channel, {})
@@ -149,7 +149,7 @@ def write_channel(channel: Any, content: Any, wait_ms: int) -> str | None:
 
 
 def read_channel(channel: Any) -> Any:
-    """Return what was written last, with `metadata` and `data`, in place: it is valid as long as the caller holds it.
+    """Return the newest content, with `metadata` and `data`, in place: it is valid as long as the caller holds it.
 
     Raises `ray.exceptions.RayChannelTimeoutError` if nothing was written since.
     """

@@ -182,7 +182,7 @@ def start_ray(**options: Any) -> None:
 
 @contextlib.contextmanager
 def _taken_port() -> Iterator[int]:
-    """Yield a port on which nothing else can listen, as the port of the dashboard that nobody needs.
+    """Yield a port on which nothing else can listen, as the port of the unused dashboard.
 
     Even without a dashboard Ray starts its server, for usage statistics, and waits for it for 2 s, unless the port is
     taken. Then it logs an error, which is dropped here.

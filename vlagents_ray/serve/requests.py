@@ -137,7 +137,7 @@ class PendingRequest:
             logger.exception("request %s: its caller could not take the reply", self.request.request_id)
 
     def drop_preparation(self) -> None:
-        """Let no thread prepare the observation, unless one has begun to."""
+        """Cancel the preparation of the observation, unless it has begun."""
         preparation, self.preparation = self.preparation, None
         if preparation is not None:
             preparation.cancel()

@@ -117,7 +117,7 @@ class ModelWeights:
         self._alive = WeakValueDictionary({0: first})
 
     def begin(self, session: FollowingSession, *, follows: bool) -> WeightsVersion:
-        """Let a session act with the newest or the pinned version in its next episode, and return that version."""
+        """Choose the newest or the pinned version for the next episode of a session, and return it."""
         with self._lock:
             session.follows = follows
             session.weights = version = self.newest if follows else self.pinned

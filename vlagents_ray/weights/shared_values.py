@@ -61,7 +61,7 @@ def gpu_of(named: Mapping[str, Any]) -> str:
 
 @contextmanager
 def shared(named: Mapping[str, Any]) -> Iterator[SharedValues]:
-    """Yield values by name for another process, those on the GPU on one (`gpu_of`); nobody may write into them within.
+    """Yield values by name for another process, those on the GPU on one (`gpu_of`); they stay unchanged meanwhile.
 
     Raises:
         NotShared: The memory is of a kind that CUDA does not hand over.

@@ -254,7 +254,7 @@ def _misfit(name: str, pushed: Any, held: Any) -> str | None:
 
 
 def _kind(dtype: str) -> Any:
-    """Return what is equal for types of one kind: precisions are converted, kinds are not."""
+    """Return the kind of a type, such as floating point: precisions are converted, kinds are not."""
     return next((kind for kind in _KINDS if dtype.startswith(kind)), dtype)
 
 

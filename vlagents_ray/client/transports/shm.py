@@ -1,4 +1,4 @@
-"""Messages on a Unix socket that say where the observations lie, and shared memory as the place.
+"""Messages on a Unix socket with the place of the observations, which is shared memory.
 
 `vlagents_ray.serve.endpoints.shm` is the server's side. Plasma (`.serve_handle`) is the other place.
 """

@@ -274,7 +274,7 @@ class Caller:
             raise
 
     def note(self, what: str, of: str) -> None:
-        """Write what the key did into the audit log, see `vlagents_ray.serve.access.audit`."""
+        """Write an action of the key into the audit log, see `vlagents_ray.serve.access.audit`."""
         self._keys.audit.did(self.name, what, of)
 
     def _admit(self, free: bool, scope: str | None = None) -> None:
@@ -348,7 +348,7 @@ def current_caller() -> Identity:
 
 @contextmanager
 def on_behalf_of(caller: Identity) -> Iterator[None]:
-    """Let `current_caller` return `caller` inside the context, and in tasks that are started there."""
+    """Make `caller` the current caller inside the context, and in tasks that are started there."""
     token = _CALLER.set(caller)
     try:
         yield

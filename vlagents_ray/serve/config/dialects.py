@@ -74,7 +74,7 @@ class DialectArgs(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _by_their_own_models(cls, data: Any) -> Any:
-        """Let the `Config` of each dialect read its settings; the errors of all of them are raised together."""
+        """Check the settings of each dialect by its `Config`; raise the errors of all of them together."""
         if not isinstance(data, Mapping):
             return data
         fields: dict[str, Any] = {str(name): (_config_of(str(name)) | None, None) for name in data}

@@ -150,7 +150,7 @@ class Dialect(abc.ABC):
 
     @classmethod
     def lacks(cls, config: DialectConfig, contract: Contract | None) -> list[str]:
-        """Return what the policy needs and no observation of these clients has, one sentence each with its remedy."""
+        """Return the policy's inputs that no observation of these clients has, one sentence each with its remedy."""
         mapping = config.keys()
         return [] if mapping is None else mapping.lacks(contract)
 
@@ -343,7 +343,7 @@ class ImplicitEpisode:
         self.begun, self.instruction = True, instruction
 
     def end(self) -> None:
-        """Let the next observation begin an episode."""
+        """Begin an episode with the next observation."""
         self.begun = False
 
 

@@ -164,7 +164,7 @@ class MapConnection:
         self._before_ms: float | None = None
 
     def end_episodes(self) -> None:
-        """Let the next observation of each session begin an episode."""
+        """Begin an episode of each session with its next observation."""
         for session in (self.session, *self._batched):
             session.episode.end()
 

@@ -89,7 +89,7 @@ class RequestDecoder:
         return self._checked(op, Decoded([request], {}), http, name)
 
     def _checked(self, op: Op, decoded: Decoded, http: HttpRequest, name: str) -> Decoded:
-        """Return the requests with what the headers say about them."""
+        """Return the requests with the session, deadline and class in the headers."""
         headers = headers_of(http.scope)
         stated = headers.get(REQUEST_ID_HEADER, "")
         if not is_name(stated):

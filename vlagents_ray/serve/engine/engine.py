@@ -400,7 +400,7 @@ class Engine:
                 self._act(model, weights, group, prepared_s)
 
     def _reset(self, pending: PendingRequest, opening: Opening) -> None:
-        """Begin the episode that a reset asks for, and answer it.
+        """Begin the episode of a reset, and answer it.
 
         A reset whose checkpoint is not loaded leaves the queue. It is queued again when the checkpoint is loaded, and
         answered with an error if that fails. Meanwhile the session may be reset again or closed, or its client may stop

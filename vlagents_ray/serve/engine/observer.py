@@ -43,13 +43,13 @@ class Observers(Observer):
         self._lock = threading.Lock()
 
     def add(self, observer: Observer) -> None:
-        """Let an observer see the requests from now on."""
+        """Add an observer of the requests from now on."""
         with self._lock:
             self._all = (*self._all, observer)
             self.any = True
 
     def remove(self, observer: Observer) -> None:
-        """Let it see no further requests; does nothing if it was not added."""
+        """Remove an observer; does nothing if it was not added."""
         with self._lock:
             self._all = tuple(one for one in self._all if one is not observer)
             self.any = bool(self._all)

@@ -113,7 +113,7 @@ class ModelCache:
         return None if model is None or model.key == self.draining else model
 
     def assign(self, session: Session[LoadedModel], model: LoadedModel) -> LoadedModel:
-        """Let the session hold the model, in place of any other, and return the model."""
+        """Assign the model to the session, in place of any other, and return the model."""
         self.release_model(session)
         self.loaded[model.key] = self.loaded.pop(model.key)  # the most recently used is the last
         session.model = model
@@ -292,7 +292,7 @@ class ModelManager:
 
     @property
     def uncompiled(self) -> list[str]:
-        """What of the loaded models runs without compilation, although their settings ask for it."""
+        """Return the parts of the loaded models that run without compilation, although their settings request it."""
         with self._changed:
             return [what for model in self._cache.loaded.values() for what in model.report.uncompiled]
 

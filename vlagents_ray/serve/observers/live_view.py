@@ -110,7 +110,7 @@ class ReplicaView:
         return pressed
 
     def read(self, since: int, shown: Collection[str]) -> Snapshot:
-        """Return what happened since the snapshot with the number `since`, with pictures of the sessions `shown`.
+        """Return the events since the snapshot with the number `since`, with pictures of the sessions `shown`.
 
         It may take milliseconds, so it does not belong on an event loop or the policy's thread.
         """
@@ -153,7 +153,7 @@ class ReplicaView:
         return self.ring.save(session)
 
     def _state(self) -> dict[str, Any]:
-        """Return what changes slowly, and takes long to find out."""
+        """Return the facts that change slowly and take long to collect."""
         engine, now = self._engine, time.monotonic()
         if now - self._measured > _STATE_S:
             metadata = self._metadata()
@@ -253,7 +253,7 @@ class Viewer:
         self._sent = self._more
 
     def put(self, snapshots: list[Snapshot], more: dict[str, Any] | None = None) -> None:
-        """Add what is to be sent, and drop the oldest of too much; `more` is sent if it is another than before."""
+        """Queue data to be sent, and drop the oldest if it is too much; `more` is sent only if it has changed."""
         self._waiting.append(snapshots)
         self._came.set()
         while len(self._waiting) > 1 and (len(self._waiting) > _BEHIND or self._waiting_bytes() > _WAITING_BYTES):

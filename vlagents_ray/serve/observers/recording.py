@@ -1,4 +1,4 @@
-"""Records what sessions request and get as LeRobotDatasets, while other threads copy, encode and write it.
+"""Records requests and answers of sessions as LeRobotDatasets; other threads copy, encode and write them.
 
 The thread that handles a message only puts references into a queue. A second thread copies the observations, since they
 may lie in memory that their client wants back, and a third one encodes and writes. If these fall behind, or the disk is
@@ -174,7 +174,7 @@ class SessionRecorder(Observer):
             self._write_later(partial(self._handle, recorded, reply))
 
     def close(self) -> None:
-        """Write what waits, and complete all episodes, as far as the disk is fast enough."""
+        """Write the waiting frames, and complete all episodes, as far as the disk is fast enough."""
         each_half_second.remove(self._look)
         until = time.monotonic() + _CLOSING_S
         self._copier.close(_CLOSING_S)

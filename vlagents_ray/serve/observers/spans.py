@@ -35,7 +35,7 @@ class _ServedRequest(NamedTuple):
 
 
 class RequestSpans(Observer):
-    """Makes the spans of the requests that it sees, twice a second and on a thread of its own, until `close`."""
+    """Makes spans of requests, twice a second and on its own thread, until `close`."""
 
     def __init__(self, tracer: Any, replica: str) -> None:
         """Trace requests by `tracer`, as those of the replica of this name."""

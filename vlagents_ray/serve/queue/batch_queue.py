@@ -115,7 +115,7 @@ class BatchQueue:
         return self.take()
 
     def take(self) -> Taken | None:
-        """Return what waits, as `next` does, without waiting for more."""
+        """Return the waiting requests, as `next` does, without waiting for more."""
         with self._lock:
             now = self._clock()
             self._asleep = self._driven

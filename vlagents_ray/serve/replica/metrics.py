@@ -95,7 +95,7 @@ class Exporter:
         self._periodic = Periodic(PERIOD_S)
 
     def start(self) -> None:
-        """Let the engine record its stats, and start to export them."""
+        """Make the engine record its stats, and start to export them."""
         self._engine.stats.enable()
         self._periodic.add(self.export)
 

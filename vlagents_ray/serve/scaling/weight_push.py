@@ -48,7 +48,7 @@ class ThisReplica(WeightsReplica):
     """This replica among those of a push."""
 
     def __init__(self, name: str, updates: WeightUpdates) -> None:
-        """Let pushes update the weights of this replica's engine."""
+        """Set the weights that pushes update, those of this replica's engine."""
         self._name = name
         self._updates = updates
 
