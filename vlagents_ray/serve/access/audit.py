@@ -25,7 +25,7 @@ _EVERY_S = 10.0
 
 
 def write_audit() -> None:
-    """Write the log from this process, to stderr (which Ray stores per process) unless logging is configured already."""
+    """Write this log to stderr (which Ray stores per process), unless logging is configured already."""
     logger.setLevel(logging.INFO)
     if not logger.hasHandlers():
         handler = logging.StreamHandler()
