@@ -172,7 +172,7 @@ def jax_device() -> Any:
 
 
 def forget_peak() -> None:
-    """Let `peak_mib` begin again, where the accelerator can."""
+    """Reset `peak_mib`, where the accelerator can."""
     if (used := cuda()) is not None:
         used.reset_peak_memory_stats()
 

@@ -83,7 +83,7 @@ def choose(points: Sequence[MeasuredPoint], goal: TuningGoal) -> MeasuredPoint:
 
 
 def default_point(points: Sequence[MeasuredPoint], goal: TuningGoal, max_size: int) -> MeasuredPoint | None:
-    """Return what the file gives as it is; None if that was not measured, or misses the goal."""
+    """Return the settings of the file as it is; None if they were not measured, or miss the goal."""
     own = [point for point in points if not point.variant.changes and point.sessions <= max_size]
     if goal.kind == "throughput":
         own = [point for point in own if point.sessions == max_size]

@@ -56,7 +56,7 @@ def save_observations(observations: Sequence[Obs], file: Path) -> None:
 
 
 def load_observations(file: Path) -> list[Obs]:
-    """Read what `save_observations` wrote."""
+    """Read the observations that `save_observations` wrote."""
     found: dict[int, Obs] = {}
     with np.load(file, allow_pickle=False) as arrays:
         for key in arrays.files:

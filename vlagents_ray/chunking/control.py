@@ -101,7 +101,7 @@ class Control:
             self._pauses += 1
 
     def resume(self) -> None:
-        """Let the policy continue from the next tick on, with a new answer."""
+        """Continue with the policy from the next tick on, with a new answer."""
         with self._lock:
             self._pause = None
 

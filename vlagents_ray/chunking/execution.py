@@ -36,7 +36,7 @@ class Execution:
             self._noted = False
 
     def report(self) -> dict[str, Any]:
-        """Return what the next request states: `EXECUTED`, if other actions than the policy's were executed."""
+        """Return the extra info of the next request: `EXECUTED`, if other actions than the policy's were executed."""
         stated: dict[str, Any] = {EXECUTED: np.stack(self._in_place)} if self._in_place else {}
         self._in_place.clear()
         return stated

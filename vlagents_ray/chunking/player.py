@@ -320,7 +320,7 @@ class ChunkPlayer(Agent):
         self._begin()
 
     def _ask(self, obs: Obs, tick: int, begun: float) -> None:
-        """Take what the policy has answered, and ask it if that is due."""
+        """Take the policy's answer if there is one, and send the next request if it is due."""
         if self._asker is None or self.settings.deadline_s is None:
             if self._wants(tick, obs):
                 self._note_asked(tick, obs)
@@ -450,7 +450,7 @@ class ChunkPlayer(Agent):
         return Act(action, info={SAFE: why.reason, CAUSE: why.cause, SILENT: self._silent_s()})
 
     def _begin_again(self, why: Held) -> None:
-        """Let the next action be of the answer to a new observation."""
+        """Take the next action from the answer to a new observation."""
         self._plan.drop()
         self._dropped = True
         self._trouble = why

@@ -84,13 +84,13 @@ def _model_of(error: ValidationError) -> tuple[type | None, str | None]:
 
 
 def fail(message: str, code: int) -> NoReturn:
-    """Print what went wrong, and end with that exit code."""
+    """Print an error, and end with that exit code."""
     say_error(message)
     raise typer.Exit(code)
 
 
 def say_error(message: str, console: Console | None = None) -> None:
-    """Print what went wrong, after all other output."""
+    """Print an error after all other output."""
     sys.stdout.flush()
     (console or err).print(Text.assemble(("error", "bold red"), f" {message}"))
 

@@ -77,7 +77,7 @@ def environments() -> Iterator[Listed]:
 
 
 def installing(listed: Sequence[Listed]) -> Iterator[str]:
-    """Yield what installs the rest, a line each: a command and whom it is for, or what an environment says."""
+    """Yield a line for each way to install missing packages: a command and its adapters, or an environment's cure."""
     wanted: dict[str, list[str]] = {}
     for one in listed:
         modules, sources, requirements = _lacking(one.name) if one.kind != "environment" else ([], [], "")
@@ -103,7 +103,7 @@ def require_packages(config: ServeDeploySchema) -> None:
 
 
 def missing_packages(name: str, *, checkout: bool = True) -> str | None:
-    """Say what a model family needs that this environment has not, with the cure; None if nothing."""
+    """Return the packages that a model family lacks in this environment, with the cure; None if it lacks none."""
     modules, sources, requirements = _lacking(name)
     if not modules and not (sources and checkout):
         return None
@@ -115,7 +115,7 @@ def missing_packages(name: str, *, checkout: bool = True) -> str | None:
 
 
 def _lacking(name: str) -> tuple[list[str], list[str], str]:
-    """Return what a family lacks: modules, variables one of which is to name a checkout; and its requirements file."""
+    """Return the modules and checkout variables that a family lacks, and its requirements file."""
     one = dict(families()).get(name)
     if one is None:
         return [], [], ""

@@ -86,7 +86,7 @@ def robot_command(context: typer.Context) -> None:
 
 @app.command()
 def policies(name: OneName = None, as_json: AsJson = False) -> None:
-    """List the policies and wrappers: what they are, whether their packages are here, and what installs the rest."""
+    """List policies and wrappers: their models, whether their packages are installed, how to install the rest."""
     from vlagents_ray.cli.listing import policies_and_wrappers
 
     _list(list(policies_and_wrappers()), name, as_json=as_json)

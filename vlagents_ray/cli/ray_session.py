@@ -1,4 +1,4 @@
-"""Ray under a command: what it logs goes to a file, and the command ends if Ray is lost."""
+"""Ray under a command: its logs go to a file, and the command ends if Ray is lost."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ _MEANT = (
 
 @contextlib.contextmanager
 def quiet_ray(name: str | None, started: threading.Event | None = None) -> Iterator[Path | None]:
-    """Keep what Ray, Serve and HAProxy log off the terminal, unless it is a problem.
+    """Keep the logs of Ray, Serve and HAProxy off the terminal, except for problems.
 
     The context begins before Ray is started.
 

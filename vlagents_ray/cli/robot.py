@@ -78,7 +78,7 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
 
 @contextlib.contextmanager
 def _ended_by_signals() -> Iterator[None]:
-    """Let SIGTERM (systemd) and SIGHUP (a closed terminal) end the loop as Ctrl-C does, which stops the robot."""
+    """End the loop at SIGTERM (systemd) and SIGHUP (a closed terminal) as at Ctrl-C, which stops the robot."""
 
     def end(number: int, _: object) -> None:
         signal.signal(number, signal.SIG_IGN)  # a second signal would interrupt the stop
@@ -173,7 +173,7 @@ def _leader(
     contract: Contract | None,
     stack: contextlib.ExitStack,
 ) -> Leader | None:
-    """Return what a human moves the robot with, opened."""
+    """Return the opened device with which a human moves the robot."""
     if options.leader is None:
         return None
     if make is not None:
@@ -206,7 +206,7 @@ def _say_outcome(report: LoopReport, say: Callable[[str], None], *, led: bool) -
 
 @contextlib.contextmanager
 def _restarting(watchdog: Watchdog, say: Callable[[str], None]) -> Iterator[None]:
-    """Let a person restart motion after a stop or a pause: by Enter or C at the terminal, or by SIGUSR1."""
+    """Restart motion after a stop or a pause at the operator's word: by Enter or C at the terminal, or by SIGUSR1."""
 
     def restarted() -> bool:
         if not watchdog.restart():

@@ -391,7 +391,7 @@ def read_tasks(checkout: Path) -> tuple[Any, dict[str, str]]:
 
 @contextlib.contextmanager
 def quietly() -> Iterator[None]:
-    """Keep what upstream's code prints and warns of, such as gym's end, off the terminal; errors are raised."""
+    """Keep the output and warnings of upstream's code, such as gym's end, off the terminal; errors are raised."""
     nowhere = io.StringIO()
     with contextlib.redirect_stdout(nowhere), contextlib.redirect_stderr(nowhere), warnings.catch_warnings():
         warnings.simplefilter("ignore")

@@ -129,7 +129,7 @@ def fitting(devices: Sequence[EglDevice], *, gpu: bool) -> EglDevice | None:
 
 
 def prepare_rendering() -> None:
-    """Set what drivers and simulators read when they are loaded, for rendering without a display on shared cores.
+    """Set variables of drivers and simulators for rendering without a display on shared cores.
 
     Variables set by the user are kept. Call it before any simulator is imported: ManiSkill also imports MuJoCo, which
     chooses its OpenGL then and for good.

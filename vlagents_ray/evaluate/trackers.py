@@ -60,7 +60,7 @@ class TrackerRun(ABC):
 
     @abstractmethod
     def finish(self) -> None:
-        """Send what is buffered, and end the run."""
+        """Send the buffered values, and end the run."""
 
 
 class WandbRun(TrackerRun):
@@ -252,7 +252,7 @@ class TrackerFeed:
 
 
 def _parts(results: Results) -> list[tuple[str, list[CellResults], Group]]:
-    """Return what is logged together, as (key, cells, aggregates): each cell, then each policy id."""
+    """Return the groups that are logged together, as (key, cells, aggregates): each cell, then each policy id."""
     summary = summarize(results)
     alone = [(cell.cell, [cell], group) for cell, group in zip(results.cells, summary.cells, strict=True)]
     totals = zip(results.contenders, summary.totals, strict=True)

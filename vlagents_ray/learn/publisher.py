@@ -87,7 +87,7 @@ class Publisher:
         pin: bool = False,
         version: int | None = None,
     ) -> int:
-        """Let the policy act with new weights, and return their version once all replicas hold them.
+        """Push new weights to the policy, and return their version once all replicas hold them.
 
         Args:
             named: The values by name, as `Agent.parameters` names them: numpy or JAX arrays or torch tensors, e.g. a
@@ -137,7 +137,7 @@ class WeightsTarget(ABC):
 
     @abstractmethod
     def push(self, named: Mapping[str, Any], options: PushOptions) -> int:
-        """Let the policy act with new weights, and return their version; see `Publisher.push`."""
+        """Push new weights to the policy, and return their version; see `Publisher.push`."""
 
     @abstractmethod
     def versions(self) -> list[int]:

@@ -1,1 +1,1 @@
-"""Open-loop evaluation: what a policy would have done where a LeRobotDataset says what was done."""
+"""Open-loop evaluation: a policy's actions on the observations of a LeRobotDataset, compared with the recorded ones."""

@@ -124,7 +124,7 @@ class Adapters:
         return fingerprint
 
     def stated(self, fingerprint: str) -> dict[str, Any]:
-        """Return what an act says about the weights that computed it, if these are not the base's alone."""
+        """Return the info of an act about the weights that computed it, if these are not the base's alone."""
         return {POLICY: {"version": 0, "fingerprint": fingerprint}} if fingerprint else {}
 
     @contextmanager

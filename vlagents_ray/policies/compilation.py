@@ -30,7 +30,7 @@ _TORCH = "TORCHINDUCTOR_CACHE_DIR"
 
 
 def keep_torch_programs() -> None:
-    """Let torch keep its programs in the user's cache, unless `TORCHINDUCTOR_CACHE_DIR` names another folder.
+    """Keep torch's programs in the user's cache, unless `TORCHINDUCTOR_CACHE_DIR` names another folder.
 
     Torch writes its own choice, /tmp/torchinductor_USER, into that variable when it first needs it.
     """
@@ -40,7 +40,7 @@ def keep_torch_programs() -> None:
 
 
 def keep_jax_programs(jax: Any, platform: str) -> None:
-    """Let JAX keep its programs for a GPU in the user's cache, unless `JAX_COMPILATION_CACHE_DIR` is set."""
+    """Keep JAX's programs for a GPU in the user's cache, unless `JAX_COMPILATION_CACHE_DIR` is set."""
     if platform == "cpu":
         return
     chosen = getattr(jax.config, "jax_compilation_cache_dir", "an older JAX, without this setting")

@@ -161,7 +161,7 @@ class RandomSteps:
         return velocity
 
     def stated(self, execute: int | None, dim: int | None) -> dict[int, dict[str, Any]]:
-        """Return what is wanted of rows, by their places, after the last step; None: all rows, all numbers."""
+        """Return the outputs requested of rows, by their places, after the last step; None: all rows, all numbers."""
         stds = [step_std(step, self._steps, self._level) for step in range(self._steps)]
         logprob = sum(map(normal_logprob, self._chain[1:], self._means, stds))[:, :execute, :dim].cpu().numpy()
         entropy = chain_entropy(self._steps, self._level) * logprob[0].size
@@ -249,7 +249,7 @@ class FlowPasses(abc.ABC):
         self._velocity = compilation.core("velocity", self.velocity)
 
     def encode_images(self, images: Sequence[Any]) -> Sequence[Any]:
-        """Return what `encode` gets of images (P, 3, H, W)."""
+        """Return the input of `encode` for images (P, 3, H, W)."""
         return images
 
     @abc.abstractmethod

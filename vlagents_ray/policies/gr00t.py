@@ -355,7 +355,7 @@ def flash_attention_is_here(device: Any, dtype: Any) -> bool:
 
 @contextlib.contextmanager
 def built_without_flash_attention() -> Iterator[None]:
-    """Let models be built in this context that insist on flash-attention, as N1.6's backbone does."""
+    """Allow models that insist on flash-attention to be built in this context without it, such as N1.6's backbone."""
     base: Any = require("transformers").PreTrainedModel
     check = vars(base).get(_CHECK)
     if check is None:  # newer: N1.7's, which takes another attention by itself

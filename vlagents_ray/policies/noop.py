@@ -1,4 +1,4 @@
-"""A policy that does nothing, in an adjustable time: what measures everything around a policy."""
+"""A policy that does nothing, in an adjustable time, to measure everything around a policy."""
 
 from __future__ import annotations
 

@@ -577,7 +577,7 @@ class OpenPi(ModelPolicy):
         return TransformedRow(seen.inputs, row, row.noise(*loaded.model.noise_shape or ()))
 
     def _sample(self, ready: Sequence[TransformedRow]) -> tuple[np.ndarray, dict[int, dict[str, Any]]]:
-        """Return what the model computes for rows, and what is wanted of them, by their places."""
+        """Return the model's output for rows, and the extra outputs requested of them, by their places."""
         model, rows = self.loaded().model, [one.row for one in ready]
         firsts, owners = self._shared(rows)
         batch = require("jax").tree.map(lambda *leaves: np.stack(leaves), *(ready[i].inputs for i in firsts))

@@ -224,7 +224,7 @@ def run_loop(
 
 @dataclass(slots=True)
 class _Run:
-    """One run of the control loop: what a tick needs."""
+    """One run of the control loop: the objects that each tick uses."""
 
     robot: Robot
     agent: Agent

@@ -343,7 +343,7 @@ class Terminal:
 
     @contextlib.contextmanager
     def consumed_by(self, consumer: Consumer) -> Iterator[None]:
-        """Let a consumer get the keys within the context, unless another one begins in it."""
+        """Pass the keys to a consumer within the context, unless another one begins in it."""
         with self._lock:
             self._own.append(consumer)
         try:
@@ -372,7 +372,7 @@ class Terminal:
 
     @contextlib.contextmanager
     def read_in_background(self, consumer: Consumer) -> Iterator[None]:
-        """Let a consumer get the keys that no other one takes; a thread reads them while there is no other one."""
+        """Pass the keys that no other consumer takes to this one; a thread reads them meanwhile."""
         over = threading.Event()
 
         def read() -> None:

@@ -275,7 +275,7 @@ def announce(words: Sequence[str]) -> None:
 
 
 def connection_info(apps: Mapping[str, str], port: int, environ: Mapping[str, str]) -> dict[str, Any]:
-    """Return what a client needs to connect.
+    """Return the address and key with which a client connects.
 
     Returns:
         The content of the file, with the URL of each application, the key, and a command for a tunnel.

@@ -402,7 +402,7 @@ def reads_packed(reply: Any) -> bool:
 
 
 def read_modalities(reply: Any) -> dict[str, Modality]:
-    """Return what `get_modality_config` answered, by modality; keys have no prefix such as `video.`."""
+    """Return the answer to `get_modality_config`, by modality; keys have no prefix such as `video.`."""
     if not isinstance(reply, dict):
         raise MalformedMessage(f"gr00t: got {type(reply).__name__} for modalities, want a map")
     return {str(name): _modality(str(name), value) for name, value in list(reply.items())[:_KEYS_AT_MOST]}

@@ -474,7 +474,7 @@ class KeyMapping:
         return {name: rows[:, one.start : one.stop] for name, one in self.action.items()}
 
     def lacks(self, contract: Contract | None) -> list[str]:
-        """Return what the policy needs and no observation of this mapping has, one sentence each with its remedy."""
+        """Return the policy's inputs that no observation of this mapping has, one sentence each with its remedy."""
         if contract is None:
             return []
         found = [

@@ -89,7 +89,7 @@ class Outgoing:
         return _joined("action", list(taken.values()), InvalidAction)
 
     def contract(self) -> Contract:
-        """Return what the mapping says about the policy: what it needs, and the commands of its gripper."""
+        """Return the contract that follows from the mapping: the policy's inputs and the commands of its gripper."""
         mapping, named = self.mapping, _named
         grippers = {(one.open, one.closed) for one in mapping.action_gripper}
         opened, closed = grippers.pop() if len(grippers) == 1 else (None, None)

@@ -38,7 +38,7 @@ class EpisodeRecorder(EpisodeObserver):
         return "none"
 
     def finish(self, result: EpisodeResult, second_pass: SecondPass) -> Artifacts:
-        """Return what is kept of an episode with this result; `second_pass` renders images that are missing."""
+        """Return the artifacts of an episode with this result; `second_pass` renders missing images."""
         return Artifacts()
 
     def __enter__(self) -> Self:

@@ -27,7 +27,7 @@ from vlagents_ray.registry import env_class, env_suite, env_task
 
 @dataclass(frozen=True)
 class EvalCase:
-    """A cell of the table of results: what one success rate is of."""
+    """A cell of the table of results: the episodes of one success rate."""
 
     policy: PolicyConfig
     step: int | None  # of training, in a sweep over checkpoints; or the version of pushed weights

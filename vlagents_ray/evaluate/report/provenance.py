@@ -96,7 +96,7 @@ def _identity(cell: CellResults) -> list[str]:
 
 
 def repeat(results: Results) -> Repeat:
-    """Return what repeats the evaluation."""
+    """Return the commands that repeat the evaluation."""
     folders = list(dict.fromkeys(str(run.config.get("out")) for run in results.runs))
     return Repeat([_again(run) for run in _last_runs(results)], folders)
 

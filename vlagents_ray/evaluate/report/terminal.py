@@ -38,7 +38,7 @@ def results_table(summary: Summary) -> Table:
 
 
 def print_summary(console: Console, summary: Summary) -> None:
-    """Print the table of results, what infrastructure failed, and the paths of all that was written.
+    """Print the table of results, failures of infrastructure, and the paths of all files written.
 
     Args:
         console: Where to print.

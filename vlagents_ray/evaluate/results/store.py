@@ -318,7 +318,7 @@ class Store:
         self._accept_or_raise("program", programs, "the environment is not that of the results in")
 
     def _other_plan(self, db: sqlite3.Connection) -> list[Change]:
-        """Return what the results have and this plan lacks: a plan may grow, and steps of a policy may follow.
+        """Return the cells of the results that this plan lacks: a plan may grow, and steps of a policy may follow.
 
         A trainer evaluates one version of one policy after the other into one folder, each with its plan: of
         the other policies its plan lacks nothing.

@@ -1,4 +1,4 @@
-"""The person at the robot: what they are asked and shown, at a terminal or at a page in the browser."""
+"""The operator at the robot: questions and displays at a terminal or at a page in the browser."""
 
 from __future__ import annotations
 

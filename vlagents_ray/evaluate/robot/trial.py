@@ -227,7 +227,7 @@ def play(
 
 
 def rehearse(cell: EvalCase, factory: AgentFactory, operator: Operator, obs: Obs) -> None:
-    """Let a policy answer once, without moving the robot.
+    """Run a policy once, without moving the robot.
 
     A mistake in the settings shows before the first trial. Work done on the first call, such as compilation, does not
     slow the first trial, which would reveal which policy is running.

@@ -1,4 +1,4 @@
-"""The log of an evaluation on a robot: one line a trial, in which what tells the policy is sealed.
+"""The log of an evaluation on a robot: one line a trial, in which the name of the policy is sealed.
 
 `trials.jsonl` is written while the evaluation runs, in place of results.db. Its verdicts can be read by anybody; the
 policy, its checkpoint and its timing are encrypted with the key that draws the order of trials, in parts of one length.

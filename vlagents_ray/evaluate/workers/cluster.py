@@ -1,4 +1,4 @@
-"""The Ray cluster of an evaluation: what its workers need, where they are placed, and their logs."""
+"""The Ray cluster of an evaluation: resources, placement and logs of its workers."""
 
 from __future__ import annotations
 

@@ -175,7 +175,7 @@ class Rollout:
             ]
 
     def _finished(self, env: BatchEnv, job: Job, result: EpisodeResult, recording: EpisodeRecorder) -> Artifacts:
-        """Return what is kept of an episode; where images are missing, it is played again."""
+        """Return the artifacts of an episode; where images are missing, it is played again."""
         options = options_of_reset(env, job.key.episode, job.cell.suite.reset_options)
         kept = recording.finish(
             result, lambda played, record: played.play_again(env, job.key.seed, options, self._set_phase, record)

@@ -1,4 +1,4 @@
-"""Workers of an evaluation: what they have in common, their jobs, and a worker in this process."""
+"""Workers of an evaluation: their interface, their jobs, and a worker in this process."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ class Workers(ABC):
 
     @abstractmethod
     def dispatch(self, worker: WorkerHandle, jobs: tuple[Job, ...]) -> None:
-        """Let `worker` play `jobs`, side by side."""
+        """Play `jobs` on `worker`, side by side."""
 
     @abstractmethod
     def wait(self, timeout_s: float) -> Iterator[tuple[Job, Report]]:
@@ -95,7 +95,7 @@ class Workers(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Let idle workers close their simulators, which some need for a clean exit."""
+        """Close the simulators of idle workers, as some need this for a clean exit."""
 
     def __enter__(self) -> Self:
         return self

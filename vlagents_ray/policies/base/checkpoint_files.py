@@ -37,7 +37,7 @@ def is_temporary(name: str) -> bool:
 
 
 def unfinished(path: Path) -> str | None:
-    """Return what shows that a checkpoint, a file or a folder, is incomplete; None if nothing does.
+    """Return the sign that a checkpoint, a file or a folder, is incomplete; None if there is no sign.
 
     A .safetensors file must be as long as its header says, an index may name only existing files, JSON must be valid,
     and a zip file, as torch.save writes it, must end with its directory. Files of other kinds show nothing: the caller
@@ -167,7 +167,7 @@ def files_in(path: Path) -> list[Path]:
 
 
 def _below(folder: Path, above: frozenset[str]) -> Iterator[Path]:
-    """Yield what counts in a folder, also behind links to folders, as loaders follow them; `above` are its parents."""
+    """Yield the files of a folder that count, also behind links, which loaders follow; `above` are its parents."""
     within = above | {os.path.realpath(folder)}
     with contextlib.suppress(OSError):  # unreadable or gone
         for entry in list(folder.iterdir()):

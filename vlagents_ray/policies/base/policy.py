@@ -176,7 +176,7 @@ class ModelPolicy(Agent, abc.ABC):
         self._begun().frames.append(self.perceive(obs))
 
     def prepare(self, obs: Obs) -> Any:
-        """Return what `perceive` makes of the observation; None if actions of an earlier chunk may be left."""
+        """Return the result of `perceive` on the observation; None if actions of an earlier chunk may be left."""
         return None if self.config.actions == "queue" and self.history == 1 else self.perceive(obs)
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
@@ -209,7 +209,7 @@ class ModelPolicy(Agent, abc.ABC):
         return super()._trainable()
 
     def adapt(self, adapter: str, folder: Path) -> None:
-        """Check what lies beside an adapter in its folder, and keep statistics by which its rows are normalised.
+        """Check the files beside an adapter in its folder, and keep the statistics that normalise its rows.
 
         Args:
             adapter: The adapter's fingerprint, as in `Row.adapter`.

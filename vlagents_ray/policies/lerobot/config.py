@@ -88,11 +88,11 @@ def refusal(name: str) -> str | None:
 
 
 def reads(version: str) -> str:
-    """Return what to do for a checkpoint of that version of LeRobot."""
+    """Return the cure for a checkpoint of that version of LeRobot."""
     return f"LeRobot {version} reads it: `vlagents-ray env make {REQUIREMENTS[version]}`"
 
 
 def other_version() -> str:
-    """Return what to do if a checkpoint is of the other version of LeRobot."""
+    """Return the cure if a checkpoint is of the other version of LeRobot."""
     other = "0.4.4" if is_new() else "0.6.1"
     return f"the LeRobot here is {installed()}; if it was written by another, {reads(other)}"

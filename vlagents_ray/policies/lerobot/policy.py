@@ -126,7 +126,7 @@ class LeRobot(ModelPolicy):
     def _described(
         self, kind: Kind, processors: Processors, trained: DatasetContract, renames: dict[str, str]
     ) -> LoadedLeRobot:
-        """Return what is loaded with the contract that follows from that of the training."""
+        """Return the loaded checkpoint with the contract that follows from its training."""
         settings = kind.config
         cameras = _cameras(settings, self.config, renames, trained.cameras)
         parts = list(self.config.state or trained.state or [JOINTS]) if settings.robot_state_feature else []

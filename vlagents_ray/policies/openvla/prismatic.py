@@ -490,7 +490,7 @@ class PrismaticPolicy(ModelPolicy):
         return chunks
 
     def _stated(self, bins: ActionBins, entry: PreparedRow, tokens: Any, logits: Any) -> dict[str, Any]:
-        """Return what is wanted of a row with tokens (H, D), drawn from the bins by logits (H, D, V)."""
+        """Return the outputs requested of a row with tokens (H, D), drawn from the bins by logits (H, D, V)."""
         if not entry.row.want:
             return {}
         tokens = tokens[:, : entry.scale.dim]

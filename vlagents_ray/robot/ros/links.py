@@ -86,7 +86,7 @@ class Ros2:
         self._publishers[topic] = self._node.create_publisher(made, topic, 1), made
 
     def open(self) -> None:
-        """Let messages come."""
+        """Begin to receive messages."""
         self._executor = require("rclpy.executors").SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
         self._thread = threading.Thread(target=self._spin, name="vlagents-ray-ros2", daemon=True)
