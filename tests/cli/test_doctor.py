@@ -89,14 +89,14 @@ def test_an_old_python_fails() -> None:
 
 def test_another_ray_than_those_that_are_tested_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
     assert doctor.ray().status == "ok"
-    monkeypatch.setattr("importlib.metadata.requires", lambda _: ["numpy", 'ray[serve]<2.61,>=2.59; extra == "serve"'])
-    for version in ("2.59.0", "2.60.1"):
+    monkeypatch.setattr("importlib.metadata.requires", lambda _: ["numpy", 'ray[serve]<2.61,>=2.60; extra == "serve"'])
+    for version in ("2.60.0", "2.60.1"):
         monkeypatch.setattr("importlib.metadata.version", lambda _, version=version: version)
         assert doctor.ray().status == "ok"
     monkeypatch.setattr("importlib.metadata.version", lambda _: "2.1.0")
     row = doctor.ray()
     assert row.status == "warn"
-    assert row.detail == "2.1.0; this package is tested with <2.61,>=2.59"
+    assert row.detail == "2.1.0; this package is tested with <2.61,>=2.60"
 
 
 def test_haproxy_really_starts() -> None:

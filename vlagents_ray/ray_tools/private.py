@@ -1,9 +1,9 @@
 """The private names of Ray and of Ray Serve that this package uses, all in one place.
 
-They were read in Ray 2.59 and 2.60; read them again before another version is allowed (`tests/support/ray_names.py`
-lists those that it lacks). Ray is imported inside the functions, as clients without Ray import this module. Only
-`vlagents_ray.serve.scaling.router` uses others, as its class overrides private methods of Serve's, and Serve sends that
-module by value to processes that need not have this package.
+They were read in Ray 2.60, and 2.59 has them as well; read them again before another version is allowed
+(`tests/support/ray_names.py` lists those that it lacks). Ray is imported inside the functions, as clients without Ray
+import this module. Only `vlagents_ray.serve.scaling.router` uses others, as its class overrides private methods of
+Serve's, and Serve sends that module by value to processes that need not have this package.
 """
 
 from __future__ import annotations

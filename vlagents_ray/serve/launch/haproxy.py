@@ -57,13 +57,6 @@ ROBOTS = {
     # HAProxy removes a leaving replica within a second; the default delays every stop by 30 s.
     "RAY_SERVE_DIRECT_INGRESS_MIN_DRAINING_PERIOD_S": "1",
 }
-# Defaults of Ray 2.60. In 2.59 HAProxy needs 50,000 open files to start, waits for a connection without a limit, and
-# leaves a replica that refuses connections only after its next health checks.
-_DEFAULTS = {
-    "RAY_SERVE_HAPROXY_MAXCONN": "4096",
-    "RAY_SERVE_HAPROXY_TIMEOUT_CONNECT_S": "5",
-    "RAY_SERVE_HAPROXY_OBSERVE_MARK_DOWN_ENABLED": "1",
-}
 NO_INGRESS = {"RAY_SERVE_ENABLE_HA_PROXY": "0"}  # settings of a cluster without HTTP
 
 
@@ -175,7 +168,6 @@ def ingress_environment(folder: Path, binary: str, listener: PublicListener | No
         "RAY_SERVE_HAPROXY_METRICS_PORT": str(metrics),
         "RAY_SERVE_HAPROXY_STATS_PORT": str(stats),
         "RAY_SERVE_HAPROXY_NBTHREAD": "2",
-        **_DEFAULTS,
         _BALANCE: ROBOTS[_BALANCE] + ("" if listener is None else listener.settings()),
         "RAY_SERVE_DIRECT_INGRESS_MIN_HTTP_PORT": str(replicas),
         "RAY_SERVE_DIRECT_INGRESS_MAX_HTTP_PORT": str(replicas + _REPLICA_PORTS),
