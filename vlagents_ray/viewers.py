@@ -46,10 +46,9 @@ class ViewerFrame:
     tick: int  # of the episode
     time: float  # s since 1970, of the observation
     cameras: Mapping[str, np.ndarray] = field(default_factory=dict)  # (H, W, 3) uint8 RGB
-    files: Mapping[str, bytes] = field(default_factory=dict)  # JPEG or PNG files of cameras that are not in `cameras`
     state: Mapping[str, np.ndarray] = field(default_factory=dict)  # (D,) float32; the gripper is a part
     executed: np.ndarray | None = None  # (D,) float32
-    planned: np.ndarray | None = None  # (D,) float32: what the newest chunk says of this tick
+    planned: np.ndarray | None = None  # (D,) float32, the row of the newest chunk for this tick
     chunk: np.ndarray | None = None  # (H, D) float32, where a new one begins
     numbers: Mapping[str, float] = field(default_factory=dict)  # times and whatever else is a number, by name
     note: str = ""  # what a person should read, such as why the action is a safe one
@@ -71,10 +70,6 @@ class ViewerFrame:
             state["gripper"] = np.array([obs.gripper], np.float32)
         cameras = {name: np.array(image) for name, image in obs.cameras.items()}
         return cls(tick, **{"time": obs.info.get(CAPTURED, time.time()), **what}, cameras=cameras, state=state)
-
-    def images(self) -> dict[str, bytes]:
-        """Return a JPEG or PNG file for each camera."""
-        return {**self.files, **{name: encode_jpeg(image) for name, image in self.cameras.items()}}
 
 
 def numbers_of(info: Mapping[str, Any]) -> dict[str, float]:
@@ -130,9 +125,9 @@ class RerunEpisode:
         rerun, recording = self._rerun, self._recording
         recording.set_time("tick", sequence=frame.tick)
         recording.set_time("time", timestamp=frame.time)
-        for name, data in frame.images().items():
-            kind = "image/jpeg" if data[:3] == b"\xff\xd8\xff" else "image/png"
-            recording.log(["cameras", name], rerun.EncodedImage(contents=data, media_type=kind))
+        for name, image in frame.cameras.items():
+            picture = rerun.EncodedImage(contents=encode_jpeg(image), media_type="image/jpeg")
+            recording.log(["cameras", name], picture)
         for name, part in frame.state.items():
             recording.log(["state", name], rerun.Scalars(part))
         for name, action in (("executed", frame.executed), ("planned", frame.planned)):

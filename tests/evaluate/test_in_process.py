@@ -16,7 +16,7 @@ from eval_fakes import DRIFTING_LINE, LINE, OTHER_LINE, ToZero
 from in_process_pool import without_ray
 
 from vlagents_ray.errors import ClusterLost, ConfigError, EnvFailed
-from vlagents_ray.evaluate import EvalConfig, EvaluationInterrupted, Summary, evaluate
+from vlagents_ray.evaluate import EvalConfig, EvaluationInterrupted, Summary, evaluate, run
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.plan.jobs import Job
 from vlagents_ray.evaluate.workers.rollout import Report
@@ -101,3 +101,31 @@ def test_what_a_signal_to_the_whole_group_ends_first_costs_no_attempt(config: Co
     assert stopped.value.summary.total.episodes == 2
     with closing(sqlite3.connect(config().out / "results.db")) as db:
         assert db.execute("SELECT count(*) FROM attempts").fetchone() == (0,)
+
+
+def test_failures_that_come_together_wait_for_a_signal_once(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A policy that is lost fails an episode of each environment at once, and all workers wait meanwhile."""
+    once, limits, wait = [True], [], threading.Event.wait
+
+    class FailsOnce(InProcessWorkers):
+        def free_slot(self) -> bool:
+            return len(self._workers) < 3
+
+        def wait(self, timeout_s: float) -> Iterator[tuple[Job, Report]]:
+            reports = [*super().wait(timeout_s)]
+            for job, report in reports:
+                yield job, Report(failure=Failure("policy", "unavailable", "gone")) if once[0] else report
+            once[0] = once[0] and not reports
+
+    def waited(event: threading.Event, timeout: float | None = None) -> bool:
+        limits.append(timeout)
+        return wait(event, timeout)
+
+    monkeypatch.setattr(threading.Event, "wait", waited)
+    monkeypatch.setattr(run, "SIGNAL_S", 0.0123)
+    with without_ray(pool=FailsOnce):
+        summary = evaluate(config(workers=3), agent_factory=ToZero)
+    assert summary.total.episodes == 6
+    with closing(sqlite3.connect(summary.out / "results.db")) as db:
+        assert db.execute("SELECT count(*) FROM attempts").fetchone() == (3,)
+    assert limits.count(0.0123) == 1

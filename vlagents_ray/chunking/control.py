@@ -18,7 +18,7 @@ PAUSED = "paused by an operator"
 
 
 class Leader(Protocol):
-    """The interface of what a human moves a robot with: a keyboard, a SpaceMouse, a second arm."""
+    """The interface of a device that a human moves a robot with: a keyboard, a SpaceMouse, a second arm."""
 
     def engaged(self) -> bool:
         """Return at once whether the human moves the robot at this tick."""
@@ -28,7 +28,7 @@ class Leader(Protocol):
         """Return the human's action at once, (D,) float32 in the contract's units, for a tick with `engaged()`.
 
         Raises:
-            InvalidAction: There is none at this tick; the robot holds still.
+            InvalidAction: The device has no action at this tick; the robot holds still.
         """
         ...
 

@@ -25,7 +25,6 @@ from vlagents_ray.chunking.buffer import (
     stamped,
 )
 from vlagents_ray.chunking.control import Control, Leader
-from vlagents_ray.chunking.execution import Execution
 from vlagents_ray.chunking.fallback import (
     LATE,
     OLD,
@@ -46,6 +45,7 @@ from vlagents_ray.errors import ConfigError, InvalidAction, InvalidInput, NotRes
 from vlagents_ray.interface import (
     CAUSE,
     DEADLINE,
+    EXECUTED,
     INTERVENTION,
     OF_THE_LOOP,
     SAFE,
@@ -59,6 +59,7 @@ from vlagents_ray.interface import (
 from vlagents_ray.validation import check_action
 
 _CLOSE_S = 2.0
+_IN_PLACE = 256  # most actions between two requests that were executed in place of the policy's
 
 
 class AsyncCaller:
@@ -166,17 +167,47 @@ class PlayerSettings:
             object.__setattr__(self, "deadline_s", 0.0)
 
 
+class Execution:
+    """Collects the actions of one episode that are executed in place of the policy's; a request states each once."""
+
+    def __init__(self) -> None:
+        """Begin an episode."""
+        self._in_place: deque[np.ndarray] = deque(maxlen=_IN_PLACE)
+        self._noted = False  # an action was noted in place of the policy's at this tick
+
+    def tick(self) -> None:
+        """Begin a tick, at which no action is executed in place of the policy's yet."""
+        self._noted = False
+
+    def note_in_place(self, action: np.ndarray) -> None:
+        """Note an action, (D,), that is executed in place of the policy's; the next request says so."""
+        self._in_place.append(action)
+        self._noted = True
+
+    def interrupt(self) -> None:
+        """Note that the action of this tick was not executed, since the robot was stopped or moved."""
+        if self._noted:
+            self._in_place.pop()
+            self._noted = False
+
+    def report(self) -> dict[str, Any]:
+        """Return the extra info of the next request: `EXECUTED`, if other actions than the policy's were executed."""
+        stated: dict[str, Any] = {EXECUTED: np.stack(self._in_place)} if self._in_place else {}
+        self._in_place.clear()
+        return stated
+
+
 class ChunkPlayer(Agent):
     """An `Agent` around another, local or remote, whose `act` returns single actions, (D,), one a control tick.
 
     Ticks are counted by the calls of `act`. Row r of a chunk is for r executed actions after the observation that the
-    chunk answers, whenever it comes: rows in place of which others were executed meanwhile are left out, and while the
-    robot holds still none is (see `vlagents_ray.chunking.buffer.ChunkBuffer`). `reset` may block: it begins the episode
-    and, with a deadline, waits for the first chunk.
+    chunk answers, whenever it arrives: rows in place of which others were executed meanwhile are left out, but no row
+    is while the robot holds still (see `vlagents_ray.chunking.buffer.ChunkBuffer`). `reset` may block: it begins the
+    episode and, with a deadline, waits for the first chunk.
 
     In mode "async", and in the others with `deadline_s`, `act` returns within `deadline_s`: the policy's action, or the
-    `safe` one where there is none, with the reason in `act.info["safe"]` and its kind in
-    `act.info["safe_cause"]`. `info` also tells `age_ticks`, `chunk`, `row`, and `silent_s`, for how long an answer has
+    `safe` one where that is missing, with the reason in `act.info["safe"]` and its kind in
+    `act.info["safe_cause"]`. `info` also has `age_ticks`, `chunk`, `row`, and `silent_s`, for how long an answer has
     been waited for. Errors that asking again will not cure (`InvalidInput`, and any that is not this package's) are
     raised by the next `act`; the others are the reason of safe actions until the policy answers. Without a deadline,
     errors are raised.

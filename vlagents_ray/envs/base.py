@@ -28,7 +28,7 @@ Steps = tuple[list[Obs], list[float], list[bool], list[bool], list[dict[str, Any
 
 
 class Environment(ABC):
-    """What a single environment and a batch of them have in common."""
+    """The common interface of a single environment and a batch of them."""
 
     max_steps: int
     """The task's step limit; `step` reports `truncated` when it is reached."""
@@ -56,14 +56,14 @@ class Environment(ABC):
     @property
     @abstractmethod
     def contract(self) -> Contract:
-        """What each environment gives (cameras, state, gripper, rate) and takes (actions)."""
+        """The observations (cameras, state, gripper, rate) and the actions of each environment."""
 
     def renderer(self) -> Renderer | None:
-        """What draws the images, once it is made; None if that is no device. Here: this thread's OpenGL context."""
+        """The device that renders the images, once it is made; None without one. Here: this thread's OpenGL context."""
         return opengl_renderer()
 
     def describe(self) -> dict[str, Any]:
-        """What a reader of the results must know: versions, control mode, render backend."""
+        """Facts that a reader of the results needs: versions, control mode, render backend."""
         return {}
 
     @abstractmethod

@@ -47,7 +47,7 @@ _FNV_PRIME = 0x01000193
 
 @dataclass(frozen=True, slots=True)
 class Chain:
-    """What an episode consists of."""
+    """The tasks and the initial state of an episode."""
 
     tasks: tuple[str, ...]  # CALVIN's names, e.g. "open_drawer"
     robot: np.ndarray  # (15,) its `robot_obs`
@@ -332,7 +332,7 @@ class Calvin(SimulatorEnv):
 
 
 def find_checkout(chosen: str | None) -> Path:
-    """Return the checkout of CALVIN, `chosen` or that of CALVIN_SRC; raises `ConfigError` if it is none."""
+    """Return the checkout of CALVIN, `chosen` or that of CALVIN_SRC; raises `ConfigError` if it is incomplete."""
     named = chosen or os.environ.get(VARIABLE)
     if not named:
         raise ConfigError(f"calvin: {VARIABLE} is not set; {_CURE}")

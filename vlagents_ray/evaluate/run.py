@@ -212,11 +212,14 @@ class _Run:
     def _poll_pool(self, pool: Workers, stop: threading.Event) -> None:
         if self._deadline.leaves_room:
             dispatch(pool, self._queue, self._deadline.begin)
+        late_s = SIGNAL_S
         for job, report in pool.wait(POLL_S):
             self._deadline.end(job)
-            # A terminal or a service manager signals workers and policies as well: that costs no attempt.
-            if report.failure is not None and stop.wait(SIGNAL_S):
-                continue
+            if report.failure is not None:
+                # A terminal or a service manager signals workers and policies as well: that costs no attempt.
+                if stop.wait(late_s):
+                    continue
+                late_s = 0.0  # one wait is for all failures of a poll: a lost policy fails many episodes at once
             with storing(self._config.out):
                 self._handle(job, report)
 
