@@ -41,8 +41,9 @@ def ray(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Processes:
     logs, kept = tmp_path / "logs", tmp_path / "kept"
     logs.mkdir()
     kept.mkdir()
-    node = SimpleNamespace(is_head=lambda: True, get_logs_dir_path=lambda: str(logs))
+    node = SimpleNamespace(get_logs_dir_path=lambda: str(logs))
     monkeypatch.setattr(ray_session, "node_of_this_process", lambda: node)
+    monkeypatch.setattr(ray_session, "started_here", lambda: True)
     monkeypatch.setattr(ray_session, "_FOLLOW_S", 0.01)
     monkeypatch.setattr("tempfile.tempdir", str(kept))
     return Processes(logs)

@@ -56,7 +56,7 @@ def test_it_is_not_asked_at_every_turn(monkeypatch: pytest.MonkeyPatch) -> None:
 def node(silent: socket.socket, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> SimpleNamespace:
     """Ray's record of this machine, whose daemon listens as the test wants; the head answers."""
     silent.listen()
-    node = SimpleNamespace(raylet_socket_name=str(tmp_path / "raylet"), is_head=lambda: False)
+    node = SimpleNamespace(raylet_socket_name=str(tmp_path / "raylet"))
     monkeypatch.setattr(head_monitor, "node_of_this_process", lambda: node)
     return node
 
@@ -76,7 +76,7 @@ def test_a_head_that_this_process_started_is_not_waited_for(
     node: SimpleNamespace, silent: socket.socket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     watched = HeadMonitor("go on")
-    node.is_head = lambda: True
+    monkeypatch.setattr(head_monitor, "started_here", lambda: True)
     own = HeadMonitor("go on")
     silent.close()
     later = head_monitor.monotonic() + 3

@@ -59,7 +59,7 @@ def test_more_gpus_than_this_machine_has_are_refused_at_once(
     said: dict[str, Any], wanted: float, own: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A cluster that others started may get more: there it is said, and waited for."""
-    monkeypatch.setattr(server, "node_of_this_process", lambda: SimpleNamespace(is_head=lambda: own))
+    monkeypatch.setattr(server, "started_here", lambda: own)
     monkeypatch.setattr(ray, "cluster_resources", lambda: {"GPU": wanted})
     server._require_gpus(deployment("noop", **said))
     if not wanted:

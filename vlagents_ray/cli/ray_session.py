@@ -18,6 +18,7 @@ from pathlib import Path
 from vlagents_ray.cli.console import err, say_error
 from vlagents_ray.errors import ClusterLost, ConfigError
 from vlagents_ray.ray_tools.private import LOGGERS, node_of_this_process
+from vlagents_ray.ray_tools.session import started_here
 from vlagents_ray.ray_tools.signals import raise_dropped_interrupt
 
 log = logging.getLogger(__name__)
@@ -132,7 +133,7 @@ def _follow(terminal: _Terminal, ended: threading.Event) -> None:
     while not over:
         over = ended.wait(_FOLLOW_S)
         node = node_of_this_process()
-        if node is not None and node.is_head():
+        if node is not None and started_here():
             folder = Path(node.get_logs_dir_path())
             for path in (one for pattern in _LOG_FILES for one in folder.glob(pattern) if one not in files):
                 files[path] = _LogFile(path)

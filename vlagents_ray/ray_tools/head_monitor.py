@@ -17,6 +17,7 @@ import ray
 
 from vlagents_ray.errors import ClusterLost
 from vlagents_ray.ray_tools.private import node_of_this_process
+from vlagents_ray.ray_tools.session import started_here
 
 log = logging.getLogger(__name__)
 
@@ -38,7 +39,7 @@ class HeadMonitor:
         self._name = f"the head of the Ray cluster, {host}:{port},"
         self._cure = cure
         self._timeout_s = _SHARE * float(os.environ.get(_RAY_TIMEOUT) or _RAY_TIMEOUT_S)
-        if self.node is not None and self.node.is_head():
+        if started_here():
             self._timeout_s = min(self._timeout_s, PERIOD_S)  # started by this process: it will not be replaced
         self._daemon = None if self.node is None else str(self.node.raylet_socket_name)
         if self._daemon is not None and not _exists(self._daemon):  # the machine does not list its sockets

@@ -21,8 +21,9 @@ from vlagents_ray.errors import ClusterLost, ConfigError
 from vlagents_ray.ray_tools.private import (
     START_LOGGER,
     address_of_ray_start,
-    end_unneeded_processes,
+    node_of_this_process,
     node_that_failed,
+    start_head,
 )
 from vlagents_ray.ray_tools.reaper import MARK, reaped
 from vlagents_ray.ray_tools.signals import own_sigterm
@@ -32,8 +33,7 @@ log = logging.getLogger(__name__)
 _ATTEMPTS = 3
 # A driver whose head has ended would wait for 5 s to send its last events, of which nothing here makes use.
 _CONFIG = {"task_events_shutdown_flush_timeout_ms": 300}
-# Options of every cluster that is started here. What its processes print is in the log files of the cluster's folder.
-_OPTIONS: dict[str, Any] = {"include_dashboard": False, "log_to_driver": False, "_system_config": _CONFIG}
+_RESOURCES = ("num_cpus", "num_gpus", "resources", "object_store_memory")  # options of the cluster, not of its driver
 _FAILED = "Check failed: "  # in the log of a daemon that ended
 FILES = "ray"  # the folder of Ray's files in a `ray_folder`
 _SHORT = "/tmp"  # noqa: S108 - used if the names of Ray's sockets would be too long elsewhere
@@ -50,6 +50,7 @@ MODE, _TOKENS = "RAY_AUTH_MODE", ("RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
 # If this variable is "0", Ray does not take this machine for a part of a cluster and uses the loopback address as the
 # node's own, so that all its ports are there. (Ray replaces the address given as `_node_ip_address` by another one.)
 ALONE = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
+_started: list[Any] = []  # Ray's record of the daemons that this process started, if it did
 
 
 @contextlib.contextmanager
@@ -76,7 +77,7 @@ def joined(address: str | None = None, **options: Any) -> Iterator[None]:
             if address == "local":
                 folder = stack.enter_context(ray_folder())
                 with variables({MARK: str(folder)}):
-                    start_ray(_temp_dir=str(folder / FILES), **options)
+                    start_ray(folder, **options)
             elif (server := _local_server(address or os.environ.get("RAY_ADDRESS"))) is not None:
                 with own_sigterm():
                     join(server or None, **options)
@@ -89,7 +90,7 @@ def joined(address: str | None = None, **options: Any) -> Iterator[None]:
                 f"cannot connect to a Ray cluster at {where!r}: {error}. Start Ray on this machine, or join it to a "
                 f"cluster (`ray start`); the page docs/cluster/ray.md shows how"
             ) from error
-        stack.push(unless_lost(ray.shutdown))
+        stack.push(unless_lost(leave_ray))
         yield
 
 
@@ -142,26 +143,32 @@ def variables(values: Mapping[str, str]) -> Iterator[None]:
                 os.environ[name] = value
 
 
-def start_ray(**options: Any) -> None:
-    """Start a Ray cluster with `ray.init("local")`, with another attempt if its start takes too long.
+def start_ray(folder: Path, **options: Any) -> None:
+    """Start a Ray cluster of this machine and join it, with another attempt if its start takes too long.
 
     Ray's daemon waits at most 15 s for each of its helpers (ray issue 65983), which a busy machine or a slow disk with
-    Python's modules can exceed. The next attempt is faster, as the modules are cached by then.
+    Python's modules can exceed. The next attempt is faster, as the modules are cached by then. `leave_ray` ends it.
 
     Args:
-        options: Further options of `ray.init`.
+        folder: A `ray_folder`, for the files of Ray. What its processes print is in log files there.
+        options: Further options of `ray.init`: resources, `logging_level`, `namespace`, ...
 
     Raises:
         ConfigError: No attempt succeeded.
     """
     import ray
 
+    resources = {name: options.pop(name) for name in _RESOURCES if name in options}
+    if "logging_level" in options:
+        logging.getLogger("ray").setLevel(options["logging_level"])
     for attempt in range(1, _ATTEMPTS + 1):
+        node = None
         try:
-            with own_sigterm(), _taken_port() as port:  # "local" starts one even if RAY_ADDRESS is set
-                ray.init("local", dashboard_port=port, **(options | _OPTIONS))
+            with own_sigterm(), _taken_port() as port:
+                node = start_head(str(folder / FILES), port, _system_config=_CONFIG, **resources)
+                ray.init(node.gcs_address, **({"log_to_driver": False} | options))
         except Exception as error:  # Ray raises a plain Exception
-            node = node_that_failed(error)
+            node = node or node_that_failed(error)
             if node is None or not node.all_processes:  # nothing was started, so time is not the cause
                 raise
             node.kill_all_processes(check_alive=False, wait=True)  # Ray leaves them running
@@ -176,8 +183,22 @@ def start_ray(**options: Any) -> None:
                 ) from error
             log.warning("Ray did not start, trying again (attempt %d of %d): %s", attempt + 1, _ATTEMPTS, reason)
         else:
-            end_unneeded_processes()
+            _started.append(node)
             return
+
+
+def leave_ray() -> None:
+    """Leave the cluster, and end it if `start_ray` of this process started it."""
+    import ray
+
+    ray.shutdown()
+    while _started:
+        _started.pop().kill_all_processes(check_alive=False, wait=True)
+
+
+def started_here() -> bool:
+    """Whether this process is in a cluster that it started itself."""
+    return bool(_started) and node_of_this_process() is not None
 
 
 @contextlib.contextmanager

@@ -12,7 +12,7 @@ from eval_fakes import ToZero
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig, Results, evaluate
-from vlagents_ray.ray_tools.session import start_ray
+from vlagents_ray.ray_tools.session import joined
 
 Config = Callable[..., EvalConfig]
 
@@ -25,9 +25,8 @@ def cluster() -> Iterator[str]:
     """Ray's id of its node."""
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
-        start_ray(num_cpus=2, num_gpus=1, logging_level="ERROR")
-        yield ray.get_runtime_context().get_node_id()
-        ray.shutdown()
+        with joined("local", num_cpus=2, num_gpus=1, logging_level="ERROR"):
+            yield ray.get_runtime_context().get_node_id()
 
 
 def test_results_say_where_each_worker_ran_and_what_drew(config: Config, cluster: str) -> None:

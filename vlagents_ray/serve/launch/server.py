@@ -27,7 +27,6 @@ from vlagents_ray.ray_tools.private import (
     forget_serve,
     gpus_here,
     long_polls,
-    node_of_this_process,
     proxies_now,
     start_serve,
     use_loopback,
@@ -35,12 +34,13 @@ from vlagents_ray.ray_tools.private import (
 from vlagents_ray.ray_tools.reaper import MARK
 from vlagents_ray.ray_tools.session import (
     ALONE,
-    FILES,
     MODE,
     announce,
     joined,
+    leave_ray,
     ray_folder,
     start_ray,
+    started_here,
     unless_lost,
     variables,
 )
@@ -246,8 +246,7 @@ def _require_gpus(config: ServeDeploySchema, here: float | None = None) -> None:
     `here` is the number of GPUs that a Ray to be started will find. A cluster that others started may grow: there the
     lack is a warning, which is repeated while the replicas wait.
     """
-    node = node_of_this_process()
-    if here is None and (node is None or not node.is_head()):
+    if here is None and not started_here():
         return
     if (missing := _missing_gpus(config, here)) is not None:
         raise ConfigError(f"{missing}; where there are more, see `vlagents-ray doctor`")
@@ -261,8 +260,7 @@ def _missing_gpus(config: ServeDeploySchema, here: float | None = None) -> str |
     there = ray.cluster_resources().get("GPU", 0.0) if here is None else here
     if sum(wanted.values()) <= there:
         return None
-    node = node_of_this_process()
-    where = "this cluster" if here is None and (node is None or not node.is_head()) else "this machine"
+    where = "this machine" if here is not None or started_here() else "this cluster"
     return (
         f"resources.num_gpus: the replicas of {wanted} want {sum(wanted.values()):g} GPUs, {where} has {there:g}; "
         f"want less (0 runs on the CPU), or add a machine that has them"
@@ -360,7 +358,6 @@ def own_ray(
     Raises:
         ConfigError: The port is taken, or the environment excludes Ray's token or HAProxy's settings.
     """
-    import ray
 
     if os.environ.get(MODE, "token").lower() != "token":
         raise ConfigError(
@@ -393,12 +390,8 @@ def own_ray(
         stack.callback(use_loopback, use_loopback(True))  # this process read `ALONE` when it imported Ray
         if listener is not None:
             listener.require()
-        start_ray(
-            num_cpus=num_cpus,
-            logging_level="WARNING",
-            _temp_dir=str(folder / FILES),
-        )
-        stack.push(unless_lost(ray.shutdown))
+        start_ray(folder, num_cpus=num_cpus, logging_level="WARNING")
+        stack.push(unless_lost(leave_ray))
         yield listener
 
 
