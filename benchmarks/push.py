@@ -71,7 +71,7 @@ class Sessions:
             agent.reset(self._obs, "act", weights="follow")
 
     def act(self, seconds: float) -> dict[str, Any]:
-        """Act for `seconds`; return the count of acts, the longest, ms, the failures, and whether versions only grew."""
+        """Act for `seconds`; return the count of acts, the longest, ms, failures, and whether versions only grew."""
         ends = time.perf_counter() + seconds
         with ThreadPoolExecutor(len(self._agents)) as threads:
             each = list(threads.map(lambda agent: self._act(agent, ends), self._agents))
