@@ -1,7 +1,7 @@
-"""What sessions of many fine-tunes cost: LoRA adapters over one base in one batch, against a whole model for each.
+"""Cost of sessions with many fine-tunes: LoRA adapters over one base in one batch, against a whole model for each.
 
-Each way runs in a process of its own. The adapters are random ones of all linear layers, over a checkpoint of a family
-that offers them; a model for each is loaded from that checkpoint, which takes as much memory and time as merged ones.
+Each variant runs in its own process. The adapters are random, for all linear layers, over a checkpoint of a family that
+supports them; the models are loaded from that checkpoint, which takes as much memory and time as merged ones.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ ADAPTERS, MODELS, BASE = "adapters", "models", "base alone"
 def measure_adapters(
     policy: str, config: dict[str, Any], dims: Mapping[str, int], sessions: int, rank: int, rounds: int
 ) -> dict[str, Any]:
-    """Return, for each way, the memory of the process, MiB, and the acts a second of CPU time, of each round.
+    """Return the memory of the process, MiB, and the acts a second of CPU time, by variant and round.
 
     Args:
         policy: The name of the policy.
         config: Its settings.
-        dims: The lengths of parts of the state for which the policy does not say.
-        sessions: The number of sessions, each with a fine-tune of its own.
+        dims: The lengths of the parts of the state that the policy leaves open.
+        sessions: The number of sessions, each with its own fine-tune.
         rank: The rank of the adapters.
         rounds: The number of batches that are timed.
     """
@@ -57,7 +57,7 @@ def measure_adapters(
 
 
 def _alone(function: Callable[..., Any], *args: Any) -> Any:
-    """Call the function in a process of its own."""
+    """Call the function in a new process."""
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
         return pool.submit(function, *args).result()
 
@@ -108,7 +108,7 @@ def _measure(
 
 
 def _run(agents: list[ModelPolicy], views: list[Obs], sessions: list[Agent], size: int) -> None:
-    """Have all sessions act, as a replica's engine does: one batch for each model."""
+    """Run one act of all sessions as a replica's engine does: one batch for each model."""
     for number, agent in enumerate(agents):
         part = slice(number * size, (number + 1) * size)
         for act in agent.act_batch(views[part], sessions[part]):
@@ -129,7 +129,7 @@ def main(
     rounds: Annotated[int, typer.Option(min=1, help="Batches of all sessions.")] = 7,
     json_file: Json = None,
 ) -> None:
-    """What sessions of many fine-tunes cost: adapters over one base, against a model for each."""
+    """Measure the cost of sessions with many fine-tunes: adapters over one base, against a model for each."""
     with errors():
         dims = parse_dims(state or [], "--state")
         found = measure_adapters(policy, {"checkpoint": checkpoint}, dims, sessions, rank, rounds)

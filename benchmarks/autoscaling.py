@@ -1,9 +1,9 @@
-"""Replicas that come with the load and go with it: a timeline of one run on this machine.
+"""Autoscaling of replicas: a timeline of one run on this machine.
 
-An application that may have no replica at all meets, one after the other: a single robot, a burst of robots, rollout
-workers, and a single robot again, with quiet in between until the last replica is gone. All the while it is noted how
-many replicas there are and are wanted, and how many sessions they hold; each act is timed where it was asked for.
-The policy and the environment sleep, so that four replicas run on few cores.
+An application with `min_replicas` of 0 serves, one after the other, a single robot, a burst of robots, rollout workers,
+and a single robot again, with pauses until the last replica has stopped. The running and the requested replicas and
+their sessions are sampled throughout; each act is timed at its client. The policy and the environment sleep, so that
+four replicas run on few cores.
 """
 
 from __future__ import annotations
@@ -39,16 +39,16 @@ from vlagents_ray.serve.scaling.sibling_replicas import SiblingApi
 _SUFFIXES = (".png", ".svg", ".pdf")
 _SESSIONS, _BLUE, _GREY = "#e0a030", "#1f6f8b", "#b0b0b0"  # colours
 _APP = "noop"
-_EVERY_S = 0.5  # between two looks at the replicas
-_ANSWER_S = 0.3  # that a replica may take to say how many sessions it holds
-_LATE_S = 180.0  # that a burst may take longer than planned: replicas start
+_EVERY_S = 0.5  # between two samples of the replicas
+_ANSWER_S = 0.3  # time limit for a replica to state its number of sessions
+_LATE_S = 180.0  # by which a burst may exceed its plan, as replicas start
 _QUIET_S = 180.0
 _FROM_NONE = {"min_replicas": 0, "max_replicas": 4, "look_back_s": 4, "upscale_delay_s": 2, "downscale_delay_s": 6}
 
 
 @dataclass(frozen=True, slots=True)
 class AutoscalingPlan:
-    """The robots and workers that come, and the application that serves them."""
+    """The robots and workers, and the application that serves them."""
 
     robots: int = 12
     hz: float = 10.0
@@ -84,7 +84,7 @@ class LoadPhase(NamedTuple):
 
 
 def measure_autoscaling(plan: AutoscalingPlan, progress: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
-    """Run all phases; returns plain JSON values, times in s since the first robot came."""
+    """Run all phases; returns plain JSON values, with times in s since the first robot connected."""
     served = deployment(
         "noop",
         config={"action_dim": ACTION_DIM, "base_ms": plan.policy_ms},
@@ -137,7 +137,7 @@ def _met(name: str, begun: float, robots: Sequence[RobotBurst]) -> LoadPhase:
 
 
 def _rollouts(plan: AutoscalingPlan, name: str, out: Path) -> LoadPhase:
-    """Run an evaluation of about so many seconds."""
+    """Run an evaluation of about the plan's `seconds`."""
     begun = time.time()
     episodes = max(1, round(plan.seconds * 1e3 / (plan.steps * (plan.step_ms + plan.policy_ms))))
     config = EvalConfig(
@@ -178,7 +178,7 @@ class ScaleWatcher:
         self._thread.join()
 
     def wait_for_quiet(self, replicas: int) -> None:
-        """Wait until no session and only so many replicas are left. Raises `ProcessFailed` after minutes."""
+        """Wait until no session and at most `replicas` are left. Raises `ProcessFailed` after minutes."""
         deadline = time.monotonic() + _QUIET_S
         asked = time.time()
         while not any(one.running <= replicas and one.sessions == 0 and one.at > asked for one in self.samples[-1:]):
@@ -194,7 +194,7 @@ class ScaleWatcher:
 
 
 def look() -> ScaleSample:
-    """Sample the application. Replicas that stop count as running as long as they live."""
+    """Sample the application. Stopping replicas count as running until their processes end."""
     from ray.serve.context import _get_global_client
 
     client = _get_global_client()
@@ -211,7 +211,7 @@ def _sessions(replicas: Sequence[str]) -> Iterator[int]:
 
     asked = []
     for name in replicas:
-        with contextlib.suppress(ValueError):  # it ended meanwhile
+        with contextlib.suppress(ValueError):  # it has ended
             asked.append(call_replica(ray.get_actor(name, namespace="serve"), SiblingApi.peer, "Rebalancer.load"))
     ready, _ = ray.wait(asked, num_returns=len(asked), timeout=_ANSWER_S) if asked else ([], [])
     for reference in ready:
@@ -262,7 +262,7 @@ def check_plot_file(file: Path | None) -> None:
 
 
 def plot_autoscaling(found: Mapping[str, Any], file: Path) -> None:
-    """Draw replicas and sessions over time, and below how long acts took."""
+    """Draw replicas and sessions over time, and below them the duration of acts."""
     figure = require("matplotlib.figure").Figure(figsize=(9, 5), layout="constrained")
     above, below = figure.subplots(2, 1, sharex=True)
     times = [one["at"] for one in found["samples"]]
@@ -312,7 +312,7 @@ def main(
     json_file: Json = None,
     plot: Annotated[Path | None, typer.Option("--plot", help="Draw the figures here: .png, .svg or .pdf.")] = None,
 ) -> None:
-    """Replicas over time while robots and rollouts come and go, from no replica and back to none."""
+    """Measure replicas over time while robots and rollouts start and end, from no replica and back to none."""
     with errors():
         check_plot_file(plot)
         found = measure_autoscaling(AutoscalingPlan(robots=robots, workers=workers, seconds=seconds), progress)

@@ -1,4 +1,4 @@
-"""A policy without any server, as a process of `throughput`: `python -m benchmarks.bare_policy JSON`."""
+"""A policy without a server, as a process of `throughput`: `python -m benchmarks.bare_policy JSON`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from vlagents_ray.registry import policy_class
 
 
 class BarePolicy:
-    """A policy without any server, `batch` observations at a time: what a served one is compared with."""
+    """A policy without a server, `batch` observations at a time, as the reference for a served one."""
 
     def __init__(self, policy: str, config: dict[str, Any], batch: int) -> None:
         self._agent = policy_class(policy).from_config(config)
@@ -23,7 +23,7 @@ class BarePolicy:
         self._batch()
 
     def rate(self, seconds: float) -> float:
-        """Measure for at least that time, s; returns actions a second."""
+        """Measure for at least `seconds`; returns actions a second."""
         begun = time.perf_counter()
         batches = 0
         while (taken := time.perf_counter() - begun) < seconds or batches == 0:
@@ -39,7 +39,7 @@ class BarePolicy:
 
 
 def main() -> None:
-    """Run a bare policy as a process: its settings are JSON; each line is a number of seconds, answered by the rate."""
+    """Run a bare policy as a process: the settings are JSON; it answers each line, a time in s, with the rate."""
     die_with_parent()
     out = own_stdout()
     bare = BarePolicy(**json.loads(sys.argv[1]))

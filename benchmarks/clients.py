@@ -1,7 +1,7 @@
 """Round trips of the clients in other languages beside those of the Python client, in turns at one server.
 
-Each client is a process of its own, and all send the same pixels as they are. The client in TypeScript is built before:
-`cd clients/typescript && npm ci && npm run build`. The one in C++ is compiled here; it wants what its README.md names.
+Each client is a process, and all send the same raw pixels. Build the client in TypeScript first: `cd clients/typescript
+&& npm ci && npm run build`. The one in C++ is compiled here, with the packages in its README.md.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def _compiled(folder: Path) -> str:
 
 
 def _save(obs: Obs, folder: Path) -> None:
-    """Write what a client in any language reads: the pixels of each camera, and the rest as JSON."""
+    """Write the observation for clients in any language: the pixels of each camera, and the rest as JSON."""
     cameras = {}
     for name, image in obs.cameras.items():
         (folder / name).write_bytes(image.tobytes())
@@ -86,7 +86,7 @@ def _save(obs: Obs, folder: Path) -> None:
 def main(
     calls: Annotated[int, typer.Option(min=1, help="Acts of each client.")] = 2000, json_file: Json = None
 ) -> None:
-    """Round trips of the clients in other languages, beside the Python client's."""
+    """Measure round trips of the clients in other languages, beside the Python client's."""
     with errors():
         with running_server(deployment(POLICY), host="127.0.0.1") as server:
             [url] = server.apps.values()

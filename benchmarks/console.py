@@ -42,7 +42,7 @@ def show_round_trips(found: Mapping[str, Any], title: str) -> None:
 
 
 def show_skipped(found: Mapping[str, Any]) -> None:
-    """Print what could not be measured, and why."""
+    """Print the skipped clients with the reasons."""
     for name, reason in found["skipped"].items():
         out.print(Text.assemble((f"skipped {name}", "yellow"), f": {reason}"))
 
@@ -59,6 +59,6 @@ def parse_counts(text: str, option: str) -> list[int]:
 
 
 def save(found: Any, file: Path | None) -> None:
-    """Write figures as JSON, if a file was asked for."""
+    """Write figures as JSON, if `file` is set."""
     if file is not None:
         file.write_text(json.dumps(found, indent=1) + "\n")

@@ -1,4 +1,4 @@
-"""Clients that make calls when it is their turn: `Driver`, and one in a process that obeys the line protocol."""
+"""Clients that are measured in turns: `Driver`, and a client in a process with the line protocol."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ CALL_S = 30.0
 
 
 class Driver(Protocol):
-    """A client that is connected and makes calls when it is its turn."""
+    """A connected client, which makes calls in its turn."""
 
     def ready(self) -> dict[str, Any]:
-        """Wait until it is connected and warm; returns what it says of itself."""
+        """Wait until it is connected and warm; returns its description."""
 
     def measure(self, calls: int) -> list[float]:
-        """Make calls; returns the milliseconds of each."""
+        """Make calls; returns their durations, ms."""
 
 
 class ClientProcess(LineProcess):
     """A client in a process, which runs `vlagents_ray.bench.line_client.obey`."""
 
     def ready(self) -> dict[str, Any]:
-        """Read the first line of a client, which is connected and warm then: what it says of itself."""
+        """Read the first line of a client, its description, which it writes when it is connected and warm."""
         said: dict[str, Any] = self.read(START_S)
         return said
 
     def measure(self, calls: int) -> list[float]:
-        """Let a client make calls; returns the milliseconds of each."""
+        """Make calls in the client's process; returns their durations, ms."""
         taken: list[float] = self.request(str(calls), CALL_S + calls)
         return taken

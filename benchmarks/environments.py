@@ -1,6 +1,6 @@
-"""Environments of the measurements: a tabletop that records its times, and one that takes time and no CPU.
+"""Environments of the measurements: a tabletop that records its times, and one that takes time but no CPU.
 
-Standard library, numpy and this package's light part only: the peers' Python imports it too.
+It imports only the standard library, numpy and this package's light part, since the peers' Python imports it as well.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ class EpisodeTimes(NamedTuple):
 
 
 class TimedTabletop(Tabletop):
-    """The tabletop, which writes when each episode began and ended to a file for each process.
+    """The tabletop, which writes the begin and end of each episode to a file for each process.
 
-    `notes` is the folder; `step_ms` is CPU time that each step takes more, for a simulator's physics.
+    `notes` is the folder; `step_ms` is additional CPU time of each step, in place of a simulator's physics.
     """
 
     def __init__(self, *, notes: str, size: int = 224, max_steps: int = 80, step_ms: float = 0.0) -> None:
@@ -56,7 +56,7 @@ class TimedTabletop(Tabletop):
         return super().reset(seed=seed, options=options)
 
     def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
-        until = time.thread_time() + self._step_s  # CPU time: the clock would run on while others have the core
+        until = time.thread_time() + self._step_s  # CPU time: wall time would pass while others have the core
         found = super().step(act)
         while self._step_s and time.thread_time() < until:
             pass
@@ -67,7 +67,7 @@ class TimedTabletop(Tabletop):
 
 
 def read_episode_times(folder: Path) -> dict[int, list[EpisodeTimes]]:
-    """Read what each process, by its id, has played, in order. A line that is being written is left out."""
+    """Read the episodes of each process, by its id, in order. A line that is being written is left out."""
     found = {}
     for file in folder.glob("*.txt"):
         lines = [line.split() for line in file.read_text().splitlines(keepends=True) if line.endswith("\n")]

@@ -1,18 +1,18 @@
 """Episodes a minute of whole evaluations, ours and the peers' own, in alternating rounds on one machine.
 
-Each plays the same episodes of one environment (`environments.TimedTabletop`: same code, image size, step limit and
-seeds) with a policy that does nothing behind its own server, by its own command, and keeps its results. A round runs
-each once:
+Each system plays the same episodes of one environment (`environments.TimedTabletop`: same code, image size, step limit
+and seeds) with a policy that does nothing behind its own server, by its own command, and keeps its results. A round
+runs each system once:
 
 - ours: `vlagents-ray eval`, which serves the policy for the length of the run;
-- vlagents: `run-eval`, over shared memory. It plays one configuration in one process, which is its first way here;
-  the second splits the episodes into one configuration for each worker, each with a process and a server of its own;
-- vla-eval: one model server, and as many shards as ours has workers, without Docker.
+- vlagents: `run-eval`, over shared memory. It plays one configuration in one process, its first variant here; the
+  second splits the episodes into one configuration for each worker, each with its own process and server;
+- vla-eval: one model server, and as many shards as `vlagents-ray eval` has workers, without Docker.
 
-Of ours, summary.json also says which share of the time the simulators and the policy were busy.
+For ours, summary.json also has the shares of the time in which the simulators and the policy were busy.
 
-The rate is that from the first reset to the last step, so that nobody's start-up or shutdown counts: that of `run-eval`
-contains a fixed sleep of 30 s. The wall time of the whole command is the second figure, with all of that.
+The rate is that from the first reset to the last step, so that start-up and shutdown do not count: those of `run-eval`
+contain a fixed sleep of 30 s. The wall time of the whole command is the second figure.
 """
 
 from __future__ import annotations
@@ -53,14 +53,14 @@ _MOST_S = 3600.0  # for one command
 
 @dataclass(frozen=True, slots=True)
 class EvaluationPlan:
-    """What all systems play."""
+    """The episodes that all systems play."""
 
     episodes: int = 200  # in all
     workers: int = 2
     rounds: int = 3
     size: int = 224  # pixels a side
     max_steps: int = 80  # nothing else ends an episode
-    step_ms: float = 0.0  # CPU time that each env step takes more than the tabletop's own
+    step_ms: float = 0.0  # additional CPU time of each env step
 
     def __post_init__(self) -> None:
         if self.episodes % self.workers:
@@ -119,7 +119,7 @@ def measure_evaluation(
 
 
 def play(plan: EvaluationPlan, run: Run, folder: Path) -> Played:
-    """Have one system play the plan. Raises `ProcessFailed` if it did not play just that."""
+    """Run the plan with one system. Raises `ProcessFailed` if it did not play exactly those episodes."""
     notes = folder / "notes"
     notes.mkdir(parents=True)
     begun = time.monotonic()
@@ -139,7 +139,7 @@ def play(plan: EvaluationPlan, run: Run, folder: Path) -> Played:
 
 
 def ratios(ours: Sequence[Played], theirs: Sequence[Played]) -> dict[str, Any]:
-    """Return our rate over theirs and their wall time over ours: both are above 1 where we are faster."""
+    """Return our rate over theirs and their wall time over ours: both are above 1 if we are faster."""
     pairs = list(zip(ours, theirs, strict=True))
     rates = [mine.episodes_per_minute / other.episodes_per_minute for mine, other in pairs]
     walls = [other.wall_s / mine.wall_s for mine, other in pairs]
@@ -152,7 +152,7 @@ def ratios(ours: Sequence[Played], theirs: Sequence[Played]) -> dict[str, Any]:
 
 
 def alone(folder: Path) -> dict[str, str]:
-    """Return variables with which another Python imports our two packages, and nothing else of this Python's."""
+    """Return variables that let another Python import our two packages, and no others of this Python."""
     place = folder / "path"
     place.mkdir()
     for package in (Path(vlagents_ray.__file__).parent, Path(__file__).parent):
@@ -180,7 +180,7 @@ def _ours(plan: EvaluationPlan) -> Run:
 def their_runs(
     plan: EvaluationPlan, scripts: Mapping[str, Path], python: Path, environment: Mapping[str, str]
 ) -> dict[str, Run]:
-    """Return how each peer in `scripts` plays the plan; there are two ways for vlagents."""
+    """Return the run of each peer in `scripts`; vlagents has two."""
 
     def way(name: str, peer: str, workers: int) -> Run:
         def run(folder: Path, notes: Path) -> None:
@@ -240,7 +240,7 @@ def main(
         Path | None, typer.Option(help="Add the figures to this file of `python -m benchmarks.report --json`.")
     ] = None,
 ) -> None:
-    """Episodes a minute of whole evaluations: `vlagents-ray eval`, and the peers' own commands, in turns."""
+    """Measure episodes a minute of whole evaluations: `vlagents-ray eval`, and the peers' own commands, in turns."""
     with errors():
         plan = EvaluationPlan(episodes, workers, rounds, size, max_steps, env_ms)
         found = measure_evaluation(plan, peers=parse_list(peers), peers_python=peers_python, progress=progress)

@@ -1,7 +1,7 @@
-"""How a robot fares whose policy is far away: `python -m benchmarks.far_away`.
+"""A robot whose policy is far away: `python -m benchmarks.far_away`.
 
-A server and a robot on two hosts of this machine (`benchmarks.hosts`), and between them a link that delays, loses and
-is cut (`benchmarks.far_link`). Each way to execute chunks drives the robot over each link. Wants Linux and root.
+The server and the robot are on two hosts of this machine (`benchmarks.hosts`), connected by a link with delay, loss and
+cuts (`benchmarks.far_link`). Each mode of the chunk player drives the robot over each link. Needs Linux and root.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ _CUT_AFTER_S = 4.0
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """How one mode fared over one link."""
+    """The figures of one mode over one link."""
 
     link: str
     mode: str
-    period_error_p50_ms: float  # how far the time between two ticks is from the period
+    period_error_p50_ms: float  # difference of the time between two ticks from the period
     period_error_p99_ms: float
     acted: float  # share of the ticks with an action of the policy
     longest_without_s: float
@@ -46,10 +46,10 @@ class Row:
     spell_p50_s: float
     age_p50_ms: float  # of the observation behind the executed actions of the policy
     age_p99_ms: float
-    step_p99: float  # how far consecutive actions of the policy are from each other
+    step_p99: float  # distance of consecutive actions of the policy
     stops: int  # by the watchdog
     reconnects: int
-    twice: int  # observations that the policy saw twice in one session
+    twice: int  # observations that the policy got twice in one session
     recovered_s: float | None  # from the end of the cut to the next action of the policy
     transport: str
     codec: str
@@ -83,19 +83,19 @@ def run(
     seconds: float,
     **how: Any,
 ) -> tuple[dict[str, Any], float | None]:
-    """Let the robot act over the link, which is cut for a while.
+    """Run the robot over the link, which is cut for a while.
 
     Args:
         arm: The robot's process.
         link: The link.
-        conditions: What the link does.
-        cut_s: How long it is cut; 0: not at all.
-        cut_after_s: When it is cut.
+        conditions: The delay, loss and rate of the link.
+        cut_s: The duration of the cut; 0: none.
+        cut_after_s: The begin of the cut.
         seconds: The length of the run.
         how: Further arguments of `benchmarks.far_robot.drive`.
 
     Returns:
-        What the robot says, and when the cut ended, s of `time.monotonic`; None if there was none.
+        The robot's record, and the end of the cut, s of `time.monotonic`; None without a cut.
     """
     link.set(conditions)
     arm.send(json.dumps({"seconds": seconds, **how}))
@@ -114,7 +114,7 @@ def run(
 
 
 def row(link: str, mode: str, found: dict[str, Any], healed: float | None) -> Row:
-    """Compute what a run of the robot shows."""
+    """Compute the figures of a run."""
     ticks = found["ticks"]
     at = np.array(ticks["at_s"][1:])
     acted = np.array(ticks["acted"][1:])
@@ -153,7 +153,7 @@ def measure(
     congestion: str,
     say: Callable[[str], None] = lambda _: None,
 ) -> list[Row]:
-    """Let each mode drive the robot over a clean link, a long one, a long one that loses packets, and that one cut."""
+    """Run each mode over a clean link, a long one, a long one that loses packets, and the same with a cut."""
     rate = f"{mbit:g} Mbit/s"
     links = {
         f"clean, {rate}": (Conditions(mbit=mbit), 0.0),
@@ -185,7 +185,7 @@ def main(
     congestion: Annotated[str, typer.Option(help="TCP's congestion control: cubic, bbr.")] = "cubic",
     json_file: Json = None,
 ) -> None:
-    """What a robot does whose policy is far away."""
+    """Measure a robot whose policy is far away."""
     with errors():
         chosen = modes.split(",")
         if unknown := sorted(set(chosen) - set(MODES)):

@@ -1,6 +1,7 @@
-"""The process that is a link between two hosts: `python -m benchmarks.far_carrier PID PID`, the first process of each.
+"""The process that carries a link between two hosts: `python -m benchmarks.far_carrier PID PID`, the first process of
+each.
 
-It answers each line of `Conditions` with a line. Standard library only, so that it starts at once.
+It answers each line of `Conditions` with a line. It imports only the standard library, so that it starts at once.
 """
 
 from __future__ import annotations
@@ -19,17 +20,17 @@ from dataclasses import dataclass
 
 DEVICE = "far"  # its name in either host
 _TUNSETIFF, _IFF_TUN, _IFF_NO_PI = 0x400454CA, 0x0001, 0x1000  # linux/if_tun.h
-_QUEUE_S = 0.2  # what a full queue of the link delays; what comes then is dropped
+_QUEUE_S = 0.2  # delay of a full queue of the link; further packets are dropped
 
 
 @dataclass(frozen=True, slots=True)
 class Conditions:
-    """What a link does to the packets of either direction."""
+    """The treatment of packets in either direction."""
 
     delay_ms: float = 0.0  # each way
     loss: float = 0.0  # share of the packets, each by itself
     mbit: float = 1000.0  # Mbit/s
-    cut: bool = False  # whether it carries nothing; what is on its way is lost as well
+    cut: bool = False  # whether it carries nothing; packets on their way are lost as well
 
 
 class _Carrier:
@@ -40,13 +41,13 @@ class _Carrier:
         for number, pid in enumerate(pids):
             subprocess.run(["ip", "link", "set", f"far{number}", "netns", pid, "name", DEVICE], check=True)  # noqa: S607
         self._conditions = Conditions()
-        self._way: list[tuple[float, int, int, bytes]] = []  # when it is due, its number, device, and the packet
+        self._way: list[tuple[float, int, int, bytes]] = []  # due time, number, device, and the packet
         self._count = 0
-        self._free_at = [0.0, 0.0]  # when the last packet to a device has left its sender
+        self._free_at = [0.0, 0.0]  # time at which the last packet to a device left its sender
         self._random = random.Random(0)
 
     def run(self) -> None:
-        """Carry packets until standard input ends, each line of which is new conditions."""
+        """Carry packets until standard input ends; each of its lines sets new conditions."""
         poll = select.poll()
         for source in (sys.stdin.fileno(), *self._devices):
             poll.register(source, select.POLLIN)
@@ -88,7 +89,7 @@ class _Carrier:
     def _write(self, device: int, packet: bytes) -> None:
         try:
             os.write(self._devices[device], packet)
-        except OSError:  # the host is gone, or its device is not up yet: as lost as on any link
+        except OSError:  # the host has ended, or its device is not up yet: the packet is lost
             return
 
 
@@ -99,7 +100,7 @@ def _device(name: str) -> int:
 
 
 def main() -> None:
-    """Run the process that is the link, in the network namespace of the switch."""
+    """Run the process of the link, in the network namespace of the switch."""
     carrier = _Carrier(sys.argv[1:])
     print("true", flush=True)  # noqa: T201 - it is there
     carrier.run()

@@ -1,7 +1,7 @@
-"""A link between two hosts that delays, loses and cuts IP packets, also where the kernel has no netem.
+"""A link between two hosts with delay, loss and cuts of IP packets, even if the kernel has no netem.
 
-Each host gets a TUN device, whose packets `benchmarks.far_carrier` carries to the other: real packets of the
-kernel's own TCP, so that retransmissions, congestion control and head-of-line blocking are real, too.
+Each host gets a TUN device, whose packets `benchmarks.far_carrier` carries to the other: real packets of the kernel's
+own TCP, with real retransmissions, congestion control and head-of-line blocking.
 
     with hosts(2) as [cloud, home], FarLink(cloud, home) as link:
         link.set(Conditions(delay_ms=80, loss=0.02))
@@ -26,7 +26,7 @@ _ANSWER_S = 10.0
 
 
 class FarLink:
-    """A link between two hosts, and the process that is the link."""
+    """A link between two hosts, and its process."""
 
     def __init__(self, one: Host, other: Host, congestion: str = "cubic") -> None:
         """Name the ends, and TCP's congestion control, "cubic" or "bbr"; the link begins with `with`."""
@@ -52,5 +52,5 @@ class FarLink:
         self._process.close()
 
     def set(self, conditions: Conditions) -> None:
-        """Change what the link does, from now on."""
+        """Change the conditions of the link."""
         self._process.request(json.dumps(asdict(conditions)), _ANSWER_S)

@@ -1,7 +1,7 @@
-"""A robot far from its policy, which writes down each tick: `python -m benchmarks.far_robot URL`; and that policy.
+"""A robot far from its policy, which records each tick: `python -m benchmarks.far_robot URL`; and its policy.
 
 Each line that the process reads is a run, {"mode": "async", "seconds": 20}. It answers with a line when the loop
-begins, and one with what came of it when it is over.
+begins, and with its record when the loop ends.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from vlagents_ray.robot.simulated import SimulatedRobot
 
 HZ = 30.0
 CHUNK = 50  # rows: 1.7 s
-RESET_S, ACT_S = 10.0, 2.0  # how long either may take
+RESET_S, ACT_S = 10.0, 2.0  # time limits
 MAX_AGE_S = 3.0  # of the observation of an action that is executed
 SILENCE_S = 2.0  # after which the watchdog stops the robot
 MAX_STEP = 0.2  # of the guard
 _TURN = 2 * np.pi / (4 * HZ)  # of the path in a tick: one round takes 4 s
-_SWAY = 0.03  # how far the paths of two chunks lie apart
+_SWAY = 0.03  # distance of the paths of two chunks
 _IMAGE = 224  # px
 # The player's options in each mode. With a deadline of 0, no tick waits for the network.
 MODES: Mapping[str, Mapping[str, Any]] = {
@@ -45,17 +45,16 @@ MODES: Mapping[str, Mapping[str, Any]] = {
 
 
 class FarConfig(BaseModel, extra="forbid"):
-    """How long the policy computes."""
+    """The policy's computing time."""
 
     ms: float = Field(default=60.0, ge=0, description="time that a batch takes")
 
 
 class FarPolicy(Agent):
-    """Moves along a sine, with chunks that do not quite agree with each other, as those of a real policy.
+    """Moves along a sine, with chunks that differ slightly from each other, like those of a real policy.
 
-    A row is the position, the tick of the observation that it was computed from, and the number of observations that
-    came twice. With real-time chunking a chunk begins with the rows that will have been executed, and leaves them
-    gradually.
+    A row has the position, the tick of its observation, and the number of observations that came twice. With real-time
+    chunking a chunk begins with the rows that will have been executed, and leaves them gradually.
     """
 
     Config: ClassVar[type] = FarConfig
@@ -74,7 +73,7 @@ class FarPolicy(Agent):
         return Contract(cameras=cameras, state=state, action=ActionSpec(dim=3, delta=False), chunk=CHUNK)
 
     def reset(self, obs: Obs, instruction: str | None = None, **kwargs: Any) -> dict[str, Any]:
-        """Forget what was seen."""
+        """Begin an episode."""
         self._seen, self._twice = set(), 0
         return {}
 
@@ -97,12 +96,12 @@ class FarPolicy(Agent):
 
 @dataclass(slots=True)
 class Ticks:
-    """What happened at each tick of a run. The first one is the reset's observation."""
+    """The record of each tick of a run. The first one is the reset's observation."""
 
-    at_s: list[float] = field(default_factory=list)  # of `time.monotonic`, when it began
+    at_s: list[float] = field(default_factory=list)  # its begin, by `time.monotonic`
     acted: list[bool] = field(default_factory=list)  # whether the policy's action was executed
     age_ticks: list[int] = field(default_factory=list)  # of the observation behind each executed action of the policy
-    step: list[float] = field(default_factory=list)  # how far each of them is from the one before
+    step: list[float] = field(default_factory=list)  # distance of each such action from the one before
     twice: int = 0  # observations that the policy saw twice in one session
     resumed: list[int] = field(
         default_factory=list
@@ -110,7 +109,7 @@ class Ticks:
 
 
 class FarRobot(SimulatedRobot):
-    """A simulated robot that counts its ticks and what it executes."""
+    """A simulated robot that records its ticks and executed actions."""
 
     def __init__(self, contract: Contract | None) -> None:
         super().__init__(contract)
@@ -126,11 +125,11 @@ class FarRobot(SimulatedRobot):
         return obs
 
     def here(self, obs: Obs) -> np.ndarray:
-        """Return the action that keeps it where it is, also before the first action of the policy."""
+        """Return the action that holds its position, also before the first action of the policy."""
         return np.array([self._joints[0], *obs.state["ticks"]], np.float32)
 
     def note(self, act: Act) -> None:
-        """Note an action of the policy that is about to be executed."""
+        """Record an action of the policy that is about to be executed."""
         ticks = self.ticks
         ticks.acted[-1] = True
         position, tick, twice = (float(number) for number in act.action)
@@ -142,7 +141,7 @@ class FarRobot(SimulatedRobot):
 
 
 class NotingPlayer(ChunkPlayer):
-    """A chunk player that tells the robot which actions are the policy's."""
+    """A chunk player that records the policy's actions at the robot."""
 
     robot: FarRobot
 
@@ -159,9 +158,9 @@ class NotingPlayer(ChunkPlayer):
 def drive(
     url: str, mode: str, seconds: float, *, recovers: bool = False, began: Callable[[], object] = lambda: None
 ) -> dict[str, Any]:
-    """Let the policy drive the robot for so long, and return what came of it.
+    """Drive the robot by the policy for `seconds`, and return the record.
 
-    With `recovers`, the run ends sooner: as soon as the policy has driven for a second since a stop.
+    With `recovers`, the run ends earlier if the policy has driven for a second since a stop.
     """
     with RemoteAgent(url, timeout_s=RESET_S) as agent:
         robot = FarRobot(agent.contract)

@@ -1,7 +1,7 @@
 """The policy of `benchmarks.far_robot` behind the endpoints of a replica, in one process without Ray.
 
-`python -m benchmarks.far_server PORT` writes a line when it serves, and answers each line with how many sessions it
-holds, and how many it has opened. It ends with its standard input.
+`python -m benchmarks.far_server PORT` writes a line when it serves, and answers each line with the numbers of held and
+of opened sessions. It ends with its standard input.
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ def main() -> None:
     app = AccessMiddleware(build_http_app(engine, lambda: metadata, DEFAULT_LIMITS), None, "far")
     server = uvicorn.Server(uvicorn.Config(app, host=EVERYWHERE, port=int(sys.argv[1]), log_level="warning"))
     threading.Thread(target=server.run, daemon=True).start()
-    print(json.dumps("ready"), file=out, flush=True)  # who comes before uvicorn has started asks again
+    print(json.dumps("ready"), file=out, flush=True)  # clients that connect before uvicorn has started try again
     for _ in sys.stdin:
         print(json.dumps([len(engine.sessions), engine.sessions.opened]), file=out, flush=True)
-    os._exit(0)  # whoever is still connected
+    os._exit(0)  # even if clients are still connected
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ RESAMPLES = 2000
 
 @dataclass(frozen=True, slots=True)
 class RoundTrips:
-    """Milliseconds of each call of one client, by the rounds in which it was its turn."""
+    """Milliseconds of each call of one client, by round."""
 
     name: str
     rounds: np.ndarray  # (rounds, calls of each) float64, ms
@@ -64,9 +64,8 @@ def median_interval(values: np.ndarray) -> tuple[float, float]:
 def median_ratio(ours: RoundTrips, theirs: RoundTrips, *, seed: int = 0) -> Ratio:
     """Return the ratio of the two medians.
 
-    Whole rounds are drawn again, the same of both, because calls of one round, and the rounds that
-    follow one another, have in common what else the machine does. Raises `ValueError` unless both
-    have the same number of rounds.
+    The bootstrap draws whole rounds, the same of both, because calls of one round, and adjacent rounds, share the
+    machine's other load. Raises `ValueError` unless both have the same number of rounds.
     """
     if len(ours.rounds) != len(theirs.rounds):
         raise ValueError(f"rounds: got {len(ours.rounds)} and {len(theirs.rounds)}; measure both in one run")
@@ -96,7 +95,7 @@ PACKAGES = ("vlagents-ray", "ray", "numpy", "torch", "jax", "transformers", "ler
 
 
 def measured_on(program: str = "vlagents-ray") -> dict[str, Any]:
-    """Return date, command, machine and versions as JSON values; call it before measuring, as it states the load."""
+    """Return date, command, machine and versions as JSON values; call it before measuring, as it has the load."""
     return {
         "date": datetime.datetime.now(datetime.timezone.utc).date().isoformat(),
         "command": " ".join([program, shlex.join(sys.argv[1:])]).rstrip(),

@@ -1,4 +1,4 @@
-"""What a child process behind the replica costs: one `act` of a policy that does nothing, here and there, in turns."""
+"""Cost of a child process behind the replica: `act` of a policy that does nothing, in either process, in turns."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _WARM_UP = 20
 def measure_hop(
     calls: int, python: str = sys.executable, progress: Callable[[str], None] = lambda _: None
 ) -> RoundTripsOfAll:
-    """Measure `calls` acts by each way, as the engine sees them.
+    """Measure `calls` acts in each process, as the engine calls them.
 
     `python` is the child's interpreter; `ConfigError` if no policy can run there.
     """
@@ -58,7 +58,7 @@ class _Driver:
         return {}
 
     def measure(self, calls: int) -> list[float]:
-        """Make calls; returns the milliseconds of each."""
+        """Make calls; returns their durations, ms."""
         taken = []
         for _ in range(calls):
             begun = time.perf_counter()
@@ -72,7 +72,7 @@ def main(
     python: Annotated[str, typer.Option(help="The child's interpreter; default: this one.")] = sys.executable,
     json_file: Json = None,
 ) -> None:
-    """What a policy in a child process behind the replica costs, against one in the replica."""
+    """Measure the cost of a policy in a child process behind the replica, against one in the replica."""
     with errors():
         found = measure_hop(calls, python, progress).to_json()
     show_round_trips(found, "one act, as the batch queue sees it")

@@ -1,9 +1,9 @@
-"""Several hosts on one machine, as far as Ray, Slurm and a network can tell, and a Ray cluster over them.
+"""Several simulated hosts on one machine for Ray, Slurm and networks, and a Ray cluster over them.
 
-Each host has an address, a host name, processes, shared memory and a boot id of its own; they meet in a switch that
-the machine's own network does not know. Links can be limited and cut, hosts be killed. What they share is the
-machine's CPUs, memory, files (but /dev/shm, /tmp/ray and /etc/hosts) and GPUs. Whatever runs in a host ends with it,
-and hosts end with the process that made them, however that ends. Wants Linux and root.
+Each host has its own address, host name, processes, shared memory and boot id; a switch connects them, apart from the
+machine's network. Links can be limited and cut, hosts can be killed. They share the machine's CPUs, memory, files
+(except /dev/shm, /tmp/ray and /etc/hosts) and GPUs. Processes in a host end with it, and hosts end with the process
+that made them, however that ends. Needs Linux and root.
 
     with hosts(3) as [head, second, robot], ray_cluster([head, second]) as cluster:
         head.run(["ray", "status"])
@@ -32,7 +32,7 @@ from vlagents_ray.errors import ConfigError, VLAgentsError
 
 _NETWORK = "198.18.0."  # RFC 2544's, for tests of networks
 _TOOLS = ("ip", "tc", "unshare", "nsenter", "setpriv", "mount")
-_PORT = 6379  # of Ray's head, as usual: each host has all ports to itself
+_PORT = 6379  # of Ray's head, its default: each host has all ports
 _BEGIN_S = 10.0
 _RAY_S = 120.0
 # The first process of a host: ends nothing, and waits for orphans, which would stay zombies.
@@ -48,15 +48,15 @@ class Host:
     """A host. `number` counts from 1."""
 
     number: int
-    folder: Path  # outside, for what it keeps to itself
-    pid: int  # of its first process, as seen from outside
+    folder: Path  # outside, for its private files
+    pid: int  # of its first process, in the outer namespace
     switch: int  # of the switch's process
     environment: dict[str, str] = field(default_factory=dict)  # of its processes, beside this process's
     _keeper: Any = None
 
     @property
     def name(self) -> str:
-        """The host name, which the others know, too."""
+        """The host name, by which the others can also connect."""
         return f"host{self.number}"
 
     @property
@@ -88,13 +88,13 @@ class Host:
         self._switch(["ip", "link", "set", f"port{self.number}", "up"])
 
     def limit(self, rate: str) -> None:
-        """Limit what its link carries in either direction, as `tc` has it: "1gbit"."""
+        """Limit the rate of its link in either direction, in the notation of `tc`: "1gbit"."""
         for words in shaping(rate, None):
             self._switch(["tc", "qdisc", "replace", "dev", f"port{self.number}", *words])
             self.run(["tc", "qdisc", "replace", "dev", "eth0", *words])
 
     def kill(self) -> None:
-        """Kill all its processes at once, as when it loses power."""
+        """Kill all its processes at once, as a power failure does."""
         _end(self._keeper, self.pid)
 
     def _switch(self, command: Sequence[str]) -> None:
@@ -103,7 +103,7 @@ class Host:
 
 @contextlib.contextmanager
 def hosts(number: int) -> Iterator[list[Host]]:
-    """Make `number` hosts that reach each other, and nothing else. Raises as `require` does."""
+    """Make `number` hosts that reach only each other. Raises as `require` does."""
     require()
     with tempfile.TemporaryDirectory(prefix="hosts-") as top, contextlib.ExitStack() as stack:
         switch = _first_process(stack, ["--net"])
@@ -199,7 +199,7 @@ def _set_up(host: Host, switch: Sequence[str], number: int) -> None:
         "ip link set lo up",
         f"ip address add {host.address}/24 dev eth0",
         "ip link set eth0 up",
-        # Ray asks for the way to the world when it wants to know a host's own address.
+        # Ray determines a host's own address by its route to the internet.
         "ip route add default dev eth0",
         f"hostname {host.name}",
         f"mount --bind {host.folder / 'hosts'} /etc/hosts",
@@ -244,7 +244,7 @@ class RayCluster:
         return self.head.run([sys.executable, "-c", code, *arguments], timeout_s)
 
     def join(self, host: Host, cpus: float, **options: str) -> None:
-        """Start Ray there, with the environment of the head, and let it join."""
+        """Start Ray on `host` with the environment of the head, and join the cluster."""
         host.environment |= self.head.environment
         _ray_start(host, [f"--address={self.address}"], cpus, options)
 
@@ -253,7 +253,7 @@ class RayCluster:
 def ray_cluster(
     hosts: Sequence[Host], cpus: float = 2, environment: Mapping[str, str] | None = None, **options: str
 ) -> Iterator[RayCluster]:
-    """Ray with `cpus` on each host, which are bookkeeping, and Ray's token; `options` are further ones of `ray start`.
+    """Start Ray with `cpus` logical CPUs on each host, and Ray's token; `options` are further ones of `ray start`.
 
     `environment` is that of all processes started in the hosts from now on.
     """

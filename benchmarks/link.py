@@ -1,4 +1,4 @@
-"""Round trips over a true network link, on one machine: two network namespaces, a shaped veth pair between them.
+"""Round trips over a real network link on one machine: two network namespaces, joined by a shaped veth pair.
 
 The servers live in one namespace, the clients in the other. A namespace ends with its last process, and each
 process here ends with its parent or its standard input: nothing is left, however the benchmark ends. Without
@@ -44,7 +44,7 @@ CLIENTS = (
 _INSIDE = "--inside"  # then JSON: this process is in the server's namespace
 SHM = "vlagents shm"  # does not cross a network
 _SERVER, _CLIENT = "10.197.44.1", "10.197.44.2"
-_BULK = 64 * 2**20  # bytes, to see what the link carries
+_BULK = 64 * 2**20  # bytes, sent to measure the link
 _END_S = 60.0
 _RUN_S = 900.0
 _TOOLS = ("ip", "tc", "unshare", "nsenter")
@@ -59,7 +59,7 @@ def measure_link(
     peers_python: Path = Path("python"),
     progress: Callable[[str], None] = lambda _: None,
 ) -> dict[str, Any]:
-    """Measure round trips over a link, and what the link carries.
+    """Measure round trips over a link, and its bandwidth.
 
     Args:
         calls: Round trips of each client.
@@ -96,13 +96,13 @@ def measure_link(
 
 
 def _environment() -> dict[str, str]:
-    """Return the variables with which a process finds the package and this folder."""
+    """Return the variables by which a process finds the package and this folder."""
     ours = our_environment()["PYTHONPATH"]
     return {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[1]), ours])}
 
 
 def enter() -> list[str]:
-    """Return the command that runs another one in a network namespace of its own, as root or in a user namespace."""
+    """Return the prefix that runs a command in a new network namespace, as root or in a user namespace."""
     if missing := [tool for tool in _TOOLS if shutil.which(tool) is None]:
         raise ConfigError(f"link: {', '.join(missing)} not found; install iproute2 and util-linux")
     refusals = []
@@ -115,7 +115,7 @@ def enter() -> list[str]:
 
 
 def refused(reasons: Sequence[str]) -> str:
-    """Return the message to a user who may not make namespaces, with the cure."""
+    """Return the error message for users without the right to make namespaces, with the cure."""
     return (
         f"link: cannot make a network namespace, neither as this user nor in a user namespace ({'; '.join(reasons)}); "
         "run it as root, or let users make them: sysctl kernel.unprivileged_userns_clone=1 (Debian), "
@@ -129,7 +129,7 @@ class EmulatedLink:
     def __init__(self, rate: str, delay: str | None) -> None:
         self._holder = LineProcess("the client's namespace", ["unshare", "--net", "cat"])
         try:
-            self._holder.request("1", 10)  # an answer: it is there
+            self._holder.request("1", 10)  # an answer means that it runs
             target = f"/proc/{self._holder.pid}/ns/net"
             self.prefix = ["nsenter", f"--net={target}"]
             _run(["ip", "link", "set", "lo", "up"])
@@ -140,8 +140,8 @@ class EmulatedLink:
                 _run([*prefix, "ip", "link", "set", name, "up"])
                 for words in shaping(rate, delay):
                     _run([*prefix, "tc", "qdisc", "add", "dev", name, *words])
-            # Ray takes the address that leads to the world for its own; without a way there it would take one that
-            # this namespace does not have.
+            # Ray uses the address of the default route; without one it would choose an address that # this namespace
+            # lacks.
             _run(["ip", "route", "add", "default", "via", _CLIENT])
         except BaseException:
             self._holder.close()
@@ -154,7 +154,7 @@ class EmulatedLink:
         self._holder.close()
 
     def megabits(self) -> float:
-        """Measure the Mbit/s that TCP gets through, from client to server."""
+        """Measure the throughput of TCP from client to server, Mbit/s."""
         code = f"import socket; s = socket.create_connection(({_SERVER!r}, {{}})); s.sendall(bytes({_BULK}))"
         with socket.create_server((_SERVER, 0)) as server:
             server.settimeout(30)
@@ -205,7 +205,7 @@ def _inside(calls: int, rate: str, delay: str | None, peers: Sequence[str], peer
 
 
 def _interrupt_with_stdin() -> None:
-    """Interrupt this process when its standard input ends: its parent has ended, so everything is taken down."""
+    """Interrupt this process, and so end the benchmark, when its standard input ends, as its parent has ended."""
 
     def wait() -> None:
         while os.read(0, 4096):
@@ -241,7 +241,7 @@ def main(
     peers_python: others.PeersPython = others.PYTHON,
     json_file: Json = None,
 ) -> None:
-    """Round trips over a link of 1 Gbit/s between two network namespaces on this machine."""
+    """Measure round trips over a link of 1 Gbit/s between two network namespaces on this machine."""
     with errors():
         origin = measured_on("python -m benchmarks.link")
         found = measure_link(

@@ -1,10 +1,10 @@
-"""What the live page costs: acts of robots with nobody, one and four viewers, side by side in one run.
+"""Cost of the live page: acts of robots with no, one and four viewers, side by side in one run.
 
-One cluster serves three applications, each with one replica of a policy that takes 5 ms: one as it is, one whose
-dispatcher lacks the lines for the tap, and one that holds the last 30 s of each session. All serve the same robots,
-which are in processes of their own, as are the viewers: two robots of 50 Hz, and one that acts as fast as it is
-answered. The settings take turns within each round. A viewer shows the pictures of all sessions, and asks for a message
-as soon as it has one, as the page does. On a busy machine the CPU time of the replica says more than acts a second.
+One cluster serves three applications, each with one replica of a policy that takes 5 ms: one unchanged, one whose
+sender lacks the lines for the live page, and one that holds the last 30 s of each session. All serve the same robots:
+two of 50 Hz, and a saturated one that acts again at each answer. Robots and viewers have their own processes. The
+settings take turns within each round. A viewer shows the pictures of all sessions, and requests the next message at
+once, like the page. On a busy machine the CPU time of the replica is a better measure than acts a second.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ _LEASE_ENDS_S = LEASE_S + 1.0  # after the last viewer has gone
 
 
 class Measured(Noop):
-    """`noop` that says in which process it acts."""
+    """`noop` that returns the id of its process."""
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         """Return the id of the replica's process."""
@@ -81,7 +81,7 @@ def _without(method: Callable[..., Any], lines: str, instead: str) -> None:
 
 
 class Turn(NamedTuple):
-    """What the robots measured in one turn of one setting."""
+    """The robots' figures for one turn of one setting."""
 
     acts_per_s: float  # of the saturated robot
     cpu_ms: float  # of the replica's process, for each act of any robot
@@ -102,7 +102,7 @@ class Robots:
         [self.replica] = {process.read(START_S) for process in self._processes}  # the id of its process
 
     def act(self, seconds: float) -> list[list[float]]:
-        """Let all act; returns the milliseconds of each act, of the paced and of the saturated ones."""
+        """Run all robots; returns the durations of the acts, ms, of the paced robots and of the saturated one."""
         for process in self._processes:
             process.send(json.dumps(seconds))
         return [process.read(seconds + START_S) for process in self._processes]
@@ -115,7 +115,7 @@ def measure_live(
     transport: TransportName,
     progress: Callable[[str], None] = lambda _: None,
 ) -> dict[str, Any]:
-    """Measure each setting once in each round, for so many seconds; returns plain JSON values."""
+    """Measure each setting once in each round, for `seconds`; returns plain JSON values."""
     turns: dict[str, list[Turn]] = {}
     with contextlib.ExitStack() as stack:
         folder = stack.enter_context(tempfile.TemporaryDirectory())
@@ -160,7 +160,7 @@ def _name(viewers: int) -> str:
 
 
 def _base(name: str) -> str:
-    """The setting that another is compared with: without viewers a build without the tap, otherwise nobody."""
+    """Return the reference of a setting: the build without live page, or the same without viewers."""
     return ABSENT if name in (ABSENT, NOBODY) else NOBODY
 
 
@@ -206,7 +206,7 @@ def _process(name: str, settings: dict[str, Any]) -> Iterator[LineProcess]:
 
 
 def child(settings: dict[str, Any]) -> None:
-    """Run a process of robots or of a viewer: each line that it reads is the length of a turn, s."""
+    """Run a process of robots or of a viewer; each line on its standard input is the length of a turn, s."""
     die_with_parent()
     file = own_stdout()
     with contextlib.ExitStack() as stack:
@@ -269,7 +269,7 @@ def main(
     transport: Annotated[str, typer.Option(help="Of the robots.")] = "websocket",
     json_file: Json = None,
 ) -> None:
-    """What the live page costs robots, with nobody, one and four viewers."""
+    """Measure the cost of the live page for robots, with no, one and four viewers."""
     with errors():
         found = measure_live(rounds, seconds, viewers, transport, progress)  # type: ignore[arg-type]
     rows = [

@@ -1,11 +1,10 @@
-"""What an evaluation costs over the bare environments: steps a second, in alternating rounds.
+"""Overhead of an evaluation over the bare environments: steps a second, in alternating rounds.
 
-A bare round steps the environments in as many processes as the evaluation has workers, with zeros
-as actions and no policy, server or Ray. An evaluated round plays the same episodes through a served
-`noop` policy. Both count the steps made while all workers were playing: making environments, and
-waiting for the last worker to start or to finish, are left out; the gaps between episodes are not.
-CPU time is that of the same span: of all bare processes, or of everything that an evaluation runs (its own
-process, workers, replica, HAProxy and Ray's daemons).
+A bare round steps the environments in as many processes as the evaluation has workers, with zeros as actions and no
+policy, server or Ray. An evaluated round plays the same episodes with a served `noop` policy. Both count the steps made
+while all workers were playing, with the gaps between episodes, but without the creation of environments and the wait
+for the first and the last worker. CPU time is that of the same span: of all bare processes, or of all processes of the
+evaluation (driver, workers, replica, HAProxy and Ray's daemons).
 """
 
 from __future__ import annotations
@@ -42,11 +41,11 @@ from vlagents_ray.serve.launch.server import running_server
 _START_S = 600.0
 _TICK_S = 1.0 / os.sysconf("SC_CLK_TCK")
 _EVERY_S = 0.2
-_LOOK_EVERY = 5  # samples, before the processes are looked for anew
+_LOOK_EVERY = 5  # samples between two searches for processes
 
 
 class Span(NamedTuple):
-    """One episode: when it began and ended, s, and its steps."""
+    """One episode: its begin and end, s, and its steps."""
 
     begun: float
     ended: float
@@ -75,7 +74,7 @@ class Steady(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Overhead:
-    """Each round, in the order measured; round i of both ran one after the other."""
+    """All rounds in order; rounds i of both kinds ran one after the other."""
 
     env: str
     workers: int
@@ -149,13 +148,13 @@ def measure_overhead(
 
 
 def steady(episodes: Sequence[Span], workers: int) -> Steady:
-    """Find the span from when all `workers` play for the first time until they do for the last.
+    """Find the span between the first and the last moment at which all `workers` play.
 
-    Each episode's steps are taken as spread evenly over it. Raises `EnvFailed` if they never all play.
+    The steps of an episode are assumed to be spread evenly. Raises `EnvFailed` if the workers never all play.
     """
     edges = sorted([(e.begun, 1) for e in episodes] + [(e.ended, -1) for e in episodes])
     playing = 0
-    full: list[float] = []  # moments at which the number of playing workers becomes, or ceases to be, full
+    full: list[float] = []  # moments at which all workers begin to play, or no longer all play
     for moment, change in edges:
         if workers in (playing, playing + change):
             full.append(moment)
@@ -168,12 +167,12 @@ def steady(episodes: Sequence[Span], workers: int) -> Steady:
 
 
 def bare_rate(env: str, options: Mapping[str, Any], action_dim: int, workers: int, episodes: int) -> CallRate:
-    """Let `workers` processes play `episodes` episodes of zeros each."""
+    """Play `episodes` episodes of zeros in each of `workers` processes."""
     context = multiprocessing.get_context("spawn")
     start = context.Barrier(workers)
     results = context.Queue()
     before = {name: os.environ.get(name) for name in THREAD_VARIABLES}
-    os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))  # as the evaluation's workers have it
+    os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))  # as in the evaluation's workers
     try:
         processes = [
             context.Process(
@@ -229,9 +228,9 @@ def cpu_seconds(pid: int) -> float:
 
 
 class CpuSampler:
-    """Samples the CPU time of this process and of those that `processes` returns, in a context.
+    """Samples the CPU time of this process and of those that `processes` returns, within a context.
 
-    A process that has ended keeps what it was last seen with. Its own sampling is not counted.
+    An ended process counts with its last sample. The time for sampling itself is not counted.
     """
 
     def __init__(self, processes: Callable[[], Iterable[int]]) -> None:
@@ -292,7 +291,7 @@ def main(
     json_file: Json = None,
     env_set: Annotated[list[str], typer.Option("--env-set", metavar="KEY=VALUE")] = [],  # noqa: B006
 ) -> None:
-    """Steps a second, and CPU time a step, of an evaluation against those of the bare environments."""
+    """Measure steps a second, and CPU time a step, of an evaluation against the bare environments."""
     with errors():
         options = parse_settings(env_set, "--env-set")
         found = measure_overhead(

@@ -1,7 +1,6 @@
 """Our clients, each in a process or a Ray actor: `python -m benchmarks.own_clients JSON`.
 
-A process holds one client, which makes calls when it is its turn (`BenchCaller`), or several, which make load
-(`LoadGenerator`).
+A process holds one client that makes calls in its turn (`BenchCaller`), or several that make load (`LoadGenerator`).
 """
 
 from __future__ import annotations
@@ -32,15 +31,15 @@ from vlagents_ray.interface import Obs
 
 Call = tuple[float, float, float, int]  # ended, s of time.monotonic; round trip, ms; inference, ms; size of its batch
 ROBOT, SIMULATION = "robot", "simulation"
-_THINK_S = 0.05  # a robot asks at most so long after its last answer: it finds batches at any stage
+_THINK_S = 0.05  # longest pause of a robot after an answer, so that it meets batches at any stage
 
 
 @functools.cache
 def observation(size: int = 224, cameras: int = 2) -> Obs:
-    """Return what every server in a benchmark gets, ours or a peer's, byte for byte.
+    """Return the observation that every server in a benchmark gets, ours or a peer's, byte for byte.
 
-    Cameras with smooth structure and some noise, as photographs have; seven joints; a gripper. It is the same object
-    each time and must not be changed.
+    It has camera images with smooth structure and some noise, like photographs, seven joints and a gripper. Each call
+    returns the same object, which must not be changed.
     """
     rng = np.random.default_rng(0)
     y, x = np.mgrid[0:size, 0:size] / size
@@ -53,7 +52,7 @@ def observation(size: int = 224, cameras: int = 2) -> Obs:
 
 
 def save_observation(obs: Obs, path: Path) -> None:
-    """Save an .npz that a peer's client loads: every camera by its name, `joints`, `gripper`."""
+    """Save an .npz for a peer's client: every camera by its name, `joints`, `gripper`."""
     if obs.gripper is None:
         raise ValueError("the observation of a benchmark has a gripper")
     np.savez(path, gripper=np.float64(obs.gripper), joints=obs.state["joints"], **obs.cameras)  # type: ignore[arg-type]
@@ -65,7 +64,7 @@ class OwnClient:
 
     transport: str
     codec: str = "raw"
-    actor: bool = False  # from inside a Ray actor, by serve://
+    actor: bool = False  # in a Ray actor, by serve://
 
     @property
     def name(self) -> str:
@@ -88,7 +87,7 @@ OWN_CLIENTS = (
 
 
 def own_clients(only: Sequence[str] = ()) -> tuple[list[OwnClient], dict[str, str]]:
-    """Return the clients that this version has, or those whose transport is in `only`, and why others are skipped."""
+    """Return the clients of this version, or those with a transport in `only`, and the reasons for skipped ones."""
     known = get_args(TransportName)
     wanted = [one for one in OWN_CLIENTS if not only or one.transport in only]
     if unknown := set(only) - {one.transport for one in OWN_CLIENTS}:
@@ -101,8 +100,8 @@ def own_clients(only: Sequence[str] = ()) -> tuple[list[OwnClient], dict[str, st
 def connect(url: str, transport: str, codec: str, rank: str | None = None) -> RemoteAgent:
     """Make an agent that has not connected yet.
 
-    `codec` is "auto", "raw", "jpeg", or "jpeg QUALITY SUBSAMPLING". `rank` is "robot" or "simulation", and
-    has no effect where `RemoteAgent` knows no ranks.
+    `codec` is "auto", "raw", "jpeg", or "jpeg QUALITY SUBSAMPLING". `rank` is "robot" or "simulation", and has no
+    effect if `RemoteAgent` has no ranks.
     """
     name, *details = codec.split()
     chosen = ImageCodec(name, int(details[0]), details[1]) if details else codec
@@ -111,7 +110,7 @@ def connect(url: str, transport: str, codec: str, rank: str | None = None) -> Re
 
 
 class BenchCaller:
-    """One session that measures its own calls. A Ray actor holds it as well as a process does."""
+    """One session that measures its calls, in a Ray actor or a process."""
 
     def __init__(self, url: str, transport: str, codec: str) -> None:
         self._agent = connect(url, transport, codec)
@@ -123,7 +122,7 @@ class BenchCaller:
         return timed(lambda: self._obs, self._agent.act, calls)
 
     def ready(self) -> dict[str, Any]:
-        """Warm up; returns what a client says of itself when it is ready."""
+        """Warm up; returns the client's description."""
         self.measure(WARM_UP)
         return self.description
 
@@ -132,7 +131,7 @@ class BenchCaller:
 
 
 class LoadGenerator:
-    """Clients of one process that act as fast as they are answered, one thread each."""
+    """Clients of one process that act again at each answer, one thread each."""
 
     def __init__(self, url: str, transport: str, codec: str, ranks: Sequence[str]) -> None:
         self._obs = observation()
@@ -147,9 +146,9 @@ class LoadGenerator:
         return True
 
     def run(self, active: int, begin: float, end: float) -> list[list[Call]]:
-        """Let the first `active` clients act until `end`, s of `time.monotonic`.
+        """Run the first `active` clients until `end`, s of `time.monotonic`.
 
-        All begin at the same moment of the machine's monotonic clock, in whatever process or actor they live.
+        All clients begin at the same moment of the machine's monotonic clock, in every process and actor.
 
         Returns:
             For each client its calls that ended after `begin`.
@@ -204,7 +203,7 @@ def connected(client: OwnClient, url: str, app: str, prefix: Sequence[str] = ())
         try:
             yield ActorDriver(actor)
         finally:
-            with contextlib.suppress(ray.exceptions.RayError):  # `ready` has raised why it never connected
+            with contextlib.suppress(ray.exceptions.RayError):  # `ready` has raised the reason if it never connected
                 ray.get(actor.close.remote(), timeout=CALL_S)
             ray.kill(actor)
         return
@@ -215,7 +214,7 @@ def connected(client: OwnClient, url: str, app: str, prefix: Sequence[str] = ())
 
 
 def main() -> None:
-    """Run the process: its settings are JSON; with "ranks" it makes load."""
+    """Run the process: the settings are JSON; with "ranks" it makes load."""
     die_with_parent()
     out = own_stdout()
     settings = json.loads(sys.argv[1])

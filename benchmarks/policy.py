@@ -1,7 +1,7 @@
 """The speed of a policy on this machine by batch size, without Ray: bare, and behind a replica's batch queue.
 
-Bare is `act_batch` on full batches, one after another. Behind the queue as many sessions as the batch has rows ask
-again as soon as they are answered. The policy is loaded once for both.
+Bare is `act_batch` on full batches, one after another. Behind the queue, as many sessions as the batch has rows act
+again at each answer. The policy is loaded once for both.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ class PolicyPlan:
     batches: Sequence[int] = (1, 8)
     seconds: float = 2.0  # of each measurement
     rounds: int = 3  # in which all measurements take turns
-    side: int = 224  # px, of images of which the policy takes any size
-    dims: Mapping[str, int] = field(default_factory=dict)  # of parts of the state for which it does not say
+    side: int = 224  # px, of images if the policy takes any size
+    dims: Mapping[str, int] = field(default_factory=dict)  # of parts of the state that the policy leaves open
 
 
 class BareAndQueued(MeasuredPolicy):
@@ -57,7 +57,7 @@ class BareAndQueued(MeasuredPolicy):
 
 
 def measure_policy(plan: PolicyPlan, progress: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
-    """Measure what the plan says; returns plain JSON values: actions a second, ms, MiB."""
+    """Measure the plan; returns plain JSON values: actions a second, ms, MiB."""
     batch = plan.args.batch
     if batch.sizes is not None and max(plan.batches) > batch.sizes[-1]:
         raise ConfigError(f"--batch: got {max(plan.batches)}, the file's largest of batch.sizes is {batch.sizes[-1]}")
@@ -141,7 +141,7 @@ def main(
     settings: Set = [],  # noqa: B006
     json_file: Json = None,
 ) -> None:
-    """Actions a second of one policy alone, by batch size: bare, and behind its batch queue; without Ray."""
+    """Measure actions a second of one policy by batch size, bare and behind its batch queue, without Ray."""
     with errors():
         origin = measured_on("python -m benchmarks.policy")
         args, batches = server_args(file, app), parse_counts(batch, "--batch")

@@ -1,4 +1,4 @@
-"""What a push of weights costs the sessions that act meanwhile: seconds, the longest act, and the node's memory."""
+"""Cost of a push of weights during acts: its seconds, the longest act, and the node's memory."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.serve.launch.server import running_server
 
 _LAYER = 1_000_000  # parameters
-_MOMENTS = 0.05  # s between two looks at the memory
+_MOMENTS = 0.05  # s between two samples of the memory
 
 
 class TrainedConfig(BaseModel, extra="forbid"):
-    """The size and speed of the model that `Trained` stands in for."""
+    """The size and speed of the model that `Trained` simulates."""
 
     parameters: int
     dtype: str
@@ -37,7 +37,7 @@ class TrainedConfig(BaseModel, extra="forbid"):
 
 
 class Trained(Agent):
-    """Acts with zeros after `base_ms` a batch, and parameters that a learner may replace."""
+    """Returns zeros after `base_ms` a batch, and has parameters that a learner may replace."""
 
     Config = TrainedConfig
     trainable = "layers"
@@ -55,23 +55,23 @@ class Trained(Agent):
 
 
 def layers(parameters: int, dtype: str, value: float) -> dict[str, np.ndarray]:
-    """Return so many parameters, all of one value, in layers of a million."""
+    """Return `parameters` numbers, all of one value, in layers of a million."""
     sizes = [_LAYER] * (parameters // _LAYER) + [parameters % _LAYER]
     return {f"layer.{number}": np.full(size, value, dtype) for number, size in enumerate(sizes) if size}
 
 
 class Sessions:
-    """Sessions of a process beside the learner's, each with a thread of its own."""
+    """Sessions in a process beside the learner's, each on its own thread."""
 
     def __init__(self, url: str, number: int) -> None:
-        """Begin the sessions, of which each follows the newest weights."""
+        """Begin the sessions, which follow the newest weights."""
         self._obs = Obs(state={"joints": np.zeros(7, np.float32)})
         self._agents = [RemoteAgent(url) for _ in range(number)]
         for agent in self._agents:
             agent.reset(self._obs, "act", weights="follow")
 
     def act(self, seconds: float) -> dict[str, Any]:
-        """Act for so long; return the number of acts, the longest, ms, the failures, and whether versions only grew."""
+        """Act for `seconds`; return the count of acts, the longest, ms, failures, and whether versions only grew."""
         ends = time.perf_counter() + seconds
         with ThreadPoolExecutor(len(self._agents)) as threads:
             each = list(threads.map(lambda agent: self._act(agent, ends), self._agents))
@@ -99,11 +99,11 @@ class Sessions:
 def measure_push(
     parameters: int, dtype: str, sessions: int, base_ms: float, rounds: int, seconds: float
 ) -> list[dict[str, Any]]:
-    """Return, for each round: what the sessions saw without and with a push, its seconds, and the node's memory.
+    """Return for each round the sessions' figures without and with a push, its seconds, and the node's memory.
 
-    In a round the sessions act for `seconds` without a push, and for as long again, after a quarter of which the push
-    begins. The memory is what was available before the push and was not at the worst moment of it, as a multiple of the
-    model's bytes. The learner's own copy of the weights is there before.
+    In a round the sessions act for `seconds` without a push, then for `seconds` with a push after the first quarter.
+    The memory is the largest decrease of available memory during the push, as a multiple of the model's bytes, without
+    the learner's own copy of the weights.
     """
     config = {"parameters": parameters, "dtype": dtype, "base_ms": base_ms}
     document = deployment("benchmarks.push:Trained", config=config, batch={"max_size": sessions})
@@ -142,7 +142,7 @@ class _LeastAvailable:
 
     @property
     def taken(self) -> int:
-        """Bytes that were available before, and not at the worst moment."""
+        """The largest decrease of available memory, bytes."""
         return self._before - self._least
 
     def _watch(self) -> None:

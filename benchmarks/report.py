@@ -1,6 +1,6 @@
-"""The figures of docs/measured.md: everything is measured in one go, judged by targets, and written as Markdown.
+"""The figures of docs/measured.md: measured in one run, compared with targets, and written as Markdown.
 
-Figures of `python -m benchmarks.evaluation --report FILE` in the same file are judged, too.
+Figures of `python -m benchmarks.evaluation --report FILE` in the same file are also compared.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def collect(
 
 
 def write(results: Mapping[str, Any], page: Path, json_file: Path | None) -> None:
-    """Write the section into the page; the figures, from which it can be made again, into `json_file`."""
+    """Write the section into the page, and the figures for the next such section into `json_file`."""
     text = replaced(page.read_text(), section(results))
     if json_file is not None:
         json_file.parent.mkdir(parents=True, exist_ok=True)
@@ -71,7 +71,7 @@ def write(results: Mapping[str, Any], page: Path, json_file: Path | None) -> Non
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """A target and what was measured: a line of the table."""
+    """A line of the table: a target and the measured value."""
 
     what: str
     wanted: str
@@ -80,7 +80,7 @@ class Outcome:
 
 
 def outcomes(results: Results) -> list[Outcome]:
-    """Return every target, in order, with what was measured."""
+    """Return every target, in order, with the measured value."""
     rtt, link = results.get("rtt") or {}, results.get("link") or {}
     actor = next((name for name in ON_NODE if name in rtt.get("ratios", {})), ON_NODE[0])
     node, shm = "a Ray env actor and the replica on its node", "a local process and the replica"
@@ -101,7 +101,7 @@ def outcomes(results: Results) -> list[Outcome]:
 
 
 def evaluation_outcomes(found: Results) -> list[Outcome]:
-    """Return the targets of `benchmarks.evaluation`: all cores must count against the one process of a peer."""
+    """Return the targets of `benchmarks.evaluation`."""
     workers = found["plan"]["workers"]
     cores = min(found["cores"], workers)
     limits = {"vlagents": float(cores), "vlagents, split": 1.0, "vla-eval": LIMIT_VLA_EVAL}
@@ -131,7 +131,7 @@ def _ratio(part: Results, what: str, ours: str, theirs: str, limit: float) -> Ou
 
 
 def _default(rtt: Results) -> Outcome:
-    """Compare time and image quality with what vlagents sends, which is our JPEG at its setting."""
+    """Compare time and image quality with vlagents' images, which are our JPEG at its setting."""
     found = _ratio(rtt, "WebSocket, our default setting", DEFAULT, "vlagents JPEG", 0.50)
     ours, theirs = _way(rtt, DEFAULT), _way(rtt, JPEG)
     if found.met is None or ours is None or theirs is None:
@@ -193,7 +193,7 @@ def replaced(text: str, section: str) -> str:
 
 
 def section(results: Mapping[str, Any]) -> str:
-    """Write what stands between the markers: targets, round trips, the link, throughput, and their origin."""
+    """Return the text between the markers: targets, round trips, the link, throughput, and their origin."""
     parts = [_origin(results), _targets(outcomes(results))]
     if rtt := results.get("rtt"):
         parts.append(_round_trips("Round trips of one `act` on one machine", rtt))
@@ -222,7 +222,7 @@ def _origin(results: Mapping[str, Any]) -> str:
 
 def _targets(lines: Sequence[Outcome]) -> str:
     return _table(
-        ("", "wanted", "measured", "met"), [(one.what, one.wanted, one.measured, _MET[one.met]) for one in lines]
+        ("", "target", "measured", "met"), [(one.what, one.wanted, one.measured, _MET[one.met]) for one in lines]
     )
 
 
@@ -287,7 +287,7 @@ def show_outcomes(lines: Sequence[Outcome]) -> None:
     """Print targets, and whether they are met."""
     if not lines:
         return
-    rows = table("", "wanted", "measured", "met")
+    rows = table("", "target", "measured", "met")
     met = {True: Text("yes"), False: Text("no", "red"), None: Text("")}
     for one in lines:
         rows.add_row(one.what, one.wanted, one.measured, met[one.met])

@@ -1,7 +1,7 @@
 """Robots that act at their rate and do nothing else: `python -m benchmarks.robots URL`.
 
-Each line that the process reads is a burst, {"robots": 12, "hz": 10, "seconds": 20}. It is answered, when it is over,
-with what each robot measured.
+Each line that the process reads is a burst, {"robots": 12, "hz": 10, "seconds": 20}. At its end it writes each robot's
+figures.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ _CONNECT_S = 120.0
 
 
 class RobotBurst(NamedTuple):
-    """What one robot measured in a burst."""
+    """One robot's figures of a burst."""
 
-    reset_s: float  # how long its first reset took, connecting and all
-    acts: list[tuple[float, float]]  # s of `time.time()` when it was answered, ms that it took
+    reset_s: float  # duration of the first reset, connection included
+    acts: list[tuple[float, float]]  # time of the answer, s of `time.time()`, and duration, ms
     resumed: int  # acts before which the session had to begin again
-    failed: list[str]  # acts, or the reset, without an action: why
+    failed: list[str]  # reasons of acts without an action, or of a failed reset
 
 
 def burst(url: str, robots: int, hz: float, seconds: float) -> list[RobotBurst]:
-    """Let all robots act at once, each for so long after its reset."""
+    """Run all robots at once, each for `seconds` after its reset."""
     with ThreadPoolExecutor(robots) as pool:
         return list(pool.map(lambda _: play(url, hz, seconds), range(robots)))
 
 
 def play(url: str, hz: float, seconds: float) -> RobotBurst:
-    """Let one robot act. A tick that an act takes up is not made up for."""
+    """Run one robot. Ticks that pass during an act are skipped."""
     obs, acts, resumed, failed = observation(64, 1), [], 0, []
     with RemoteAgent(url, connect_timeout_s=_CONNECT_S, rank="robot") as agent:
         begun = time.time()

@@ -1,8 +1,8 @@
 """Steps a second of `Rollouts` against a plain loop of the same environments and policy in one process, in turns.
 
-The loop is what a learner writes first: environments stepped one after another, one call of the policy for all of them,
-arrays of what came of it. `Rollouts` steps as many environments in all, in workers, and asks a server. With
-`--torchrl`, TorchRL's collector with its inference server takes its turns, too.
+The loop is a learner's first program: it steps environments one after another, calls the policy once for all, and
+collects arrays. `Rollouts` steps as many environments in workers, with a server. With `--torchrl`, TorchRL's collector
+with its inference server also takes its turns.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def loop(agent: Agent, num_envs: int, episodes: int, options: dict[str, Any], *,
 
 @contextlib.contextmanager
 def served(policy: str, config: dict[str, Any], patience: float, **settings: Any) -> Iterator[Callable[[int], float]]:
-    """Yield a function that returns the steps a second of so many episodes of `Rollouts` with these settings."""
+    """Yield a function that returns the steps a second of n episodes of `Rollouts` with these settings."""
     document = deployment(policy, config=config, batch={"patience": patience})
     app = document.applications[0].name
     with (
@@ -97,7 +97,7 @@ def served(policy: str, config: dict[str, Any], patience: float, **settings: Any
 
 
 def torchrl_rate(layout: str, policy: str, episodes: int, **settings: Any) -> float:
-    """Return the steps a second of TorchRL's collector, in a process that is gone afterwards; see `rate` there."""
+    """Return the steps a second of TorchRL's collector, measured in a new process by `rate` there."""
     try:
         from benchmarks.torchrl_collector import rate
     except ModuleNotFoundError as error:
@@ -123,7 +123,7 @@ def main(
         typer.Option(help="TorchRL's collector, too: 'grouped' in as many workers, or 'processes', one for each env."),
     ] = "",
 ) -> None:
-    """Print the steps a second of each way, and the ratios in each round."""
+    """Measure steps a second of each variant, and the ratios in each round."""
     if torchrl not in ("", "grouped", "processes"):
         raise typer.BadParameter(f"--torchrl: got {torchrl!r}, want 'grouped' or 'processes'")
     name, config = _POLICIES[policy]

@@ -1,8 +1,8 @@
-"""The time that topics of ROS 2 add: from an image on its topic until the action computed from it is on another one.
+"""The time that topics of ROS 2 add: from an image on its topic to the action computed from it on another.
 
 A driver publishes images with a number in their first pixel, and times the actions, which repeat it. The policy is in
-this process and computes nothing, and there is no tick to wait for, so that the rest is the way there, decoding, the
-chunk player with its guard, and the way back. `--link ros2` and a real rosbridge (`--link ws://…`) want rclpy.
+this process and computes nothing, and no tick is awaited, so the time is that of both transports, decoding, and the
+chunk player with its guard. `--link ros2` and a real rosbridge (`--link ws://…`) need rclpy.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Repeating(Agent):
 
 
 class Stopwatch:
-    """The times at which numbers were published and came back."""
+    """The times at which numbers were published and returned."""
 
     def __init__(self) -> None:
         self.sent: dict[int, float] = {}
@@ -50,7 +50,7 @@ class Stopwatch:
         self.came = threading.Event()
 
     def arrived(self, message: Any) -> None:
-        """Note an action."""
+        """Record an action."""
         now = time.perf_counter()
         number = round((message["data"] if isinstance(message, dict) else message.data)[0])
         if number in self.sent:
@@ -60,7 +60,7 @@ class Stopwatch:
 
 @contextlib.contextmanager
 def driver(link: str, kind: str, watch: Stopwatch) -> Iterator[tuple[str, Publish]]:
-    """Yield the robot's link, and how its driver publishes."""
+    """Yield the robot's link, and its driver's function to publish."""
     if link == "double":
         with import_module("rosbridge_double").rosbridge_double() as double:
             double.noticed = watch.arrived
@@ -77,7 +77,7 @@ def driver(link: str, kind: str, watch: Stopwatch) -> Iterator[tuple[str, Publis
 
 
 def image(number: int, compressed: bool) -> dict[str, Any]:
-    """A message of 640 x 480 pixels with a number in it."""
+    """Return a message of 640 x 480 pixels with a number in it."""
     now = time.time_ns()
     pixels = np.random.default_rng(0).integers(0, 32, (480, 640, 3), np.uint8)
     pixels[:8, :8] = number
@@ -89,7 +89,7 @@ def image(number: int, compressed: bool) -> dict[str, Any]:
 
 
 def measure(link: str, *, compressed: bool, images: int) -> list[float]:
-    """Return the milliseconds from an image until its action came."""
+    """Return the times from each image to its action, ms."""
     watch = Stopwatch()
     kind = f"sensor_msgs/msg/{'CompressedImage' if compressed else 'Image'}"
     with contextlib.ExitStack() as stack:
@@ -140,7 +140,7 @@ def _act_on_each(robot: RosRobot, player: ChunkPlayer, done: threading.Event) ->
 
 
 def main() -> None:
-    """Print a row for each way."""
+    """Measure each kind of image, and print a row for each."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--link", default="double", help="double, ros2, or the address of a rosbridge beside ROS 2")
     parser.add_argument("--images", type=int, default=300)

@@ -1,10 +1,9 @@
 """Round trips of one `act` by every transport, interleaved in one run.
 
-The observation is that of the paper's measurement: two 224x224 RGB cameras and seven joints. All ways
-take turns in short rounds, in a new random order each time, so that other load on the machine hits
-them alike. Every client is a process of its own (those that need Ray, an actor); every server stays up
-and idle while it is not its turn. So each turn begins cold, which is what the 99th percentile then shows: the ways on
-the node make calls without a break, too, at the end.
+The observation is that of the paper's measurement: two 224x224 RGB cameras and seven joints. All clients take turns in
+short rounds, in a new random order each time, so that other load on the machine affects them alike. Every client is a
+process (those that need Ray, an actor); every server stays up, and idles between its turns. So each turn begins cold,
+which the 99th percentile shows; at the end the clients on the node also make calls without a break.
 """
 
 from __future__ import annotations
@@ -31,17 +30,17 @@ from vlagents_ray.serve.launch.server import running_server
 
 POLICY = "benchmarks.round_trips:MeasuredNoop"
 LOOPBACK = "127.0.0.1"
-ROUND = 100  # calls of one way before it is the next one's turn
+ROUND = 100  # calls of one client in its turn
 UNBROKEN = 200  # rounds' worth of calls without a break: a second or two
 ON_NODE = ("shm", "plasma")
 
-StartClient = Callable[[Path], AbstractContextManager[Driver]]  # from the file of the observation, a client of a server
+StartClient = Callable[[Path], AbstractContextManager[Driver]]  # given the file of the observation
 
 
 class MeasuredNoop(Noop):
-    """The policy of the round trips: `reset` also returns what the images lost on the way.
+    """The policy of the round trips: `reset` also returns the loss of the images' codec.
 
-    That is {"psnr_db"}: of the cameras, against the observation of the benchmark; None if they are the same.
+    The loss is {"psnr_db"}: of the cameras, against the observation of the benchmark; None if they are equal.
     """
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
@@ -50,13 +49,13 @@ class MeasuredNoop(Noop):
 
 @dataclass(frozen=True, slots=True)
 class RoundTripsOfAll:
-    """The round trips of all clients that were measured, and why others were not."""
+    """The round trips of all measured clients, and the reasons for skipped ones."""
 
     ours: tuple[RoundTrips, ...]
     theirs: tuple[RoundTrips, ...] = ()
     skipped: Mapping[str, str] = field(default_factory=dict)
-    steady: tuple[RoundTrips, ...] = ()  # of the ways on the node, one after the other, each without a break
-    psnr_db: Mapping[str, float | None] = field(default_factory=dict)  # of what the policy saw, by way; None: all of it
+    steady: tuple[RoundTrips, ...] = ()  # of clients on the node, each without a break
+    psnr_db: Mapping[str, float | None] = field(default_factory=dict)  # of the images, by client; None: lossless
 
     def to_json(self) -> dict[str, Any]:
         return {
@@ -78,15 +77,15 @@ def measure(
     host: str = LOOPBACK,
     prefix: Sequence[str] = (),
 ) -> RoundTripsOfAll:
-    """Measure clients of ours, and others by name with servers of their own, in turns."""
+    """Measure our clients, and others by name with their own servers, in turns."""
     others = others or {}
     drivers: dict[str, Driver] = {}
     with contextlib.ExitStack() as stack:
         obs = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "observation.npz"
         save_observation(observation(), obs)
-        for name, start in others.items():  # before Ray, whose start is what takes the time
+        for name, start in others.items():  # before Ray, whose start takes longest
             drivers[name] = stack.enter_context(start(obs))
-        # Without keys: another host than loopback is one end of a link that only this run knows.
+        # Without keys: a host other than loopback is one end of a link that only this run uses.
         server = stack.enter_context(running_server(deployment(POLICY), host=host, insecure=host != LOOPBACK))
         [(app, url)] = server.apps.items()
         for one in own:
@@ -110,7 +109,7 @@ def measure(
 
 
 def in_turns(drivers: Mapping[str, Driver], calls: int, progress: Callable[[str], None]) -> dict[str, RoundTrips]:
-    """Let each client make at most 100 calls in turn until all have made `calls`, in a new random order each time."""
+    """Run turns of at most 100 calls until all clients have made `calls`, in a new random order each time."""
     each = min(ROUND, calls)
     rounds = -(-calls // each)
     taken: dict[str, list[list[float]]] = {name: [] for name in drivers}

@@ -35,7 +35,7 @@ def measure_with_peers(
         progress: Is called with lines of progress.
 
     Returns:
-        What `benchmarks.round_trips.measure(...).to_json()` returns, and the "versions" of the peers' packages.
+        The result of `benchmarks.round_trips.measure(...).to_json()`, and the "versions" of the peers' packages.
     """
     own, skipped = own_clients(transports)
     found, absent, versions = others.peer_clients(peers, peers_python)
@@ -50,7 +50,7 @@ def main(
     peers_python: others.PeersPython = others.PYTHON,
     json_file: Json = None,
 ) -> None:
-    """Round trips to a `noop` policy on this machine: every transport, and other policy servers, in turns."""
+    """Measure round trips to a `noop` policy on this machine: every transport, and other policy servers, in turns."""
     with errors():
         origin = measured_on("python -m benchmarks.rtt")
         found = measure_with_peers(

@@ -1,13 +1,13 @@
-"""Do more workers play proportionally more episodes, and how many can one driver serve?
+"""Scaling of episodes a minute with the number of workers, and the capacity of one driver.
 
-Environment and policy sleep, so that many workers run on few cores: what is measured is everything between them. On
-clusters of one to three hosts (`benchmarks.hosts`), or one that runs already, evaluations with more and more
-workers are played in turns with one of a single worker; the rate is that while all of them were playing, so that their
-start does not count. Every node has a replica for each worker that it has room for: nobody waits for another's batch.
-Beside that, on the first cluster, all workers share one replica a node, with single actions and with chunks.
+Environment and policy sleep, so that many workers run on few cores and only the overhead is measured. On clusters of
+one to three hosts (`benchmarks.hosts`), or on a running one, evaluations with increasing numbers of workers take turns
+with one of a single worker; the rate is that while all were playing, so that their start does not count. Every node has
+a replica for each of its workers, so that none waits for another's batch. On the first cluster, all workers also share
+one replica a node, with single actions and with chunks.
 
-Then the driver: short evaluations with steps, episodes and workers in different proportions. Its CPU time is fitted by
-what an episode costs, what a step, and what a second of a busy worker's being watched.
+The driver is measured by short evaluations with steps, episodes and workers in different proportions. Its CPU time is
+fitted by the costs of an episode, a step, and a second of a busy worker.
 """
 
 from __future__ import annotations
@@ -36,23 +36,23 @@ OWN, SHARED, CHUNKS = "own", "shared", "chunks"  # applications: a replica a wor
 CHUNK = 8  # rows
 _START_S = 300.0
 _PLAY_S = 600.0
-_LATE_S = 1.0  # that each further worker may begin after the one before it
-# Steps, ms a step, and which share of the workers: what an evaluation's parts cost shows in their proportions.
+_LATE_S = 1.0  # longest delay between the starts of two workers
+# Steps, ms a step, and share of the workers, in different proportions, so that costs can be fitted.
 _COSTS = ((10, 10.0, 0.25), (100, 1.0, 0.25), (10, 200.0, 0.25), (10, 50.0, 1.0), (10, 400.0, 1.0))
 _COST_S = 5.0
 
 
 @dataclass(frozen=True, slots=True)
 class ScalingPlan:
-    """What `measure_scaling` plays. The times are near those of a simulator and a VLA on a GPU."""
+    """The evaluations of `measure_scaling`. The times are near those of a simulator and a VLA on a GPU."""
 
     workers: tuple[int, ...] = (1, 2, 4, 8, 16)
-    nodes: tuple[int, ...] = (1, 2, 3)  # sizes of clusters; none but its own where one runs already
+    nodes: tuple[int, ...] = (1, 2, 3)  # sizes of clusters; ignored on a running one
     rounds: int = 3
     step_ms: float = 20.0
     policy_ms: float = 50.0
     steps: int = 50  # of an episode
-    seconds: float = 8.0  # that all workers play together, about
+    seconds: float = 8.0  # in which all workers play together, about
 
     def __post_init__(self) -> None:
         if self.workers[0] != 1 or list(self.workers) != sorted(set(self.workers)):
@@ -64,7 +64,7 @@ class ScalingPlan:
         return self.workers[-1]
 
     def round(self, workers: int, app: str) -> ScalingRound:
-        """Plan an evaluation so long that all its workers play together for `seconds`."""
+        """Plan an evaluation in which all workers play together for `seconds`."""
         acts = self.steps / (CHUNK if app == CHUNKS else 1)
         episode_s = (self.steps * self.step_ms + acts * self.policy_ms) / 1e3
         episodes = math.ceil((self.seconds + workers * _LATE_S) / episode_s) + 1
@@ -81,7 +81,7 @@ def measure_scaling(
 ) -> dict[str, Any]:
     """Measure all clusters, or the running one at `address`; returns plain JSON values."""
     found: dict[str, Any] = {"plan": asdict(plan), "cores": os.cpu_count(), "clusters": []}
-    clusters = (0,) if address else plan.nodes  # 0: as many as there are
+    clusters = (0,) if address else plan.nodes  # 0: all nodes
     for nodes in clusters:
         with driving(plan, nodes, address) as (driver, size):
             found["clusters"].append(measure_cluster(plan, size, driver, progress, shared=nodes == clusters[0]))
@@ -107,7 +107,7 @@ def driving(plan: ScalingPlan, nodes: int, address: str | None = None) -> Iterat
         if address is None:
             resources = json.dumps({OWN: slots, SHARED: 1, CHUNKS: 1})  # for replicas, on each node
             made = stack.enter_context(hosts(nodes))
-            # Ray's workers would wait for whatever else runs here; a server of our own sets the same.
+            # Ray's workers would wait for other processes here; our own server sets the same.
             environment = our_environment() | {"RAY_worker_niceness": "0"}
             cluster = stack.enter_context(ray_cluster(made, slots, environment, resources=resources))
             address, start = cluster.address, cluster.head.command
@@ -150,10 +150,10 @@ def measure_cluster(
 def row(
     plan: ScalingPlan, app: str, workers: int, played: Sequence[PlayedEpisodes], single: Sequence[float]
 ) -> dict[str, Any]:
-    """Compute medians over rounds; `single` is what one worker played in the same ones.
+    """Compute medians over rounds; `single` has the episodes of one worker in the same rounds.
 
-    Linear is that many times a single worker of the round; with chunks, which no single one played, what the sleeping
-    alone would allow.
+    Linear is that many times the single worker of the round; with chunks, which no single worker played, the rate that
+    the sleeps alone allow.
     """
     rates = [one.rate for one in played]
     linear = [workers * each for each in single] if app != CHUNKS else [plan.ideal(workers, app)] * len(rates)
@@ -179,7 +179,7 @@ def _play(driver: LineProcess, one: ScalingRound) -> PlayedEpisodes:
 
 
 def _driver_costs(plan: ScalingPlan, driver: LineProcess) -> dict[str, Any]:
-    """Measure the costs, and how busy the driver is with more very short episodes than it can serve."""
+    """Measure the costs, and the driver's load with more very short episodes than it can serve."""
     rounds = []
     for steps, step_ms, share in _COSTS:
         workers = max(1, round(share * plan.most))
@@ -226,7 +226,7 @@ def fit(rounds: Sequence[ScalingRound], played: Sequence[PlayedEpisodes]) -> dic
 
 
 def saturation(costs_ms: Mapping[str, float], episode_s: float, steps: int) -> float:
-    """Return with how many workers one driver is always busy, if each of their episodes lasts so long."""
+    """Return the number of workers that saturate one driver, if an episode takes `episode_s`."""
     each = (costs_ms["episode"] + costs_ms["step"] * steps) / episode_s + costs_ms["worker_second"]
     return (1e3 - costs_ms["second"]) / each
 
@@ -249,7 +249,7 @@ def show_scaling(found: Mapping[str, Any]) -> None:
 
 
 def show_driver(found: Mapping[str, Any]) -> None:
-    """Print what a driver costs, and how many workers it has time for."""
+    """Print the driver's costs, and its capacity in workers."""
     costs, flooded = found["costs_ms"], found["flooded"]
     out.print(
         f"the driver's CPU time: {costs['episode']:.2f} ms an episode, {costs['step'] * 1e3:.1f} µs a step, "
@@ -275,7 +275,7 @@ def main(
     ] = None,
     json_file: Json = None,
 ) -> None:
-    """Episodes a minute against the number of workers and nodes, and what the evaluation's driver costs."""
+    """Measure episodes a minute by the number of workers and nodes, and the cost of the evaluation's driver."""
     with errors():
         plan = ScalingPlan(
             workers=tuple(parse_counts(workers, "--workers")), nodes=tuple(parse_counts(nodes, "--nodes")),

@@ -1,8 +1,8 @@
 """The driver of `bench scaling`, a process at the cluster's head: `python -m benchmarks.scaling_driver JSON`.
 
-It serves policies that sleep, says so in a line of JSON, and then plays each `ScalingRound` that it reads, a line of
-JSON, answering with a `PlayedEpisodes`. It is what `vlagents-ray eval` is: Serve's client and the evaluation's driver
-in one process, so that the CPU time that it uses, in all its threads, is a driver's.
+It serves policies that sleep, writes a line of JSON when they are ready, and answers each `ScalingRound`, a line of
+JSON, with a `PlayedEpisodes`. Like `vlagents-ray eval`, it is Serve's client and the evaluation's driver in one
+process, so that its CPU time, over all threads, is a driver's.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from vlagents_ray.policies.noop import Noop, NoopConfig
 from vlagents_ray.serve.launch.deployment_file import deployment, together
 from vlagents_ray.serve.launch.server import running_server
 
-DAEMONS = ("gcs_server", "raylet", "ServeController")  # of this node, by what their command line begins with or names
+DAEMONS = ("gcs_server", "raylet", "ServeController")  # of this node, by words of their command line
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +37,7 @@ class Fleet:
 
     replicas: int
     chunk: int = 1
-    pinned: bool = False  # each takes one of a resource with the application's name
+    pinned: bool = False  # each reserves one unit of a resource with the application's name
 
     def args(self, app: str, policy_ms: float) -> dict[str, Any]:
         """Return the arguments of its deployment."""
@@ -64,7 +64,7 @@ class PlayedEpisodes(NamedTuple):
     """The figures of a `ScalingRound`."""
 
     episodes_per_minute: float | None  # while all workers were playing; None with a policy in their own processes
-    wall_s: float  # of the whole evaluation, workers' start and all
+    wall_s: float  # of the whole evaluation, start of the workers included
     transports: list[str]
     failures: int  # attempts
     # From the first recorded episode to the last:
@@ -82,7 +82,7 @@ class PlayedEpisodes(NamedTuple):
 
 
 class ScalingLedger(Progress):
-    """When each episode was recorded, and what the driver and the daemons had used by then."""
+    """The time of each recorded episode, and the CPU time of the driver and the daemons by then."""
 
     def __init__(self) -> None:
         self.at_s, self.cpu_s = array("d"), array("d")
@@ -108,7 +108,7 @@ def play(one: ScalingRound, out: Path) -> PlayedEpisodes:
         policies=[policy],
         suites=[SuiteConfig(envs=[SLEEPING_ENV], env_options=options, episodes=one.workers * one.episodes)],
         workers=one.workers,
-        worker=WorkerConfig(cpus=1.0),  # as many on a node as it has
+        worker=WorkerConfig(cpus=1.0),  # one worker for each CPU of a node
         video="none",
         out=out,
     )

@@ -1,9 +1,9 @@
-"""Many episodes in one evaluation, with workers killed while it runs: does anything grow, slow down or get lost?
+"""Endurance of one evaluation with many episodes and killed workers: memory, speed, and lost episodes.
 
-Small images and few steps, so that what is measured is what an evaluation does around an episode. The gap is the time
-between an episode's last step and the next one's reset in the same worker: result, its way to the driver, the database,
-the next job and its way back. Every so often the youngest worker is killed; the eldest lives from the first episode to
-the last, and its memory is what is watched, beside the driver's.
+Images are small and steps few, so that the work around an episode is measured. The gap is the time between an episode's
+last step and the next one's reset in the same worker: the result, its way to the driver, the database, and the next
+job. The youngest worker is killed at intervals; the eldest plays from the first episode to the last, and its memory and
+the driver's are sampled.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from vlagents_ray.serve.launch.server import running_server
 LIMIT_GAP_MS = 5.0
 LIMIT_SLOWDOWN = 1.25  # of the last thousand episodes against the first, noise included
 LIMIT_GROWTH_MIB = 0.5  # of a process in a thousand episodes
-_EVERY_S = 0.5  # between two looks at the memory
+_EVERY_S = 0.5  # between two samples of the memory
 _PAGE = os.sysconf("SC_PAGE_SIZE")
 _MIB = 2**20
 _SETTLING = 0.2  # of the episodes, in which pools and caches fill
@@ -46,7 +46,7 @@ _SETTLING = 0.2  # of the episodes, in which pools and caches fill
 
 @dataclass(frozen=True, slots=True)
 class SoakPlan:
-    """What `measure_soak` plays, and for how long."""
+    """The evaluation of `measure_soak`."""
 
     episodes: int = 10_000
     workers: int = 2
@@ -56,7 +56,7 @@ class SoakPlan:
 
     @property
     def window(self) -> int:
-        """The number of episodes at the beginning, and at the end, that are compared: at most a quarter of all."""
+        """The number of first, and of last, episodes that are compared: at most a quarter of all."""
         return min(1000, self.episodes // 4)
 
 
@@ -99,10 +99,10 @@ def measure_soak(soak: SoakPlan, progress: Callable[[str], None] = lambda _: Non
 
 
 class SoakLedger(Progress):
-    """When each episode was recorded, and the CPU time that the driver had used by then."""
+    """The time of each recorded episode, and the driver's CPU time by then."""
 
     def __init__(self, progress: Callable[[str], None]) -> None:
-        self.at_s, self.cpu_s = array("d"), array("d")  # of time.time(); small beside what they are to find
+        self.at_s, self.cpu_s = array("d"), array("d")  # of time.time(); small compared with the growth to detect
         self._progress = progress
 
     def episode(self, cell: EvalCase, result: EpisodeResult) -> None:
@@ -114,7 +114,7 @@ class SoakLedger(Progress):
 
 
 class SoakWatcher:
-    """Samples memory, and kills the youngest worker every so often. Use as a context manager."""
+    """Samples memory, and kills the youngest worker at intervals. Use as a context manager."""
 
     def __init__(self, notes: Path, ledger: SoakLedger, soak: SoakPlan) -> None:
         self.samples: list[ResourceSample] = []
@@ -148,7 +148,7 @@ class SoakWatcher:
                 since = time.monotonic()
 
     def _kill(self) -> bool:
-        """Kill the youngest, once all are playing."""
+        """Kill the youngest worker, once all are playing."""
         playing = [pid for pid in self._seen if is_worker(pid)]
         if len(playing) < self._soak.workers:
             return False
@@ -159,7 +159,7 @@ class SoakWatcher:
 
 
 def is_worker(pid: int) -> bool:
-    """Return whether that process is one of Ray's, and not another that has got its number since."""
+    """Return whether that process is one of Ray's, and not a later one with the same number."""
     try:
         return b"ray::" in Path(f"/proc/{pid}/cmdline").read_bytes()
     except OSError:
@@ -218,8 +218,8 @@ def gaps(workers: Iterable[Sequence[EpisodeTimes]]) -> list[float]:
 def growth(samples: Sequence[tuple[int, int]], episodes: int) -> dict[str, float] | None:
     """Fit the growth of resident memory in a thousand episodes, MiB, by least squares.
 
-    `samples` are (episodes, bytes). The first fifth is left out, in which pools and caches fill, and what comes after
-    the last episode, when all results are read. None of too few.
+    `samples` are (episodes, bytes). The first fifth, in which pools and caches fill, and samples after the last
+    episode, when all results are read, are left out. Returns None if too few are left.
     """
     settled = [(done, size) for done, size in samples if _SETTLING * episodes <= done < episodes]
     if len({done for done, _ in settled}) < 2:
@@ -275,7 +275,7 @@ def _growth(what: str, row: Mapping[str, Any] | None) -> Outcome:
 
 
 def show_soak(found: Mapping[str, Any]) -> None:
-    """Print what was counted, and the targets."""
+    """Print the counts and the targets."""
     out.print(
         f"{found['plan']['episodes']} episodes, {found['episodes_per_minute']:.0f} a minute; workers killed: "
         f"{found['killed']}, retries: {found['retries']}, played again: {found['played_again']}",
@@ -289,7 +289,7 @@ def main(
     kill_every: Annotated[float, typer.Option(min=0, help="Seconds between two kills of a worker; 0: none.")] = 30.0,
     json_file: Json = None,
 ) -> None:
-    """Many short episodes, with workers killed meanwhile: memory, what an episode costs around it, each once."""
+    """Play many short episodes while workers are killed: check memory, overhead, and that each is played once."""
     with errors():
         found = measure_soak(SoakPlan(episodes, workers, kill_every), progress)
     show_soak(found)

@@ -1,8 +1,8 @@
-"""Actions a second that many clients get from one replica, against what the policy alone could give.
+"""Actions a second that many clients get from one replica, against those of the policy alone.
 
-The default policy takes 20 ms for a batch and 1 ms for each observation in it, without using the CPU: with 16 in
-a batch, 444 actions a second are the ideal. A policy whose speed is not known is measured bare, in the same
-run. All transports take turns. Among simulations, a robot is measured, which asks at random moments.
+The default policy takes 20 ms for a batch and 1 ms for each observation in it, without using the CPU: with 16 in a
+batch, 444 actions a second are the ideal. Any other policy is measured bare in the same run. All transports take turns.
+A robot among simulations, which acts at random moments, is also measured.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from vlagents_ray.serve.launch.server import running_server
 DEFAULT_TRANSPORTS = ("plasma", "handle", "shm", "websocket")
 BASE_MS, PER_ITEM_MS = 20.0, 1.0
 SLOW_NOOP = ("noop", {"base_ms": BASE_MS, "per_item_ms": PER_ITEM_MS})
-_PROCESSES = 4  # that the clients share, besides the robot's
+_PROCESSES = 4  # shared by the clients, besides the robot's
 _WARM_S = 0.5
 _LATE_S = 60.0
 _BARE = "benchmarks.bare_policy"
@@ -56,7 +56,7 @@ class ThroughputPlan:
 
     @property
     def ideal(self) -> Callable[[int], float] | None:
-        """The actions a second of K clients if everything but the policy took no time; None if it is to be measured."""
+        """The actions a second of K clients if only the policy took time; None if that must be measured."""
         if self.policy != "noop":
             return None
         base = float(self.config.get("base_ms", 0.0))
@@ -67,7 +67,7 @@ class ThroughputPlan:
 
 
 def measure_throughput(plan: ThroughputPlan, progress: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
-    """Measure what the plan says; returns plain JSON values."""
+    """Measure the plan; returns plain JSON values."""
     found, skipped = own_clients(plan.transports)
     chosen = _one_each(found)
     served = deployment(
@@ -127,17 +127,17 @@ class _Part:
 
 @dataclass(frozen=True, slots=True)
 class _Fleet:
-    """All clients of one transport: one robot in a part of its own, simulations in the others."""
+    """All clients of one transport: one robot in one part, simulations in the others."""
 
     _parts: Sequence[_Part]
     _robot: _Part
 
     def run(self, clients: int, seconds: float) -> list[list[Call]]:
-        """Let so many simulations act for so long, spread over the parts; returns their calls."""
+        """Run `clients` simulations for `seconds`, spread over the parts; returns their calls."""
         return self._together(self._spread(clients), seconds)
 
     def robot_run(self, clients: int, seconds: float) -> list[Call]:
-        """Let a robot act among `clients` - 1 simulations; returns its calls."""
+        """Run a robot among `clients` - 1 simulations; returns its calls."""
         return self._together([(self._robot, 1), *self._spread(clients - 1)], seconds)[0]
 
     def _spread(self, clients: int) -> list[tuple[_Part, int]]:
@@ -180,7 +180,7 @@ def _actor(client: OwnClient, url: str, ranks: list[str]) -> Iterator[_Part]:
         ray.get(actor.ready.remote(), timeout=START_S)
         yield _Part(lambda spec: actor.run.remote(**spec), lambda pending, late: ray.get(pending, timeout=late))
     finally:
-        with contextlib.suppress(ray.exceptions.RayError):  # `ready` has raised why it never connected
+        with contextlib.suppress(ray.exceptions.RayError):  # `ready` has raised the reason if it never connected
             ray.get(actor.close.remote(), timeout=START_S)
         ray.kill(actor)
 
@@ -189,7 +189,7 @@ def _actor(client: OwnClient, url: str, ranks: list[str]) -> Iterator[_Part]:
 def _bare(plan: ThroughputPlan) -> Iterator[LineProcess]:
     settings = json.dumps({"policy": plan.policy, "config": dict(plan.config), "batch": plan.batch})
     with LineProcess("the bare policy", [sys.executable, "-m", _BARE, settings], our_environment()) as child:
-        child.read(10 * START_S)  # it may have weights to load
+        child.read(10 * START_S)  # it may load weights
         yield child
 
 
@@ -199,7 +199,7 @@ def _shares(clients: int, parts: int) -> list[int]:
 
 
 def _one_each(found: Sequence[OwnClient]) -> list[OwnClient]:
-    """Choose one client for each transport: not an actor if possible, over networks with the default codec."""
+    """Choose one client for each transport: preferably not an actor; over networks, with the default codec."""
     first: dict[str, OwnClient] = {}
     for one in found:
         kept = first.get(one.transport)
@@ -216,7 +216,7 @@ def _point(plan: ThroughputPlan, fleet: _Fleet, clients: int) -> dict[str, Any]:
         "clients": clients,
         "actions_per_s": rate,
         "of_ideal": rate / plan.ideal(clients) if plan.ideal else None,
-        # Each call counts its batch once for each of the batch's members: the harmonic mean is the batches' own.
+        # A batch counts once for each of its members: the harmonic mean undoes that.
         "mean_batch": len(flat) / sum(1 / size for *_, size in flat) if flat else None,
         "p50_ms": float(np.median([call[1] for call in flat])) if flat else None,
         "p99_ms": float(np.quantile([call[1] for call in flat], 0.99)) if flat else None,
@@ -224,7 +224,7 @@ def _point(plan: ThroughputPlan, fleet: _Fleet, clients: int) -> dict[str, Any]:
 
 
 def _waiting(calls: Sequence[Call]) -> dict[str, Any] | None:
-    """Return the robot's round trips, and how long it waited beside the inference; None without a call."""
+    """Return the robot's round trips, and its waiting time without the inference; None without a call."""
     if not calls:
         return None
     round_trip = np.array([call[1] for call in calls])
@@ -250,7 +250,7 @@ def main(
     num_gpus: Annotated[float, typer.Option(min=0, help="That Ray gives to the replica.")] = 0.0,
     json_file: Json = None,
 ) -> None:
-    """Actions a second of many clients on one replica, against the ideal, or the bare policy in the same run."""
+    """Measure actions a second of many clients on one replica, against the ideal, or the bare policy."""
     with errors():
         origin = measured_on("python -m benchmarks.throughput")
         if settings and policy is None:

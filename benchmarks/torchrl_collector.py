@@ -24,7 +24,7 @@ _TIMEOUT_S = 0.02  # longest wait of its server for a whole batch
 
 
 class TorchTabletop(EnvBase):  # type: ignore[misc]
-    """The tabletop as TorchRL's collector wants it."""
+    """The tabletop as an environment of TorchRL."""
 
     def __init__(self, first_seed: int, options: dict[str, Any]) -> None:
         super().__init__(device="cpu", batch_size=())
@@ -92,7 +92,7 @@ def rate(
     whole_batches: bool,
     images: bool,
 ) -> float:
-    """Return the steps a second of TorchRL's collector; in a process of its own, since its threads never rest.
+    """Return the steps a second of TorchRL's collector. Call it in a separate process, since its threads never idle.
 
     Args:
         policy: The policy's name.
@@ -101,8 +101,8 @@ def rate(
         episodes: Episodes that are measured, a multiple of all environments.
         workers: Processes of environments.
         num_envs: Environments of each of these.
-        grouped: Whether these are the processes, which its coordinator in this process steps; if not, each environment
-            has a process of its own, which asks a process of the server itself.
+        grouped: Whether a process holds `num_envs` environments, which the coordinator in this process steps; if not,
+            each environment has its own process, which calls the server's process itself.
         whole_batches: Whether the server waits for the requests of all environments.
         images: Whether the policy gets the images.
     """

@@ -1,7 +1,7 @@
-"""What `upstream` adds to another policy server: one `act`, asked directly and through us, in turns.
+"""Overhead of `upstream` over another policy server: one `act`, directly and through us, in turns.
 
-The server speaks openpi's protocol and answers at once, so that all of the time is that of the way. It is asked as
-openpi's own client asks it; by the policy `upstream`, as our batch queue does; and through a whole server of ours.
+The server has openpi's protocol and answers at once, so that only the transport takes time. It is called like openpi's
+own client does, by the policy `upstream` as from our batch queue, and through a whole server of ours.
 """
 
 from __future__ import annotations
@@ -40,12 +40,12 @@ _ACTIONS = np.zeros((10, 7))
 def measure_upstream(
     calls: int, size: int, whole: bool, progress: Callable[[str], None] = lambda _: None
 ) -> RoundTripsOfAll:
-    """Measure `calls` acts by each way.
+    """Measure `calls` acts by each path.
 
     Args:
-        calls: The number of acts by each way.
+        calls: The number of acts by each path.
         size: Height and width of the two cameras' images, pixels.
-        whole: Whether a whole server of ours is measured, too, which starts Ray.
+        whole: Whether a whole server of ours, which starts Ray, is also measured.
         progress: Called with a line for each part of the measurement.
     """
     obs = _observation(size)
@@ -61,16 +61,16 @@ def measure_upstream(
 
 
 class _Driver:
-    """Makes calls of one way."""
+    """Makes calls by one path."""
 
     call: Callable[[], Any]
 
     def ready(self) -> dict[str, Any]:
-        """Return nothing: the way is ready."""
+        """Return nothing: the path is ready."""
         return {}
 
     def measure(self, calls: int) -> list[float]:
-        """Make calls; returns the milliseconds of each."""
+        """Make calls; returns their durations, ms."""
         taken = []
         for _ in range(calls):
             begun = time.perf_counter()
@@ -80,7 +80,7 @@ class _Driver:
 
 
 class _Direct(_Driver, contextlib.ExitStack):
-    """What openpi_client.websocket_client_policy does: pack, send, receive, unpack."""
+    """Packs, sends, receives and unpacks like openpi_client.websocket_client_policy."""
 
     def __init__(self, url: str, obs: Obs) -> None:
         super().__init__()
@@ -142,7 +142,7 @@ def _observation(size: int) -> Obs:
 
 @contextlib.contextmanager
 def _serving() -> Iterator[str]:
-    """Run the other server in a process of its own."""
+    """Run the other server in a new process."""
     port = free_port()
     process = multiprocessing.get_context("spawn").Process(target=_serve, args=(port,), daemon=True)
     process.start()
@@ -171,7 +171,7 @@ def main(
     whole: Annotated[bool, typer.Option(help="Measure a whole server of ours, too, which starts Ray.")] = False,
     json_file: Json = None,
 ) -> None:
-    """What the policy `upstream` adds to the policy server that it asks."""
+    """Measure the overhead of the policy `upstream` over the policy server behind it."""
     with errors():
         found = measure_upstream(calls, size, whole, progress).to_json()
     show_round_trips(found, f"one act, two images of {size} x {size} pixels")

@@ -1,11 +1,12 @@
 """Compare two checkpoints: is the later one better, or was it luck?
 
-Both play the same episodes, so that those count which only one of them solves. `python compare_checkpoints.py` plays
-2 x 40 episodes in this process, in seconds, and prints the difference with its interval and McNemar's test, for each
-environment and for all. The checkpoints are made up: an expert whose hand drifts less, the longer its training lasted.
+Both play the same episodes; the decisive ones are those that only one checkpoint solves. `python
+compare_checkpoints.py` plays 2 x 40 episodes in this process, in seconds, and prints the difference with its interval
+and McNemar's test, for each environment and for all. The checkpoints are simulated: an expert whose hand drifts less
+after longer training.
 
-With checkpoints of yours, served, `vlagents-ray eval` plays them, and the same lines compare them:
-docs/tutorials/checkpoints.md leads there. `vlagents-ray merge` puts results of different runs into one folder.
+`vlagents-ray eval` plays your own checkpoints, and the same lines compare them (docs/tutorials/checkpoints.md).
+`vlagents-ray merge` combines results of different runs in one folder.
 """
 
 import time
@@ -20,10 +21,10 @@ ENVS = ["tabletop/lift", "tabletop/slide"]
 
 
 class Trainee(Scripted):
-    """Stands for a policy with checkpoints."""
+    """A simulated policy with checkpoints."""
 
     def reset(self, obs, instruction, checkpoint_step=0, seed=0, **kwargs):
-        """Begin an episode as that checkpoint; its drift depends on the seed of the episode alone."""
+        """Begin an episode with that checkpoint; its drift depends on the seed of the episode alone."""
         drift = 0.35 * 0.5 ** (checkpoint_step / 5000)  # per action
         self.drift = np.random.default_rng(seed).normal(0, drift, 3).astype(np.float32)
         return super().reset(obs, instruction, **kwargs)
@@ -36,7 +37,7 @@ class Trainee(Scripted):
 
 
 def main():
-    """Play, and compare."""
+    """Play the episodes, and compare the checkpoints."""
     plan = EvalConfig(
         policies=[{"name": "trainee", "steps": [2000, 8000]}],
         suites=[{"name": env, "envs": [env], "episodes": 20} for env in ENVS],

@@ -1,9 +1,9 @@
-"""Wrap a simulator of your own, so that policies are evaluated in it.
+"""Wrap your own simulator, so that policies are evaluated in it.
 
-`Crane` stands for the simulator: it has its own units, colours and habits, and knows nothing of this project.
-`CraneEnv` is what you write. `python own_env.py` checks it, in the folder of this file, and
-`vlagents-ray eval own_env:CraneEnv --policy NAME --out runs/crane` evaluates a policy in it; own_policy.py is one that
-works. `vlagents-ray new env NAME` writes a skeleton with its test.
+`Crane` is the simulator, with other units, colours and conventions than this project. You write `CraneEnv`. `python
+own_env.py` checks it, in the folder of this file, and `vlagents-ray eval own_env:CraneEnv --policy NAME --out
+runs/crane` evaluates a policy in it; own_policy.py is one that works. `vlagents-ray new env NAME` writes a skeleton
+with its test.
 """
 
 import numpy as np
@@ -15,7 +15,7 @@ from vlagents_ray.testing import check_env
 
 
 class Crane:
-    """A hook over a floor of 1 x 1 m, seen by a camera that somebody mounted turned around its own axis."""
+    """A hook over a floor of 1 x 1 m, and a camera that is mounted with a rotation about its axis."""
 
     def load(self, seed, camera_turn):
         self.hook, self.mark = np.random.default_rng(seed).uniform(-450, 450, (2, 2))  # mm
@@ -34,7 +34,7 @@ class Crane:
 
 
 class CraneEnv(EvalEnv):
-    """The hook has to come within 5 cm of the mark."""
+    """The task: move the hook to within 5 cm of the mark."""
 
     max_steps = 40  # after which an episode is cut off
     STEP_MM = 80  # that an action of 1 moves the hook by
@@ -44,7 +44,7 @@ class CraneEnv(EvalEnv):
 
     @property
     def contract(self):
-        """What the environment gives and takes: a policy that does not fit is refused before the first step."""
+        """The observations and actions: a policy that does not fit is refused before the first step."""
         return Contract(
             cameras={"front": CameraSpec(self.side, self.side)},
             state={"xy": StateSpec(2, "m")},
@@ -58,18 +58,18 @@ class CraneEnv(EvalEnv):
         return "move the hook to the mark"
 
     def reset(self, *, seed, options=None):
-        """Begin the episode of this seed: it is the same whatever was played before, in any process."""
+        """Begin the episode of this seed, which does not depend on earlier episodes or the process."""
         self.crane.load(seed, self.camera_turn)
         self.steps = 0
         return self._observe(), {}
 
     def step(self, act):
-        """Take one action, (2,); the rows of a chunk come one after the other."""
+        """Execute one action, (2,); rows of a chunk are passed one after the other."""
         before = self._distance()
         self.crane.drive(*(self.STEP_MM * np.clip(one_row(act, self.contract), -1, 1)))
         self.steps += 1
         success = self._distance() < 0.05
-        # Terminated: it cannot go on. Truncated: it was cut off. Success is neither, and is counted.
+        # Terminated: it cannot continue. Truncated: the step limit. Success is stated apart, and counted.
         return self._observe(), before - self._distance(), success, self.steps >= self.max_steps, {"success": success}
 
     def close(self):

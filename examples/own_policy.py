@@ -1,7 +1,7 @@
-"""Serve a policy of your own.
+"""Serve your own policy.
 
-`Servo` looks for the red hook and the green mark in the picture of own_env.py, and moves the hook towards the mark;
-your model takes the place of its 2 x 2 weights. In the folder of this file,
+`Servo` finds the red hook and the green mark in the picture of own_env.py, and moves the hook towards the mark; your
+model replaces its 2 x 2 weights. In the folder of this file,
 
     python own_policy.py                                        checks it, and plays 20 episodes without a server
     vlagents-ray serve own_policy:Servo --set camera_turn=120   serves it to robots, simulators and evaluations
@@ -24,13 +24,13 @@ from vlagents_ray.testing import check_agent
 
 
 class ServoConfig(BaseModel, extra="forbid"):
-    """The settings: `--set camera_turn=120`, or `config:` in a deployment file. What is misspelled is refused."""
+    """The settings: `--set camera_turn=120`, or `config:` in a deployment file. Unknown keys are refused."""
 
     camera_turn: float = Field(default=0.0, description="degrees by which the camera is mounted turned")
 
 
 def offset(picture):
-    """From the hook to the mark in a picture, (H, W, 3) uint8 RGB: (2,) in picture widths, x to the right, y down."""
+    """Return the vector from hook to mark in a picture, (H, W, 3) uint8 RGB: (2,) picture widths, x right, y down."""
     red, green = picture[..., 0] > 200, picture[..., 1] > 200
     if not (red.any() and green.any()):
         raise InvalidObservation("camera 'front': got a picture without a red hook and a green mark, want both in it")
@@ -39,7 +39,7 @@ def offset(picture):
 
 
 class Servo(Agent):
-    """Moves the hook along the offset in the picture, turned back by how the camera is mounted."""
+    """Moves the hook along the offset in the picture, rotated by the mounting angle of the camera."""
 
     Config = ServoConfig
     trainable = "weights"  # rl_loop.py gives it new ones while it is served
@@ -49,7 +49,7 @@ class Servo(Agent):
 
     @property
     def contract(self):
-        """What the policy needs and gives; a robot or an environment that does not fit is told the difference."""
+        """The inputs and outputs; a robot or an environment that does not fit gets an error with the difference."""
         return Contract(cameras={"front": CameraSpec()}, action=ActionSpec(dim=2, space="ee_position", delta=True))
 
     def initialize(self):
@@ -59,12 +59,12 @@ class Servo(Agent):
         self.weights = {"gain": (10 * back).astype(np.float32)}  # (2, 2), actions per picture width
 
     def reset(self, obs, instruction, spread=0.0, seed=0, **kwargs):
-        """Begin an episode, on a copy of the policy that belongs to this session alone; its options are a client's."""
+        """Begin an episode on this session's copy of the policy; the options come from the client."""
         self.spread, self.rng = spread, np.random.default_rng(seed)  # of a learner's exploration
         return {}
 
     def act_batch(self, obs, sessions):
-        """Answer all sessions that wait in one forward pass: `sessions[i]` is the copy that `obs[i]` belongs to."""
+        """Answer all waiting sessions in one forward pass: `sessions[i]` is the copy for `obs[i]`."""
         seen = np.stack([offset(one.cameras["front"]) for one in obs])  # (B, 2)
         actions = seen @ self.weights["gain"].T
         tried = [session.rng.normal(0, session.spread, 2) if session.spread else 0.0 for session in sessions]

@@ -1,4 +1,4 @@
-"""Reinforcement learning with the server in the loop: a policy that does not know how its camera is mounted finds out.
+"""Reinforcement learning with the server in the loop: a policy learns the mounting angle of its camera.
 
 The policy of own_policy.py acts in a server, workers play episodes in own_env.py with it, and this program learns from
 their transitions (REINFORCE) and pushes new weights. In the folder of this file, in two terminals:
@@ -21,12 +21,12 @@ from vlagents_ray.evaluate import EvalConfig
 from vlagents_ray.learn import Publisher, RolloutPlan, Rollouts, TrainingEvaluation, arrays
 
 ENV = "own_env:CraneEnv"
-SPREAD = 0.5  # of the actions: standard deviation of what is tried
+SPREAD = 0.5  # standard deviation of the explored actions
 ITERATIONS, EPISODES, RATE = 4, 32, 80.0
 
 
 class Learner:
-    """Trains a policy's gain towards the actions that brought the hook nearer than others did."""
+    """Trains a policy's gain towards the actions that moved the hook nearer than others."""
 
     def __init__(self):
         self.policy = Servo()
@@ -48,13 +48,13 @@ class Learner:
 
 
 def main(url):
-    """Learn for some iterations, and evaluate before and after on episodes that are not trained on."""
+    """Learn for several iterations, and evaluate before and after on held-out episodes."""
     join(url, log_to_driver=False)  # so that the workers run in the server's Ray, beside the policy
     learner = Learner()
     held_out = {"envs": [ENV], "episodes": 20, "seeds": [10_000]}
     out = time.strftime("runs/rl-%H%M%S")
     plan = EvalConfig(policies=[{"name": "servo"}], suites=[held_out], out=out, video="none")
-    evaluation = TrainingEvaluation(learner.policy, plan)  # in this process; or of the URL, by workers
+    evaluation = TrainingEvaluation(learner.policy, plan)  # in this process; with the URL, in workers
     exploring = {"policy_options": {"spread": SPREAD}}
     with Publisher(url) as weights, Rollouts(RolloutPlan(ENV, url, workers=2, num_envs=4, **exploring)) as rollouts:
         for iteration in range(ITERATIONS + 1):

@@ -1,7 +1,7 @@
-"""A robot's loop: a steady rate, a guard that sees every action before the arm does, and a watchdog for silence.
+"""A robot's loop: a steady rate, a guard that checks every action before the arm executes it, and a watchdog.
 
-The arm is simulated, and the policy is one that no arm should trust: it draws joint targets at random. So the guard
-refuses what is too far away, and the arm holds its pose at those ticks. In two terminals:
+The arm is simulated, and the policy draws joint targets at random. So the guard refuses distant targets, and the arm
+holds its pose at those ticks. In two terminals:
 
     vlagents-ray serve random --set chunk=10 --set low=-0.3 --set high=0.3
     python robot_loop.py http://localhost:8000
@@ -17,7 +17,7 @@ from vlagents_ray.robot.simulated import SimulatedRobot
 
 
 def main(url):
-    """Drive the arm for two seconds at 50 Hz, and print how that went."""
+    """Drive the arm for two seconds at 50 Hz, and print the report."""
     arm = SimulatedRobot()  # of yours: observe() -> Obs, apply(action), stop()
     agent = RemoteAgent(url, timeout_s=5)
     guard = Guard(
@@ -27,9 +27,9 @@ def main(url):
         max_step=0.5,  # rad, from one action to the next
         measure=lambda obs: obs.state["joints"],  # where the arm is, for the first action and after a stop
     )
-    # Stops the arm when the server owes an answer for 1 s, or the loop does not come round for 0.2 s.
+    # Stops the arm when an answer is overdue by 1 s, or the loop has not ticked for 0.2 s.
     watchdog = Watchdog(lambda _reason: arm.stop(), {"server": 1.0, "loop": 0.2})
-    # In "async" the next chunk is asked for while the last one is executed, so that no tick waits for the network.
+    # In "async" the next chunk is requested while the last one is executed, so that no tick waits for the network.
     with ChunkPlayer(agent, PlayerSettings(mode="async", safe="hold"), check=guard) as player:
         report = run_loop(arm, player, hz=50, seconds=2, instruction="stack the cups", watchdog=watchdog)
     refused = report.safe.get("max_step", 0)

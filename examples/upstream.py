@@ -1,8 +1,8 @@
-"""Use a model that another system's server runs: `policy: upstream`.
+"""Use a model in another system's server: `policy: upstream`.
 
-Here that server is openpi's: `theirs` speaks its protocol in a few lines, in place of `scripts/serve_policy.py` in a
-checkout of openpi. The policy `upstream` asks it, and an evaluation plays with the policy. `python upstream.py` does
-both in this process. With the real server at ws://gpu-box:9000,
+Here the server is openpi's: `theirs` implements its protocol in a few lines, in place of `scripts/serve_policy.py` in a
+checkout of openpi. The policy `upstream` connects to it, and an evaluation plays with the policy. `python upstream.py`
+does both in this process. With the real server at ws://gpu-box:9000,
 
     python upstream.py ws://gpu-box:9000                 plays the same episodes with its model, if its keys are these
     vlagents-ray serve deployments/upstream.yaml         puts batches, sessions, keys and the live page before it
@@ -23,7 +23,7 @@ from websockets.sync.server import serve
 from vlagents_ray.evaluate import EvalConfig, evaluate, print_summary
 from vlagents_ray.policies.upstream import Upstream
 
-MAPPING = {  # our names on the left; on the right, where the server looks for them
+MAPPING = {  # our names on the left, the server's on the right
     "cameras": {"front": "observation/image"},
     "state": {"xyzrpy": "observation/state"},
     "instruction": "prompt",
@@ -32,10 +32,10 @@ MAPPING = {  # our names on the left; on the right, where the server looks for t
 
 @contextlib.contextmanager
 def theirs():
-    """Run a server that speaks openpi's protocol; its model moves the hand to the middle of the table."""
+    """Run a server with openpi's protocol; its model moves the hand to the middle of the table."""
 
     def answer(connection):
-        connection.send(msgpack.packb({"robot": "example"}))  # who it is
+        connection.send(msgpack.packb({"robot": "example"}))  # the server's metadata
         for message in connection:
             observation = msgpack.unpackb(message)
             pose = np.frombuffer(observation["observation/state"][b"data"], np.float32)  # (6,), m and rad
@@ -54,7 +54,7 @@ def theirs():
 
 
 def main(url):
-    """Evaluate the model behind a server of openpi."""
+    """Evaluate the model in a server of openpi."""
     config = {"protocol": "openpi", "urls": [url], "mapping": MAPPING, "contract": {"action": {"dim": 4}, "chunk": 10}}
     suite = {"envs": ["tabletop/lift"], "episodes": 3}
     out = time.strftime("runs/upstream-%H%M%S")

@@ -1,4 +1,4 @@
-"""Write random weights of a family's true size, and a deployment file of them."""
+"""Write random weights of a family's true size, and a deployment file for them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def main(
     size: Annotated[Literal["full", "small"], typer.Option(help="full: as published; small: for a CPU.")] = "full",
     dtype: Annotated[str | None, typer.Option(help="Of the weights; default: bfloat16, if the family has it.")] = None,
 ) -> None:
-    """Random weights of a family's true size, and a deployment file of them; run it in the family's environment."""
+    """Write random weights of a family's true size, and a deployment file; run it in the family's environment."""
     with errors():
         written = write_checkpoint(family, folder, size, dtype)
     out.print(

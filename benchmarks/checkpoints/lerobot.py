@@ -74,7 +74,7 @@ def make_policy(recipe: Recipe) -> tuple[Any, Any]:
         policy = policy_class(config)
     config.device = device
     if recipe.family == "smolvla" and recipe.dtype == "bfloat16":
-        # as the published one: LeRobot began with the language model's weights in bfloat16, and the rest is float32
+        # as published: the language model's weights, with which LeRobot began, are bfloat16, and the rest is float32
         policy.model.vlm_with_expert.vlm.to(require("torch").bfloat16)
         config.load_vlm_weights = True
     return policy, config
@@ -102,7 +102,7 @@ def features(cameras: Sequence[str], side: int, state: int = JOINTS) -> dict[str
 def make_statistics(
     state: int = JOINTS, actions: int = JOINTS, cameras: Sequence[str] = ()
 ) -> dict[str, dict[str, np.ndarray]]:
-    """Return the statistics of a dataset that never was; none of them is the identity, and cameras share theirs."""
+    """Return statistics of an invented dataset; none is the identity, and all cameras share theirs."""
     rng = np.random.default_rng(0)
 
     def of(*shape: int) -> dict[str, np.ndarray]:
@@ -124,7 +124,7 @@ def write_processors(folder: Path, config: Any) -> None:
 
 @contextlib.contextmanager
 def local_tokenizer(kind: str, folder: Path) -> Iterator[None]:
-    """Let π0's and π0.5's pipelines name a tokenizer in `folder`; LeRobot names one that would be downloaded."""
+    """Make π0's and π0.5's pipelines name a tokenizer in `folder` instead of LeRobot's, which is a download."""
     if not folder.is_dir():
         yield
         return

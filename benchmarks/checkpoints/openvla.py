@@ -1,4 +1,4 @@
-"""Random checkpoints of OpenVLA, by the model's own code out of a clone of its repository."""
+"""Random checkpoints of OpenVLA, by the model's own code in a clone of its repository."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class PrismaticSize:
 
     text: dict[str, Any]  # of the language model's config
     backbones: tuple[str, str]  # models of timm
-    side: int = _SIDE  # px, of what they see
+    side: int = _SIDE  # px, of their images
 
 
 SMALL = PrismaticSize(
@@ -74,7 +74,7 @@ def make_config(config_class: Any, size: PrismaticSize | None = None, **settings
     text: dict[str, Any] = {"vocab_size": VOCABULARY, "pad_token_id": _PADDING}
     if size is not None:
         text |= size.text
-        # in the JSON these go before what the id of the backbones stands for
+        # in the JSON these override the defaults of the backbones' id
         settings |= {"timm_model_ids": list(size.backbones), "image_sizes": [size.side, size.side]}
     return config_class(
         vision_backbone_id="dinosiglip-vit-so-224px",
@@ -89,7 +89,7 @@ def make_config(config_class: Any, size: PrismaticSize | None = None, **settings
 
 
 def answer_with_actions(head: Any) -> None:
-    """Let a language model's head, (V, D), answer with action tokens, as that of a trained model does."""
+    """Make a language model's head, (V, D), answer with action tokens, like that of a trained model."""
     last = VOCABULARY - _MULTIPLE
     head[: last - BINS] = 0
     head[last:] = 0
@@ -117,7 +117,7 @@ def make_tokenizer() -> Any:
 
 
 def make_statistics(datasets: Sequence[str]) -> dict[str, Any]:
-    """Return ranges of actions and proprioception of datasets that never were."""
+    """Return ranges of actions and proprioception of invented datasets."""
     found = {}
     for name in datasets:
         rng = np.random.default_rng(len(name))

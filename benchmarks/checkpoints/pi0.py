@@ -56,7 +56,7 @@ def make_model(recipe: Recipe) -> tuple[Any, Any]:
 
 
 def transformers_class(name: str) -> Any:
-    """Return a class of transformers; torchvision, which it imports, is made to fit torch first."""
+    """Return a class of transformers, after making torchvision, which it imports, fit torch."""
     ensure_torchvision()
     return getattr(require("transformers"), name)
 
@@ -95,7 +95,7 @@ def make_processor(
 
 
 def make_statistics() -> dict[str, list[float]]:
-    """Return means and standard deviations of a dataset that never was."""
+    """Return means and standard deviations of an invented dataset."""
     rng = np.random.default_rng(1)
     return {
         "state_mean": rng.normal(0, 0.3, STATE_DIM).tolist(),

@@ -1,4 +1,4 @@
-"""What a recipe is asked for, and what it wrote."""
+"""The checkpoint to write, and the written one."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class Recipe:
     """A checkpoint to be written."""
 
     family: str
-    folder: Path  # absolute, and there
+    folder: Path  # absolute; it exists
     size: SizeName
     dtype: str  # of the weights
 

@@ -1,4 +1,4 @@
-"""The families whose checkpoints can be made, and the deployment file of one."""
+"""The families with random checkpoints, and the deployment file of a checkpoint."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def write_checkpoint(family: str, folder: Path, size: SizeName = "full", dtype: 
         dtype: Of the weights; None: the family's usual one.
 
     Returns:
-        What was written.
+        The written checkpoint.
 
     Raises:
         ConfigError: The family, the type of the weights or the size is unknown, or the folder is not empty.
@@ -77,7 +77,7 @@ def write_checkpoint(family: str, folder: Path, size: SizeName = "full", dtype: 
         written: WrittenCheckpoint = module.write(Recipe(family, folder, size, dtype))
         _write_deployment(folder / DEPLOYMENT, family, written)
     except BaseException:
-        shutil.rmtree(folder)  # half a checkpoint looks like a whole one
+        shutil.rmtree(folder)  # a partial checkpoint cannot be told from a complete one
         raise
     return written
 

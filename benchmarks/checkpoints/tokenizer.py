@@ -1,4 +1,4 @@
-"""A byte-level tokenizer, trained on the spot: the true ones are downloads."""
+"""A byte-level tokenizer, trained here, since the published ones are downloads."""
 
 from __future__ import annotations
 

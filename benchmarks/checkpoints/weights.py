@@ -1,7 +1,7 @@
 """Random weights in safetensors files, written one tensor at a time.
 
-A model on the device meta has names, shapes and types, and no values. Each tensor gets its values when it is written:
-memory holds the largest tensor, not the model.
+A model on the device meta has names, shapes and types, but no values. Each tensor gets its values when it is written,
+so that memory holds one tensor, not the model.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _SPREAD = 0.1  # of scales around 1, and of biases around 0
 
 @contextmanager
 def parameters_on_meta() -> Iterator[None]:
-    """Let modules that are made within hold parameters without values; buffers have theirs, as no checkpoint may."""
+    """Create parameters of modules made within without values; buffers keep theirs, which a checkpoint may lack."""
     module_class = require("torch").nn.Module
     parameter_class = require("torch").nn.Parameter
     register = module_class.register_parameter
@@ -54,7 +54,7 @@ def write_weights(
         model: The model. A tensor on the device meta gets random values; any other one keeps its own.
         folder: Gets model.safetensors, or, of a larger model, several shards and their index.
         shard_bytes: The size of a shard, at most, unless a single tensor is larger; None: everything is in one file.
-        changes: By the name of a tensor, what is done to its values before they are written.
+        changes: Functions by the name of a tensor that change its values before they are written.
 
     Returns:
         The number of parameters; one that has several names counts once, and is written under its first name.
@@ -86,7 +86,7 @@ def write_weights(
 
 
 def fill(tensor: Any, name: str, generator: Any) -> None:
-    """Fill a tensor with random values with which activations keep their size: 1 / sqrt(inputs) for a matrix."""
+    """Fill a tensor with random values that preserve the scale of activations: 1 / sqrt(inputs) for a matrix."""
     if not tensor.is_floating_point():
         tensor.zero_()
         return

@@ -1,10 +1,10 @@
-"""Other policy servers, each in processes of its own and with a Python of its own.
+"""Other policy servers, in their own processes and Python environment.
 
 A `<name>_peer.py` is a script, run by its path with the peers' Python: it imports the peer's packages, numpy, the
 standard library and `peer.py` beside it, never `vlagents_ray`. `serve HOST PORT` is the peer's server with a policy
-that does nothing; `drive HOST PORT OBS.npz MODE` is its own client, which obeys the line protocol of `peer.py`.
-`evaluate HOST PORT PLAN`, where the peer evaluates, is a whole evaluation of its own: there alone, when an environment
-is made, the script imports the environment that all are measured with (`benchmarks/environments.py`).
+that does nothing; `drive HOST PORT OBS.npz MODE` is its own client, with the line protocol of `peer.py`. `evaluate HOST
+PORT PLAN` is a whole evaluation, if the peer has one: only there the script imports the environment that all systems
+play (`benchmarks/environments.py`).
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class PeerClient:
     """A peer's own client to its own server."""
 
     name: str
-    peer: str  # as users name it, and the distribution that must be installed
+    peer: str  # its name for users, and the distribution that must be installed
     script: str
     mode: str
     distributions: tuple[str, ...]
@@ -60,7 +60,7 @@ PEERS = tuple(dict.fromkeys(one.peer for one in PEER_CLIENTS))
 
 
 def peer_clients(names: Sequence[str], python: Path) -> tuple[list[PeerClient], dict[str, str], dict[str, str]]:
-    """Return the clients of the peers in `names` ("all" is all), why others are skipped, and installed versions."""
+    """Return the clients of the peers in `names` (or "all"), the reasons for skipped ones, and installed versions."""
     wanted = PEERS if "all" in names else tuple(names)
     if unknown := set(wanted) - set(PEERS):
         raise ConfigError(f"peers: got {sorted(unknown)}, want some of {list(PEERS)}, or 'all'")
@@ -81,7 +81,7 @@ def peer_clients(names: Sequence[str], python: Path) -> tuple[list[PeerClient], 
 
 
 def installed(python: Path, distributions: Sequence[str]) -> dict[str, str]:
-    """Return the versions of those distributions that this Python has."""
+    """Return the versions of the distributions that `python` has."""
     code = (
         "import importlib.metadata as m, json, sys\nfound = {}\nfor name in sys.argv[1:]:\n"
         "    try: found[name] = m.version(name)\n    except m.PackageNotFoundError: pass\nprint(json.dumps(found))"
@@ -99,7 +99,7 @@ def installed(python: Path, distributions: Sequence[str]) -> dict[str, str]:
 def peer_connected(
     client: PeerClient, python: Path, obs: Path, *, host: str = LOOPBACK, prefix: Sequence[str] = ()
 ) -> Iterator[Driver]:
-    """Start a peer's server on `host`, and its client (its command begins with `prefix`), until the context ends."""
+    """Run a peer's server on `host`, and its client, whose command begins with `prefix`, within a context."""
     command, address = [str(python), str(SCRIPTS / client.script)], (host, str(free_port(host)))
     alone = {"PYTHONPATH": ""}  # nothing of ours in the peer's environment
     with (
@@ -112,15 +112,15 @@ def peer_connected(
 def starters(
     clients: Sequence[PeerClient], python: Path, *, host: str = LOOPBACK, prefix: Sequence[str] = ()
 ) -> dict[str, StartClient]:
-    """Return what starts each client, by its name, as `measure` takes it."""
+    """Return the starter of each client by its name, for `measure`."""
     return {one.name: partial(peer_connected, one, python, host=host, prefix=prefix) for one in clients}
 
 
 def set_up(folder: Path, progress: Callable[[str], None] = lambda _: None) -> Path:
-    """Make the environment, or bring it to the pinned versions; returns its Python.
+    """Make the environment, or update it to the pinned versions; returns its Python.
 
-    The peers need packages that ours conflict with, so nothing of ours is in it. Raises `ConfigError` with the
-    end of uv's output if that fails.
+    It has no package of ours, since the peers' packages conflict with them. Raises `ConfigError` with the end of uv's
+    output if that fails.
     """
     from vlagents_ray.serve.python_env.create import create, install
 

@@ -1,4 +1,4 @@
-"""Install other policy servers, at pinned versions, in a Python environment of their own."""
+"""Install other policy servers, at pinned versions, in a separate Python environment."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from vlagents_ray.cli.console import errors, out, progress
 
 
 def main(folder: Annotated[Path, typer.Option("--dir", help="Folder of the environment.")] = FOLDER) -> None:
-    """Install other policy servers, at pinned versions, in a Python environment of their own."""
+    """Install other policy servers, at pinned versions, in a separate Python environment."""
     with errors():
         python = set_up(folder, progress)
     used = "" if folder == FOLDER else f" --peers-python {python}"

@@ -1,8 +1,8 @@
 """openpi: its client from PyPI (`openpi-client`), images as raw bytes.
 
-Its server is not on PyPI. This one does what openpi's `WebsocketPolicyServer` does: the asyncio server of
-`websockets` without compression or size limit, the metadata first, then msgpack in and out by openpi's own
-`msgpack_numpy`, inference on the event loop, and both timings in the reply.
+Its server is not on PyPI. This one equals openpi's `WebsocketPolicyServer`: the asyncio server of `websockets` without
+compression or size limit, the metadata first, then msgpack in and out by openpi's own `msgpack_numpy`, inference on the
+event loop, and both timings in the reply.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from openpi_client.websocket_client_policy import WebsocketClientPolicy
 
 
 def infer(_obs: dict[str, Any]) -> dict[str, Any]:
-    """A policy that does nothing: a chunk of one action."""
+    """Return a chunk of one action, as a policy that does nothing."""
     return {"actions": np.zeros((1, 7), np.float32), "policy_timing": {"infer_ms": 0.0}}
 
 
 async def handler(websocket: websockets.asyncio.server.ServerConnection) -> None:
-    """One connection."""
+    """Serve one connection."""
     packer = msgpack_numpy.Packer()
     await websocket.send(packer.pack({}))
     previous = None
@@ -46,7 +46,7 @@ async def handler(websocket: websockets.asyncio.server.ServerConnection) -> None
 
 
 def serve(host: str, port: int) -> None:
-    """Until the end of the process."""
+    """Run the server until the process ends."""
 
     async def forever() -> None:
         async with websockets.asyncio.server.serve(handler, host, port, compression=None, max_size=None) as server:
@@ -56,7 +56,7 @@ def serve(host: str, port: int) -> None:
 
 
 def drive(host: str, port: int, path: str, _mode: str, out: TextIO) -> None:
-    """Its own client."""
+    """Drive the server with openpi's own client."""
     arrays = peer.observation(path)
     obs = {
         "observation/image": arrays["camera_0"],

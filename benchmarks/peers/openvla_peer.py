@@ -1,9 +1,9 @@
 """OpenVLA's REST server: FastAPI and uvicorn, `POST /act`, arrays as `json_numpy` writes them.
 
-OpenVLA is not on PyPI. This is the server of its `vla-scripts/deploy.py` around a policy that does nothing, and
-the client of its documentation: `requests.post(url, json=...).json()` with `json_numpy` patched in, a
-connection for each call. OpenVLA's own request holds one image; here it holds the bench's two, and the
-joints, as the fine-tuned forks post them, so that every server carries the same observation.
+OpenVLA is not on PyPI. This is the server of its `vla-scripts/deploy.py` around a policy that does nothing, and the
+client of its documentation: `requests.post(url, json=...).json()` with `json_numpy` patched in, a connection for each
+call. OpenVLA's own request has one image; here it has the benchmark's two, and the joints, as in the fine-tuned forks,
+so that every server gets the same observation.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from fastapi.responses import JSONResponse  # noqa: E402
 
 
 def predict_action(payload: dict[str, Any]) -> JSONResponse:
-    """`POST /act`: FastAPI runs it in its thread pool, as it does OpenVLA's."""
+    """Answer `POST /act`; FastAPI runs it in its thread pool, like OpenVLA's."""
     double_encoded = "encoded" in payload
     if double_encoded:
         payload = json.loads(payload["encoded"])
@@ -37,14 +37,14 @@ def predict_action(payload: dict[str, Any]) -> JSONResponse:
 
 
 def serve(host: str, port: int) -> None:
-    """Until the end of the process."""
+    """Run the server until the process ends."""
     app = FastAPI()
     app.post("/act", response_model=None)(predict_action)
     uvicorn.run(app, host=host, port=port)
 
 
 def drive(host: str, port: int, path: str, _mode: str, out: TextIO) -> None:
-    """The client of its documentation."""
+    """Drive the server with the client of OpenVLA's documentation."""
     arrays = peer.observation(path)
     obs = {
         "image": arrays["camera_0"],

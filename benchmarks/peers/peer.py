@@ -1,6 +1,6 @@
-"""What every script here needs: the line protocol, and that it ends with the benchmark.
+"""Common parts of the scripts: the line protocol, and the end of a process with the benchmark.
 
-Standard library and numpy only, as it runs in other environments.
+It imports only the standard library and numpy, as it runs in other environments.
 """
 
 from __future__ import annotations
@@ -52,14 +52,14 @@ def observation(path: str) -> dict[str, np.ndarray]:
 
 
 def _stdin_has_ended() -> bool:
-    """Return whether the parent of this process has ended, maybe before `die_with_parent` was called."""
+    """Return whether the parent of this process has ended, possibly before `die_with_parent` was called."""
     poller = select.poll()
     poller.register(0, select.POLLIN)
     return any(events & select.POLLHUP for _, events in poller.poll(0))
 
 
 def wait_for_port(host: str, port: int) -> None:
-    """Wait until a server listens there; `TimeoutError` after a minute. Ends this process if its input ends."""
+    """Wait until a server listens; `TimeoutError` after a minute. Ends this process if its input ends."""
     deadline = time.monotonic() + _START_S
     while True:
         try:
@@ -81,7 +81,7 @@ def run(
 ) -> None:
     """Run the command of a script: `serve HOST PORT`, `drive HOST PORT OBS.npz MODE`, `evaluate HOST PORT PLAN`.
 
-    PLAN is JSON; `evaluate` writes a line when all its episodes are played and everything that it started has ended.
+    PLAN is JSON; `evaluate` writes a line when all its episodes are played and all its processes have ended.
     """
     die_with_parent()
     out = own_stdout()

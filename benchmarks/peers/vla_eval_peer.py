@@ -1,10 +1,10 @@
 """vla-eval: its model server around a policy that does nothing, and its `Connection`.
 
-Images take its default codec, PNG, unless `mode` names another ("jpeg", "raw").
+Images are sent by its default codec, PNG, unless `mode` names another ("jpeg", "raw").
 
 An evaluation is one model server and a `vla-eval run --no-docker` for each shard, all on one recording, and then
-`vla-eval export`, as its script for sharded runs does. Videos are off, its default; images go raw, as compressing
-them for a server on the same machine would only cost time. `run ...` and `export ...` are its commands of those names.
+`vla-eval export`, as in its script for sharded runs. Videos are off, its default; images are raw, since compression for
+a server on the same machine only costs time. `run ...` and `export ...` are its commands of those names.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class VlaEvalNoop(PredictModelServer):
 
 
 class VlaEvalTabletop(StepBenchmark):
-    """The environment that all are measured with; each shard imports it by name."""
+    """The environment that all systems play; each shard imports it by name."""
 
     def __init__(self, seed: int, env: dict[str, Any]) -> None:
         from benchmarks.environments import TimedTabletop
@@ -64,12 +64,12 @@ class VlaEvalTabletop(StepBenchmark):
 
 
 def serve(host: str, port: int) -> None:
-    """As its `run_server` does."""
+    """Run the server as vla-eval's `run_server` does."""
     serve_forever(VlaEvalNoop(), host, port)
 
 
 def drive(host: str, port: int, path: str, mode: str, out: TextIO) -> None:
-    """Its own client, on an event loop of its own."""
+    """Drive the server with vla-eval's own client, on a new event loop."""
     if mode != "png":
         set_image_format(mode)
     arrays = peer.observation(path)

@@ -1,12 +1,12 @@
 """vlagents, the paper's own system: its server, and its `RemoteAgent` with mode "shm" or "jpeg".
 
-The policy derives from its `Agent` and calls `super().act`, which decodes the cameras, as its documentation asks.
-JPEG is what its client sends: simplejpeg's defaults, quality 85 and 4:4:4. The server is what `vlagents
-start-server` starts. Its client changes the observation that it is given, so each call gets a new one.
+The policy derives from its `Agent` and calls `super().act`, which decodes the cameras, as its documentation requires.
+Its client sends JPEG with simplejpeg's defaults, quality 85 and 4:4:4. The server is that of `vlagents start-server`.
+Its client changes the observation, so each call gets a new one.
 
-An evaluation is its `run-eval` with `same_machine`, images as they are, and no videos. It plays each configuration in
-a process of its own, with a server of its own, so several processes are several configurations of one environment,
-whose seeds follow each other. `start-server ...` is its command of that name, with this file's agent registered.
+An evaluation is its `run-eval` with `same_machine`, raw images, and no videos. Each configuration has its own process
+and server, so several processes are several configurations of one environment, with consecutive seeds. `start-server
+...` is its command of that name, with this file's agent registered.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ ENV = "bench_tabletop"
 
 
 class VlagentsNoop(Agent):
-    """Decodes the observation and returns seven zeros. `run-eval` names a device, whatever the policy."""
+    """Decodes the observation and returns seven zeros. `run-eval` passes a device to every policy."""
 
     def __init__(self, device: str | None = None, checkpoint_step: int | None = None) -> None:
         super().__init__(default_checkpoint_path="", checkpoint_step=checkpoint_step)
@@ -42,7 +42,7 @@ class VlagentsNoop(Agent):
 
 
 class VlagentsTabletop(EvalEnv):
-    """The environment that all are measured with."""
+    """The environment that all systems play."""
 
     def do_import(self) -> None:
         from benchmarks.environments import TimedTabletop
@@ -54,7 +54,7 @@ class VlagentsTabletop(EvalEnv):
         return self._make(**self.env_kwargs)
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
-        if seed is None:  # after each episode, for nobody to look at: it costs nothing here
+        if seed is None:  # after each episode; its observation is not used, so it costs nothing here
             return self._last, {}
         obs, info = self.env.reset(seed=seed)
         return self._translated(obs), info
@@ -72,7 +72,7 @@ class VlagentsTabletop(EvalEnv):
             cameras=dict(obs.cameras),
             gripper=obs.gripper,
             xyzrpy=obs.state["xyzrpy"],
-            info={"high_res_cameras": {}},  # of which it makes the videos; without, of every camera
+            info={"high_res_cameras": {}},  # the cameras for videos; without the key, all cameras
         )
         self._last = Obs(obs={"robot": robot}, language_instruction=self.env.instruction)
         return self._last
@@ -83,7 +83,7 @@ register_env(ENV, VlagentsTabletop)
 
 
 def serve(host: str, port: int) -> None:
-    """As `vlagents start-server` does."""
+    """Run the server as `vlagents start-server` does."""
     service = AgentService(VlagentsNoop(), NAME)
     with service:
         rpyc.ThreadedServer(
@@ -108,9 +108,9 @@ def drive(host: str, port: int, path: str, mode: str, out: TextIO) -> None:
 
 
 def evaluate(host: str, port: int, plan: dict[str, Any]) -> None:
-    """Its `run-eval`; processes other than the first take the ports that follow."""
+    """Run vlagents' `run-eval`; processes other than the first use the next ports."""
     folder = Path(plan["folder"])
-    server = folder / "python"  # `run-eval` starts PYTHON -m vlagents start-server ..., which knows no agent of ours
+    server = folder / "python"  # `run-eval` starts PYTHON -m vlagents start-server ..., which has no agent of ours
     server.write_text(f"#!/bin/sh\nshift 2\nexec '{sys.executable}' '{__file__}' \"$@\"\n")
     server.chmod(0o755)
     each = plan["episodes"] // plan["workers"]

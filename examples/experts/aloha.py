@@ -16,7 +16,7 @@ _SHOULDER = 0.12705  # height of the shoulder's axis over the table, m
 _UPPER = np.array([0.05955, 0.3])  # from the shoulder to the elbow with all joints at 0: forward, up, m
 _FOREARM = 0.3  # from the elbow to the wrist's axis, m
 _HAND = 0.2  # from the wrist's axis to between the fingers' pads, m
-_BASES = {"left": (-0.469, 0.5, 1.0), "right": (0.469, 0.5, -1.0)}  # x, y, m, and the direction that the arm looks in
+_BASES = {"left": (-0.469, 0.5, 1.0), "right": (0.469, 0.5, -1.0)}  # x, y, m, and the direction that the arm faces
 _OPEN, _CLOSED = 1.0, 0.0
 _TILT = math.radians(60)  # of a hand that grasps from above, so that it does not hit the other one
 _OBJECTS = {"transfer_cube": 7, "insertion": 14}  # numbers of `info["sim_state"]`
@@ -24,7 +24,7 @@ _OBJECTS = {"transfer_cube": 7, "insertion": 14}  # numbers of `info["sim_state"
 
 @dataclass(frozen=True, slots=True)
 class HandPose:
-    """Where the fingers' pads shall be, and how the hand is held."""
+    """Target of the fingers' pads, and orientation of the hand."""
 
     xyz: tuple[float, float, float]  # m, in the world's frame
     pitch: float  # of the hand below the horizontal, rad
@@ -33,7 +33,7 @@ class HandPose:
 
 
 def joints(arm: str, pose: HandPose) -> list[float]:
-    """Return the joint angles of an arm and its gripper's position, 7 numbers; out of reach, the nearest ones."""
+    """Return the joint angles of an arm and its gripper's position, 7 numbers; the nearest ones if out of reach."""
     base_x, base_y, facing = _BASES[arm]
     x, y = facing * (pose.xyz[0] - base_x), facing * (pose.xyz[1] - base_y)
     out = math.hypot(x, y) - _HAND * math.cos(pose.pitch)
@@ -77,7 +77,7 @@ class AlohaExpert:
 
 
 def _transfer(objects: np.ndarray) -> dict[str, Waypoints]:
-    """The right hand lifts the cube to the middle, where the left hand, turned by 90 degrees, takes it."""
+    """Let the right hand lift the cube to the middle, and the left hand, turned by 90 degrees, take it."""
     x, y = objects[:2]
     middle, side = (0.0, 0.5, 0.25), math.pi / 2
     return {
@@ -91,7 +91,7 @@ def _transfer(objects: np.ndarray) -> dict[str, Waypoints]:
 
 
 def _insertion(objects: np.ndarray) -> dict[str, Waypoints]:
-    """Both hands lift, the right one the peg, the left one the socket, and move towards each other."""
+    """Lift the peg with the right hand and the socket with the left one, and move them together."""
     peg, socket = objects[:2], objects[7:9]
     held = {"right": (peg, 1.0, 0.22), "left": (socket, -1.0, 0.2)}  # the peg is grasped 2 cm lower than the socket
     return {
@@ -105,7 +105,7 @@ def _insertion(objects: np.ndarray) -> dict[str, Waypoints]:
 
 
 def _grasp(x: float, y: float, later: int) -> Waypoints:
-    """Above the object, down to it, and the fingers closed."""
+    """Return waypoints above the object, at it, and with closed fingers."""
     return [
         (70 + later, HandPose((x, y, 0.12), _TILT)),
         (110 + later, HandPose((x, y, 0.02), _TILT)),

@@ -1,7 +1,7 @@
 """Experts for robosuite's OSC_POSE, which pick an object from above: for LIBERO's and robosuite's tasks.
 
-They know where the objects are from the simulator's state. An action is (7,) for one arm: 0.05 m and 0.5 rad a unit,
-gripper -1 open, 1 closed.
+They read the positions of the objects from the simulator's state. An action is (7,) for one arm: 0.05 m and 0.5 rad a
+unit, gripper -1 open, 1 closed.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class PickPhase:
 
 
 class PickExpert(ABC):
-    """Moves the hand to one pose after another, each of which is aimed at when its phase begins."""
+    """Moves the hand through a sequence of poses, each of which is computed when its phase begins."""
 
     per_m: ClassVar[float] = 10.0
     """Units of the action for a metre of the remaining distance; 20 command all of it."""
@@ -107,7 +107,7 @@ class LiberoExpert(PickExpert):
     """Grasps the object of the goal from above, and places it at the goal's target, in two of LIBERO's suites.
 
     The hand keeps its initial orientation. Bowls in or on the cabinet (libero_spatial/4 and /9) are then out of reach:
-    it acts there, and fails.
+    there it acts, but fails.
     """
 
     def __init__(self, env_name: str) -> None:
@@ -168,7 +168,7 @@ class Handling:
     name: str  # robosuite's
     handle_m: float = 0.0  # from the object's origin to the grasp, along its own x axis
     aligned: bool = False  # the fingers close across that axis, and the object is turned by its nearest right angle
-    lift_m: float = 0.12  # so that it passes over what stands between
+    lift_m: float = 0.12  # to pass over other objects
     release_m: float | None = None  # height of its origin above the place when the hand opens; None: only lifted
 
 
@@ -192,7 +192,7 @@ _PLACE = (
 
 
 class RobosuiteExpert(PickExpert):
-    """Grasps the task's object from above, lifts it and, unless that is all, brings it to its place."""
+    """Grasps the task's object from above, lifts it and, if the task has one, moves it to its place."""
 
     per_m = 20.0
 
@@ -236,7 +236,7 @@ class RobosuiteExpert(PickExpert):
                 self._turn(right)
 
     def _turn(self, yaw: float) -> None:
-        """Hold the hand so that its fingers close across the direction `yaw`, rad, of two ways by the shorter."""
+        """Turn the hand, by the smaller of two angles, so that its fingers close across the direction `yaw`, rad."""
         near = (yaw + math.pi / 2) % math.pi - math.pi / 2
         if self._first is not None:
             self._turned = _matrix(np.array([0.0, 0.0, near])) @ self._first

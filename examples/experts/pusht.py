@@ -1,4 +1,4 @@
-"""An expert for PushT: tries pushes from all sides of the block in a simulator of its own, and plays the best."""
+"""An expert for PushT: tries pushes from all sides of the block in its own simulator, and plays the best."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ _FIELD_PX = 512.0
 _CLEAR_PX = 6.0  # between agent and block on the way around it
 _APART_PX = 30.0  # between two places from which pushes are tried
 _WALK_PX = 50.0  # each step of the way around the block
-_PUSHES_PX = (16.0, 6.0, 2.0)  # each step of a push: far first, then ever more exactly
+_PUSHES_PX = (16.0, 6.0, 2.0)  # steps of a push, from coarse to fine
 _PUSH_STEPS = 12
-_STEP_COSTS_PX = 0.15  # what each further step has to reduce the error by
-_WORSE_PX = 5.0  # a push is tried no further once its error is this much above its lowest one
-_ASTRAY_PX = 2.0  # how far corners of the block may be from where they were expected before there is a new plan
+_STEP_COSTS_PX = 0.15  # least reduction of the error by a further step
+_WORSE_PX = 5.0  # a trial ends once its error is this much above its lowest one
+_ASTRAY_PX = 2.0  # largest error of the predicted corners of the block before a new plan
 # The agent follows its target as a critically damped spring of 10 rad/s. In a step, 0.1 s, it covers this share of the
 # distance, and its velocity carries it on for this long.
 _COVERED = 1 - 2 / math.e
@@ -36,9 +36,9 @@ class _Step(NamedTuple):
 
 
 class PushTExpert:
-    """Needs `info["sim_state"]`, as `vlagents_ray.envs.gymnasium` gives it; actions are (2,) in [0, 512] px.
+    """Solves PushT by `info["sim_state"]` of `vlagents_ray.envs.gymnasium`; actions are (2,) in [0, 512] px.
 
-    A push goes straight towards the block, from one of some places around it, at one of three speeds. The expert
+    A push moves straight towards the block, from one of several places around it, at one of three speeds. The expert
     chooses the push, and the step at which it ends, that brings the block's corners nearest to the target's.
     """
 
@@ -61,7 +61,7 @@ class PushTExpert:
         self._plan.clear()
 
     def act(self, obs: Obs) -> Act:
-        """Compute the next action, (2,) float32; it takes longer where a push has ended and another one is chosen."""
+        """Compute the next action, (2,) float32; the choice of a new push takes longer."""
         state = sim_vector(obs, _SIZE, self._name)
         if not self._plan or self._error(state, self._placed(self._expected[4:])) > _ASTRAY_PX:
             self._plan = deque(self._best_push(state))
@@ -120,9 +120,9 @@ class PushTExpert:
         return np.asarray(self._shapely.get_coordinates(places))
 
     def _play(self, state: np.ndarray, places: np.ndarray) -> Iterator[_Step]:
-        """Simulate steps after each of which the agent shall be at one of `places`, (N, 2) px."""
+        """Simulate steps that move the agent to each of `places`, (N, 2) px, in turn."""
         sim = self._sim
-        sim._setup()  # a new space: one that has been used remembers its contacts
+        sim._setup()  # a new space, since a used one keeps its contacts
         sim.agent.position, sim.agent.velocity = tuple(state[:2]), tuple(state[2:4])
         sim.block.angle = state[6]  # before the position, as it turns the block about its centre of gravity
         sim.block.position = tuple(state[4:6])

@@ -38,7 +38,7 @@ _STAGES = (
 
 
 class SimplerExpert:
-    """Needs `info["sim_state"]`, as `vlagents_ray.envs.simpler` gives it."""
+    """Solves the four tasks by `info["sim_state"]` of `vlagents_ray.envs.simpler`."""
 
     def __init__(self, env_name: str) -> None:
         self._name = env_name

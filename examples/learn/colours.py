@@ -1,4 +1,4 @@
-"""What the student sees: where on the table each colour is, and which colour the instruction names."""
+"""The student's perception: the places of each colour on the table, and the colour in the instruction."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _PIXELS = 20.0  # unit of the first column
 
 
 def places(image: np.ndarray) -> np.ndarray:
-    """Return where the pixels of each colour are.
+    """Locate the pixels of each colour.
 
     Args:
         image: The camera's image, (H, W, 3) uint8.
@@ -53,12 +53,12 @@ def places(image: np.ndarray) -> np.ndarray:
 
 
 def puck_position(image: np.ndarray, colour: str) -> tuple[float, float] | None:
-    """Return where a puck stands, (x, y) m, from the middle of its pixels; None if fewer than three are seen."""
+    """Return the position of a puck, (x, y) m, from the middle of its pixels; None if fewer than three are visible."""
     middle = round(_ANGLES[colour] / 360 * _HUES)
     number, x, y = places(image)[[_HUES + (middle + step) % _HUES for step in (-1, 0, 1)]].T
     if number.sum() * _PIXELS < 3:
         return None
-    above = PUCK_HEIGHT / 2 / math.tan(ELEVATION)  # m, by which the puck's middle seems to be further away
+    above = PUCK_HEIGHT / 2 / math.tan(ELEVATION)  # m, apparent additional distance of the puck's middle
     return float(number @ x / number.sum()) / 10, float(number @ y / number.sum()) / 10 - above
 
 
@@ -66,7 +66,7 @@ def named_colour(instruction: str | None) -> str:
     """Return the colour of the puck that an instruction names.
 
     Raises:
-        InvalidObservation: It names none.
+        InvalidObservation: The instruction names no colour.
     """
     found = re.search(r"the (\w+) puck", instruction or "")
     if found is None or found[1] not in WORDS:

@@ -17,8 +17,8 @@ def group_advantages(columns: Mapping[str, np.ndarray]) -> np.ndarray:
     """Return the advantages of the actions by the groups of episodes from one start state, (T,) float32.
 
     An episode's reward is 1 if the task was solved at any step. Each of its actions has the advantage (reward - mean of
-    the group) / (standard deviation of the group + 1e-6) (GRPO, arXiv 2402.03300), those after the task was solved have
-    none. Nor have those of groups whose episodes were all solved, or none of them (DAPO, arXiv 2503.14476).
+    the group) / (standard deviation of the group + 1e-6) (GRPO, arXiv 2402.03300). It is 0 after the task was solved,
+    and in groups with all or no episodes solved (DAPO, arXiv 2503.14476).
     """
     starts, lengths = episodes(columns)
     solved = np.logical_or.reduceat(columns["success"], starts).astype(np.float64)
@@ -36,7 +36,7 @@ class GRPOLearner(NetworkLearner):
     want = ("logprob", "replay")
     batch = 512
     steps_at_once = 20
-    rate = 1e-4  # what few episodes say is mostly noise, which larger or more steps would learn
+    rate = 1e-4  # few episodes are mostly noise, which larger or more steps would learn
     network_class = TokenNetwork
 
     def improve(self, columns: Mapping[str, np.ndarray], steps: int) -> None:
@@ -44,7 +44,7 @@ class GRPOLearner(NetworkLearner):
 
         Args:
             columns: The transitions, with `logprob` and `replay.tokens`, of whole groups of episodes.
-            steps: The number of steps; none is taken if no group has both solved and other episodes.
+            steps: The number of steps; 0 are taken if no group has both solved and unsolved episodes.
         """
         gain = group_advantages(columns)
         kept = np.flatnonzero(gain)

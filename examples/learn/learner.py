@@ -45,9 +45,9 @@ def episodes(columns: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]
 
 
 def advice(teacher: RemoteAgent, columns: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Ask a served teacher what it would have done at each observation of whole episodes.
+    """Get a served teacher's action at each observation of whole episodes.
 
-    Each episode is a session of the teacher, and one message asks for the next step of all of them, so that its server
+    Each episode is a session of the teacher, and one message has the next step of all sessions, so that the server
     computes them in batches.
 
     Args:
@@ -78,9 +78,9 @@ def advice(teacher: RemoteAgent, columns: Mapping[str, np.ndarray]) -> np.ndarra
 
 
 def until_solved(columns: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return which transitions are before the task was solved, or solve it, (T,) bool: the others teach nothing."""
+    """Return which transitions come before the task was solved, or solve it, (T,) bool: only these are learned from."""
     (starts, lengths), success = episodes(columns), columns["success"]
-    before = np.cumsum(success) - success  # steps at which a task was solved, in the rows before each
+    before = np.cumsum(success) - success  # number of solved steps in the rows before each
     kept: np.ndarray = before == np.repeat(before[starts], lengths)
     return kept
 
@@ -88,8 +88,8 @@ def until_solved(columns: Mapping[str, np.ndarray]) -> np.ndarray:
 def advantages(columns: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Return the advantages of the actions, and the targets of the values, each (T,) float32.
 
-    The reward is 1 for the step that solves the task, which ends the episode here; both are 0 after it. Otherwise the
-    step limit ends it, so that the value of what would follow is that of the last observation.
+    The reward is 1 for the step that solves the task, which ends the episode here; both are 0 after it. An episode that
+    the step limit ends is continued by the value of its last observation.
     """
     value, success, kept = columns["value"], columns["success"], until_solved(columns)
     gain = np.zeros(len(value), np.float32)
@@ -104,7 +104,7 @@ def advantages(columns: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarra
 
 
 class NetworkLearner(ABC):
-    """Trains a network of a student: by behaviour cloning, and as its subclass improves the student's own episodes."""
+    """Trains a student's network by behaviour cloning, and by its subclass's algorithm on the student's episodes."""
 
     want: tuple[str, ...]
     """What the student states for `improve`, beside its actions."""
@@ -126,14 +126,14 @@ class NetworkLearner(ABC):
         others = [one for name, one in self.network.named_parameters() if not name.startswith("look.")]
         self._optimizer = torch.optim.Adam([{"params": look, "lr": _LOOK_RATE}, {"params": others, "lr": _RATE}])
         self._seen = np.empty((0, INPUTS), np.float32)
-        self._advised = np.empty((0, ACTION), np.float32)  # what the teacher would have done at each
+        self._advised = np.empty((0, ACTION), np.float32)  # the teacher's action at each
 
     def state(self) -> dict[str, Any]:
         """Return the weights, for a `Publisher`."""
         return dict(self.network.state_dict())
 
     def checkpoint(self) -> dict[str, Any]:
-        """Return all that another learner needs to go on, for `restore`."""
+        """Return the state that `restore` needs to continue."""
         return {
             "steps": self.steps,
             "network": self.network.state_dict(),
@@ -143,18 +143,18 @@ class NetworkLearner(ABC):
         }
 
     def restore(self, checkpoint: Mapping[str, Any]) -> None:
-        """Go on where the learner that made the checkpoint was."""
+        """Continue from a checkpoint."""
         self.steps = checkpoint["steps"]
         self.network.load_state_dict(checkpoint["network"])
-        self._optimizer.load_state_dict(deepcopy(checkpoint["optimizer"]))  # which torch would share, and change
+        self._optimizer.load_state_dict(deepcopy(checkpoint["optimizer"]))  # torch would share and change it
         self._seen, self._advised = checkpoint["seen"].numpy(), checkpoint["advised"].numpy()
 
     def add_advice(self, seen: np.ndarray, actions: np.ndarray) -> None:
-        """Take what the teacher does, or would have done, as a part of all that is imitated.
+        """Add actions of the teacher to the data for imitation.
 
         Args:
             seen: Inputs of the network, (T, INPUTS).
-            actions: What is to be done at each, (T, 4).
+            actions: The teacher's actions, (T, 4).
         """
         self._seen = np.concatenate([self._seen, seen])
         self._advised = np.concatenate([self._advised, actions])
@@ -169,10 +169,10 @@ class NetworkLearner(ABC):
 
     @abstractmethod
     def improve(self, columns: Mapping[str, np.ndarray], steps: int) -> None:
-        """Take steps by the transitions of the student's own episodes.
+        """Take optimizer steps on the transitions of the student's own episodes.
 
         Args:
-            columns: The transitions, with what the learner wants.
+            columns: The transitions, with the values that the learner needs.
             steps: The number of steps.
         """
 
@@ -187,7 +187,7 @@ class NetworkLearner(ABC):
         return self._error(self._tensor(self._seen, rows), self._advised[rows])
 
     def _error(self, seen: Any, actions: np.ndarray) -> Any:
-        """Return the error of the network's actions: the mean squared one."""
+        """Return the mean squared error of the network's actions."""
         mean, _ = self.network(seen)
         return ((mean - torch.from_numpy(actions)) ** 2).mean()
 
@@ -196,7 +196,7 @@ class NetworkLearner(ABC):
         return torch.minimum(ratio * gain, ratio.clamp(1 - _CLIP, 1 + _CLIP) * gain).mean()
 
     def _generator(self) -> np.random.Generator:
-        """Return one that a learner which goes on from a checkpoint has as well."""
+        """Return a generator that is the same after a restore."""
         return np.random.default_rng([self._seed, self.steps])
 
     def _drawn(self, rng: np.random.Generator, number: int) -> np.ndarray:
@@ -242,7 +242,7 @@ class PPOLearner(NetworkLearner):
 class RPDLearner(PPOLearner):
     """Trains by refined policy distillation (arXiv 2503.05833): the distance to a teacher's advice is in PPO's loss."""
 
-    steps_at_once = NetworkLearner.steps_at_once  # the advice is no noise, and stays valid
+    steps_at_once = NetworkLearner.steps_at_once  # the advice has no noise, and stays valid
     rate = None
 
     def _advised_loss(self, loss: Any, rng: np.random.Generator) -> Any:

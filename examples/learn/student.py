@@ -27,7 +27,7 @@ _METRES = 5.0  # units of the robot's position per m
 
 
 def inputs(obs: Obs, colour: str) -> np.ndarray:
-    """Return what the network gets of an observation, (INPUTS,) float32.
+    """Return the network's input for an observation, (INPUTS,) float32.
 
     Args:
         obs: The observation, with the camera "front", the state "xyzrpy" and the gripper.
@@ -43,7 +43,7 @@ def inputs(obs: Obs, colour: str) -> np.ndarray:
 
 
 class LookingNetwork(nn.Module):
-    """Looks at places whose colours the word selects, and where the fingers are."""
+    """Attends to the places of the colours that the word selects, and to the fingers."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -54,7 +54,7 @@ class LookingNetwork(nn.Module):
             self.aim.bias.zero_()
 
     def features(self, inputs: torch.Tensor) -> torch.Tensor:
-        """Return what the heads of the network get, (B, FEATURES), from inputs (B, INPUTS)."""
+        """Return the inputs of the network's heads, (B, FEATURES), from inputs (B, INPUTS)."""
         seen, robot, word = inputs.split([3 * BINS, STATE, len(WORDS)], dim=-1)
         seen = seen.unflatten(-1, (BINS, 3))
         scores = 8 * self.look(word).unflatten(-1, (_LOOKS, BINS)) + torch.log(seen[:, None, :, 0] + 1e-4)
@@ -73,7 +73,7 @@ def head(out: int) -> nn.Module:
 
 
 class Network(LookingNetwork):
-    """Inputs (B, INPUTS) to means of actions (B, 4) and values (B,); `log_std` is (4,)."""
+    """Maps inputs (B, INPUTS) to means of actions (B, 4) and values (B,); `log_std` is (4,)."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -86,14 +86,14 @@ class Network(LookingNetwork):
 
 
 def seeded(make: Callable[[], nn.Module], seed: int) -> Any:
-    """Return a new network with random weights of this seed, and leave torch's own generator as it was."""
+    """Return a new network with random weights of this seed, without changing torch's generator."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         return make()
 
 
 class Student(Agent):
-    """Acts by the mean of a normal distribution, or draws from it if a log-probability is wanted."""
+    """Acts by the mean of a normal distribution, or draws from it if a log-probability is requested."""
 
     trainable = "network"
     shared = ("network",)
@@ -150,7 +150,7 @@ class Student(Agent):
         return mean
 
     def _draw(self, draws: np.random.Generator, *outputs: Any) -> tuple[np.ndarray, dict[str, Any]]:
-        """Return an action that is drawn from the distribution, and what a learner may want to know of it."""
+        """Return an action drawn from the distribution, and its values for a learner."""
         mean, value = outputs
         log_std = self.network.log_std.detach().numpy()
         drawn = draws.standard_normal(ACTION).astype(np.float32)

@@ -1,4 +1,4 @@
-"""The teacher: it lifts a puck by feedback from each observation, so that it can advise in states that others reach."""
+"""The teacher: it lifts a puck by feedback from each observation, so that it can advise in any state."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _OPEN, _CLOSED = 1.0, -1.0
 
 
 class Teacher(Agent):
-    """Descends to the puck in a funnel, closes the fingers, and lifts it, by where it sees the puck, or saw it last."""
+    """Descends to the last visible position of the puck in a funnel, closes the fingers, and lifts it."""
 
     def __init__(self) -> None:
         self._colour: str | None = None
@@ -57,7 +57,7 @@ class Teacher(Agent):
         dx, dy = self._puck[0] - x, self._puck[1] - y
         distance = math.hypot(dx, dy)
         fingers = _OPEN
-        if opening < _HELD[1]:  # closed: around the puck, or around nothing
+        if opening < _HELD[1]:  # closed, with or without the puck
             height, fingers = z + _STEP, _CLOSED if opening > _HELD[0] else _OPEN
         else:
             height = _GRASP_Z + min(max(_FUNNEL * (distance - _CENTRED), 0.0), _HIGHEST)

@@ -12,7 +12,7 @@ TOKENS = 11  # bins of each number of an action, whose middles are from -1 to 1
 
 
 def tokens_of(actions: np.ndarray) -> np.ndarray:
-    """Return the nearest token of each number of actions, int64; those beyond [-1, 1] have the outermost."""
+    """Return the nearest token of each number of actions, int64; the outermost for those beyond [-1, 1]."""
     found: np.ndarray = np.rint((np.clip(actions, -1.0, 1.0) + 1.0) / 2 * (TOKENS - 1)).astype(np.int64)
     return found
 
@@ -24,7 +24,7 @@ def actions_of(tokens: np.ndarray) -> np.ndarray:
 
 
 class TokenNetwork(LookingNetwork):
-    """Inputs (B, INPUTS) to log-probabilities of tokens (B, 4, TOKENS) and entropies (B,), nats."""
+    """Maps inputs (B, INPUTS) to log-probabilities of tokens (B, 4, TOKENS) and entropies (B,), nats."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -36,7 +36,7 @@ class TokenNetwork(LookingNetwork):
 
 
 class TokenStudent(Student):
-    """Acts by the likeliest tokens, or draws them at temperature 1 if something is wanted for a learner."""
+    """Acts by the likeliest tokens, or draws them at temperature 1 if a learner requests values."""
 
     behaviour = ("logprob", "entropy", "replay")
     network_class = TokenNetwork

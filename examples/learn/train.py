@@ -3,9 +3,9 @@
     python examples/learn/train.py
     python examples/learn/train.py examples/learn/rpd.yaml --seed 1 --out runs/rpd-1
 
-A teacher records demonstrations, and a student clones them (BC). The clone goes on with the teacher's advice (RPD), or
-alone (PPO, GRPO), and each of its versions is evaluated on the same seeds. docs/tutorials/learn.md goes through it. It
-needs torch and the extra 'learn'.
+A teacher records demonstrations, and a student clones them (BC). The clone continues with the teacher's advice (RPD),
+or alone (PPO, GRPO), and each version is evaluated on the same seeds. docs/tutorials/learn.md explains it. It needs
+torch and the extra 'learn'.
 """
 
 from __future__ import annotations
@@ -44,13 +44,13 @@ Method = Literal["bc", "rpd", "ppo", "grpo"]
 
 
 class LearnPlan(BaseModel):
-    """How much is learned, and where the results go. Each method but "bc" improves the clone that "bc" makes."""
+    """The amount of training, and the folder of results. Each method except "bc" improves the clone that "bc" makes."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     methods: list[Method] = Field(default=["bc", "rpd", "ppo"], min_length=1)
     out: Path = Path("runs/learn")
-    resume: bool = False  # go on where a run that was interrupted, or killed, had got to
+    resume: bool = False  # continue an interrupted or killed run
     seed: NonNegativeInt = 0  # of the networks, and of the training's episodes
     demonstrations: PositiveInt = 48  # episodes of the teacher
     clone_steps: PositiveInt = 2000  # of the optimizer
@@ -66,12 +66,12 @@ class LearnPlan(BaseModel):
 
 
 class MethodParts(NamedTuple):
-    """What a method trains, and how."""
+    """The student and the learner of a method."""
 
     student: str  # class of the policy
     learner: type[NetworkLearner]
-    learns: bool = True  # whether it goes on after the clone
-    advised: bool = False  # whether it asks the teacher about each transition
+    learns: bool = True  # whether it continues after the clone
+    advised: bool = False  # whether the teacher advises on each transition
     grouped: bool = False  # whether several episodes begin in one state
 
 
@@ -85,10 +85,10 @@ Played = TypeVar("Played")
 
 
 def learn(plan: LearnPlan) -> Summary:
-    """Record demonstrations, clone them, improve the clone by each method, and compare all of it.
+    """Record demonstrations, clone them, improve the clone by each method, and compare all versions.
 
     Args:
-        plan: How much is learned.
+        plan: The settings of the run.
 
     Returns:
         The summary of all versions, whose numbers are the optimizer's steps: "bc@2000", "rpd@4500", …
@@ -107,10 +107,10 @@ def learn(plan: LearnPlan) -> Summary:
 
 
 class RunCheckpoints:
-    """The state of each method after its last iteration, in `out`/checkpoints; each file is whole, or is not there."""
+    """The state of each method after its last iteration, in `out`/checkpoints, in files that are written atomically."""
 
     def __init__(self, plan: LearnPlan) -> None:
-        """Begin a run, or go on with one of the same settings; raises `ConfigError` as `learn` does."""
+        """Begin a run, or continue one with the same settings; raises `ConfigError` as `learn` does."""
         self._folder = plan.out / "checkpoints"
         file = self._folder / "plan.json"
         mine = plan.model_dump_json(exclude={"methods", "out", "resume", "iterations", "track"})
@@ -123,7 +123,7 @@ class RunCheckpoints:
             raise ConfigError(f"{plan.out} has a run with other settings: got {mine}, want {its}, or another folder")
 
     def save(self, name: str, state: Mapping[str, Any]) -> None:
-        """Write the state of a method; if that fails, the one before stays."""
+        """Write the state of a method; if that fails, the last one is kept."""
         part = self._folder / f"{name}.part"
         torch.save(dict(state), part)
         part.replace(self._folder / f"{name}.pt")
@@ -138,14 +138,14 @@ class RunCheckpoints:
 
 
 class LearnRun:
-    """A run, against the servers of the students and of their teacher."""
+    """A run with the servers of the students and of their teacher."""
 
     def __init__(self, plan: LearnPlan, checkpoints: RunCheckpoints) -> None:
         self._plan, self._checkpoints = plan, checkpoints
         self._clones: dict[str, dict[str, Any]] = {}  # checkpoints of learners, by the student that they train
 
     def summary(self) -> Summary:
-        """Go through all methods, and return the summary of all versions."""
+        """Run all methods, and return the summary of all versions."""
         demonstrations = self._checkpoints.load("demonstrations") or self._demonstrations()
         for method in self._plan.methods:
             state = self._checkpoints.load(method) or self._cloned(method, demonstrations)
@@ -172,7 +172,7 @@ class LearnRun:
         return {"iteration": 0, "position": 0, "learner": self._clones[parts.student]}
 
     def _learn(self, method: Method, state: Mapping[str, Any]) -> Summary:
-        """Learn by one method, from where it had got to."""
+        """Run one method from its state."""
         plan, parts = self._plan, METHODS[method]
         learner = parts.learner(plan.seed)
         learner.restore(state["learner"])
@@ -203,7 +203,7 @@ class LearnRun:
         return summary
 
     def _played(self, weights: Publisher, learner: NetworkLearner, play: Callable[[], Played]) -> Played:
-        """Play with the learner's weights; they are pushed again if the replica that had them was restarted."""
+        """Play with the learner's weights; push them again if the replica was restarted."""
         failures = 0
         while True:
             try:
@@ -270,7 +270,7 @@ def main(
     resume: Annotated[bool, typer.Option("--resume", help="Go on with what is in --out.")] = False,
     track: Annotated[str, typer.Option(help="Show success rates in: wandb, trackio, tensorboard.")] = "",
 ) -> None:
-    """A small policy learns to lift pucks: from demonstrations, with a teacher's advice, and alone."""
+    """Train a small policy to lift pucks: from demonstrations, with a teacher's advice, and alone."""
     given = {"out": out_dir, "seed": seed, "resume": resume or None, "track": parse_list(track) or None}
     with errors():
         settings = {} if file is None else read_run_file(file, "file of settings", "`methods`")

@@ -40,7 +40,7 @@ def policies(folder: str = "") -> Iterator[str]:
 
 def environments(folder: str = "") -> Iterator[str]:
     """Yield the rows of the environments; `folder` leads to docs/benchmarks."""
-    yield from ("| environment | tasks | wants |", "|---|---|---|")
+    yield from ("| environment | tasks | needs |", "|---|---|---|")
     for name, one in _listed(ENVS):
         packages = [f"`'.[{one.extra}]'`"] if one.extra else []
         packages += [f"`requirements/{file}.txt`" for file in one.requirements]

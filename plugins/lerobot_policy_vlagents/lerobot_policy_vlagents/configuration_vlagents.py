@@ -17,11 +17,11 @@ TRAINING = (
 @PreTrainedConfig.register_subclass("vlagents")
 @dataclass
 class VlagentsConfig(PreTrainedConfig):
-    """The server, and what the policy's names for cameras and states are at this robot or environment."""
+    """The server, and the mapping of the policy's cameras and states to those of this robot or environment."""
 
     url: str = ""  # http(s)://HOST:PORT[/APP], as of `RemoteAgent`
     cameras: dict[str, str] = field(default_factory=dict)  # policy's camera -> robot's, where the names differ
-    state: list[str] = field(default_factory=list)  # parts of the policy that `observation.state` is, in its order
+    state: list[str] = field(default_factory=list)  # the policy's parts in `observation.state`, in its order
     instruction: str | None = None  # in place of the task of the dataset or the environment
     n_action_steps: int | None = None  # rows of each chunk that are executed; None: all that the server returns
     checkpoint: str | None = None  # one of those that the server offers; None: its own
@@ -34,7 +34,7 @@ class VlagentsConfig(PreTrainedConfig):
     rank: str = "robot"  # "simulation": robots of the same server go first
     timeout_s: float = 30.0  # for a request; after it the command ends with an error
     connect_timeout_s: float = 60.0  # for a server that is still loading
-    device: str | None = "cpu"  # where observations wait to be sent
+    device: str | None = "cpu"  # of observations until they are sent
     push_to_hub: bool = False
 
     def __post_init__(self) -> None:

@@ -30,7 +30,7 @@ logger = logging.getLogger(__name__)
 
 
 class VlagentsPolicy(PreTrainedPolicy):
-    """A policy on a server. Each row of a batch, i.e. each robot or environment, is a session of its own."""
+    """A policy on a server. Each row of a batch, i.e. each robot or environment, is a session."""
 
     config_class, name = VlagentsConfig, "vlagents"
 
@@ -43,7 +43,7 @@ class VlagentsPolicy(PreTrainedPolicy):
 
         Raises:
             ConfigError: An option is missing or wrong.
-            ContractMismatch: The policy needs what is not there, or returns other actions than are wanted.
+            ContractMismatch: The policy needs a missing input, or returns other actions than the robot needs.
             PolicyUnavailable: The server was not ready within `connect_timeout_s`.
         """
         super().__init__(config)
@@ -71,7 +71,7 @@ class VlagentsPolicy(PreTrainedPolicy):
         self._sessions.reset()
 
     def select_action(self, batch: dict[str, Any], **_: Any) -> torch.Tensor:
-        """Return the next row of each session's chunk, (B, D) float32; a session whose chunk is over gets another.
+        """Return the next row of each session's chunk, (B, D) float32; after its last row, request a new chunk.
 
         Args:
             batch: Images (B, C, H, W) in [0, 1], states (B, D), and the `task`, with LeRobot's names.
@@ -86,13 +86,13 @@ class VlagentsPolicy(PreTrainedPolicy):
         prev_chunk_left_over: torch.Tensor | None = None,
         **_: Any,
     ) -> torch.Tensor:
-        """Return a new chunk of each session, (B, H, D) float32; `select_action` does not see it.
+        """Return a new chunk of each session, (B, H, D) float32; it does not affect `select_action`.
 
         Args:
             batch: As of `select_action`.
             inference_delay: Real-time chunking: the number of rows of the plan that will have been executed.
             prev_chunk_left_over: Real-time chunking: the plan from this observation on, (H', D) or (B, H', D), which
-                LeRobot fills up with rows of zeros.
+                LeRobot pads with rows of zeros.
         """
         rtc = getattr(self.config, "rtc_config", None)
         left = prev_chunk_left_over if rtc is None or rtc.enabled else None
@@ -105,7 +105,7 @@ class VlagentsPolicy(PreTrainedPolicy):
         return torch.from_numpy(np.stack(chunks))
 
     def supports_rtc(self) -> bool:
-        """Return True; raises `ConfigError` if the server's policy does not go on from the plan that is executed."""
+        """Return True; raises `ConfigError` if the server's policy does not continue the executed plan."""
         if not self._sessions.agent.continues_plans:
             raise ConfigError(
                 "inference.type: got rtc, and the server's policy ignores the plan that is executed, so that its "
@@ -116,7 +116,7 @@ class VlagentsPolicy(PreTrainedPolicy):
         return True
 
     def init_rtc_processor(self) -> None:
-        """Let all threads share one session: LeRobot computes chunks on another one than that which calls `reset`.
+        """Let all threads share one session, since LeRobot computes chunks and calls `reset` on different threads.
 
         LeRobot calls this once `config.rtc_config` is set. Raises `ConfigError` for settings that the server has.
         """
@@ -146,7 +146,7 @@ class VlagentsPolicy(PreTrainedPolicy):
 
 
 class _Robot:
-    """What LeRobot's command drives, robot or environments, as far as it says."""
+    """The robot or the environments of LeRobot's command, as far as it states them."""
 
     def __init__(self, config: VlagentsConfig, dataset_meta: Any) -> None:
         self.config = config
@@ -220,7 +220,7 @@ class _Sessions:
         return np.stack([rows.popleft() for rows in self._rows])
 
     def chunks(self, batch: Mapping[str, Any], plans: Sequence[dict[str, Any]]) -> list[np.ndarray]:
-        """Return a new chunk of each session, (H, D) float32 each, which goes on from its plan if it has one."""
+        """Return a new chunk of each session, (H, D) float32 each, which continues its plan if it has one."""
         begun = self._begin_if_due(batch)
         return self._act(batch, range(len(self._agents)), () if begun else plans)
 
@@ -291,7 +291,7 @@ def _size(batch: Mapping[str, Any]) -> int:
 def _plans(left: torch.Tensor | None, delay: int, size: int) -> list[dict[str, Any]]:
     """Return the `Obs.info` of real-time chunking of each session; none without a plan.
 
-    LeRobot fills a plan up to its execution horizon with rows of zeros. Nothing is normalised here: they are actions.
+    LeRobot pads a plan to its execution horizon with rows of zeros. Its rows are actions, not normalised.
     """
     if left is None:
         return []
@@ -309,7 +309,7 @@ def _names(names: Any) -> list[str]:
 
 
 def _successes(results: Sequence[Any]) -> list[Any]:
-    """Return the results if none of them is an exception; raise the first that is one."""
+    """Return the results, or raise the first exception among them."""
     for result in results:
         if isinstance(result, Exception):
             raise result

@@ -25,7 +25,7 @@ _STATE_OPTION = "--policy.state='[joints, gripper]'"
 
 
 class ObservationMapping:
-    """Which feature of the observations is which camera and state of the policy."""
+    """The mapping of the observations' features to the policy's cameras and states."""
 
     def __init__(
         self, config: VlagentsConfig, policy: Contract | None, shapes: Mapping[str, Sequence[int]], names: Sequence[str]
@@ -39,7 +39,7 @@ class ObservationMapping:
             names: The names of the values in `observation.state`; empty if they are unknown.
 
         Raises:
-            ConfigError: The options name a camera that is not there, or the state cannot be divided into parts.
+            ConfigError: The options name a missing camera, or the state cannot be divided into parts.
         """
         self._shapes = shapes
         robots = {_short(key): key for key in shapes if key.startswith(_IMAGE)}
@@ -82,7 +82,7 @@ def shapes_of_batch(batch: Mapping[str, Any]) -> dict[str, Sequence[int]]:
 
 
 def shapes_of_features(features: Mapping[str, PolicyFeature]) -> dict[str, Sequence[int]] | None:
-    """Return the shape of each feature that is an image or a state; None if the state is made of others only later."""
+    """Return the shapes of images and states; None if LeRobot composes the state later."""
     states = {key for key, feature in features.items() if feature.type is FeatureType.STATE}
     if states - {OBS_STATE}:
         return None  # LIBERO: LeRobot joins them to `observation.state` at each step
@@ -90,7 +90,7 @@ def shapes_of_features(features: Mapping[str, PolicyFeature]) -> dict[str, Seque
 
 
 def require_fit(policy: Contract | None, here: Contract) -> None:
-    """Raise `ContractMismatch` with every difference between the server's policy and what LeRobot's command drives."""
+    """Raise `ContractMismatch` with every difference between the server's policy and the robot or environments here."""
     try:
         require_match(policy, here)
     except ContractMismatch as error:

@@ -1,8 +1,8 @@
 """The parts of ARRO. Each part is a class that takes an instance of its `Config`, and loads its weights in `load`.
 
-A part is shared by all sessions of a replica and keeps no state of theirs; a tracker's memory of one session and camera
-is a separate object, which can be pickled. Each part gets the images of several sessions at once, and its result for
-one must not depend on the others.
+All sessions of a replica share a part, which keeps none of their state; a tracker's memory of one session and camera is
+a separate object, which can be pickled. Each part gets the images of several sessions at once, and its result for one
+must not depend on the others.
 """
 
 from __future__ import annotations

@@ -102,7 +102,7 @@ def _iou(one: np.ndarray, other: np.ndarray) -> float:
 
 
 class Sam2Config(PretrainedConfig):
-    """The weights of SAM 2: those of the video model can be used for images, too."""
+    """The weights of SAM 2; those of the video model also serve images."""
 
     checkpoint: str = Field(default="facebook/sam2.1-hiera-small", min_length=1)
 
