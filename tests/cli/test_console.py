@@ -99,7 +99,9 @@ def test_what_installs_the_rest_is_said_once_for_all_that_want_it(
     policies()
     rest = shown.getvalue().partition("\n\n")[2].splitlines()
     assert rest[0] == "for the rest, whose Python a deployment names as `environment`:"
-    assert "  vlagents-ray env make requirements/hf.txt  # pi0, vjepa2_ac" in rest
+    of_hf = sorted(name for name, one in POLICIES.items() if one.requirements[:1] == ("hf",))
+    assert {"pi0", "vjepa2_ac"} <= set(of_hf)
+    assert f"  vlagents-ray env make requirements/hf.txt  # {', '.join(of_hf)}" in rest
     assert "  vlagents-ray env make requirements/openvla.txt  # openvla, openvla_oft" in rest
     assert "  export VJEPA2_SRC=FOLDER  # a checkout, for vjepa2_ac" in rest
     assert not any("OPENVLA" in line for line in rest)

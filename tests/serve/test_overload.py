@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import fcntl
 import http.client
-import json
 import os
 import socket
 import struct
@@ -27,14 +26,11 @@ from api_key_replica import (
     KeyedReplica,
     PlasmaChannel,
     Visitor,
-    _read_map,
     _read_reply,
     _read_vla_eval,
     keyed_replica,
-    over_gr00t,
     over_websocket,
 )
-from dialect_server import body, libero
 from eval_fakes import wait_for
 from in_flight import read_requests
 from probes import bytes_probe, is_probe_answer
@@ -188,27 +184,6 @@ def _stream(path: str) -> list[Callable[[Visitor, str], str]]:
     return [over_websocket(path, lambda _: frame(reset()), _read_reply)]
 
 
-def _arena(mark: str) -> bytes:
-    return libero(1, mark, endpoint="infer", session_id="a")
-
-
-PUSH = "`WS /v1/weights`, scope `weights`"
-# Each way in by which something to decode comes, for a key; docs/access.md has them all.
-CARRY: dict[str, list[Callable[[Visitor, str], str]]] = {
-    "`POST /v1/reset`": [_post("/v1/reset", *_form()), _post("/v1/reset", CONTENT_TYPE, frame(reset()))],
-    "`POST /v1/act`": [_post("/v1/act", *_form()), _post("/v1/act", CONTENT_TYPE, frame({"op": "act", "obs": SEEN}))],
-    "`POST /act`": [_post("/act", "application/json", json.dumps(body(1)).encode())],
-    "`WS /v1/stream`": _stream("/v1/stream"),
-    "own port": _stream("own"),
-    "`WS /`": [over_websocket("/", lambda mark: libero(1, mark), _read_map)],
-    "`WS /openpi`": [over_websocket("/openpi", lambda mark: libero(1, mark), _read_map)],
-    "`WS /roboarena`": [over_websocket("/roboarena", _arena, _read_map)],
-    "`WS /vla-eval`": [over_websocket("/vla-eval", _image_of_vla_eval, _read_vla_eval)],
-    PUSH: [WAYS[PUSH]],
-    "shared memory": [_over_shm],
-    "GR00T's gateway, replica on its host": [over_gr00t(True)],
-    "GR00T's gateway, replica on another": [over_gr00t(False)],
-}
 NOTHING_TO_DECODE = {
     *(way for way in WAYS if way.startswith("`GET")),
     "`POST /v1/close`",  # nothing that it brings is decoded
@@ -224,6 +199,16 @@ NO_KEY = {
     "LeRobot's gateway, `without_key: true`",
     "Serve handle (`serve://`)",
     "plasma (`serve://`)",
+}
+# The attempts by each other way, which carry something to decode; those of WAYS, unless another message carries more.
+CARRY: dict[str, list[Callable[[Visitor, str], str]]] = {
+    **{way: [attempt] for way, attempt in WAYS.items() if way not in NOTHING_TO_DECODE | NO_KEY},
+    "`POST /v1/reset`": [_post("/v1/reset", *_form()), _post("/v1/reset", CONTENT_TYPE, frame(reset()))],
+    "`POST /v1/act`": [_post("/v1/act", *_form()), _post("/v1/act", CONTENT_TYPE, frame({"op": "act", "obs": SEEN}))],
+    "`WS /v1/stream`": _stream("/v1/stream"),
+    "own port": _stream("own"),
+    "`WS /vla-eval`": [over_websocket("/vla-eval", _image_of_vla_eval, _read_vla_eval)],
+    "shared memory": [_over_shm],
 }
 
 
@@ -265,7 +250,7 @@ def test_nothing_of_a_key_over_its_rate_is_decoded(
     assert attempt(replica.visitor("over its rate"), when) == "429"
     assert decoded == []
     assert attempt(replica.visitor("right"), when) in ("done", "200", "409", "404")  # an act before a reset
-    assert decoded != []
+    assert decoded != [], "NOTHING_TO_DECODE lists a way that carries nothing to decode"
 
 
 @pytest.mark.parametrize("way", sorted(NO_KEY))

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import ClassVar
+
 import numpy as np
 import pytest
+from dialect_server import body, serving
 from in_process_replicas import Replicas
-from served_agents import Witness
+from served_agents import Mirror, Witness
 
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import InvalidObservation
@@ -13,6 +17,8 @@ from vlagents_ray.interface import Obs
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.dialects.base import ImplicitEpisode
 from vlagents_ray.serve.dialects.gateway_sessions import GatewaySessions
+from vlagents_ray.serve.dialects.openvla import OpenVLADialect
+from vlagents_ray.wire import openvla
 
 
 def test_an_episode_begins_with_the_first_observation_and_with_each_new_instruction() -> None:
@@ -63,3 +69,24 @@ def test_a_client_of_the_gateway_keeps_its_instruction_and_each_session_its_own(
     finally:
         sessions.close()
         replicas.close()
+
+
+class WithReset(OpenVLADialect):
+    """A protocol over HTTP that has a reset."""
+
+    paths: ClassVar[Mapping[str, str]] = {**OpenVLADialect.paths, "POST /reset": "end_episode"}
+
+
+def test_a_reset_over_http_begins_an_episode_of_the_session_that_it_names() -> None:
+    with serving(Mirror(), {f"{__name__}:WithReset": {}}) as (client, _):
+
+        def count(session: str) -> float:
+            answer = client.post("/act", json=body(5), headers={"x-session-id": session})
+            return float(openvla.decode(b'{"action": %s}' % answer.content)[0]["action"][2])
+
+        assert client.post("/reset", headers={"x-session-id": "a"}).status_code == 200
+        assert [count("a"), count("a"), count("b")] == [1, 2, 1]
+        answer = client.post("/reset", headers={"x-session-id": "a"})
+        assert (answer.status_code, answer.json()) == (200, {})
+        assert [count("a"), count("b")] == [1, 2]
+        assert client.post("/reset").json()["code"] == "malformed"

@@ -1,17 +1,9 @@
-"""The base classes of all dialects, and the steps to add one.
+"""The base classes of all dialects, which are other systems' protocols.
 
-A dialect is another system's protocol:
-
-1. `vlagents_ray/wire/NAME.py` converts bytes to values and back, within `Limits`, without unpickling, and has the
-   mappings of the system's clients. It imports nothing of the server; the policy `upstream` uses it, too.
-2. `vlagents_ray/serve/dialects/NAME.py` has one class, which states its settings (`Config`), the system whose clients
-   it serves, the packages that it requires and the mappings that deployment files may name, and serves those clients:
-   an `HttpDialect` for plain requests over HTTP, a `RouteDialect` for WebSockets and anything else on the server's own
-   port, or a `PortDialect` for a protocol that needs its own port.
-3. `DIALECTS` in `vlagents_ray/registry.py` has one line for it. A third-party package has an entry point in the group
-   `vlagents_ray.dialects` instead; without either, a deployment file names the class, as `my_package:MyDialect`.
-4. `deployments/NAME.yaml` names the dialect under `args.dialects`.
-5. `tests/serve/dialects/test_NAME.py` tests it with the bytes of the real client, and with garbage.
+A dialect is an `HttpDialect` for plain requests over HTTP, a `RouteDialect` for WebSockets and anything else on the
+server's own port, or a `PortDialect` for a protocol that needs its own port. CONTRIBUTING.md has the steps to add one;
+a third-party package has an entry point in the group `vlagents_ray.dialects`, or a deployment file names the class, as
+`my_package:MyDialect`.
 
 The following is a complete dialect, for clients that post `{"q": [...], "task": "..."}` and read a list of numbers::
 
@@ -448,7 +440,8 @@ class HttpDialect(RouteDialect):
     """A dialect of HTTP requests.
 
     Each request is an episode of one step, unless it has the header `x-session-id`: then it belongs to that session,
-    in which each new instruction begins an episode. Errors have their status and a problem+json document.
+    in which each new instruction begins an episode, and a request to a path of `end_episode`. Errors have their status
+    and a problem+json document.
     """
 
     def __init__(self, name: str, config: DialectConfig, context: ReplicaContext) -> None:
@@ -504,6 +497,15 @@ class HttpDialect(RouteDialect):
             return problem_response(problem, name)
         finally:
             admission.release()
+
+    async def end_episode(self, http: HttpRequest) -> Response:
+        """Answer `{}`; the next observation of the session that the header names begins an episode."""
+        name = request_id(http)
+        try:
+            self._kept_session(session_id(http)).episode.end()
+        except VLAgentsError as error:
+            return problem_response(error, name)
+        return Response(b"{}", media_type="application/json")
 
     def _kept_session(self, name: str) -> ImplicitSession:
         """Return the session that a client names, which is kept as long as the engine keeps it."""
