@@ -1,4 +1,4 @@
-"""The files of an episode: where they are, how they are written whole, and what is raised if the disk is full."""
+"""The files of an episode: their paths, atomic writing, and errors of the disk."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def stem(key: EpisodeKey) -> str:
 
 
 def require_below(path: str) -> str:
-    """Return `path`, of an episode's file in results.db, or raise `ConfigError` if it leads out of the folder.
+    """Return the `path` of an episode's file in results.db, or raise `ConfigError` if it leads out of the folder.
 
     The folder may come from another machine.
     """
@@ -73,7 +73,7 @@ def require_below(path: str) -> str:
 
 
 def inside(home: Path, path: str) -> Path:
-    """The absolute path of the file `path` in the folder of results `home`, whether it exists or not.
+    """Return the absolute path of the file `path` in the folder of results `home`; it need not exist.
 
     Raises `ConfigError` if it leads out of that folder, also by a symbolic link: its target is neither read, copied nor
     published.
@@ -88,7 +88,7 @@ def inside(home: Path, path: str) -> Path:
 
 
 def require_there(path: Path) -> Path:
-    """Return `path`, of an episode's file, or raise `ConfigError` if it is missing, as in a folder copied in part."""
+    """Return the `path` of an episode's file, or raise `ConfigError` if it is missing, as in a partial copy."""
     if not path.is_file():
         raise ConfigError(
             f"{path}: got no file, want the one that results.db names there; copy the folder again from where it was "
@@ -112,7 +112,7 @@ def outcome(result: EpisodeResult) -> str:
 
 @contextmanager
 def whole(path: Path) -> Iterator[Path]:
-    """A path to write a file to, which is renamed to `path` when it is whole; missing folders are made.
+    """Yield a path for writing, which is renamed to `path` when the file is complete; make missing folders.
 
     If writing fails, the file is removed: others need the room on a full disk.
     """
@@ -129,7 +129,7 @@ def whole(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def whole_folder(path: Path) -> Iterator[Path]:
-    """A folder to write into, which becomes `path`, an empty folder or none so far, when all of it is written.
+    """Yield a folder for writing, which becomes `path`, missing or empty so far, when it is complete.
 
     It is beside `path` until then, and removed if writing fails.
     """
@@ -153,7 +153,7 @@ def link_or_copy(source: Path, target: Path) -> None:
 
 @contextmanager
 def storing(folder: Path) -> Iterator[None]:
-    """Raise `StorageFailed` in place of an error of the disk that `folder` is on, with its cause and its cure.
+    """Raise `StorageFailed` in place of an error of the disk of `folder`, with cause and cure.
 
     Use it around code in which only the disk raises `OSError`. Other errors pass.
     """
