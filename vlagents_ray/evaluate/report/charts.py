@@ -1,7 +1,7 @@
 """Geometry of the page's charts, in SVG's units; `templates/charts.html.j2` draws them.
 
-Colours are the classes c0 to c5 of the stylesheet, so that light, dark and paper each have their own. Lines differ in
-their dashes too, for readers who cannot tell the colours apart.
+Colours are the classes c0 to c5 of the stylesheet, which has them for light, dark and print. Lines also differ in their
+dashes, for readers who cannot distinguish the colours.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from vlagents_ray.evaluate.results.statistics import Rate
 NONE, MINUS = "\u2013", "\u2212"
 _COLOURS = 6
 _DASHES = (None, "7 3", "2 3", "9 3 2 3", "12 4", "4 4")
-_GLYPH, _EDGE = 96, 6  # width of a glyph, and what a dot takes beyond the ends of its axis
+_GLYPH, _EDGE = 96, 6  # width of a glyph, and margin of a dot beyond the ends of its axis
 
 
 def percent(rate: Rate) -> str:
@@ -34,7 +34,7 @@ def interval(rate: Rate) -> str:
 
 
 def interval_name(rate: Rate) -> str:
-    """The kind of that interval: a confidence sequence where cells could stop early, else Wilson's."""
+    """Return the kind of that interval: a confidence sequence if cells could stop early, else Wilson's."""
     if rate.error_rate is None:
         return "95 % Wilson interval"
     return f"{100 * (1 - rate.error_rate):g} % confidence sequence"
@@ -154,7 +154,7 @@ class Glyph:
 
 
 def rate_chart(series: Sequence[Series], x_label: str, title: str) -> RateChart:
-    """The lines of `series` in the order in which they are given, on a common axis from the least x to the largest."""
+    """Return the lines of `series`, in their order, on a common axis from the least x to the largest."""
     most = max((x for one in series for x, _ in one.points), default=0.0)
     least = min((x for one in series for x, _ in one.points), default=0.0)
     left, right = (least - 1, most + 1) if least == most else (least, most)
@@ -181,7 +181,7 @@ def rate_chart(series: Sequence[Series], x_label: str, title: str) -> RateChart:
 
 
 def bar_chart(rows: Mapping[str, Mapping[str, float]], title: str) -> BarChart:
-    """A bar for each of `rows`, of which there is at least one."""
+    """Return a bar for each of `rows`, at least one."""
     names = dict.fromkeys(part for parts in rows.values() for part in parts)
     styles = {name: Style(name, f"c{index % _COLOURS}") for index, name in enumerate(names)}
     longest = max(sum(parts.values()) for parts in rows.values())

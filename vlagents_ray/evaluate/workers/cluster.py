@@ -48,9 +48,9 @@ def ray_cluster(config: EvalConfig) -> Iterator[None]:
         if os.environ.get("RAY_ADDRESS"):
             stack.enter_context(joined())
         else:
-            # The number of CPUs is only an account: the user's number of workers must fit.
+            # CPUs are logical: the user's number of workers must fit.
             cpus = max(os.cpu_count() or 1, ceil(config.workers * most_cpus(config)))
-            with withheld():  # workers get the key when they are ready; Ray's daemons do not need it
+            with withheld():  # workers get the key when they are ready; Ray's daemons need none
                 stack.enter_context(joined("local", num_cpus=cpus))
         yield
 
@@ -102,7 +102,7 @@ def _kinds(config: EvalConfig) -> list[WorkerConfig]:
 
 
 class Placement:
-    """Chooses the node of a worker: that of a replica which it will use, as long as there is room.
+    """Chooses the node of a worker: that of its replica, as long as there is room.
 
     Only the replicas of policies that this cluster serves are known, `serve://APP`.
     """
@@ -135,9 +135,9 @@ def strategy(node: str | None) -> Any:
 
 
 class CapacityMonitor:
-    """Decides whether an evaluation goes on while the cluster has no room for some of its workers.
+    """Decides whether an evaluation continues while the cluster has no room for some of its workers.
 
-    It goes on as long as other workers play: a worker's node may have been lost, and may return.
+    It continues as long as other workers play: a worker's node may have been lost, and may return.
     """
 
     def __init__(self, config: EvalConfig, now: Callable[[], float] = monotonic) -> None:
