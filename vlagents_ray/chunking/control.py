@@ -36,7 +36,7 @@ class Leader(Protocol):
 class Control:
     """The state machine of a robot.
 
-    | state | who moves the robot | it ends by |
+    | state | source of motion | ends by |
     |---|---|---|
     | "autonomous" | the policy | any of the others |
     | "human" | the leader that is engaged | its release: then the policy continues, or the robot is paused |
@@ -49,7 +49,7 @@ class Control:
     operator at the robot, and for its own program.
 
     Args:
-        leader: What a human moves the robot with; None if there is nothing.
+        leader: The operator's device, or None.
     """
 
     def __init__(self, leader: Leader | None = None) -> None:
@@ -95,7 +95,7 @@ class Control:
             return sorted(self._silent)
 
     def pause(self, reason: str = PAUSED) -> None:
-        """Hold the robot still until `resume`, or until a human takes over; a human who moves it is not interrupted."""
+        """Hold the robot still until `resume` or a takeover; an operator who moves it is not interrupted."""
         with self._lock:
             self._pause = reason
             self._pauses += 1
@@ -165,7 +165,7 @@ class Control:
             return self._outcome or ""
 
     def update(self) -> bool:
-        """Decide at the beginning of a tick who moves the robot; return whether that makes the policy's plan void."""
+        """Set the source of motion at the beginning of a tick; return whether the policy's plan becomes void."""
         pauses, engaged = self._pauses, False
         if self.leader is not None:
             try:
@@ -188,7 +188,7 @@ class Control:
 
     @property
     def held(self) -> Held | None:
-        """Why the robot must not move, by the last `update` and what came since; None if it may move."""
+        """The reason why the robot must not move, by the last `update` and later events; None if it may move."""
         with self._lock:
             if self._state == "stopped" or self.stopped or self._unseen:
                 silent = " and the ".join(sorted(self._silent))

@@ -1,4 +1,4 @@
-"""The safe action of a robot, for when the policy's does not come in time, and the checks that each command passes."""
+"""The safe action of a robot, used if the policy's is late, and the checks of each command."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from vlagents_ray.validation import check_action
 
 SafeName = Literal["auto", "hold", "zero"]
 Cause = Literal[
-    "waiting",  # the rows of the last answer are used up, and the next answer has not come: not counted as `safe`
-    "late",  # the answer came after others had been executed in place of all its rows
+    "waiting",  # the rows of the last answer are used up before the next answer: not counted as `safe`
+    "late",  # the answer came too late for all its rows
     "old",  # the plan is older than max_age_s
     "stale",  # the observation is older than max_age_s
     "lost",  # the server gave no answer: no connection, or not in time
@@ -73,7 +73,7 @@ Safe = SafeName | np.ndarray | Callable[[Obs], np.ndarray]
 
 
 class SafeAction:
-    """Computes the action that keeps a robot still, which depends on what its actions mean.
+    """Computes the action that holds a robot still, which depends on the meaning of its actions.
 
     "hold" commands the last action again, which is right for absolute targets. "zero" commands no motion, which is
     right for deltas and velocities; the columns in `grippers` keep the last action's value, as 0 would half open a
@@ -84,12 +84,12 @@ class SafeAction:
     Args:
         safe: The name, array or function of the safe action.
         spec: The actions of the contract.
-        grippers: The columns of the grippers; by default the last one, if the contract says how the gripper is opened.
+        grippers: The columns of the grippers; by default the last one, if the contract states the gripper's opening.
 
     Raises:
         ConfigError: The choice would be a guess or would move the robot: a repeated delta continues the motion, and
             zeros as joint targets move the arm to its zero position. Only "hold" may be chosen where the contract does
-            not say what the actions are.
+            not describe the actions.
     """
 
     def __init__(self, safe: Safe, spec: ActionSpec, grippers: Sequence[int] | None = None) -> None:
@@ -123,7 +123,7 @@ class SafeAction:
         return action
 
     def _first(self, obs: Obs) -> np.ndarray | None:
-        """Return no motion with the gripper as it stands, (D,); None if the contract does not say enough for that."""
+        """Return no motion with the gripper held, (D,); None if the contract does not suffice for that."""
         spec = self._spec
         if spec.dim is None:
             return None
@@ -142,7 +142,7 @@ def stopping(spec: ActionSpec) -> SafeName:
 
 
 def neutral(spec: ActionSpec, dim: int | None = None) -> np.ndarray:
-    """Return no motion for relative actions, (D,) float32, with the gripper open where `spec` says how."""
+    """Return no motion for relative actions, (D,) float32, with the gripper open if `spec` states its opening."""
     dim = spec.dim if dim is None else dim
     if dim is None:
         raise InvalidAction("neutral action: got a contract without action.dim; want one that states it")

@@ -37,7 +37,7 @@ from vlagents_ray.protocol.messages import (
     Request,
 )
 
-_UNKNOWN_APP_S = 10.0  # a starting server knows no path until its first replica exists
+_UNKNOWN_APP_S = 10.0  # a starting server has no path until its first replica exists
 
 
 class HttpTransport:

@@ -190,7 +190,7 @@ class ReplicaNodes:
                 self._nodes = self._answer.result(timeout_s=wait_s)
                 self._answer = None
         except TimeoutError:
-            pass  # the answer comes later
+            pass  # the answer follows later
         except (RayServeException, ray.exceptions.RayError):
             self._nodes, self._answer = {}, None
         return self._nodes

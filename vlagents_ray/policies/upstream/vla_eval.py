@@ -19,7 +19,7 @@ _STATED = ("model_server", "harness_version", "protocol_version", "observation_p
 
 
 class VlaEvalClient(WebSocketClient):
-    """A client that says where episodes begin, and asks for one action a step."""
+    """A client that announces episodes, and requests one action a step."""
 
     keeps_sessions: ClassVar[bool] = True
     mapping: ClassVar[str | None] = "vla-eval"
