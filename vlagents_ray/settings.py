@@ -13,7 +13,7 @@ import numpy as np
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.naming import did_you_mean
 
-_WANT = "Input should be "  # as pydantic says it
+_WANT = "Input should be "  # in pydantic's words
 # The types of the values that a plain type allows: also numpy's, and whole numbers for a float, as YAML reads 1 as int.
 _PLAIN: dict[type, tuple[type, ...]] = {
     bool: (bool, np.bool_),

@@ -18,14 +18,14 @@ PAUSED = "paused by an operator"
 
 
 class Leader(Protocol):
-    """The interface of a device that a human moves a robot with: a keyboard, a SpaceMouse, a second arm."""
+    """The interface of a device with which an operator moves a robot: a keyboard, a SpaceMouse, a second arm."""
 
     def engaged(self) -> bool:
-        """Return at once whether the human moves the robot at this tick."""
+        """Return at once whether the operator moves the robot at this tick."""
         ...
 
     def action(self, obs: Obs) -> np.ndarray:
-        """Return the human's action at once, (D,) float32 in the contract's units, for a tick with `engaged()`.
+        """Return the operator's action at once, (D,) float32 in the contract's units, for a tick with `engaged()`.
 
         Raises:
             InvalidAction: The device has no action at this tick; the robot holds still.
@@ -75,12 +75,12 @@ class Control:
 
     @property
     def state(self) -> ControlState:
-        """The state at this tick: whether the policy, a human or nothing moves the robot."""
+        """The state at this tick: whether the policy, an operator or nothing moves the robot."""
         return self._state
 
     @property
     def reason(self) -> str | None:
-        """Why the robot is paused, or will be when the human lets go; None if it is not."""
+        """The reason why the robot is paused, or will be when the operator lets go; None if it is not."""
         return self._pause
 
     @property
@@ -175,7 +175,7 @@ class Control:
                 self.pause(str(error) if own else f"the leader failed: {error!r}")
         with self._lock:
             before = self._state
-            if engaged and not self._engaged and pauses == self._pauses:  # no pause since the human took over
+            if engaged and not self._engaged and pauses == self._pauses:  # no pause since the takeover
                 self._pause = None
             self._engaged = engaged
             if self.stopped:

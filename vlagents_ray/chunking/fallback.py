@@ -31,7 +31,7 @@ Cause = Literal[
     "limits",  # the guard refused the action: beyond a limit
     "max_step",  # the guard refused the action: too far from the one before
     "invalid",  # the action is NaN, has a wrong shape, or was refused by another check
-    "leader",  # the human's device gave no action
+    "leader",  # the operator's device gave no action
     "robot",  # the robot must not move (`holds`), such as for a camera that hangs
     "stopped",  # the robot was stopped, and not restarted yet
     "paused",  # counted apart
@@ -55,7 +55,7 @@ STALE = Held(
     "sensors with different clocks, or for an info['captured_at'] that is not time.time()",
 )
 STOPPED = Held("waiting", "the robot was stopped since the observation that was answered last")
-RELEASED = Held("waiting", "a human has released the robot, or a pause is over: waiting for a new answer")
+RELEASED = Held("waiting", "the operator has released the robot, or a pause is over: waiting for a new answer")
 _LOST = (ConnectionLost, PolicyUnavailable, DeadlineExceeded)
 
 
@@ -198,7 +198,7 @@ class Motion:
         self._state = "stopped"
 
     def move(self, action: np.ndarray, obs: Obs) -> np.ndarray:
-        """Return an action of the policy or a human, (D,) float32, if it may reach the robot; else `InvalidAction`."""
+        """Return an action of policy or operator, (D,) float32, if it may reach the robot, or raise `InvalidAction`."""
         if self._state == "held":  # by the last target; the robot may have been moved since, or never have arrived
             with contextlib.suppress(InvalidAction):
                 self._last, self._state = self._checked(action, self._last), "moving"

@@ -336,7 +336,7 @@ class ChunkPlayer(Agent):
             self._trouble = Held("failed", str(error))  # the operator continues, and the policy's action is not known
         self._tick = tick + 1
         act = self._led(obs) if led else self._chosen(obs, tick)
-        if led and SAFE not in act.info:  # the human's action is executed in place of a row
+        if led and SAFE not in act.info:  # the operator's action is executed in place of a row
             self._execution.note_in_place(act.action)
             self._plan.advance()
         return act
@@ -437,14 +437,14 @@ class ChunkPlayer(Agent):
         extras = self._execution.report()
         if self.settings.timeout_s is not None:
             extras[DEADLINE] = self.settings.timeout_s * 1e3
-        # A human executes other actions than those of the plan.
+        # The operator's actions replace those of the plan.
         if self.settings.real_time_chunking and self.control.state != "human":
             extras |= self._plan.continuation(self._delays)
         return extras
 
     def _led(self, obs: Obs) -> Act:
         """Return the operator's action, or the safe one if the guard refuses it."""
-        info: dict[str, Any] = {INTERVENTION: True, SILENT: 0.0}  # the policy's silence stops no human
+        info: dict[str, Any] = {INTERVENTION: True, SILENT: 0.0}  # the policy's silence does not stop an operator
         if (planned := self._next()) is not None:
             info[WANTED] = planned.action.copy()
         try:

@@ -191,7 +191,7 @@ def _leader(
 def _say_outcome(report: LoopReport, say: Callable[[str], None], *, led: bool) -> None:
     say(f"from a tick until its action is applied: p50 {report.work_p50_ms:.2f} ms, p99 {report.work_p99_ms:.2f} ms")
     if led:
-        say(f"ticks at which a human moved the robot: {report.interventions}; ticks paused: {report.paused}")
+        say(f"ticks at which an operator moved the robot: {report.interventions}; ticks paused: {report.paused}")
     say(f"ticks without an action of the policy: {report.safe_ticks} of {report.jitter['ticks']:.0f}")
     causes = {**report.safe, "waiting": report.waiting}
     for cause, ticks in sorted(causes.items(), key=lambda one: -one[1]):
@@ -274,7 +274,7 @@ def command_parser() -> tuple[argparse.ArgumentParser, list[argparse.Action], li
     real("--instruction", help="the task in words")
     real("--robot", metavar="MODULE:CLASS", help="your robot's class, without arguments; default: a simulated one")
     real("--ros", metavar="FILE", help="a robot behind topics of ROS 2, from this file; see docs/ros.md")
-    leaders = "what a human takes over with: keyboard, spacemouse, or, without --env, MODULE:CLASS of yours, see Leader"
+    leaders = "device for taking over: keyboard, spacemouse, or, without --env, your MODULE:CLASS, see Leader"
     add("--leader", metavar="LEADER", help=leaders)
     add("--step", type=seconds, help="what a key or axis of these adds to a number of the action at a tick")
     add("--mode", choices=get_args(Mode), help="see PlayerSettings (default: async; with --env open_loop)")

@@ -167,7 +167,7 @@ def opengl_renderer() -> Renderer | None:
 
 
 def vulkan_renderer(name: str, cuda: int | None, *, asked_for: bool = False) -> Renderer:
-    """Return the renderer for the device that SAPIEN uses; `asked_for` says that the env's options named it."""
+    """Return the renderer for the device that SAPIEN uses; `asked_for` is whether the env's options named it."""
     files = filter(None, map(os.environ.get, VULKAN_DRIVERS))
     named = has_gpu() is False and any(_SAPIENS_OWN not in file for file in files)
     return Renderer(name, name.startswith(_SOFTWARE_VULKAN), cuda, asked_for or named)

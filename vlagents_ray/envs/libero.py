@@ -4,7 +4,8 @@
         obs, _ = env.reset(seed=0, options={"init_state": 3})
         obs, reward, terminated, truncated, info = env.step(Act(action=np.zeros(7, np.float32)))
 
-The scenes' meshes and textures are in no package: `Libero.missing()` says how to download them; nothing here does.
+The scenes' meshes and textures are in no package: `Libero.missing()` returns how to download them; nothing here does
+so.
 """
 
 from __future__ import annotations
@@ -69,7 +70,7 @@ SUITES: Mapping[str, Suite] = {
 
 @dataclass(frozen=True, slots=True)
 class LiberoProtocol:
-    """The conventions of an episode; comments say where openpi and OpenVLA differ.
+    """The conventions of an episode; comments state the differences of openpi and OpenVLA.
 
     `max_steps` counts the policy's actions alone: peers count to `max_steps` plus the settling ones.
 
@@ -234,7 +235,7 @@ class Libero(SimulatorEnv):
             gripper_open: The action's last number that opens the gripper; None is LIBERO's -1. OpenVLA
                 says 1, and 0 to close, which openvla's evaluation turns into LIBERO's as this does.
             gripper_closed: The one that closes it; None is LIBERO's 1.
-            assets: The folder with LIBERO's meshes and textures; None is what LIBERO_ASSETS names.
+            assets: The folder with LIBERO's meshes and textures; None is the one in LIBERO_ASSETS.
         """
         super().__init__(f"libero/{task}", width=width, height=height, max_steps=max_steps)
         if (settling_steps or 0) < 0:
@@ -396,7 +397,7 @@ class LiberoSimulation:
             camera_names=list(protocol.cameras.values()),
             camera_heights=protocol.image_size[0],
             camera_widths=protocol.image_size[1],
-            horizon=protocol.settling_steps + protocol.max_steps + 1,  # robosuite's own limit stays out of the way
+            horizon=protocol.settling_steps + protocol.max_steps + 1,  # so that robosuite's own limit has no effect
         )
         self._cameras = CameraRenderer(self._env.env)
 
@@ -486,8 +487,8 @@ def import_libero() -> Path:
 def _own_config(folder: Path) -> Iterator[None]:
     """A configuration of this process alone.
 
-    LIBERO reads one from the home, asks on stdin where there is none, and writes it there. Its paths are
-    wanted nowhere but in helpers that are not used here, so it goes with the import.
+    LIBERO reads one from the home, or else asks on stdin and writes it there. Only helpers that are not used here need
+    its paths, so it is removed after the import.
     """
     parts = {"assets": "assets", "bddl_files": "bddl_files", "datasets": "datasets", "init_states": "init_files"}
     paths = {"benchmark_root": str(folder)} | {key: str(folder / name) for key, name in parts.items()}

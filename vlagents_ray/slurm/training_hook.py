@@ -100,7 +100,7 @@ def _abandoned_since(mark: Path) -> int | None:
 
 
 def _submit_abandoned(record: Path, mark: Path, python: str) -> None:
-    """Submit other checkpoints, claimed by processes that were killed, as no other call may come for them."""
+    """Submit other checkpoints, claimed by processes that were killed, as no other call may follow for them."""
     for other in sorted(record.glob("step-*.json")):
         claim = _read(other)
         if other == mark or "words" not in claim or _abandoned_since(other) is None:

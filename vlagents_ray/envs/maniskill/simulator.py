@@ -28,7 +28,7 @@ from vlagents_ray.registry import require
 
 DEFAULT_CONTROL_MODE = "pd_ee_delta_pose"
 
-# The tasks whose assets come with the package.
+# The tasks whose assets are in the package.
 INSTRUCTIONS: dict[str, str] = {
     "LiftPegUpright-v1": "lift the peg and stand it upright on the table",
     "PegInsertionSide-v1": "pick up the peg and insert its orange end into the hole in the box",
@@ -80,7 +80,7 @@ def chosen_backend(wanted: str) -> str:
         return wanted
     try:
         require("sapien").Device("cuda")
-    except RuntimeError:  # how SAPIEN says that there is none
+    except RuntimeError:  # SAPIEN's error without a device
         return "cpu"
     return "gpu" if require("torch").cuda.is_available() else "cpu"
 
@@ -316,7 +316,7 @@ class Simulator:
         reward_mode: str | None = None,
         sensors: Mapping[str, Any],
     ) -> None:
-        """`name` stands in errors. Raises `ConfigError`, or `EnvFailed` with its cure."""
+        """Make the simulator, with `name` in errors; raises `ConfigError`, or `EnvFailed` with its cure."""
         self.name = name
         self._task = task
         self._asked_for = render_backend != "auto"

@@ -1,4 +1,4 @@
-"""Draws the table as the camera "front" sees it.
+"""Renders the table for the camera "front".
 
 Objects at rest are drawn once; a step copies that image and adds the gripper, the object that it holds, and their
 shadows. The camera's geometry is in the package's docstring.

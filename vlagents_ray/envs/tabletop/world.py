@@ -37,7 +37,7 @@ class Puck:
     x: float
     y: float
     z: float = 0.0  # m, of its underside
-    lifted: bool = False  # has it left the table in this episode?
+    lifted: bool = False  # whether it has left the table in this episode
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,7 +169,7 @@ class TabletopWorld:
             puck.lifted = puck.lifted or puck.z > _LIFTED
 
     def _support(self, puck: Puck) -> float:
-        """Height in m of what lies under `puck`: the table, or a puck under its centre of mass."""
+        """Return the height of the support of `puck`, m: the table, or a puck under its centre of mass."""
         height = 0.0
         for other in self.pucks:
             top = other.z + PUCK_HEIGHT

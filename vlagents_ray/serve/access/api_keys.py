@@ -66,7 +66,7 @@ class Keys:
         self._checked = float("-inf")
         self._unreadable: float | None = None  # time since which the file is unreadable, s; None if it is readable
         self._reminded = 0.0
-        self._hung: threading.Thread | None = None  # a check that has not come back
+        self._hung: threading.Thread | None = None  # a check that has not returned
         self._lock = threading.Lock()
         self.audit = Audit()
         self._state: object = self._changed()
@@ -111,7 +111,7 @@ class Keys:
         return caller
 
     def key(self, digest: bytes) -> Key | None:
-        """Return the key with this SHA-256 as the file has it now; None if there is none."""
+        """Return the key with this SHA-256 in the present file, or None."""
         self._refresh()
         return self._keys.get(digest)
 
@@ -173,7 +173,7 @@ class Keys:
                 self._hung = None
 
     def _read_again(self, now: float) -> None:
-        """Read the file if it has changed; on a thread of its own, which a network drive may hold up."""
+        """Read the file if it has changed, on a separate thread, which a network drive may block."""
         try:
             state = self._changed()
             if state == self._state:
@@ -392,8 +392,8 @@ class ScopeCheck:
     """The check of one endpoint.
 
     Args:
-        subject: What the endpoint is about, for the error message.
-        open_to_network: Whether other machines reach this server without a key; then nobody may do it.
+        subject: The subject of the endpoint, for the error message.
+        open_to_network: Whether other machines reach this server without a key; then it is refused.
     """
 
     def __init__(self, subject: str, *, open_to_network: bool) -> None:

@@ -29,7 +29,7 @@ class _DeploymentModel(BaseModel):
 
 
 class LiveArgs(_DeploymentModel):
-    """The last seconds of each session, which a press on the live page saves; see `vlagents_ray.serve.observers`."""
+    """The last seconds of each session, which a button of the live page saves; see `vlagents_ray.serve.observers`."""
 
     folder: AbsolutePath = Field(
         description="folder of the datasets, on each replica's own node or shared; each replica writes its own below it"
@@ -60,7 +60,7 @@ class EnvironmentArgs(_DeploymentModel):
     def _one(self) -> EnvironmentArgs:
         if self.python is None and self.process != "auto":
             raise ValueError(f"process: got {self.process!r} without `python`; name an interpreter, or leave it out")
-        # The check covers a child process, too: Serve shows the deployment, and a child may become a replica.
+        # The check also covers a child process: Serve shows the deployment, and a child may become a replica.
         require_no_secrets({"env_vars": self.env_vars})
         return self
 

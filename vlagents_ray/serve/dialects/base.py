@@ -3,7 +3,7 @@
 A dialect is another system's protocol:
 
 1. `vlagents_ray/wire/NAME.py` converts bytes to values and back, within `Limits`, without unpickling, and has the
-   mappings of the system's clients. It imports nothing of the server; the policy `upstream` uses it, too.
+  mappings of the system's clients. It imports nothing of the server; the policy `upstream` also uses it.
 2. `vlagents_ray/serve/dialects/NAME.py` has one class, which states its settings (`Config`), the system whose clients
    it serves, the packages that it requires and the mappings that deployment files may name, and serves those clients:
    an `HttpDialect` for plain requests over HTTP, a `RouteDialect` for WebSockets and anything else on the server's own

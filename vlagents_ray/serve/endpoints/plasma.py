@@ -63,7 +63,7 @@ class Channel:
     leased: float = 0.0  # time of the latest lease, s, monotonic
 
     def read(self) -> bytes:
-        """Return a copy of the frame that was written, without waiting; raise `MalformedMessage` if there is none."""
+        """Return a copy of the written frame, without waiting; raise `MalformedMessage` if there is none."""
         found = self._take()
         if found.metadata != PlasmaAddress.TAG:  # Ray's parser below trusts its input, as it does everywhere
             raise MalformedMessage("plasma: what the channel holds is no frame; is this a client of vlagents_ray?")

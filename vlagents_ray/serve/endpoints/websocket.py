@@ -1,9 +1,9 @@
 """The WebSocket port of a replica, without a proxy between the robot and the policy thread.
 
-The metadata gives a client the port and an unguessable path, so that a client that may not read the metadata cannot
-use the port; where there are API keys, the handshake must contain one, too. Messages are those of `WS /v1/stream` on
-the server's port, which remains for clients that cannot reach this one. As with local clients the policy thread reads
-the sockets (see `vlagents_ray.serve.endpoints.connection`) and decodes the messages.
+The metadata gives a client the port and an unguessable path, so that a client that may not read the metadata cannot use
+the port; with API keys, the handshake must also contain one. Messages are those of `WS /v1/stream` on the server's
+port, which remains for clients that cannot reach this one. As with local clients the policy thread reads the sockets
+(see `vlagents_ray.serve.endpoints.connection`) and decodes the messages.
 """
 
 from __future__ import annotations
@@ -183,13 +183,13 @@ class WebSocketConnection(PolledConnection):
         self._received = ReceiveBuffer()
         self._out = SendBuffer(connection, self._sending, STREAM_BYTES)
         self._paused = False  # whether too much is unanswered; guarded by the lock
-        # Received but unprocessed frames, their arrival times, s, and the admissions of those that came in parts.
+        # Received but unprocessed frames, their arrival times, s, and the admissions of those received in parts.
         self._frames: deque[tuple[Frame, float, MessageAdmission | None]] = deque()
         self._partial: MessageAdmission | None = None  # admission of the message of which a part is here
         self._unanswered = self._unanswered_bytes = 0  # messages; bytes with the decoded images
         self._messages = 0  # number received so far
         self._ending = False  # `end` was called; bytes that arrive now are ignored
-        self._discarded = 0  # bytes that arrived after a wrong message, which nobody reads
+        self._discarded = 0  # unread bytes after a wrong message
         # Of `overdue` alone: messages at its last call, since when so many, since when a part of the next is here (s).
         self._seen, self._quiet_since, self._part_since = 0, time.monotonic(), float("inf")
 
@@ -251,7 +251,7 @@ class WebSocketConnection(PolledConnection):
             self._pause(_BACKLOGGED)
 
     def _hold_partial(self, sender: Sender) -> None:
-        """Count a message of which a part is here for its key, before the rest is read, and its bytes as they come."""
+        """Count a partly received message for its key, before the rest is read, and its bytes as they arrive."""
         try:
             if self._partial is None:
                 admission = sender.admission(self._limits)

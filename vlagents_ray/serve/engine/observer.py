@@ -1,7 +1,7 @@
-"""The interface of observers, which are the only way to see the requests and the answers of an engine.
+"""The interface of observers, the only access to the requests and the answers of an engine.
 
 An observer is called on the threads that requests and answers take: it copies or passes on references, and leaves the
-rest to a thread of its own. It retains nothing unbounded: beyond a limit in bytes or entries it drops. Requests that
+rest to its own thread. What it retains is bounded: beyond a limit in bytes or entries it drops data. Requests that
 could not be decoded reach no observer. `vlagents_ray.serve.observers` has the observers.
 """
 

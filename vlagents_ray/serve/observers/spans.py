@@ -18,11 +18,11 @@ from vlagents_ray.serve.requests import PendingRequest
 _KEPT = 4096  # most answers between two half seconds; older ones have no spans
 _STAGES = {"queue": "queue", "inference": "batch"}  # in their order from the end of decoding on; names of the spans
 _OPS = ("act", "reset")
-_TEXT = 200  # most characters of an error, or of what a client states
+_TEXT = 200  # most characters of an error, or of a client's text
 
 
 class _ServedRequest(NamedTuple):
-    """What is kept of a request and its answer: nothing that its client may make large."""
+    """The kept data of a request and its answer, of bounded size."""
 
     session: str
     op: str

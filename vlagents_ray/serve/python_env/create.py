@@ -71,7 +71,7 @@ def find_python(version: str) -> str:
     It is this process's own, one on PATH, or one that pyenv or uv has installed for this user.
 
     Raises:
-        ConfigError: There is none.
+        ConfigError: There is no such interpreter.
     """
     folders = [Path(folder) for folder in os.environ.get("PATH", "").split(os.pathsep) if folder]
     pyenv = Path(os.environ.get("PYENV_ROOT") or Path.home() / ".pyenv") / "versions"
