@@ -172,8 +172,8 @@ class Gr00tConfig(ModelConfig):
     compile: Literal[False] = Field(default=False, description="not offered for GR00T")
     trust_remote_code: bool = Field(
         default=False,
-        description="run Python code that lies in the checkpoint or its backbone: whoever can write there can do on "
-        "this machine whatever this process can",
+        description="run Python code in the checkpoint or its backbone: write access to them then gives all rights "
+        "of this process",
     )
 
 

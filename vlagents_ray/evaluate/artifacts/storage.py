@@ -67,7 +67,7 @@ def require_below(path: str) -> str:
     if not parts or path.startswith("/") or ".." in parts or "\0" in path:
         raise ConfigError(
             f"got {path!r} as a file of an episode, want a path below the folder of results; "
-            f"no evaluation writes another: do not trust whoever made this results.db"
+            f"no evaluation writes another: do not trust the author of this results.db"
         )
     return path
 

@@ -49,7 +49,7 @@ _KNOWN = re.compile(
     rf"|{TRAJECTORIES}/({_PART}/){{1,3}}{_PART}\.(npz|mp4)|{VIDEOS}/({_PART}/){{1,3}}{_PART}\.mp4"
 )
 _BROKEN = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError)
-_DISTRUST = "no `vlagents-ray bundle` writes that: do not trust whoever made this bundle"
+_DISTRUST = "no `vlagents-ray bundle` writes that: do not trust the author of this bundle"
 
 
 class FileDigest(BaseModel):

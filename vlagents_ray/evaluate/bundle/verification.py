@@ -112,7 +112,7 @@ def verify(
             except (ArithmeticError, LookupError, RecursionError, TypeError, ValueError, AttributeError) as error:
                 raise ConfigError(
                     f"{bundle}: its database holds values that no evaluation writes ({type(error).__name__}: {error}); "
-                    f"do not trust whoever made it"
+                    f"do not trust its author"
                 ) from error
             if into is not None:
                 os.replace(folder, into)

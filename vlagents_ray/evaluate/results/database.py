@@ -78,7 +78,7 @@ def require_readable(out: Path, db: sqlite3.Connection) -> None:
     for kind, name, sql in db.execute("SELECT type, name, sql FROM sqlite_master WHERE sql IS NOT NULL"):
         if kind not in begins or not str(sql).startswith(begins[kind]):
             raise ConfigError(
-                f"{out / FILE}: got {name!r}, which is a {kind} that no evaluation makes: do not trust whoever made it"
+                f"{out / FILE}: got {name!r}, which is a {kind} that no evaluation makes: do not trust its author"
             )
     version = db.execute("PRAGMA user_version").fetchone()[0]
     if version != VERSION:

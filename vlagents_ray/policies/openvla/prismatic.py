@@ -240,8 +240,8 @@ class PrismaticConfig(ModelConfig):
     )
     trust_remote_code: bool = Field(
         default=False,
-        description="run the Python code that lies in the checkpoint's folder instead: whoever can write there, or in "
-        "the hub's repository, can do on this machine whatever this process can",
+        description="run the Python code in the checkpoint's folder instead: write access to it, or to the hub's "
+        "repository, then gives all rights of this process",
     )
     attention: Literal["sdpa", "eager", "flash_attention_2"] = Field(
         default="sdpa", description="of the language model; flash_attention_2 needs the package flash-attn and a GPU"

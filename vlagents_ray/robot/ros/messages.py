@@ -132,7 +132,7 @@ def pose(message: Any, rotation: PoseRotation = "quat_xyzw") -> np.ndarray:
     length = float(np.linalg.norm(quaternion))
     if not length > 1e-6:
         raise MalformedMessage(
-            f"pose: got the quaternion {quaternion.tolist()}, want one of unit length; has nobody filled it in?"
+            f"pose: got the quaternion {quaternion.tolist()}, want one of unit length; is the field unset?"
         )
     quaternion = quaternion / length
     if rotation == "quat_wxyz":

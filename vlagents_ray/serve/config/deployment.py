@@ -239,7 +239,7 @@ class AccessArgs(_DeploymentModel):
         description="path of the API keys, on every node the same; unset: what VLAGENTS_RAY_KEYS_FILE or "
         "VLAGENTS_RAY_KEYS say where the replica runs",
     )
-    insecure: bool = Field(default=False, description="let in anybody who reaches the port from another machine")
+    insecure: bool = Field(default=False, description="accept clients on other machines without keys")
     plain_http: bool = Field(
         default=False, description="keys may cross the network unencrypted: no warning (TLS ends elsewhere, a VPN)"
     )

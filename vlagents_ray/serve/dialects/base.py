@@ -249,8 +249,8 @@ class PortDialect(Dialect):
         super().__init__(name, config, context)
         if isinstance(config, KeylessPortConfig) and not (isinstance(context.check, NoKey) or config.without_key):
             raise ConfigError(
-                f"dialects.{name}: the server wants API keys, and this protocol has none; remove the dialect, or "
-                "accept whoever reaches its port, with without_key: true"
+                f"dialects.{name}: the server requires API keys, and this protocol has none; remove the dialect, or "
+                "accept all clients that reach its port, with without_key: true"
             )
 
     @classmethod
