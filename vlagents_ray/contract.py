@@ -153,7 +153,7 @@ def differences(policy: Contract, env: Contract) -> list[str]:
 
 
 def _differ(a: object, b: object) -> bool:
-    """Whether both values are stated and differ."""
+    """Return whether both values are stated and differ."""
     return a is not None and b is not None and a != b
 
 

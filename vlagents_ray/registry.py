@@ -322,32 +322,32 @@ def names(kind: str) -> dict[str, str]:
 
 
 def policy_class(name: str) -> type[Any]:
-    """The Agent class registered as `name`, or written out as "module:Class"."""
+    """Return the Agent class registered as `name`, or written out as "module:Class"."""
     return named_class(name, names("policies"), UnknownPolicy)
 
 
 def wrapper_class(name: str) -> type[Any]:
-    """The Wrapper class registered as `name`, or written out as "module:Class"."""
+    """Return the wrapper class registered as `name`, or written out as "module:Class"."""
     return named_class(name, names("wrappers"), UnknownWrapper)
 
 
 def dialect_class(name: str) -> type[Any]:
-    """The Dialect class registered as `name`, or written out as "module:Class"."""
+    """Return the dialect class registered as `name`, or written out as "module:Class"."""
     return named_class(name, DIALECTS if name in DIALECTS else names("dialects"))
 
 
 def env_class(name: str) -> type[Any]:
-    """The EvalEnv class for `name`, e.g. "tabletop" or "maniskill/PushCube-v1"."""
+    """Return the EvalEnv class for `name`, e.g. "tabletop" or "maniskill/PushCube-v1"."""
     return named_class(env_suite(name), names("envs"), UnknownEnv)
 
 
 def env_suite(name: str) -> str:
-    """The registered part of an env's name: "maniskill" of "maniskill/PushCube-v1"."""
+    """Return the registered part of an env's name: "maniskill" of "maniskill/PushCube-v1"."""
     return name if _is_class(name) else name.partition("/")[0]
 
 
 def env_task(name: str) -> str | None:
-    """The task within the suite: "PushCube-v1" of "maniskill/PushCube-v1"; None if not given."""
+    """Return the task within the suite: "PushCube-v1" of "maniskill/PushCube-v1"; None if not given."""
     return None if _is_class(name) else name.partition("/")[2] or None
 
 

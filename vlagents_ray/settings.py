@@ -77,7 +77,7 @@ def _kinds_of_default(default: Any) -> list[type]:
 
 
 def _is(value: Any, kind: type) -> bool:
-    """Whether a value is of a plain type; a boolean does not count as a number."""
+    """Return whether a value is of a plain type; a boolean does not count as a number."""
     return isinstance(value, _PLAIN[kind]) and (kind is bool or not isinstance(value, bool))
 
 
@@ -134,7 +134,7 @@ def _fields(model: type | None, place: Iterable[Any]) -> Mapping[str, Any]:
 
 
 def _of(model: type | None) -> Mapping[str, Any]:
-    """The fields of a model; of one whose fields are registered names, those."""
+    """Return the fields of a model; of one whose fields are registered names, those."""
     registered: Callable[[], Mapping[str, Any]] | None = getattr(model, "registered_fields", None)
     return getattr(model, "model_fields", {}) if registered is None else registered()
 

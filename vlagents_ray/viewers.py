@@ -175,7 +175,7 @@ def open_viewer(target: str) -> EpisodeViewer:
 
 
 def is_live(target: str) -> bool:
-    """Whether a target is a connection, not a folder."""
+    """Return whether a target is a connection, not a folder."""
     return target == "live" or target.startswith("rerun+")
 
 

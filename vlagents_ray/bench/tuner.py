@@ -213,7 +213,7 @@ class Tuner:
                 measured.add(self._turn(process, measured.sessions))
 
     def _worth_more(self, found: Sequence[TunedSize]) -> bool:
-        """Whether a larger batch may serve the goal better than those that were measured, ascending."""
+        """Return whether a larger batch may serve the goal better than those that were measured, ascending."""
         if found and self._plan.goal.p99_ms is not None:
             return found[-1].point().round_trip_ms <= self._plan.goal.p99_ms
         rates = [measured.rates[0] for measured in found]

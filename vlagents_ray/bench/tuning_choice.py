@@ -57,7 +57,7 @@ class MeasuredPoint:
     difference: float  # largest difference from the actions of the file's own settings, as a share of their range
 
     def reaches(self, goal: TuningGoal) -> bool:
-        """Whether round trips are short enough for robots, if the goal is of them."""
+        """Return whether round trips are short enough for robots, if the goal is of them."""
         return goal.p99_ms is None or self.p99_ms <= goal.p99_ms
 
 

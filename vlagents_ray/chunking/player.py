@@ -381,7 +381,7 @@ class ChunkPlayer(Agent):
         return self._plan.next
 
     def _wants(self, tick: int, obs: Obs) -> bool:
-        """Whether a request with this tick's observation is due."""
+        """Return whether a request with this tick's observation is due."""
         if self._is_old(self._captured(obs)):
             return False
         step = self._next()

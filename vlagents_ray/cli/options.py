@@ -31,7 +31,7 @@ Live = Annotated[
 ]
 LiveAt = Annotated[
     str | None,
-    typer.Option("--live-at", metavar="HOST:PORT", help="The same there; beyond this machine it wants API keys."),
+    typer.Option("--live-at", metavar="HOST:PORT", help="The same there; beyond this machine it needs API keys."),
 ]
 
 StateDims = Annotated[

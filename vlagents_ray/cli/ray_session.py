@@ -94,7 +94,7 @@ class _Terminal:
         self._started = started
 
     def is_shown(self, record: logging.LogRecord) -> bool:
-        """Whether a record of this process is a problem; for `logging`."""
+        """Return whether a record of this process is a problem; for `logging`."""
         text = record.getMessage()
         shown = _is_problem(text, record.levelno)
         if not shown:

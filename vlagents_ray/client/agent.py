@@ -108,7 +108,7 @@ class ClientSession:
                 self.episode.recent.append(copied(obs))
 
     def is_lost(self, reply: Reply) -> bool:
-        """Whether the session must begin again; if not, its replica checks that no answer was lost."""
+        """Return whether the session must begin again; if not, its replica checks that no answer was lost."""
         return isinstance(reply.error, _LOST) or self.episode is None or self.episode.step is None
 
     def begin_again(self, request: Request) -> Request:

@@ -379,7 +379,7 @@ class SequentialBatch(BatchEnv):
                 closing.callback(env.close)
 
     def _stacked(self, seen: list[Obs], moved: Collection[int]) -> list[Obs]:
-        """The observations with the images of each camera as rows of one array, if they are used.
+        """Return the observations with the images of each camera as rows of one array, if they are used.
 
         An idle environment may have left its images out when it last moved; those of one that moved stand for them.
         """

@@ -116,7 +116,7 @@ class Renderer:
 
 
 def has_gpu() -> bool | None:
-    """Whether this process was given a GPU; None if that is not stated."""
+    """Return whether this process was given a GPU; None if that is not stated."""
     visible = os.environ.get(GPUS)
     return None if visible is None else visible.strip() not in ("", "-1")
 

@@ -130,7 +130,7 @@ class LiberoTask:
 
 
 def task_names() -> list[str]:
-    """Every task, e.g. "libero_spatial/0"; needs no simulator."""
+    """Return every task, e.g. "libero_spatial/0"; needs no simulator."""
     return [f"{name}/{number}" for name, suite in SUITES.items() for number in range(suite.tasks)]
 
 
@@ -148,7 +148,7 @@ def require_suite(name: str) -> tuple[str, str]:
 
 
 def find_task(name: str) -> LiberoTask:
-    """The task `name`, "SUITE/NUMBER" or "SUITE/NAME"; imports LIBERO; raises `UnknownEnv` if there is none."""
+    """Return the task `name`, "SUITE/NUMBER" or "SUITE/NAME"; imports LIBERO; raises `UnknownEnv` if there is none."""
     suite, which = require_suite(name)
     root = import_libero()
     known = require("libero.libero.benchmark").task_maps[suite]
@@ -170,7 +170,7 @@ def find_task(name: str) -> LiberoTask:
 
 
 def read_states(path: Path) -> np.ndarray:
-    """The initial states in a file, (N, D) float64: time, qpos and qvel of MuJoCo.
+    """Return the initial states in a file, (N, D) float64: time, qpos and qvel of MuJoCo.
 
     They are pickled numpy arrays, in torch's archives. LIBERO loads them as any pickle; here nothing but such an array
     is let in.
@@ -349,7 +349,7 @@ def _contract_of(protocol: LiberoProtocol) -> Contract:
 
 
 def to_simulator(action: np.ndarray, protocol: LiberoProtocol) -> np.ndarray:
-    """An action under `protocol`, (7,), as robosuite takes it: the gripper -1 to open, 1 to close, 0 to stay.
+    """Return an action under `protocol`, (7,), as robosuite takes it: the gripper -1 to open, 1 to close, 0 to stay.
 
     Closer to `gripper_open` means open, as in openvla's evaluation, which binarises, and as robosuite's own
     gripper does, of whose command only the sign counts.
@@ -360,7 +360,7 @@ def to_simulator(action: np.ndarray, protocol: LiberoProtocol) -> np.ndarray:
 
 
 def axis_angle(quaternion: np.ndarray) -> np.ndarray:
-    """A unit quaternion xyzw to axis times angle, (3,) rad, the angle in [0, 2 pi].
+    """Return a unit quaternion xyzw to axis times angle, (3,) rad, the angle in [0, 2 pi].
 
     As robosuite's `quat2axisangle`, q and -q give different ones: policies were trained on states in which
     no sign was normalised. For a gripper that points down w is near 0, and a state that chose the sign by it
@@ -458,7 +458,7 @@ class LiberoSimulation:
 
 
 def package_folder() -> Path:
-    """The package's folder with its problems and initial states; raises `MissingDependency`."""
+    """Return the package's folder with its problems and initial states; raises `MissingDependency`."""
     require("libero")
     spec = importlib.util.find_spec("libero.libero")
     if spec is None or spec.origin is None:

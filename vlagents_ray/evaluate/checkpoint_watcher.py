@@ -80,7 +80,7 @@ class CheckpointWatcher:
         return (self.folder / FINISHED).exists()
 
     def is_settled(self, now: float) -> bool:
-        """Whether no unfinished checkpoint has changed for `settle_s` seconds."""
+        """Return whether no unfinished checkpoint has changed for `settle_s` seconds."""
         return all(now - seen.since >= self._settle_s for seen in self._seen.values())
 
     def waiting(self) -> dict[int, str]:

@@ -304,7 +304,7 @@ def _of_other_weights(folders: Sequence[Results]) -> set[str]:
 
 
 def _labels(folders: Sequence[Results], base: Path) -> list[str]:
-    """Names of the folders: their last parts, or their paths under `base` if last parts are the same."""
+    """Return names of the folders: their last parts, or their paths under `base` if last parts are the same."""
     names = [each.out.resolve().name for each in folders]
     if len(set(names)) == len(names):
         return names

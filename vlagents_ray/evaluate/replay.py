@@ -74,7 +74,7 @@ def find(results: Results, name: str) -> Recorded:
 
 
 def compare(recorded: Recorded, replayed: Results) -> list[str]:
-    """The differences of the replay, a sentence each; empty if it is the same episode.
+    """Return the differences of the replay, a sentence each; empty if it is the same episode.
 
     Actions are compared byte for byte, durations not at all. Raises `ConfigError` if infrastructure failed the replay.
     """

@@ -125,7 +125,7 @@ class CaptureLock:
 
     @contextmanager
     def capture(self) -> Iterator[None]:
-        """Wait for running acts and pushes, none of which begins within this context."""
+        """Wait for running acts and pushes, and block new ones within this context."""
         if threading.get_ident() in self._acting:
             raise RuntimeError("a CUDA graph cannot be captured within an act; capture it in Agent.initialize")
         with self.pushes:

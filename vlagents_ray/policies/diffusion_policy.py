@@ -237,7 +237,7 @@ def _read(path: Path) -> tuple[Any, Mapping[str, Any]]:
         ) from error
     name = "ema_model" if require("omegaconf").OmegaConf.select(settings, "training.use_ema") else "model"
     if name not in states:
-        raise ConfigError(f"checkpoint {path}: has no {name!r}, which its training.use_ema wants; has {sorted(states)}")
+        raise ConfigError(f"checkpoint {path}: has no {name!r}, which its training.use_ema needs; has {sorted(states)}")
     return settings, states[name]
 
 

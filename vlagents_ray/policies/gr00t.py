@@ -348,7 +348,7 @@ _CHECK = "_check_and_enable_flash_attn_2"  # of transformers' models, up to 4.5
 
 
 def flash_attention_is_here(device: Any, dtype: Any) -> bool:
-    """Whether flash-attention is installed, and computes on a device in a dtype: on CUDA, in 16 bits."""
+    """Return whether flash-attention is installed, and computes on a device in a dtype: on CUDA, in 16 bits."""
     computes = device.type == "cuda" and dtype.itemsize == 2
     return computes and bool(require("transformers.utils").is_flash_attn_2_available())
 

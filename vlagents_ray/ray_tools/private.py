@@ -253,7 +253,7 @@ def http_options() -> Any:
 
 
 def replica_is_ending() -> bool:
-    """Whether Serve has begun to stop the replica that this process is; it has no hook for that."""
+    """Return whether Serve has begun to stop the replica that this process is; it has no hook for that."""
     import ray
 
     worker = ray._private.worker.global_worker

@@ -252,7 +252,7 @@ class SessionTable(Generic[M]):
             return True
 
     def close_owned(self, connection: str, session_ids: Iterable[str]) -> None:
-        """Close those of the sessions that still end with the connection."""
+        """Close the given sessions, except any that no longer end with the connection."""
         with self._lock:
             for session_id in session_ids:
                 session = self._sessions.get(session_id)

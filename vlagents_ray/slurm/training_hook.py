@@ -75,7 +75,7 @@ def _submit_once(words: list[str], checkpoint: str, step: int, record: Path, pyt
 
 
 def _is_claimed(mark: Path, claim: dict[str, Any]) -> bool:
-    """Whether this process submits the checkpoint: the first to claim it, or another one if that was killed."""
+    """Return whether this process submits the checkpoint: the first to claim it, or another one if that was killed."""
     try:
         mark.open("x").close()
     except FileExistsError:

@@ -111,7 +111,7 @@ class Outgoing:
         )
 
     def _own_gripper(self) -> bool:
-        """Whether the gripper's number is not one of a state's, which then sets it."""
+        """Return whether the gripper's number is not one of a state's, which then sets it."""
         gripper = self.mapping.gripper
         return gripper is not None and not any(
             _first(part.key) == _first(gripper.key)

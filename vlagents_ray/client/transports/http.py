@@ -183,7 +183,7 @@ def http_url(url: str) -> SplitResult:
 
 
 def _closed_by_peer(sock: socket.socket | None) -> bool:
-    """Whether the server closed an idle connection: only then is there anything to read."""
+    """Return whether the server closed an idle connection: only then is there anything to read."""
     if sock is None:
         return True
     poller = select.poll()

@@ -41,7 +41,7 @@ class ClientApi(Protocol):
     """
 
     async def attach(self, node: str = "", boot_id: str = "", must_be_near: bool = False) -> tuple[dict[str, Any], Any]:
-        """Return the metadata of the replica that suits a client on that node best, and its actor."""
+        """Return metadata and actor of the best replica for a client on that node."""
         ...
 
     async def call(self, session_id: str, frame: Any) -> bytes:

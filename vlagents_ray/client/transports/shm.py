@@ -51,7 +51,7 @@ class UnixTransport(ABC):
 
     @abstractmethod
     def _is_free(self) -> bool:
-        """Whether the next requests can be written."""
+        """Return whether the next requests can be written."""
 
     @abstractmethod
     def _write(self, requests: Sequence[Request], deadline: float) -> tuple[bytes, int | None]:

@@ -53,7 +53,7 @@ def instruction_for(task: str) -> str:
 
 
 def registered_limit(task: str) -> int | None:
-    """The step limit that ManiSkill registers for `task`; imports ManiSkill and readies the process for it."""
+    """Return the step limit that ManiSkill registers for `task`; imports ManiSkill and readies the process for it."""
     prepare_rendering()
     require("sapien")
     require("mani_skill.envs")
@@ -86,7 +86,7 @@ def chosen_backend(wanted: str) -> str:
 
 
 def make_bare(task: str, control_mode: str | None, *, sim_backend: str, render_backend: str, **options: Any) -> Any:
-    """The bare environment, without Gymnasium's wrappers; options that are None are left to ManiSkill.
+    """Return the bare environment, without Gymnasium's wrappers; options that are None are left to ManiSkill.
 
     `control_mode` None is the default one, or the robot's own if it lacks that. Raises `ConfigError`
     for a control mode that the robot lacks, else `EnvFailed`.
@@ -240,7 +240,7 @@ class ManiSkillRobot:
 
 
 def _tool(agent: Any) -> Any:
-    """The link whose pose is the tool's; None if there is none."""
+    """Return the link whose pose is the tool's; None if there is none."""
     tcp = getattr(agent, "tcp", None)
     return agent.robot.links_map.get(_TOOL_LINK) if tcp is None else tcp
 

@@ -257,7 +257,7 @@ class Goal:
         return TEMPLATES[self.task].format(puck=self.puck, target=self.target)
 
     def reached(self, world: TabletopWorld) -> bool:
-        """Whether the puck is at the instruction's target and released."""
+        """Return whether the puck is at the instruction's target and released."""
         puck = world.puck(self.puck)
         if self.target is None:
             return puck is world.held and puck.z >= _LIFT_HEIGHT

@@ -54,7 +54,7 @@ def episode_folder(out: Path, kind: str, cell: EvalCase) -> Path:
 
 
 def stem(key: EpisodeKey) -> str:
-    """The beginning of the names of an episode's files, before "_" or "."."""
+    """Return the beginning of the names of an episode's files, before "_" or "."."""
     return f"ep{key.episode:04d}_seed{key.seed}"
 
 
@@ -104,7 +104,7 @@ def remove_old(folder: Path, key: EpisodeKey) -> None:
 
 
 def outcome(result: EpisodeResult) -> str:
-    """The outcome of an episode: "success", "failure", "policy_error" or "infra_failed"."""
+    """Return the outcome of an episode: "success", "failure", "policy_error" or "infra_failed"."""
     if result.status != "done":
         return result.status
     return "success" if result.success_once else "failure"
@@ -168,7 +168,7 @@ def storing(folder: Path) -> Iterator[None]:
 
 
 def _number(error: sqlite3.OperationalError, folder: Path) -> int | None:
-    """The errno of an error of SQLite; None if it is not about the disk."""
+    """Return the errno of an error of SQLite; None if it is not about the disk."""
     number = _SQLITE.get(str(error))
     disk = os.statvfs(next(one for one in (folder, *folder.absolute().parents) if one.exists()))
     if number == errno.EACCES and disk.f_flag & os.ST_RDONLY:
@@ -177,12 +177,12 @@ def _number(error: sqlite3.OperationalError, folder: Path) -> int | None:
 
 
 def driver_code() -> dict[str, GitState | None]:
-    """The git state of the working directory and of this package; None where there is no git repository."""
+    """Return the git state of the working directory and of this package; None where there is no git repository."""
     return {"folder": code_in(Path.cwd()), "vlagents_ray": code_of("vlagents_ray")}
 
 
 def versions() -> dict[str, Any]:
-    """The versions of Python, of packages and of the platform in the driver, and `driver_code` as JSON."""
+    """Return the versions of Python, of packages and of the platform in the driver, and `driver_code` as JSON."""
     packages = {}
     for name in ("vlagents-ray", "ray", "numpy", "av"):
         try:
@@ -194,7 +194,7 @@ def versions() -> dict[str, Any]:
 
 
 def policy_code(metadata: dict[str, Any]) -> GitState | None:
-    """The git state of a policy's code, diff included, if it is the same here as on its server; else None."""
+    """Return the git state of a policy's code, diff included, if it is the same here as on its server; else None."""
     policy = metadata.get("policy")
     here = code_of(names("policies").get(policy, policy)) if isinstance(policy, str) else None
     return here if here is not None and here.to_json() == metadata.get("code") else None

@@ -117,7 +117,7 @@ class TrajectoryRecorder(EpisodeObserver):
         self._success.append(success)
 
     def finish(self) -> Trajectory:
-        """The trajectory; if no action was executed, the shape of `actions` is (0, 0)."""
+        """Return the trajectory; if no action was executed, the shape of `actions` is (0, 0)."""
         return Trajectory(
             np.stack(self._actions) if self._actions else np.zeros((0, 0), np.float32),
             np.array(self._rewards, np.float64),

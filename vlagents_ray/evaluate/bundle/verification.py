@@ -170,7 +170,7 @@ def _check_trajectories(results: Results) -> Finding:
 
 
 def _recorded(results: Results, episode: Episode) -> Trajectory | None:
-    """The recording of an episode; None if the bundle has none. Raises `ConfigError` if it cannot be read."""
+    """Return the recording of an episode; None if the bundle has none. Raises `ConfigError` if it cannot be read."""
     if episode.trajectory is None or not (path := results.file(episode.trajectory)).is_file():
         return None
     try:
@@ -357,7 +357,7 @@ def _check_replays(results: Results, most: int, *, trust: bool) -> Iterator[Find
 
 
 def _chosen(results: Results, most: int) -> list[tuple[CellResults, Episode, Trajectory]]:
-    """The first episode with a recording of each cell in turns, then the second of each, and so on."""
+    """Return the first episode with a recording of each cell in turns, then the second of each, and so on."""
     left = [
         (cell, iter([one for one in cell.episodes if one.result.status == "done" and one.trajectory is not None]))
         for cell in results.cells

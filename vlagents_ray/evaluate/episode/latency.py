@@ -108,7 +108,7 @@ class ChunkExecutor:
                 yield Tick(step.action, waited=True)
 
     def _goes_on(self) -> bool:
-        """Whether holding an action moves the robot; then the held action counts as a row."""
+        """Return whether holding an action moves the robot; then the held action counts as a row."""
         return self._clock.meanwhile == "hold" and self._plan.executed > 0 and stopping(self._spec) == "zero"
 
     def _held(self, dim: int) -> np.ndarray:

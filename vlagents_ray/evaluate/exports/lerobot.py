@@ -261,7 +261,7 @@ def _finished(one: _Demonstration, angles: Mapping[int, Centre], folder: Path) -
 
 
 def _policy_contract(one: _Demonstration) -> Contract:
-    """The contract of a policy that is trained on the dataset: its actions are the env's, without bounds."""
+    """Return the contract of a policy that is trained on the dataset: its actions are the env's, without bounds."""
     env = one.contract
     specs = env.state or {}
     return Contract(
@@ -274,7 +274,7 @@ def _policy_contract(one: _Demonstration) -> Contract:
 
 
 def _numbers(one: _Demonstration, about: DatasetContract) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Rows and features: the state in one vector and part by part, the action, and its outcome."""
+    """Return rows and features: the state in one vector and part by part, the action, and its outcome."""
     frames, dim = one.actions.shape
     together, names = state_vector(one.state, one.gripper, one.parts)
     together = about.wrapped(together)
@@ -312,7 +312,7 @@ def _numbers(one: _Demonstration, about: DatasetContract) -> tuple[dict[str, np.
 
 
 def _statistics(video: Path, frames: int) -> tuple[Stats, tuple[int, int]]:
-    """The statistics of the first `frames` images, and their (height, width) in pixels."""
+    """Return the statistics of the first `frames` images, and their (height, width) in pixels."""
     seen = ImageStatistics()
     with require("av").open(str(video)) as container:
         stream = container.streams.video[0]

@@ -34,7 +34,7 @@ class Job:
     attempt: int = 1
 
     def again(self) -> Job:
-        """The next attempt at the same episode."""
+        """Return the next attempt at the same episode."""
         return replace(self, attempt=self.attempt + 1)
 
 

@@ -159,7 +159,7 @@ def episodes(results: Results, gallery: Gallery) -> Episodes | None:
 
 
 def failures(results: Results, gallery: Gallery) -> Failures | None:
-    """The episodes that were not solved; None if there are none."""
+    """Return the episodes that were not solved; None if there are none."""
     found = [
         (cell, one) for cell in results.cells for one in cell.episodes if one.counts and not one.result.success_once
     ]

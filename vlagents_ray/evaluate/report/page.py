@@ -93,7 +93,7 @@ def write_report(results: Results, path: Path, *, inline: bool = False) -> Path:
 
 
 def report(summary: Summary, gallery: Gallery) -> str:
-    """The page as text."""
+    """Return the page as text."""
     results = summary.results
     sections = [
         Section("Success", "success", success_table(summary)),
@@ -174,7 +174,7 @@ class Latency:
 
 
 def latency(summary: Summary) -> Latency | None:
-    """The latencies; None if no episode was played."""
+    """Return the latencies; None if no episode was played."""
     results = summary.results
     by_name = {name: [one for cell in results.of(name) for one in cell.counted] for name in results.contenders}
     played = {name: counted for name, counted in by_name.items() if counted}

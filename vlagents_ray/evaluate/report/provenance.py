@@ -60,7 +60,7 @@ class Repeat:
 
 
 def protocol(results: Results) -> list[Env]:
-    """The description and contract of the envs; envs with the same ones are one entry."""
+    """Return the description and contract of the envs; envs with the same ones are one entry."""
     alike: dict[str, tuple[CellResults, list[str]]] = {}
     for cell in results.cells:
         settings = {name: cell.settings.get(name) for name in _SETTINGS}

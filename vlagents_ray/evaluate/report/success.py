@@ -185,7 +185,7 @@ class Comparisons:
 
 
 def compare_all(summary: Summary) -> Comparisons | None:
-    """All comparisons; None for a single policy id."""
+    """Return all comparisons; None for a single policy id."""
     if len(summary.results.contenders) < 2:
         return None
     reasons: list[str] = []

@@ -38,7 +38,7 @@ class Line:
         return difference_interval(self.strata)
 
     def to_json(self) -> dict[str, Any]:
-        """The fields for JSON."""
+        """Return the fields for JSON."""
         beside = {"interval_95": list(self.interval), "p_holm": self.adjusted}
         return {"suite": self.suite} | self.pairs.to_json() | beside
 
@@ -54,7 +54,7 @@ class Comparison:
     cells: tuple[CellResults, ...] = ()  # of `clock_gaps`: the cells in real time
 
     def to_json(self) -> dict[str, Any]:
-        """The fields for JSON; `lines` has one entry for each suite, and the total last."""
+        """Return the fields for JSON; `lines` has one entry for each suite, and the total last."""
         return {"a": self.a, "b": self.b, "lines": [line.to_json() for line in (*self.suites, self.total)]}
 
 
@@ -178,7 +178,7 @@ def _of_env(cell: CellResults) -> dict[str, Any]:
 
 
 def _pairs(a: CellResults, b: CellResults) -> Pairs:
-    """The episodes of both cells, by success once."""
+    """Return the episodes of both cells, by success once."""
     theirs = {(one.key.episode, one.key.seed): bool(one.success_once) for one in b.counted}
     outcomes = [
         (bool(one.success_once), theirs[one.key.episode, one.key.seed])

@@ -71,7 +71,7 @@ class Rate:
         return wilson(self.successes, self.episodes) if self.bounds is None else self.bounds
 
     def to_json(self) -> dict[str, Any]:
-        """The fields for JSON: `successes`, `episodes`, `rate`, and the interval.
+        """Return the fields for JSON: `successes`, `episodes`, `rate`, and the interval.
 
         The interval is `wilson_95` or, if the evaluation could stop early, `confidence_sequence` with its `error_rate`.
         """
@@ -125,7 +125,7 @@ class Pairs:
         return mcnemar(self.only_a, self.only_b)
 
     def to_json(self) -> dict[str, Any]:
-        """The four numbers, with `pairs` (their sum), `difference` and `p_value`, for JSON."""
+        """Return the four numbers, with `pairs` (their sum), `difference` and `p_value`, for JSON."""
         counts = {"both": self.both, "only_a": self.only_a, "only_b": self.only_b, "neither": self.neither}
         return counts | {"pairs": self.total, "difference": self.difference, "p_value": self.p_value}
 

@@ -101,7 +101,7 @@ class Store:
             self._db.execute("UPDATE runs SET ended = ?, state = ? WHERE run = ?", (time.time(), state, self._run))
 
     def finished(self) -> set[str]:
-        """The keys of the episodes that will not be played again."""
+        """Return the keys of the episodes that will not be played again."""
         return {key for (key,) in self._db.execute("SELECT key FROM episodes WHERE status != 'infra_failed'")}
 
     def record(

@@ -51,7 +51,7 @@ class Group:
         return self.success_once.episodes
 
     def to_json(self) -> dict[str, Any]:
-        """The fields for JSON, with `episodes`."""
+        """Return the fields for JSON, with `episodes`."""
         rates = {"success_once": self.success_once.to_json(), "success_at_end": self.success_at_end.to_json()}
         return asdict(self) | {"episodes": self.episodes} | rates
 
@@ -82,7 +82,7 @@ class Summary:
         return group_of((TOTAL, "", TOTAL), self.results.cells)
 
     def parts(self, contender: str) -> dict[str, Group]:
-        """The totals of a policy id, by the clock of their episodes (`by_timing`)."""
+        """Return the totals of a policy id, by the clock of their episodes (`by_timing`)."""
         return {
             timing: group_of((contender, "", TOTAL), cells)
             for timing, cells in by_timing(self.results.of(contender)).items()
@@ -128,7 +128,7 @@ class Summary:
         return [result for cell in self.results.cells for result in cell.counted]
 
     def to_json(self) -> dict[str, Any]:
-        """The content of summary.json."""
+        """Return the content of summary.json."""
         cells = [
             group.to_json()
             | {"checkpoint": checkpoint_of(cell), "weights": weights_of(cell), "revision": revision_of(cell)}

@@ -56,12 +56,12 @@ def ray_cluster(config: EvalConfig) -> Iterator[None]:
 
 
 def most_cpus(config: EvalConfig) -> float:
-    """The largest number of CPUs that any worker of the evaluation requests; a share of one may be requested."""
+    """Return the largest number of CPUs that any worker of the evaluation requests; a share of one may be requested."""
     return max(worker.cpus for worker in _kinds(config))
 
 
 def most_gpus(config: EvalConfig) -> float:
-    """The largest number of GPUs that any worker of the evaluation requests; a share of one may be requested."""
+    """Return the largest number of GPUs that any worker of the evaluation requests; a share of one may be requested."""
     return max(worker.gpus for worker in _kinds(config))
 
 
@@ -153,7 +153,7 @@ class CapacityMonitor:
         self._warned = False
 
     def timed_out(self, since: float) -> bool:
-        """Whether a worker that was requested at `since` has waited for too long."""
+        """Return whether a worker that was requested at `since` has waited for too long."""
         return self._now() - since > self._config.place_timeout_s
 
     def report_shortage(self, worker: WorkerConfig, running: int) -> None:
@@ -167,7 +167,7 @@ class CapacityMonitor:
         self._warned = True
         want = {"CPU": worker.cpus, "GPU": worker.gpus}
         message = (
-            f"the cluster found no room for a worker in {self._config.place_timeout_s:g} s: each wants {want}, "
+            f"the cluster found no room for a worker in {self._config.place_timeout_s:g} s: each needs {want}, "
             f"free are {ray.available_resources()} of {ray.cluster_resources()}; lower `workers` or "
             f"`worker.cpus`, or raise `place_timeout_s` if the cluster is still growing"
         )

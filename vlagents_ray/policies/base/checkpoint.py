@@ -77,7 +77,7 @@ def find_checkpoint(name: str, step: int | None = None, needs: Iterable[str] = (
 
 
 def _holds(folder: Path, path: Path) -> bool:
-    """Whether `path` is in the folder, or the folder itself under another name, as behind a link `last`."""
+    """Return whether `path` is in the folder, or the folder itself under another name, as behind a link `last`."""
     if not folder.is_dir():
         return False
     # A file of the hub's cache is a link out of its folder.

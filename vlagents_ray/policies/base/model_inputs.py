@@ -119,7 +119,7 @@ def camera_specs(cameras: Mapping[str, str]) -> dict[str, CameraSpec]:
 
 
 def needs_gripper(parts: Sequence[str]) -> bool:
-    """Whether `Obs.gripper` is among the parts, for a contract."""
+    """Return whether `Obs.gripper` is among the parts, for a contract."""
     return GRIPPER in parts or CLOSED in parts
 
 

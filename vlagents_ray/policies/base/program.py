@@ -139,7 +139,7 @@ def _spec(name: str) -> ModuleSpec | None:
 
 
 def _is_own(file: Path) -> bool:
-    """Whether a file is in no installed package, nor in this one or the standard library."""
+    """Return whether a file is in no installed package, nor in this one or the standard library."""
     path = file.resolve()
     here = Path(__file__).resolve().parents[2]
     return not _SITES & set(path.parts) and not any(path.is_relative_to(one) for one in (*_LIBRARIES, here))

@@ -71,7 +71,7 @@ def installed() -> str:
 
 
 def is_new() -> bool:
-    """Whether this environment has LeRobot 0.6 or newer."""
+    """Return whether this environment has LeRobot 0.6 or newer."""
     return tuple(int(part) for part in installed().split(".")[:2]) >= (0, 6)
 
 

@@ -97,7 +97,7 @@ class Processors:
         return {}
 
     def normalises(self, feature: Any) -> bool:
-        """Whether the pre-processor changes numbers of that feature by their statistics."""
+        """Return whether the pre-processor changes numbers of that feature by their statistics."""
         maps = [step.norm_map for step in self._before.steps if hasattr(step, "norm_map")]
         return any(getattr(one.get(feature.type), "name", "IDENTITY") != "IDENTITY" for one in maps)
 

@@ -67,7 +67,7 @@ class VlaEvalClient(WebSocketClient):
         params = metadata.get("observation_params")
         wants_state = isinstance(params, dict) and params.get("send_state") is True
         if wants_state and not outgoing.mapping.state:
-            return ["state: the upstream wants it (send_state), the mapping has none; add it to mapping.state"]
+            return ["state: the upstream needs it (send_state), the mapping has none; add it to mapping.state"]
         return []
 
     def _send(self, kind: vla_eval.Kind, payload: dict[str, Any]) -> None:

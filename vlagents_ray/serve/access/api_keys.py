@@ -133,7 +133,7 @@ class Keys:
             raise error
 
     def throttled_s(self, name: str) -> float:
-        """Return for how long no sender with the key is read, s: over 0 if one of them was over the key's rate."""
+        """Return the time for which the key's senders are not read, s; 0 unless one exceeded the key's rate."""
         bucket = self._buckets.get(name)
         return 0.0 if bucket is None else max(0.0, bucket.unread_until - time.monotonic())
 

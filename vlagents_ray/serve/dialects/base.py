@@ -328,7 +328,7 @@ class ImplicitEpisode:
         self.begun = False  # whether there was an observation of this episode
 
     def begins(self, instruction: str | None) -> bool:
-        """Whether an observation with that instruction begins an episode."""
+        """Return whether an observation with that instruction begins an episode."""
         return not self.begun or (instruction is not None and instruction != self.instruction)
 
     def opening(self, instruction: str | None, contract: Contract | None) -> str | None:

@@ -116,7 +116,7 @@ def _is_public(scope: Scope) -> bool:
 
 
 def _has_body(scope: Scope, most: int = 0) -> bool:
-    """Whether a body of more than `most` bytes, or of unstated length, follows the headers."""
+    """Return whether a body of more than `most` bytes, or of unstated length, follows the headers."""
     headers = headers_of(scope)
     stated = headers.get("content-length", "0")
     return "transfer-encoding" in headers or not stated.isdecimal() or int(stated) > most

@@ -153,7 +153,7 @@ class WebSocketServer(PolledServer["WebSocketConnection"]):
         return caller
 
     def remove(self, client: WebSocketConnection) -> None:
-        """See `PolledServer`."""
+        """Forget a connection, also during its handshake."""
         self._handshaking.pop(client, None)
         super().remove(client)
 
@@ -266,7 +266,7 @@ class WebSocketConnection(PolledConnection):
             self.end(str(error), _TRY_AGAIN_LATER if isinstance(error, Overloaded) else POLICY_VIOLATION)
 
     def _is_backlogged(self) -> bool:
-        """Whether the client has too many unanswered messages or bytes; the caller holds the lock."""
+        """Return whether the client has too many unanswered messages or bytes; the caller holds the lock."""
         return self._unanswered >= _UNANSWERED or self._unanswered_bytes > self._limits.body_bytes
 
     def _discard(self) -> None:
@@ -275,7 +275,7 @@ class WebSocketConnection(PolledConnection):
         self._out.close()
 
     def overdue(self, now: float, refusal: Callable[[Caller], str | None]) -> tuple[str, int] | None:
-        """See `PolledConnection`.
+        """Return a reason and a close code if the connection is too slow or has to end; see `PolledConnection`.
 
         Time counts against the client only while the server has read all that arrived: a slow policy keeps its thread
         from reading.

@@ -55,19 +55,19 @@ class Observers(Observer):
             self.any = bool(self._all)
 
     def on_request(self, pending: PendingRequest) -> None:
-        """See `Observer`; as below, an error of an observer costs no answer."""
+        """Call all observers with a request; their errors are logged, and affect no answer."""
         for observer in self._all:
             with _logged(observer):
                 observer.on_request(pending)
 
     def before_answer(self, pending: PendingRequest, reply: Reply) -> None:
-        """See `Observer`."""
+        """Call all observers before an answer is sent; their errors are logged."""
         for observer in self._all:
             with _logged(observer):
                 observer.before_answer(pending, reply)
 
     def on_answer(self, pending: PendingRequest, reply: Reply) -> None:
-        """See `Observer`."""
+        """Call all observers with an answer; their errors are logged."""
         for observer in self._all:
             with _logged(observer):
                 observer.on_answer(pending, reply)

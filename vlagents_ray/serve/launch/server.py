@@ -264,7 +264,7 @@ def _missing_gpus(config: ServeDeploySchema, here: float | None = None) -> str |
     node = node_of_this_process()
     where = "this cluster" if here is None and (node is None or not node.is_head()) else "this machine"
     return (
-        f"resources.num_gpus: the replicas of {wanted} want {sum(wanted.values()):g} GPUs, {where} has {there:g}; "
+        f"resources.num_gpus: the replicas of {wanted} need {sum(wanted.values()):g} GPUs, {where} has {there:g}; "
         f"want less (0 runs on the CPU), or add a machine that has them"
     )
 

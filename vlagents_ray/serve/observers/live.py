@@ -140,7 +140,7 @@ class LiveObserver(Observer):
         self._observers.remove(self)
 
     def on_request(self, pending: PendingRequest) -> None:
-        """See `Observer`."""
+        """Keep the request's observation, and read the outcomes of commands."""
         pending.kept[self] = self._keep(pending)
         if self._commands is not None:
             self._commands.read_outcomes(pending.session_id, pending.request)
@@ -151,7 +151,7 @@ class LiveObserver(Observer):
             self._commands.send(pending.session_id, reply)
 
     def on_answer(self, pending: PendingRequest, reply: Reply) -> None:
-        """See `Observer`."""
+        """Add the answer to the session's observation."""
         observation = pending.kept.pop(self, None)
         if observation is not None and reply.act is not None and (row := reply.act.rows()[0]).size <= _ACTION:
             observation.action = np.array(row)
@@ -234,7 +234,7 @@ def _info(info: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _is_number(value: object) -> bool:
-    """Whether it is a number of bounded size, and no NaN."""
+    """Return whether it is a number of bounded size, and no NaN."""
     return type(value) in (int, float) and -_MOST <= value <= _MOST  # type: ignore[operator]
 
 

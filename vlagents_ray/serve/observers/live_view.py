@@ -98,9 +98,9 @@ class ReplicaView:
         self.live.close()
 
     def press(self, session: str, do: str, by: str) -> dict[str, Any] | None:
-        """Give a command to a session, see `CommandBoard.press`, and await its outcome for a while.
+        """Give a command to a session and await its outcome for a limited time; see `CommandBoard.press`.
 
-        Returns None if the session is not here.
+        Returns None if the session is not at this replica.
         """
         try:
             pressed = self.commands.press(session, do, by)

@@ -151,7 +151,7 @@ class SessionRecorder(Observer):
         return self.dropped + self._writer.lost
 
     def on_request(self, pending: PendingRequest) -> None:
-        """See `Observer`."""
+        """Copy the request for the recording, on another thread."""
         request = pending.request
         if self.ended is not None or request.op not in ("act", "reset", "close"):
             return
@@ -168,7 +168,7 @@ class SessionRecorder(Observer):
         self._copier.put(partial(self._copy, recorded))
 
     def on_answer(self, pending: PendingRequest, reply: Reply) -> None:
-        """See `Observer`."""
+        """Record the frame of the answered request."""
         recorded = pending.kept.pop(self, None)
         if recorded is not None and reply.error is None:
             self._write_later(partial(self._handle, recorded, reply))

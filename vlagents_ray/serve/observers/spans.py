@@ -54,14 +54,14 @@ class RequestSpans(Observer):
         tracing.flush()
 
     def on_request(self, pending: PendingRequest) -> None:
-        """See `Observer`."""
+        """Remember the begin of the request."""
         request = pending.request
         if request.op in _OPS:
             session, parent = pending.session_id, _traceparent(request)
             pending.kept[self] = _ServedRequest(session, request.op, request.rank, parent, time.time_ns())
 
     def on_answer(self, pending: PendingRequest, reply: Reply) -> None:
-        """See `Observer`."""
+        """Export the span of the answered request."""
         served: _ServedRequest | None = pending.kept.pop(self, None)
         if served is not None:
             error = "" if reply.error is None else f"{reply.error.code}: {reply.error}"[:_TEXT]

@@ -230,7 +230,7 @@ def _minor(python: Path) -> str:
 
 
 def _is(python: Path, version: str) -> bool:
-    """Whether an interpreter runs and has that minor version; a shim of pyenv's may not run."""
+    """Return whether an interpreter runs and has that minor version; a shim of pyenv's may not run."""
     done = subprocess.run([str(python), "-c", _MINOR], capture_output=True, text=True, check=False)  # noqa: S603
     return done.returncode == 0 and done.stdout.strip() == version
 

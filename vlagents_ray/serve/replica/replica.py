@@ -445,7 +445,7 @@ def _plain_host() -> str:
 
 
 def _others_run() -> bool:
-    """Whether the application has a replica that accepts requests."""
+    """Return whether the application has a replica that accepts requests."""
     context = serve.get_replica_context()
     app = serve.status().applications.get(context.app_name)
     policy = None if app is None else app.deployments.get(context.deployment)

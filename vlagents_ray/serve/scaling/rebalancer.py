@@ -128,7 +128,7 @@ class Rebalancer:
         self._placing = asyncio.Lock()  # clients are placed in turn
 
     async def run(self) -> None:
-        """Compare periodically, until cancelled."""
+        """Compare the numbers of sessions periodically, until cancelled."""
         while True:
             await asyncio.sleep(random.uniform(0.8, 1.2) * PERIOD_S)
             try:
