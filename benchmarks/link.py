@@ -140,7 +140,7 @@ class EmulatedLink:
                 _run([*prefix, "ip", "link", "set", name, "up"])
                 for words in shaping(rate, delay):
                     _run([*prefix, "tc", "qdisc", "add", "dev", name, *words])
-            # Ray uses the address of the default route; without one it would choose an address that # this namespace
+            # Ray uses the address of the default route; without one it would choose an address that this namespace
             # lacks.
             _run(["ip", "route", "add", "default", "via", _CLIENT])
         except BaseException:

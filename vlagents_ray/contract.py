@@ -74,7 +74,7 @@ class ActionSpec:
 class Contract:
     """The inputs and actions of a policy, or of a robot or env, to be compared with the other side's.
 
-    The comments at the fields say what each side states by them.
+    The comments at the fields describe the meaning for each side.
     """
 
     cameras: Mapping[str, CameraSpec] | None = None  # policy: needs; env: provides
@@ -85,7 +85,7 @@ class Contract:
     control_hz: float | None = None  # policy: rate of its training data, Hz; env: rate of its steps, Hz
     chunk: int | None = None  # policy: rows of an `Act`; env: rows it accepts at once (None: any)
     history: int | None = None  # policy: consecutive observations it keeps per session
-    behaviour: tuple[str, ...] | None = None  # policy: what an `Act` says on demand, e.g. "logprob", "value"
+    behaviour: tuple[str, ...] | None = None  # policy: values that an `Act` has on request, e.g. "logprob", "value"
 
     def to_json(self) -> dict[str, Any]:
         """Return the contract as plain JSON values, which processes with another version of numpy can read."""
@@ -153,7 +153,7 @@ def differences(policy: Contract, env: Contract) -> list[str]:
 
 
 def _differ(a: object, b: object) -> bool:
-    """Whether both values are stated and differ."""
+    """Return whether both values are stated and differ."""
     return a is not None and b is not None and a != b
 
 

@@ -39,9 +39,9 @@ GOAL_IMAGE = "goal_image"  # (H, W, 3) uint8 RGB, for goal-conditioned policies
 DEPTH = "depth"  # {camera: (H, W) float32, metres; or uint16, millimetres}
 SAMPLES = "samples"  # in an observation: the number of samples of its action distribution to return, N
 # In the Act: {"mean", "std": shaped as the action; "samples": (N, *action)} float32, and for each name of WANT what the
-# act says of every sample, with N as the first dimension.
+# act states, for every sample, with N as the first dimension.
 DISTRIBUTION = "distribution"
-WANT = "want"  # in an observation: names of what the Act is to say beside the action, out of `Contract.behaviour`
+WANT = "want"  # in an observation: names of values that the Act returns beside the action, out of `Contract.behaviour`
 BEHAVIOUR = "behaviour"  # in the Act: {name: number, or one for each row or token}, e.g. the action's "logprob", nats
 CAPTURED = "captured_at"  # in an observation: the time at which its first sensor was read, s since 1970 (`time.time`)
 DEADLINE = "deadline_ms"  # in an observation: the time after which `RemoteAgent` gives the request up, ms
@@ -55,10 +55,10 @@ POLICY = "policy"
 # In the Act of a chunk player:
 SAFE = "safe"  # str: the reason why this is the safe action; absent if the action is the policy's
 CAUSE = "safe_cause"  # str: the kind of that reason, see `vlagents_ray.chunking.fallback.Cause`
-INTERVENTION = "intervention"  # True: a human's action; absent if it is not
-WANTED = "policy_action"  # (D,) float32: what the policy wanted in place of the human's action; absent if unknown
+INTERVENTION = "intervention"  # True for an operator's action, else absent
+WANTED = "policy_action"  # (D,) float32: the policy's action at an operator's; absent if unknown
 AGE = "age_ticks"  # int: ticks since the observation from which the action was computed
-PLANNED = "planned"  # (H, D) float32: the chunk that the action comes from
+PLANNED = "planned"  # (H, D) float32: the chunk of the action
 CHUNK, ROW = "chunk", "row"  # int: its number in the episode, and the row of the action
 AGE_MS = "age_ms"  # float: the same in ms, from its capture until the player returned the action
 SILENT = "silent_s"  # float: seconds since the oldest unanswered request, retries included; 0.0 if there is none
@@ -194,7 +194,7 @@ class Agent:
 
     @property
     def continues_plans(self) -> bool:
-        """Whether a chunk goes on from the plan in `Obs.info` (`LEFTOVER`), which it ignores otherwise."""
+        """Whether a chunk continues the plan in `Obs.info` (`LEFTOVER`); if not, the plan is ignored."""
         return False
 
     def initialize(self) -> None:

@@ -1,4 +1,4 @@
-"""Names of policies, environments and dialects, where their code lives, and what they need.
+"""Names of policies, environments and dialects, the location of their code, and their requirements.
 
 A name stands for `"module:Class"`, imported only when it is used. Third parties add names through the entry-point
 groups `vlagents_ray.policies`, `vlagents_ray.wrappers`, `vlagents_ray.envs` and `vlagents_ray.dialects`; a
@@ -28,12 +28,12 @@ class Adapter:
 
     target: str  # "module:Class"
     about: str = ""  # its models or tasks, for the tables of README and docs/; empty: it is not in them
-    needs: tuple[str, ...] = ()  # import names; where `checkouts` name a source, the first one may come from there
+    needs: tuple[str, ...] = ()  # import names; the first one may be in a source named by `checkouts`
     requirements: tuple[str, ...] = ()  # files of requirements/ that install these, the usual one first
     extra: str | None = None  # extra of this package that installs them
     checkouts: tuple[str, ...] = ()  # variables, one of which names a checkout of the authors' code
     wants: str = ""  # what else its users have to get, such as "assets"
-    tasks: str = ""  # of an environment: what follows its name
+    tasks: str = ""  # of an environment: the pattern after its name
     page: str | None = None  # below docs/policies or docs/benchmarks, "" for none; None: that of its name
 
 
@@ -249,7 +249,7 @@ _EXTRAS = {
     "rerun": "rerun",
 }
 
-# import name -> how to come by a package that no extra and no file of requirements/ installs
+# import name -> how to install a package that is in no extra and no file of requirements/
 _ELSEWHERE = {
     "rclpy": "source the setup file of ROS 2 (`. /opt/ros/jazzy/setup.bash`) and start its Python, or reach ROS "
     "through a rosbridge, `link: ws://arm-pc:9090`",
@@ -288,12 +288,12 @@ def require(module: str, *, extra: str | None = None) -> ModuleType:
     except ModuleNotFoundError as error:
         top = module.partition(".")[0]
         if error.name is None or error.name.partition(".")[0] != top:
-            raise  # the module is installed, but one of its own imports is not, which this error names
+            raise  # the module is installed, but an import of it is missing, which this error names
         raise MissingDependency(f"{module!r} is not installed; {_install(top, extra)}") from error
 
 
 def _install(package: str, extra: str | None = None) -> str:
-    """How to install an optional package, as the end of an error message."""
+    """Return how to install an optional package, as the end of an error message."""
     simulators = [one for one in ENVS.values() if package in one.needs]
     extra = extra or _EXTRAS.get(package) or next((one.extra for one in simulators if one.extra), None)
     if extra:
@@ -322,42 +322,42 @@ def names(kind: str) -> dict[str, str]:
 
 
 def policy_class(name: str) -> type[Any]:
-    """The Agent class registered as `name`, or written out as "module:Class"."""
+    """Return the Agent class registered as `name`, or written out as "module:Class"."""
     return named_class(name, names("policies"), UnknownPolicy)
 
 
 def wrapper_class(name: str) -> type[Any]:
-    """The Wrapper class registered as `name`, or written out as "module:Class"."""
+    """Return the wrapper class registered as `name`, or written out as "module:Class"."""
     return named_class(name, names("wrappers"), UnknownWrapper)
 
 
 def dialect_class(name: str) -> type[Any]:
-    """The Dialect class registered as `name`, or written out as "module:Class"."""
+    """Return the dialect class registered as `name`, or written out as "module:Class"."""
     return named_class(name, DIALECTS if name in DIALECTS else names("dialects"))
 
 
 def env_class(name: str) -> type[Any]:
-    """The EvalEnv class for `name`, e.g. "tabletop" or "maniskill/PushCube-v1"."""
+    """Return the EvalEnv class for `name`, e.g. "tabletop" or "maniskill/PushCube-v1"."""
     return named_class(env_suite(name), names("envs"), UnknownEnv)
 
 
 def env_suite(name: str) -> str:
-    """The registered part of an env's name: "maniskill" of "maniskill/PushCube-v1"."""
+    """Return the registered part of an env's name: "maniskill" of "maniskill/PushCube-v1"."""
     return name if _is_class(name) else name.partition("/")[0]
 
 
 def env_task(name: str) -> str | None:
-    """The task within the suite: "PushCube-v1" of "maniskill/PushCube-v1"; None if not given."""
+    """Return the task within the suite: "PushCube-v1" of "maniskill/PushCube-v1"; None if not given."""
     return None if _is_class(name) else name.partition("/")[2] or None
 
 
 def _is_class(name: str) -> bool:
-    """Whether an env's name is "module:Class"; a task may hold a colon, too, as in "gymnasium/MODULE:ID"."""
+    """Return whether an env's name is "module:Class"; a task may also have a colon, as in "gymnasium/MODULE:ID"."""
     return ":" in name and name.partition("/")[0] not in ENVS
 
 
 def named_class(name: str, known: dict[str, str], unknown: type[ConfigError] = ConfigError) -> type[Any]:
-    """The class that `known` has under `name`, or written out as "module:Class"; raises `unknown` if there is none."""
+    """Return the class named `name` in `known`, or given as "module:Class"; raises `unknown` if there is none."""
     target = known.get(name, name)
     module, colon, attribute = target.partition(":")
     if not colon:

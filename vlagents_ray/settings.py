@@ -13,7 +13,7 @@ import numpy as np
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.naming import did_you_mean
 
-_WANT = "Input should be "  # as pydantic says it
+_WANT = "Input should be "  # in pydantic's words
 # The types of the values that a plain type allows: also numpy's, and whole numbers for a float, as YAML reads 1 as int.
 _PLAIN: dict[type, tuple[type, ...]] = {
     bool: (bool, np.bool_),
@@ -77,7 +77,7 @@ def _kinds_of_default(default: Any) -> list[type]:
 
 
 def _is(value: Any, kind: type) -> bool:
-    """Whether a value is of a plain type; a boolean does not count as a number."""
+    """Return whether a value is of a plain type; a boolean does not count as a number."""
     return isinstance(value, _PLAIN[kind]) and (kind is bool or not isinstance(value, bool))
 
 
@@ -134,7 +134,7 @@ def _fields(model: type | None, place: Iterable[Any]) -> Mapping[str, Any]:
 
 
 def _of(model: type | None) -> Mapping[str, Any]:
-    """The fields of a model; of one whose fields are registered names, those."""
+    """Return the fields of a model; of one whose fields are registered names, those."""
     registered: Callable[[], Mapping[str, Any]] | None = getattr(model, "registered_fields", None)
     return getattr(model, "model_fields", {}) if registered is None else registered()
 

@@ -1,4 +1,4 @@
-"""OpenTelemetry: the tracer of this process, if the environment asks for traces; the extra "otel".
+"""OpenTelemetry: the tracer of this process, if the environment enables traces; the extra "otel".
 
 `VLAGENTS_RAY_OTEL=1` turns tracing on, in a client's process and in a server's alike. A request carries its trace as
 the observation's `info["traceparent"]`, in the format of https://www.w3.org/TR/trace-context/, over every transport.
@@ -19,7 +19,7 @@ TRACEPARENT = "traceparent"
 
 
 def tracer() -> Any | None:
-    """Return the tracer of this process; None unless the environment asks for traces.
+    """Return the tracer of this process; None unless the environment enables traces.
 
     Raises:
         MissingDependency: The extra "otel" is not installed.

@@ -83,7 +83,7 @@ def check_action(action: object, contract: Contract | None) -> np.ndarray:
 
 
 def _finite(array: np.ndarray) -> bool:
-    """Whether no number is NaN or infinite; for a robot's few numbers Python is four times as fast as numpy."""
+    """Return whether no number is NaN or infinite; for a robot's few numbers Python is four times as fast as numpy."""
     if array.size <= _FEW:
         return all(map(math.isfinite, array.ravel().tolist()))
     return bool(np.isfinite(array).all())

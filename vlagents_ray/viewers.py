@@ -1,6 +1,6 @@
 """Episodes for Rerun (https://rerun.io): `.rrd` files, or a viewer that runs; the extra "rerun".
 
-A thread writes them, and drops what comes too fast: what is shown is never delayed by it.
+A thread writes them, and drops frames that come too fast, so that the loop is never delayed.
 """
 
 from __future__ import annotations
@@ -175,7 +175,7 @@ def open_viewer(target: str) -> EpisodeViewer:
 
 
 def is_live(target: str) -> bool:
-    """Whether a target is a connection, not a folder."""
+    """Return whether a target is a connection, not a folder."""
     return target == "live" or target.startswith("rerun+")
 
 

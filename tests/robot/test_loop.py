@@ -753,7 +753,7 @@ def test_the_command_lets_a_human_take_over_and_records_that(
     monkeypatch.setattr(Served, "contract", Contract(action=ActionSpec(dim=2, delta=False)))
     assert main([*SHORT, "--leader", "scripted_leader:HoldingLeader", "--record", str(tmp_path)]) == 0
     said = capsys.readouterr().out
-    ticks = int(re.search(r"a human moved the robot: (\d+)", said)[1])  # type: ignore[index]
+    ticks = int(re.search(r"an operator moved the robot: (\d+)", said)[1])  # type: ignore[index]
     rows = pq.read_table(tmp_path / "data/chunk-000/file-000.parquet").to_pydict()
     assert rows["intervention"] == [True] * ticks
     assert rows["action"] == [[0.25, 0.25]] * ticks

@@ -65,10 +65,10 @@ def test_more_gpus_than_this_machine_has_are_refused_at_once(
     if not wanted:
         return
     monkeypatch.setattr(ray, "cluster_resources", dict)
-    with pytest.raises(ConfigError, match=f"want {wanted:g} GPUs, this machine has 0") if own else nullcontext():
+    with pytest.raises(ConfigError, match=f"need {wanted:g} GPUs, this machine has 0") if own else nullcontext():
         server._require_gpus(deployment("noop", **said))
     where = "machine" if own else "cluster"
-    assert f"want {wanted:g} GPUs, this {where} has 0; want less" in str(
+    assert f"need {wanted:g} GPUs, this {where} has 0; want less" in str(
         server._missing_gpus(deployment("noop", **said))
     )
 
@@ -88,7 +88,7 @@ def test_more_gpus_than_this_machine_has_are_refused_before_a_ray_starts(
     monkeypatch.setattr(ray, "is_initialized", lambda: False)
     monkeypatch.setattr(server, "gpus_here", lambda: float(gpus))
     wanted = deployment("noop", resources={"num_gpus": 1}, replicas=2)
-    said = None if gpus else "want 2 GPUs, this machine has 0; want less"
+    said = None if gpus else "need 2 GPUs, this machine has 0; want less"
     with pytest.raises(NoRay if gpus else ConfigError, match=said), server.running_server(wanted):
         pass
 

@@ -28,7 +28,7 @@ def die_with_parent() -> None:
 
 
 def own_stdout() -> TextIO:
-    """Return the standard output, for the protocol alone; what anything else prints goes to standard error."""
+    """Return the standard output for the protocol alone; all other output goes to standard error."""
     out = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
     return out

@@ -27,14 +27,14 @@ class ProcessFailed(VLAgentsError):
 
 
 class LineProcess:
-    """A process that answers lines with lines of JSON. What it writes on standard error is shown if it fails."""
+    """A process that answers lines with lines of JSON. Its standard error is shown if it fails."""
 
     def __init__(
         self, name: str, command: Sequence[str], environment: Mapping[str, str] | None = None, *, end_s: float = _END_S
     ) -> None:
         self.name = name
         self._end_s = end_s  # how long it may take to end once its input has ended
-        self._received = b""  # what came after the last whole line
+        self._received = b""  # the bytes after the last complete line
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed by `close`
         self._process = subprocess.Popen(  # noqa: S603 - the bench's own scripts
             list(command),
@@ -76,7 +76,7 @@ class LineProcess:
         """Send a line, without waiting for the answer."""
         if self._process.stdin is None:
             raise ProcessFailed(f"{self.name}: has no standard input")
-        with contextlib.suppress(BrokenPipeError):  # `read` will say why
+        with contextlib.suppress(BrokenPipeError):  # `read` raises the reason
             self._process.stdin.write(line.encode() + b"\n")
             self._process.stdin.flush()
 

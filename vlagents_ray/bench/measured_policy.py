@@ -147,7 +147,8 @@ class MeasuredPolicy:
 def rate_of(calls: Sequence[Sequence[tuple[float, ...]]]) -> float:
     """Return actions a second: the slope of the line through all ends of calls.
 
-    They come in batches, so that counting them in a time would be wrong by up to a batch. 0 for fewer than two calls.
+    Actions come in batches, so that counting them in a time would be wrong by up to a batch. 0 for fewer than two
+    calls.
 
     Args:
         calls: The calls of each client; the first number of a call is its end, s.

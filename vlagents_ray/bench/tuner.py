@@ -32,7 +32,7 @@ _SMALLEST_RANGE = 0.1  # of a number of the action, as a share of its largest ma
 
 
 class VariantFailed(VLAgentsError):
-    """A variant could not be loaded or measured; the message says why."""
+    """A variant could not be loaded or measured; the message has the reason."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +48,7 @@ class TunePlan:
     dtypes: Sequence[str] | None = None  # to try; None: those that the device computes natively
     frames: Path | None = None  # folder of recorded trajectories; None: random observations
     side: int = 224  # px, of random images of which the policy takes any size
-    dims: Mapping[str, int] = field(default_factory=dict)  # of parts of the state for which it does not say
+    dims: Mapping[str, int] = field(default_factory=dict)  # of parts of the state that it leaves open
 
 
 @dataclass(slots=True)
@@ -78,7 +78,7 @@ class TunedSize:
 
 
 class Tuner:
-    """Measures what the plan says; what it leaves out is in `left_out`, a sentence each."""
+    """Measures the plan; skipped variants are in `left_out`, a sentence each."""
 
     def __init__(
         self, plan: TunePlan, progress: Callable[[str], None] = lambda _: None, began: float | None = None
@@ -106,7 +106,7 @@ class Tuner:
         return [size.point() for size in self._sizes]
 
     def _measure_own(self, frames: Path | None) -> Mapping[str, Any]:
-        """Measure the file's own settings; returns what their process says of them."""
+        """Measure the file's own settings; returns their process's report."""
         own, ready = Variant(), None
         try:
             with self._loaded(own, frames) as (process, ready):
@@ -150,7 +150,7 @@ class Tuner:
         return sorted(size for size in rates if size <= most)
 
     def _try(self, variant: Variant, frames: Path | None, parts: int) -> None:
-        """Measure a variant; if that fails, say so."""
+        """Measure a variant, or report its failure."""
         if any(failed.changes.items() <= variant.changes.items() for failed in self._failed):
             return
         if time.monotonic() >= self._end:
@@ -170,7 +170,7 @@ class Tuner:
 
     @contextmanager
     def _loaded(self, variant: Variant, frames: Path | None) -> Iterator[tuple[LineProcess, Mapping[str, Any]]]:
-        """Yield the process of a variant that is loaded, and what it says of itself."""
+        """Yield the process of a loaded variant, and its report."""
         args, environment = self._plan.args, self._plan.args.environment
         settings = ProcessSettings(
             policy=args.policy,
@@ -213,14 +213,14 @@ class Tuner:
                 measured.add(self._turn(process, measured.sessions))
 
     def _worth_more(self, found: Sequence[TunedSize]) -> bool:
-        """Whether a larger batch may serve the goal better than those that were measured, ascending."""
+        """Return whether a larger batch may serve the goal better than those that were measured, ascending."""
         if found and self._plan.goal.p99_ms is not None:
             return found[-1].point().round_trip_ms <= self._plan.goal.p99_ms
         rates = [measured.rates[0] for measured in found]
         return len(rates) < 3 or max(rates[-2:]) >= _RISING * max(rates[:-2])  # one may have been disturbed
 
     def _add(self, process: LineProcess, variant: Variant, size: int, found: list[TunedSize], until: float) -> bool:
-        """Compare the actions of a batch size, and measure it once; return False if it is left out, and say why."""
+        """Compare the actions of a batch size, and measure it once; return False, with a report, if it is skipped."""
         began = time.monotonic()
         if found and began + found[-1].took_s * size / found[-1].sessions > until:
             self.left_out.append(f"{variant.name}, {sessions(size)}: no time was left")

@@ -57,7 +57,7 @@ class MeasuredPoint:
     difference: float  # largest difference from the actions of the file's own settings, as a share of their range
 
     def reaches(self, goal: TuningGoal) -> bool:
-        """Whether round trips are short enough for robots, if the goal is of them."""
+        """Return whether round trips are short enough for robots, if the goal is of them."""
         return goal.p99_ms is None or self.p99_ms <= goal.p99_ms
 
 
@@ -104,7 +104,7 @@ def chosen_settings(chosen: MeasuredPoint, batch: BatchArgs, fixed: Sequence[int
 
 
 def figures(points: Sequence[MeasuredPoint]) -> list[list[str]]:
-    """Return a table of what was measured, with its head as the first row."""
+    """Return a table of the measurements, with its header as the first row."""
     rows = [["settings", "sessions", "actions/s", "round trip ms", "p99 ms", "peak MiB", "actions off by"]]
     for one in points:
         numbers = [f"{one.actions_per_s:.1f}", f"{one.round_trip_ms:.1f}", f"{one.p99_ms:.1f}", f"{one.peak_mib:.0f}"]

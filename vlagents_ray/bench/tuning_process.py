@@ -42,7 +42,7 @@ class ProcessSettings:
     batch_sizes: Sequence[int]  # `batch.sizes`, or none
     frames: str | None  # a file of `save_observations`; None: random observations
     side: int  # px, of random images whose size the contract does not state
-    dims: Mapping[str, int]  # dimensions of parts of the state for which it does not say
+    dims: Mapping[str, int]  # dimensions of parts of the state that it leaves open
 
 
 def save_observations(observations: Sequence[Obs], file: Path) -> None:

@@ -60,11 +60,11 @@ class Step(NamedTuple):
     """The action of one step of the plan."""
 
     action: np.ndarray  # (D,) float32
-    chunk: Chunk  # the newest chunk that the action comes from
+    chunk: Chunk  # the newest chunk of the action
     row: int  # the row of that chunk
 
     def played(self, action: np.ndarray, tick: int, silent_s: float) -> Act:
-        """Return `action` in place of the planned one, for a tick, with what is known of its chunk."""
+        """Return `action` in place of the planned one for a tick, with the data of its chunk."""
         chunk = self.chunk
         about = {
             AGE: tick - chunk.tick,
@@ -142,7 +142,7 @@ class ChunkBuffer:
         self.add(Chunk(0, self.executed if step is None else step, rows))
 
     def leftover(self) -> np.ndarray | None:
-        """Return the actions to execute from now on, (H', D); None if there are none."""
+        """Return the remaining actions, (H', D); None without any."""
         rows: list[np.ndarray] = []
         while (step := self._at(self.executed + len(rows))) is not None:
             rows.append(step.action)

@@ -18,14 +18,14 @@ PAUSED = "paused by an operator"
 
 
 class Leader(Protocol):
-    """The interface of a device that a human moves a robot with: a keyboard, a SpaceMouse, a second arm."""
+    """The interface of a device with which an operator moves a robot: a keyboard, a SpaceMouse, a second arm."""
 
     def engaged(self) -> bool:
-        """Return at once whether the human moves the robot at this tick."""
+        """Return at once whether the operator moves the robot at this tick."""
         ...
 
     def action(self, obs: Obs) -> np.ndarray:
-        """Return the human's action at once, (D,) float32 in the contract's units, for a tick with `engaged()`.
+        """Return the operator's action at once, (D,) float32 in the contract's units, for a tick with `engaged()`.
 
         Raises:
             InvalidAction: The device has no action at this tick; the robot holds still.
@@ -36,7 +36,7 @@ class Leader(Protocol):
 class Control:
     """The state machine of a robot.
 
-    | state | who moves the robot | it ends by |
+    | state | source of motion | ends by |
     |---|---|---|
     | "autonomous" | the policy | any of the others |
     | "human" | the leader that is engaged | its release: then the policy continues, or the robot is paused |
@@ -49,7 +49,7 @@ class Control:
     operator at the robot, and for its own program.
 
     Args:
-        leader: What a human moves the robot with; None if there is nothing.
+        leader: The operator's device, or None.
     """
 
     def __init__(self, leader: Leader | None = None) -> None:
@@ -75,12 +75,12 @@ class Control:
 
     @property
     def state(self) -> ControlState:
-        """The state at this tick: whether the policy, a human or nothing moves the robot."""
+        """The state at this tick: whether the policy, an operator or nothing moves the robot."""
         return self._state
 
     @property
     def reason(self) -> str | None:
-        """Why the robot is paused, or will be when the human lets go; None if it is not."""
+        """The reason why the robot is paused, or will be when the operator lets go; None if it is not."""
         return self._pause
 
     @property
@@ -95,7 +95,7 @@ class Control:
             return sorted(self._silent)
 
     def pause(self, reason: str = PAUSED) -> None:
-        """Hold the robot still until `resume`, or until a human takes over; a human who moves it is not interrupted."""
+        """Hold the robot still until `resume` or a takeover; an operator who moves it is not interrupted."""
         with self._lock:
             self._pause = reason
             self._pauses += 1
@@ -165,7 +165,7 @@ class Control:
             return self._outcome or ""
 
     def update(self) -> bool:
-        """Decide at the beginning of a tick who moves the robot; return whether that makes the policy's plan void."""
+        """Set the source of motion at the beginning of a tick; return whether the policy's plan becomes void."""
         pauses, engaged = self._pauses, False
         if self.leader is not None:
             try:
@@ -175,7 +175,7 @@ class Control:
                 self.pause(str(error) if own else f"the leader failed: {error!r}")
         with self._lock:
             before = self._state
-            if engaged and not self._engaged and pauses == self._pauses:  # no pause since the human took over
+            if engaged and not self._engaged and pauses == self._pauses:  # no pause since the takeover
                 self._pause = None
             self._engaged = engaged
             if self.stopped:
@@ -188,7 +188,7 @@ class Control:
 
     @property
     def held(self) -> Held | None:
-        """Why the robot must not move, by the last `update` and what came since; None if it may move."""
+        """The reason why the robot must not move, by the last `update` and later events; None if it may move."""
         with self._lock:
             if self._state == "stopped" or self.stopped or self._unseen:
                 silent = " and the ".join(sorted(self._silent))

@@ -1,4 +1,4 @@
-"""The safe action of a robot, for when the policy's does not come in time, and the checks that each command passes."""
+"""The safe action of a robot, used if the policy's is late, and the checks of each command."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from vlagents_ray.validation import check_action
 
 SafeName = Literal["auto", "hold", "zero"]
 Cause = Literal[
-    "waiting",  # the rows of the last answer are used up, and the next answer has not come: not counted as `safe`
-    "late",  # the answer came after others had been executed in place of all its rows
+    "waiting",  # the rows of the last answer are used up before the next answer: not counted as `safe`
+    "late",  # the answer came too late for all its rows
     "old",  # the plan is older than max_age_s
     "stale",  # the observation is older than max_age_s
     "lost",  # the server gave no answer: no connection, or not in time
@@ -31,7 +31,7 @@ Cause = Literal[
     "limits",  # the guard refused the action: beyond a limit
     "max_step",  # the guard refused the action: too far from the one before
     "invalid",  # the action is NaN, has a wrong shape, or was refused by another check
-    "leader",  # the human's device gave no action
+    "leader",  # the operator's device gave no action
     "robot",  # the robot must not move (`holds`), such as for a camera that hangs
     "stopped",  # the robot was stopped, and not restarted yet
     "paused",  # counted apart
@@ -55,7 +55,7 @@ STALE = Held(
     "sensors with different clocks, or for an info['captured_at'] that is not time.time()",
 )
 STOPPED = Held("waiting", "the robot was stopped since the observation that was answered last")
-RELEASED = Held("waiting", "a human has released the robot, or a pause is over: waiting for a new answer")
+RELEASED = Held("waiting", "the operator has released the robot, or a pause is over: waiting for a new answer")
 _LOST = (ConnectionLost, PolicyUnavailable, DeadlineExceeded)
 
 
@@ -73,7 +73,7 @@ Safe = SafeName | np.ndarray | Callable[[Obs], np.ndarray]
 
 
 class SafeAction:
-    """Computes the action that keeps a robot still, which depends on what its actions mean.
+    """Computes the action that holds a robot still, which depends on the meaning of its actions.
 
     "hold" commands the last action again, which is right for absolute targets. "zero" commands no motion, which is
     right for deltas and velocities; the columns in `grippers` keep the last action's value, as 0 would half open a
@@ -84,12 +84,12 @@ class SafeAction:
     Args:
         safe: The name, array or function of the safe action.
         spec: The actions of the contract.
-        grippers: The columns of the grippers; by default the last one, if the contract says how the gripper is opened.
+        grippers: The columns of the grippers; by default the last one, if the contract states the gripper's opening.
 
     Raises:
         ConfigError: The choice would be a guess or would move the robot: a repeated delta continues the motion, and
             zeros as joint targets move the arm to its zero position. Only "hold" may be chosen where the contract does
-            not say what the actions are.
+            not describe the actions.
     """
 
     def __init__(self, safe: Safe, spec: ActionSpec, grippers: Sequence[int] | None = None) -> None:
@@ -123,7 +123,7 @@ class SafeAction:
         return action
 
     def _first(self, obs: Obs) -> np.ndarray | None:
-        """Return no motion with the gripper as it stands, (D,); None if the contract does not say enough for that."""
+        """Return no motion with the gripper held, (D,); None if the contract does not suffice for that."""
         spec = self._spec
         if spec.dim is None:
             return None
@@ -142,7 +142,7 @@ def stopping(spec: ActionSpec) -> SafeName:
 
 
 def neutral(spec: ActionSpec, dim: int | None = None) -> np.ndarray:
-    """Return no motion for relative actions, (D,) float32, with the gripper open where `spec` says how."""
+    """Return no motion for relative actions, (D,) float32, with the gripper open if `spec` states its opening."""
     dim = spec.dim if dim is None else dim
     if dim is None:
         raise InvalidAction("neutral action: got a contract without action.dim; want one that states it")
@@ -198,7 +198,7 @@ class Motion:
         self._state = "stopped"
 
     def move(self, action: np.ndarray, obs: Obs) -> np.ndarray:
-        """Return an action of the policy or a human, (D,) float32, if it may reach the robot; else `InvalidAction`."""
+        """Return an action of policy or operator, (D,) float32, if it may reach the robot, or raise `InvalidAction`."""
         if self._state == "held":  # by the last target; the robot may have been moved since, or never have arrived
             with contextlib.suppress(InvalidAction):
                 self._last, self._state = self._checked(action, self._last), "moving"

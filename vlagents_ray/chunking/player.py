@@ -88,7 +88,7 @@ class AsyncCaller:
         self._jobs.put(obs)
 
     def take(self, wait_s: float = 0.0) -> Act | Exception | None:
-        """Return the policy's answer or its error, if it comes within `wait_s` seconds; else None."""
+        """Return the policy's answer or its error within `wait_s` seconds, else None."""
         try:
             answer = self._answers.get(timeout=wait_s) if wait_s else self._answers.get_nowait()
         except queue.Empty:
@@ -126,7 +126,7 @@ class _Request(NamedTuple):
 
 @dataclass(frozen=True)
 class PlayerSettings:
-    """The settings of a `ChunkPlayer`: when it asks the policy, and what it does with the answers.
+    """The settings of a `ChunkPlayer`: its requests to the policy, and its use of the answers.
 
     Raises:
         ConfigError: A setting is out of range, or settings do not go together.
@@ -180,7 +180,7 @@ class Execution:
         self._noted = False
 
     def note_in_place(self, action: np.ndarray) -> None:
-        """Note an action, (D,), that is executed in place of the policy's; the next request says so."""
+        """Record an action, (D,), that is executed in place of the policy's, for the next request."""
         self._in_place.append(action)
         self._noted = True
 
@@ -201,9 +201,9 @@ class ChunkPlayer(Agent):
     """An `Agent` around another, local or remote, whose `act` returns single actions, (D,), one a control tick.
 
     Ticks are counted by the calls of `act`. Row r of a chunk is for r executed actions after the observation that the
-    chunk answers, whenever it arrives: rows in place of which others were executed meanwhile are left out, but no row
-    is while the robot holds still (see `vlagents_ray.chunking.buffer.ChunkBuffer`). `reset` may block: it begins the
-    episode and, with a deadline, waits for the first chunk.
+    chunk answers, whenever it arrives: rows for ticks at which others were executed are left out, except while the
+    robot holds still (see `vlagents_ray.chunking.buffer.ChunkBuffer`). `reset` may block: it begins the episode and,
+    with a deadline, waits for the first chunk.
 
     In mode "async", and in the others with `deadline_s`, `act` returns within `deadline_s`: the policy's action, or the
     `safe` one where that is missing, with the reason in `act.info["safe"]` and its kind in
@@ -228,13 +228,13 @@ class ChunkPlayer(Agent):
 
         Args:
             agent: The policy, in this process or a `RemoteAgent`.
-            settings: When the policy is asked, and what is executed of its answers; default: `PlayerSettings()`.
+            settings: The requests to the policy, and the use of its answers; default: `PlayerSettings()`.
             check: Sees every action before it is returned, such as a `vlagents_ray.robot.Guard`. In place of one of the
                 policy's that it refuses the safe one is taken, and the plan is dropped; in place of a safe one the last
-                action, if that keeps the robot still; else `act` raises `InvalidAction`. It gets the last action, too;
-                a `Guard` with `measure` takes the measured pose where there is none, and after safe actions.
-            override: What a human moves the robot with. While it is engaged, `act` returns its actions with
-                `info["intervention"]` and, where known, `info["policy_action"]`. They pass `check`, too.
+                action, if that holds the robot still; else `act` raises `InvalidAction`. It also gets the last action;
+                a `Guard` with `measure` uses the measured pose without one, and after safe actions.
+            override: The operator's device. While it is engaged, `act` returns its actions with `info["intervention"]`
+                and, if known, `info["policy_action"]`. `check` also applies to them.
         """
         self.settings = settings = settings or PlayerSettings()
         self.check = check
@@ -291,7 +291,7 @@ class ChunkPlayer(Agent):
     def interrupt(self) -> None:
         """Drop the plan: the robot was stopped or moved, and did not execute the last action of `act`.
 
-        Earlier observations are not acted on any more, so the policy is asked again. `run_loop` calls this at each tick
+        Earlier observations are no longer acted on, so the policy is queried again. `run_loop` calls this at each tick
         at which it holds the robot; call it in your own loop when you stop or take over the robot.
         """
         self._begin_again(STOPPED)
@@ -303,8 +303,8 @@ class ChunkPlayer(Agent):
 
         Args:
             obs: The observation.
-            action: What the robot executed in place of the policy's action, (D,), where your own loop decides that. It
-                counts as a tick, and the next request says so (`EXECUTED` in `vlagents_ray.interface`).
+            action: The action that the robot executed in place of the policy's, (D,), if your own loop chose it. It
+                counts as a tick, and the next request has it (`EXECUTED` in `vlagents_ray.interface`).
 
         Raises:
             InvalidAction: The check refuses the action.
@@ -333,10 +333,10 @@ class ChunkPlayer(Agent):
         except Exception as error:
             if not led:
                 raise
-            self._trouble = Held("failed", str(error))  # the human goes on, and the policy's action is not known
+            self._trouble = Held("failed", str(error))  # the operator continues, and the policy's action is not known
         self._tick = tick + 1
         act = self._led(obs) if led else self._chosen(obs, tick)
-        if led and SAFE not in act.info:  # the human's action is executed in place of a row
+        if led and SAFE not in act.info:  # the operator's action is executed in place of a row
             self._execution.note_in_place(act.action)
             self._plan.advance()
         return act
@@ -381,7 +381,7 @@ class ChunkPlayer(Agent):
         return self._plan.next
 
     def _wants(self, tick: int, obs: Obs) -> bool:
-        """Whether a request with this tick's observation is due."""
+        """Return whether a request with this tick's observation is due."""
         if self._is_old(self._captured(obs)):
             return False
         step = self._next()
@@ -426,7 +426,7 @@ class ChunkPlayer(Agent):
         tick, step, seen_at = self._request
         rows = Act(check_action(act.action, self._contract)).rows()[: self.settings.horizon]
         if self.settings.mode == "open_loop" and act.done and self.settings.execute is not None:
-            # A late answer keeps one row: the last row says that the task is done.
+            # A late answer keeps one row, since the last row states that the task is done.
             rows = rows[: max(self.settings.execute, self._plan.executed + 1 - step)]
         self._delays.append(now - tick)
         added = self._plan.add(Chunk(self._chunks, step, rows, act.done, act.info, tick, seen_at))
@@ -437,14 +437,14 @@ class ChunkPlayer(Agent):
         extras = self._execution.report()
         if self.settings.timeout_s is not None:
             extras[DEADLINE] = self.settings.timeout_s * 1e3
-        # A human executes other actions than those of the plan.
+        # The operator's actions replace those of the plan.
         if self.settings.real_time_chunking and self.control.state != "human":
             extras |= self._plan.continuation(self._delays)
         return extras
 
     def _led(self, obs: Obs) -> Act:
-        """Return the action of the human who has the robot, or the safe one where that is refused."""
-        info: dict[str, Any] = {INTERVENTION: True, SILENT: 0.0}  # the policy's silence stops no human
+        """Return the operator's action, or the safe one if the guard refuses it."""
+        info: dict[str, Any] = {INTERVENTION: True, SILENT: 0.0}  # the policy's silence does not stop an operator
         if (planned := self._next()) is not None:
             info[WANTED] = planned.action.copy()
         try:

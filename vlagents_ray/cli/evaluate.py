@@ -1,4 +1,4 @@
-"""`vlagents-ray eval`: the settings of an evaluation from a file or from options, and what is done with them."""
+"""`vlagents-ray eval`: evaluations by a file or by options."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ class EvalOptions:
     live_at: LiveAt = None
 
     def given(self, *names: str) -> list[str]:
-        """Return those of these options that the command line has, as it writes them; 0 is given, False is not."""
+        """Return the set options among `names`, as the command line writes them; 0 counts as set, False does not."""
         values = {name: getattr(self, name) for name in names}
         return [f"--{name.replace('_', '-')}" for name, one in values.items() if one or (one == 0 and one is not False)]
 
@@ -206,7 +206,7 @@ def _given(options: dict[str, Any], model: type[BaseModel]) -> dict[str, Any]:
 
 
 def _with_resources(config: EvalConfig, resources: dict[str, float]) -> EvalConfig:
-    """Give each worker these resources where the configuration does not say what it takes."""
+    """Set these resources for each worker without resources in the configuration."""
     if not resources:
         return config
 

@@ -1,4 +1,4 @@
-"""Evaluations from the command line, once their configuration is known: played, planned, watched, or on a robot."""
+"""Evaluations from the command line by their configuration: played, planned, watched, or on a robot."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 
 POLICY_ERRORS = 3  # exit status: an error of the policy ended every episode of a cell
-LOOK_S = 1.0  # between two looks at the folder
+LOOK_S = 1.0  # period at which the folder is read
 
 
 def run_evaluation(
@@ -73,7 +73,7 @@ def play_one(config: EvalConfig, address: str | None, only: tuple[int, int]) -> 
 
 
 def evaluate_and_print(config: EvalConfig, progress: Progress, end_at: float | None = None) -> Summary:
-    """Evaluate policies that are at their URLs; an interrupted evaluation prints what it has."""
+    """Evaluate policies at their URLs; an interrupted evaluation prints its results so far."""
     from vlagents_ray.evaluate import EvaluationInterrupted, OutOfTime, Results, evaluate, print_summary
     from vlagents_ray.evaluate.results.summary import failing_cells, summarize
 
@@ -97,7 +97,7 @@ def evaluate_and_print(config: EvalConfig, progress: Progress, end_at: float | N
 def require_results(config: EvalConfig, summary: Summary) -> None:
     """End the command with status 3 if an error of the policy ended every episode of a cell that `config` plans.
 
-    With status 1, if an episode has no result: infrastructure lost it.
+    The status is 1 if infrastructure lost an episode.
     """
     from vlagents_ray.evaluate.results.summary import errors_of_policies, failing_cells
 
@@ -132,12 +132,12 @@ def watch_training(
 ) -> None:
     """Evaluate each step of the one policy whose checkpoint holds `{step}` once it is whole.
 
-    All go into one folder, and one server stays up for them. Policies without `{step}` are evaluated in the first
-    round. `live` is the address of the live page, as for `live_progress`. Ends as `rounds` does, or by Ctrl-C; to go
-    on, resume. An episode without a result ends the command with status 1, after the last round.
+    All results go into one folder, and one server stays up. Policies without `{step}` are evaluated in the first round.
+    `live` is the address of the live page, as for `live_progress`. Ends as `rounds` does, or by Ctrl-C; resume to
+    continue. An episode without a result ends the command with status 1, after the last round.
     """
     place, pattern = _watched(config)
-    if (config.out / FILE).is_file() and not config.resume:  # said now, not when the first checkpoint is there
+    if (config.out / FILE).is_file() and not config.resume:  # raised now, not at the first checkpoint
         raise ConfigError(f"{config.out} already has results: resume them (--resume), or choose another out folder")
     if address is None:
         for part in resolve_policies(_at(config, place, [0]), ask=False)[1].values():
@@ -206,7 +206,7 @@ def run_on_robot(config: EvalConfig, address: str | None, *, operator: str, unbl
     if unblinded:
         print_summary(out, unblind(config.out, config.robot.key if config.robot is not None else None))
         return
-    planned_cells(config)  # what is wrong is said before anything starts
+    planned_cells(config)  # raises before anything starts
     with served(config, address) as ready, contextlib.ExitStack() as stack:
         person = TerminalOperator() if operator == "terminal" else stack.enter_context(PageOperator(out.print))
         summary = evaluate_on_robot(ready, person)
@@ -219,8 +219,8 @@ class Forecast:
 
     cell: EvalCase
     finished: int  # episodes, among those that are planned
-    left: int  # episodes that would be played; fewer than the rest where the cell has stopped early
-    seconds: float | None  # of one episode, the mean of those that its policy played in its env; None: not known
+    left: int  # episodes to play; fewer than the rest if the cell has stopped early
+    seconds: float | None  # mean time of its policy's episodes in its env; None: not known
 
 
 def print_plan(config: EvalConfig) -> None:
@@ -275,7 +275,7 @@ def _sum(config: EvalConfig, found: list[Forecast]) -> list[str]:
     policies, envs = len({case.contender for case in cases}), len({(case.suite.name, case.env) for case in cases})
     planned, finished = sum(case.planned for case in cases), sum(one.finished for one in found)
     left = sum(one.left for one in found)
-    # Workers share one queue; what is short of a worker's turn is a single episode at the end.
+    # Workers share one queue, so that at most one episode's time is lost at the end.
     seconds = sum(one.left * (one.seconds or 0.0) for one in found) / max(1, min(config.workers, left))
     unknown = sum(one.seconds is None for one in found)
     beside = f", and {unknown} cells whose envs were not played yet" if unknown else ""

@@ -1,4 +1,4 @@
-"""The listings of `vlagents-ray policies` and `vlagents-ray envs`: names, their state, and how to install the rest."""
+"""The listings of `vlagents-ray policies` and `vlagents-ray envs`: names, state, and installation commands."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ class Listed:
     Attributes:
         kind: "policy", "wrapper" or "environment".
         name: Its registered name.
-        what: What it is, or an environment's tasks, in one line.
-        missing: What keeps it from running in this Python, with the cure; None if it is ready.
+        what: A description, or an environment's tasks, in one line.
+        missing: The reason why it cannot run in this Python, with the cure; None if it is ready.
         details: The settings of a policy or wrapper as `name=default`, the tasks of an environment.
     """
 
@@ -41,7 +41,7 @@ class Listed:
     details: list[str]
 
     def lines(self) -> Iterator[str]:
-        """Yield all there is to say, in whole lines, which can be copied and searched."""
+        """Yield the full description, in whole lines, which can be copied and searched."""
         yield f"{self.name}: {self.what}"
         yield f"  {'ready' if self.missing is None else self.missing}"
         yield f"  {'tasks' if self.kind == 'environment' else 'settings'}: {', '.join(self.details) or 'none'}"
@@ -94,7 +94,7 @@ def installing(listed: Sequence[Listed]) -> Iterator[str]:
 def require_packages(config: ServeDeploySchema) -> None:
     """Raise `MissingDependency` if a policy that is to run in this environment lacks packages here.
 
-    A checkout of its source is not looked for: a setting may name one.
+    A checkout of its source is not required, as a setting may name one.
     """
     for app in config.applications:
         name, environment = str(app.args.get("policy")), app.args.get("environment")

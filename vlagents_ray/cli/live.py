@@ -22,7 +22,7 @@ from vlagents_ray.serve.ports import LOOPBACK, is_free
 from vlagents_ray.serve.scaling.sibling_replicas import ReplicasInCluster
 
 _PORT = 8050  # of the page, if it is free
-_NAME = "eval"  # of the page, where keys are for some applications alone
+_NAME = "eval"  # the page's application, for keys that are limited to applications
 
 
 def live_address(at: str | None) -> tuple[str, int]:

@@ -45,7 +45,7 @@ app.command("serve")(serve_command)
 
 @app.command()
 def demo(out_dir: Annotated[Path, typer.Option("--out", help="Folder of the results.")] = Path("runs/demo")) -> None:
-    """The main job in a few minutes: serve the scripted policy, evaluate it in two environments, leave videos."""
+    """Try it in a few minutes: serve the scripted policy, evaluate it in two environments, record videos."""
     from vlagents_ray.cli.evaluation import run_evaluation
     from vlagents_ray.envs.maniskill import ManiSkill
     from vlagents_ray.evaluate import EvalConfig, PolicyConfig, SuiteConfig
@@ -78,7 +78,7 @@ app.add_typer(slurm, name="slurm")
     "robot", add_help_option=False, context_settings={"allow_extra_args": True, "ignore_unknown_options": True}
 )
 def robot_command(context: typer.Context) -> None:
-    """Drive a robot, or a simulation, by a policy, by a human, or by a policy that a human corrects."""
+    """Drive a robot, or a simulation, by a policy, by an operator, or by a policy that an operator corrects."""
     from vlagents_ray.cli.robot import main
 
     raise typer.Exit(main(context.args))
@@ -86,7 +86,7 @@ def robot_command(context: typer.Context) -> None:
 
 @app.command()
 def policies(name: OneName = None, as_json: AsJson = False) -> None:
-    """List policies and wrappers: their models, whether their packages are installed, how to install the rest."""
+    """List policies and wrappers: their models, whether their packages are installed, and installation commands."""
     from vlagents_ray.cli.listing import policies_and_wrappers
 
     _list(list(policies_and_wrappers()), name, as_json=as_json)
@@ -94,14 +94,14 @@ def policies(name: OneName = None, as_json: AsJson = False) -> None:
 
 @app.command()
 def envs(name: OneName = None, as_json: AsJson = False) -> None:
-    """List the environments: their tasks, whether they run here, and what installs the rest."""
+    """List the environments: their tasks, whether they run here, and installation commands."""
     from vlagents_ray.cli.listing import environments
 
     _list(list(environments()), name, as_json=as_json)
 
 
 def _list(listed: Sequence[Listed], name: str | None, *, as_json: bool) -> None:
-    """Print a listing: a line for each and what installs the rest, or all that there is to say of one name."""
+    """Print a listing: a line for each with installation commands, or the full description of one name."""
     from vlagents_ray.cli.listing import installing
 
     chosen = [one for one in listed if name in (None, one.name)]
@@ -148,7 +148,7 @@ def make(
     light: Annotated[bool, typer.Option("--light", help="Without Ray, for a child process.")] = False,
     cuda: Annotated[bool, typer.Option("--cuda", help="CUDA packages also without a GPU: several GB.")] = False,
 ) -> None:
-    """Make a virtual environment with this vlagents-ray and a policy's requirements, and say how to use it."""
+    """Make a virtual environment with this vlagents-ray and a policy's requirements, and print how to use it."""
     from vlagents_ray.serve.python_env.create import make_environment
 
     folder = into or Path(f".venv-{requirements.stem}")

@@ -24,7 +24,7 @@ Name = Annotated[str, typer.Argument(metavar="NAME", help="Name of the module: l
 
 @new.command()
 def policy(name: Name) -> None:
-    """Write NAME.py, test_NAME.py and NAME.yaml: a policy of your own, its test, and its deployment file."""
+    """Write NAME.py, test_NAME.py and NAME.yaml: a new policy, its test, and its deployment file."""
     with errors():
         _write(name, "policy")
         out.print(f"vlagents-ray serve {name}.yaml                    serves it")
@@ -33,7 +33,7 @@ def policy(name: Name) -> None:
 
 @new.command("env")
 def environment(name: Name) -> None:
-    """Write NAME.py, test_NAME.py and NAME.yaml: an environment of your own, its test, and a file of runs."""
+    """Write NAME.py, test_NAME.py and NAME.yaml: a new environment, its test, and a file of runs."""
     with errors():
         _write(name, "env")
         out.print(f"vlagents-ray eval {name}.yaml   plays ten episodes in it")
@@ -41,7 +41,7 @@ def environment(name: Name) -> None:
 
 @new.command()
 def dialect(name: Name) -> None:
-    """Write NAME.py, test_NAME.py and NAME.yaml: a protocol of your own, its test, and a deployment file."""
+    """Write NAME.py, test_NAME.py and NAME.yaml: a new protocol, its test, and a deployment file."""
     with errors():
         _write(name, "dialect")
         out.print(f"vlagents-ray serve {name}.yaml   serves a policy that does nothing; then, in a second terminal:")
@@ -49,7 +49,7 @@ def dialect(name: Name) -> None:
 
 
 def _write(name: str, kind: Literal["policy", "env", "dialect"]) -> None:
-    """Write the files into the current folder, or none of them. Raises `ConfigError` for a name that cannot be."""
+    """Write the files into the current folder, or none of them. Raises `ConfigError` for an invalid name."""
     if not re.fullmatch(r"[a-z][a-z0-9_]*", name) or keyword.iskeyword(name):
         raise ConfigError(f"NAME: got {name!r}, want the name of a Python module in lower case, such as my_policy")
     names = {"name": name, "title": "".join(word.title() for word in name.split("_"))}

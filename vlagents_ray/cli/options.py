@@ -1,4 +1,4 @@
-"""Options that several commands have, and how `KEY=VALUE`, lists and times are parsed."""
+"""Common options of commands, and parsers for `KEY=VALUE`, lists and times."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Live = Annotated[
 ]
 LiveAt = Annotated[
     str | None,
-    typer.Option("--live-at", metavar="HOST:PORT", help="The same there; beyond this machine it wants API keys."),
+    typer.Option("--live-at", metavar="HOST:PORT", help="The same there; beyond this machine it needs API keys."),
 ]
 
 StateDims = Annotated[
@@ -41,7 +41,7 @@ _Options = TypeVar("_Options")
 
 
 def command_of(options: type[_Options]) -> Callable[[Callable[[_Options], None]], Callable[..., None]]:
-    """Make a command for Typer of a function that takes all its options as one object.
+    """Make a command for Typer from a function that takes its options as one object.
 
     Args:
         options: A dataclass, each of whose fields is annotated with its `typer.Option` or `typer.Argument`.
@@ -106,7 +106,7 @@ def parse_list(text: str) -> list[str]:
 
 
 def parse_time(text: str, option: str) -> float:
-    """Parse seconds since 1970, or a date and time of day (local unless it says otherwise), to seconds since 1970."""
+    """Parse seconds since 1970, or a date and time of day (local unless it has a zone), to seconds since 1970."""
     try:
         return float(text)
     except ValueError:

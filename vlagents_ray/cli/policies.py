@@ -1,4 +1,4 @@
-"""The policies of an evaluation: at their URLs, or served for as long as it takes."""
+"""The policies of an evaluation: at their URLs, or served for its duration."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
     from vlagents_ray.evaluate import EvalConfig, PolicyConfig
 
-_STARTING_S = 30.0  # how long to wait for a server at a URL
+_STARTING_S = 30.0  # time limit for a server at a URL
 
 
 @contextlib.contextmanager
@@ -50,7 +50,7 @@ def served(config: EvalConfig, address: str | None = None, *, replica_per_gpu: b
         if address is not None:
             stack.enter_context(joined(address))
         config, parts = resolve_policies(config)
-        # What is wrong is said before anything starts.
+        # Raise errors before anything starts.
         if address is None:
             _require_gpus(config)
             for part in parts.values():
@@ -61,14 +61,14 @@ def served(config: EvalConfig, address: str | None = None, *, replica_per_gpu: b
         if parts and replica_per_gpu:
             parts = spread_over_gpus(parts, kept=config.workers * most_gpus(config))
         if parts:
-            # Ray's CPUs are bookkeeping here: the number of workers that the user asked for must fit.
+            # Ray's CPUs are logical here: the requested number of workers must fit.
             cpus = max(os.cpu_count() or 1, math.ceil(config.workers * most_cpus(config)))
             stack.enter_context(running_server(together(parts), address=address, num_cpus=cpus, ingress=False))
         yield config
 
 
 def _require_gpus(config: EvalConfig) -> None:
-    """Raise `ConfigError` if workers want more GPUs than this machine has: Ray would never start them here."""
+    """Raise `ConfigError` if workers need more GPUs than this machine has: Ray would never start them here."""
     from vlagents_ray.evaluate.plan.cases import cells
 
     wanted = max(cell.worker.gpus for cell in cells(config))
@@ -94,7 +94,7 @@ def _require_match(config: EvalConfig, parts: Mapping[str, ServeDeploySchema]) -
 
 
 def resolve_policies(config: EvalConfig, *, ask: bool = True) -> tuple[EvalConfig, dict[str, ServeDeploySchema]]:
-    """Find out what the policies of an evaluation are and where.
+    """Find the names, URLs and deployments of the policies of an evaluation.
 
     Returns:
         The evaluation with names and URLs of its policies; and the deployments to start for it, by application.
@@ -115,7 +115,7 @@ def _resolve_policy(policy: PolicyConfig, parts: dict[str, ServeDeploySchema], *
     own = own_settings(part.applications[0])
     name = policy.name if "name" in policy.model_fields_set else str(part.applications[0].args["policy"])
     application = re.sub(r"\W+", "-", name.rpartition(":")[2])
-    if policy.steps and own.get(STEP) is None:  # the deployment's own is some step; what is recorded is the pattern
+    if policy.steps and own.get(STEP) is None:  # record the pattern, not the deployment's own step
         part = with_settings(part, {STEP: policy.steps[0]}, steps=True)
     parts[application] = part
     found = {"name": name, "url": f"serve://{application}", "config": own, "checkpoint": resolved(own)}
@@ -130,7 +130,7 @@ def policy_deployment(policy: PolicyConfig, source: str, *, step_follows: bool =
 
 
 def _found(policy: PolicyConfig, url: str) -> dict[str, Any]:
-    """Request what the server serves: a result belongs to that, not to an address."""
+    """Request the served policy: a result belongs to it, not to an address."""
     if policy.config:
         raise ConfigError(f"policy {policy.name!r}: got {sorted(policy.config)}, but {url} has its settings already")
     said = _metadata(url)

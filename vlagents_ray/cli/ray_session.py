@@ -24,21 +24,21 @@ from vlagents_ray.ray_tools.signals import raise_dropped_interrupt
 log = logging.getLogger(__name__)
 
 _LEAVE_S = 10.0  # for a command to end in order
-_EXIT_S = 3.0  # for its process to end then: Ray's own farewell may wait for what is not there any more
-_LOOK_S = 1.0  # between two looks for an interrupt that Python dropped
-_END_S = 90.0  # from Ctrl-C to the end: Serve has a third of it to end in order, and Ray's farewell the rest
+_EXIT_S = 3.0  # for its process to end then: Ray's shutdown may wait for lost processes
+_LOOK_S = 1.0  # period of the check for an interrupt that Python dropped
+_END_S = 90.0  # from Ctrl-C to the end: a third for Serve, the rest for Ray's shutdown
 RESTART = "start it again"
 RESUME = "what was played is kept: go on with --resume when there is a cluster again"
 
 _FILE_BYTES = 10_000_000  # Serve logs each request; twice as much is kept
 _FOLLOW_S = 0.3  # period at which the log files of Ray's processes are read
 _LOG_FILES = ("worker-*.out", "worker-*.err", "raylet*.err")  # names in the folder of Ray's logs
-_ACTOR = ":actor_name:"  # begins the line by which Ray names the actor that writes to the file
+_ACTOR = ":actor_name:"  # begins the line that names the actor of the file
 _TITLES = (_ACTOR, ":task_name:", ":job_id:")
 _LOAD_FAILURES = ("Exception in Replica(", "Failed to update the deployments", "the policy did not load")
 _SERVES_LINE = re.compile(r"[A-Z]+ \d{4}-\d\d-\d\d \d\d:")
-_SERVES_INFO = re.compile(r"(INFO|DEBUG) \d{4}-\d\d-\d\d \d\d:")  # as each line of Serve's processes begins
-# Warnings of what is meant to be so: of `own_ray`, which is on loopback, has a token and leaves signals alone.
+_SERVES_INFO = re.compile(r"(INFO|DEBUG) \d{4}-\d\d-\d\d \d\d:")  # begin of each line of Serve's processes
+# Warnings about intended settings of `own_ray`: it is on loopback, has a token and does not handle signals.
 _MEANT = (
     "won't accept connections from HAProxy on other nodes",
     "Token authentication is enabled",
@@ -53,7 +53,7 @@ def quiet_ray(name: str | None, started: threading.Event | None = None) -> Itera
     The context begins before Ray is started.
 
     Args:
-        name: What the name of the log file begins with; None keeps no log.
+        name: The prefix of the log file's name; None keeps no log.
         started: Set once the server serves. Until then, the traceback of a policy that does not load is kept off the
             terminal as well, since the command ends with its last line.
 
@@ -95,7 +95,7 @@ class _Terminal:
         self._started = started
 
     def is_shown(self, record: logging.LogRecord) -> bool:
-        """Whether a record of this process is a problem; for `logging`."""
+        """Return whether a record of this process is a problem; for `logging`."""
         text = record.getMessage()
         shown = _is_problem(text, record.levelno)
         if not shown:
@@ -124,9 +124,9 @@ class _Terminal:
 
 
 def _follow(terminal: _Terminal, ended: threading.Event) -> None:
-    """Hand on what the processes of the Ray that this process started write, until `ended`. Runs on its own thread.
+    """Forward the output of Ray's processes, until `ended`. Runs on its own thread.
 
-    Ray's own way, `log_to_driver`, has no filter.
+    Ray's own `log_to_driver` has no filter.
     """
     files: dict[Path, _LogFile] = {}
     over = False
@@ -191,11 +191,11 @@ def exit_if_ray_is_lost(cure: str) -> Iterator[RayLoss]:
     except ClusterLost as error:
         loss.error = error
         raise
-    except KeyboardInterrupt:  # or SIGTERM, which may have ended Ray as well
+    except KeyboardInterrupt:  # or SIGTERM, which may also have ended Ray
         loss.interrupted = True
         raise
     except Exception as error:
-        if loss.error is not None:  # what Ray says of it is its consequence
+        if loss.error is not None:  # Ray's own error is a consequence
             raise loss.error from error
         raise
     finally:
@@ -203,13 +203,13 @@ def exit_if_ray_is_lost(cure: str) -> Iterator[RayLoss]:
 
 
 class RayLoss:
-    """Watches the Ray that this process has joined, and knows whether it is lost."""
+    """Watches the Ray that this process has joined for its loss."""
 
     def __init__(self, cure: str) -> None:
-        """`cure` is what the user can do about it."""
+        """`cure` is the advice in the error."""
         self.error: ClusterLost | None = None
         self.interrupted = False
-        self.left = threading.Event()  # the command has ended, or is about to say why it does
+        self.left = threading.Event()  # the command has ended, or is about to print its error
         self._cure = cure
         self._known = threading.Event()
 
@@ -220,7 +220,7 @@ class RayLoss:
                 raise_dropped_interrupt()
         except KeyboardInterrupt:
             self.left.set()
-            faulthandler.dump_traceback_later(_END_S, exit=True)  # and says where, whatever hangs in whatever thread
+            faulthandler.dump_traceback_later(_END_S, exit=True)  # and prints the stacks of all threads
             raise
         if self.error is not None:
             raise self.error
@@ -241,7 +241,7 @@ class RayLoss:
             say_error(said)
         sys.stdout.flush()
         sys.stderr.flush()
-        os._exit(1)  # whatever else runs is ended by the reaper
+        os._exit(1)  # the reaper ends all other processes
 
     def _watch_ray(self) -> None:
         """Watch the Ray that this process is in, until it leaves it or that Ray is lost."""
@@ -257,7 +257,7 @@ class RayLoss:
                     head = HeadMonitor(self._cure)
                 head.answers()
             except ClusterLost as error:
-                if node_of_this_process() is node:  # it is not being left just now
+                if node_of_this_process() is node:  # this process is not just leaving it
                     self.error = error
                 return
             except Exception as error:  # noqa: BLE001 - whatever Ray raises while it is being joined or left

@@ -23,9 +23,9 @@ def report_command(
     live: Live = False,
     live_at: LiveAt = None,
 ) -> None:
-    """Write a page of what came out: success with intervals, comparisons, latency, failures, and all that made it.
+    """Write the report: success with intervals, comparisons, latency, failures, and settings.
 
-    With --live it writes none: it shows the results in OUT as another process adds to them, until Ctrl-C.
+    With --live it shows the results in OUT as another process adds to them, until Ctrl-C, and writes no report.
     """
     from vlagents_ray.evaluate import Results
     from vlagents_ray.evaluate.merge import combined
@@ -104,7 +104,7 @@ def merge_command(
         bool, typer.Option("--accept-changes", help="Although files or weights differ; the report says so.")
     ] = False,
 ) -> None:
-    """Put results together: each episode once, by its key; videos and trajectories go along."""
+    """Merge results: each episode once, by its key, with videos and trajectories."""
     from vlagents_ray.evaluate import print_summary
     from vlagents_ray.evaluate.merge import merge
 
@@ -133,10 +133,10 @@ def verify_command(
     trust: Annotated[bool, typer.Option("--trust", help="Also make environments that name code or files.")] = False,
     most_gb: Annotated[float, typer.Option(min=0, help="Refuse a bundle that unpacks to more.")] = 16.0,
 ) -> None:
-    """Check a bundle, also a stranger's: what is equal, what differs, what could not be checked.
+    """Check a bundle, also a stranger's, and print what is equal, differs, or could not be checked.
 
     Exit code 0 if nothing contradicts it, 1 if something does: a digest, the table, a recording, an outcome of a
-    replay. Other versions of software here are named, and contradict nothing.
+    replay. Other versions of software here are only listed.
     """
     from vlagents_ray.evaluate.bundle import verify
 
@@ -169,8 +169,8 @@ def replay_command(
 ) -> None:
     """Play an episode of an evaluation again: exit code 0 if all is the same. Or play a dataset to another policy.
 
-    A dataset is what a server recorded, or any LeRobotDataset: its errors by joint and by step of the horizon are
-    printed, and written as JSON.
+    A dataset is a server's recording, or any LeRobotDataset: the policy's errors by joint and by step of the horizon
+    are printed, and written as JSON.
     """
     with errors():
         if is_dataset(folder):
@@ -193,7 +193,7 @@ def replay_command(
 
 
 def _same(folder: Path, episode: str, policy: str | None, out_dir: Path | None, address: str | None) -> bool:
-    """Play an episode again, print what differs, and return whether nothing does."""
+    """Play an episode again, print the differences, and return whether there are none."""
     from vlagents_ray.cli.evaluation import play_one
     from vlagents_ray.evaluate import Results
     from vlagents_ray.evaluate.replay import compare, find

@@ -1,6 +1,6 @@
 """Drive a robot, with the light install: a served policy in the control loop, and a report at its end.
 
-With --env a simulation is driven: by a policy, by a human, or by a policy that a human corrects.
+With --env a simulation is driven: by a policy, by an operator, or by a policy that an operator corrects.
 
 Exit status: 0 if every tick had an action of the policy, 1 if not, 3 if fewer than half had, 2 if it could not run.
 """
@@ -34,7 +34,7 @@ MOSTLY_SAFE = 3  # exit status
 WAIT_S = 1.0  # deadline of a tick in the modes that wait for an answer; half of the default of --silent-s
 _DEVICES: dict[str, type[Keyboard | SpaceMouse]] = {"keyboard": Keyboard, "spacemouse": SpaceMouse}
 _HZ = 50.0  # of a robot
-RESTART_KEYS = "c\n"  # Enter is the keyboard's own while that moves the robot
+RESTART_KEYS = "c\n"  # without Enter while the keyboard moves the robot
 _HEADER = ("", "ticks", "missed", "within 2 ms", "p50 ms", "p99 ms", "max ms")
 
 
@@ -57,7 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
-    """Parse the words of the command; the process ends with status 2 where they do not go together."""
+    """Parse the arguments; the process ends with status 2 if they are inconsistent."""
     parser, of_robot, of_env = command_parser()
     options = parser.parse_args(arguments)
     in_env = options.env is not None
@@ -124,7 +124,7 @@ def _run(options: argparse.Namespace) -> LoopReport:
         )
         guard = Guard(contract, max_step=options.max_step, measure=measured_state(options.measure))
         player = stack.enter_context(ChunkPlayer(agent, settings, check=guard, override=leader))
-        player.initialize()  # refuses settings that do not fit, before anything is timed or moves
+        player.initialize()  # refuses unfit settings before anything is timed or moves
         robot: Robot = topics or (SimulatedRobot(contract) if make_robot is None else make_robot())
         recorder = None
         if options.record:
@@ -160,7 +160,7 @@ def _run(options: argparse.Namespace) -> LoopReport:
         say(_line(_HEADER))
         say(_row(f"{options.mode}, {agent.transport}", report.jitter))
         _say_outcome(report, say, led=leader is not None)
-    if recorder is not None:  # closed, so everything is written
+    if recorder is not None:  # closed: everything is written
         say(f"recorded: {recorder.episodes} episodes in {options.record}, {recorder.dropped} frames dropped")
     if viewer is not None:
         say(viewer.report())
@@ -173,7 +173,7 @@ def _leader(
     contract: Contract | None,
     stack: contextlib.ExitStack,
 ) -> Leader | None:
-    """Return the opened device with which a human moves the robot."""
+    """Return the opened device with which an operator moves the robot."""
     if options.leader is None:
         return None
     if make is not None:
@@ -191,13 +191,13 @@ def _leader(
 def _say_outcome(report: LoopReport, say: Callable[[str], None], *, led: bool) -> None:
     say(f"from a tick until its action is applied: p50 {report.work_p50_ms:.2f} ms, p99 {report.work_p99_ms:.2f} ms")
     if led:
-        say(f"ticks at which a human moved the robot: {report.interventions}; ticks paused: {report.paused}")
+        say(f"ticks at which an operator moved the robot: {report.interventions}; ticks paused: {report.paused}")
     say(f"ticks without an action of the policy: {report.safe_ticks} of {report.jitter['ticks']:.0f}")
     causes = {**report.safe, "waiting": report.waiting}
     for cause, ticks in sorted(causes.items(), key=lambda one: -one[1]):
         if ticks:
             say(f"  {ticks} x {cause}, first: {report.reasons[cause]}")
-    if report.mostly_safe is not None:  # `run_loop` has logged why, and the cure
+    if report.mostly_safe is not None:  # `run_loop` has logged the reason and the cure
         say(f"MOSTLY SAFE ACTIONS, exit status {MOSTLY_SAFE}")
     for bark in report.barks:
         say(f"stopped: {bark}")
@@ -206,7 +206,7 @@ def _say_outcome(report: LoopReport, say: Callable[[str], None], *, led: bool) -
 
 @contextlib.contextmanager
 def _restarting(watchdog: Watchdog, say: Callable[[str], None]) -> Iterator[None]:
-    """Restart motion after a stop or a pause at the operator's word: by Enter or C at the terminal, or by SIGUSR1."""
+    """Restart motion after a stop or a pause by the operator: Enter or C at the terminal, or SIGUSR1."""
 
     def restarted() -> bool:
         if not watchdog.restart():
@@ -250,7 +250,7 @@ def _number(kind: type[float] | type[int] = float, *, least: float = 0, above: b
 
 
 def command_parser() -> tuple[argparse.ArgumentParser, list[argparse.Action], list[argparse.Action]]:
-    """Return the parser, with the options that are refused beside --env, and those that are refused without it."""
+    """Return the parser, the options that are refused with --env, and those that need it."""
     parser = argparse.ArgumentParser(
         prog="vlagents-ray robot", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -274,7 +274,7 @@ def command_parser() -> tuple[argparse.ArgumentParser, list[argparse.Action], li
     real("--instruction", help="the task in words")
     real("--robot", metavar="MODULE:CLASS", help="your robot's class, without arguments; default: a simulated one")
     real("--ros", metavar="FILE", help="a robot behind topics of ROS 2, from this file; see docs/ros.md")
-    leaders = "what a human takes over with: keyboard, spacemouse, or, without --env, MODULE:CLASS of yours, see Leader"
+    leaders = "device for taking over: keyboard, spacemouse, or, without --env, your MODULE:CLASS, see Leader"
     add("--leader", metavar="LEADER", help=leaders)
     add("--step", type=seconds, help="what a key or axis of these adds to a number of the action at a tick")
     add("--mode", choices=get_args(Mode), help="see PlayerSettings (default: async; with --env open_loop)")

@@ -1,4 +1,4 @@
-"""`vlagents-ray serve`: serve a policy, and say how clients and a browser reach it."""
+"""`vlagents-ray serve`: serve a policy, and print the addresses for clients and a browser."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def serve_command(options: ServeOptions) -> None:
 def connection_lines(
     config: ServeDeploySchema, urls: Mapping[str, str], host: str, keys: Path | None = None, *, insecure: bool = False
 ) -> Iterator[str]:
-    """Say of each application its URL, its policy, its page, and where clients of other systems connect."""
+    """Return lines with the URL, policy and page of each application, and addresses for clients of other systems."""
     from vlagents_ray.serve.config.deployment import ServerArgs
     from vlagents_ray.serve.dialects.routes import describe
     from vlagents_ray.serve.launch.deployment_file import IMPORT_PATH, own_settings
@@ -134,7 +134,7 @@ def connection_lines(
         keyed = not insecure and (keys is not None or _wants_key(args))
         curl = 'curl -H "Authorization: Bearer $VLAGENTS_RAY_API_KEY" ' if keyed else ""
         yield f"  how to talk to it: {curl}{url}/docs"
-        if not (insecure or args.access.insecure):  # without keys there is no watching
+        if not (insecure or args.access.insecure):  # --insecure shows no live page
             yield f"  what it does now: {url}/live"
         for name, one in describe(args.dialects).items():
             places = [one["address"]] if "address" in one else [_address(url, path) for path in one["paths"]]
@@ -144,7 +144,7 @@ def connection_lines(
 def _wants_key(args: ServerArgs) -> bool:
     try:
         return args.access.keys() is not None
-    except ConfigError:  # they are on the cluster's machines, not on this one
+    except ConfigError:  # the keys are on the cluster's machines
         return True
 
 

@@ -1,4 +1,4 @@
-"""Episodes of an environment in the control loop of a robot: driven by a policy, by a human, or by both."""
+"""Episodes of an environment in the control loop of a robot: driven by a policy, an operator, or both."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _MOVES = {
 
 
 class EnvPolicy(Wrapper):
-    """A policy in an environment, whose actions stand in for those that its own contract does not state."""
+    """A policy in an environment, which supplies the action contract if the policy states none."""
 
     def __init__(self, agent: Agent, env: Contract) -> None:
         super().__init__(agent)
@@ -45,7 +45,7 @@ class EnvPolicy(Wrapper):
         self._loaded = False
 
     def initialize(self) -> None:
-        """Load the policy once, though each run of the control loop initializes its agent."""
+        """Load the policy once, although each run of the control loop initializes its agent."""
         if not self._loaded:
             super().initialize()
         self._loaded = True
@@ -64,7 +64,7 @@ class EnvPolicy(Wrapper):
 
 
 def drive(options: argparse.Namespace) -> int:
-    """Play what the options of `vlagents-ray robot --env` say, and return the command's exit status."""
+    """Play by the options of `vlagents-ray robot --env`, and return the command's exit status."""
     try:
         with errors():
             run = RobotRun(options)
@@ -85,18 +85,18 @@ class RobotRun:
         self.options = options
         self._env_options = parse_settings(options.env_set, "--env-set")
         self._settings = parse_settings(options.set, "--set")
-        self.verdict: Label | None = None  # of the running episode, once a human has given it
-        self.over = False  # the human wants no further episode
+        self.verdict: Label | None = None  # the operator's label of the running episode
+        self.over = False  # the operator has ended the run
         self.recorder: Recorder | None = None
         self._control: Control | None = None
         self._viewer: EpisodeViewer | None = None
-        self._said: str | None = None  # what moves the robot, as printed
+        self._said: str | None = None  # the printed source of motion
 
     def play(self, seeds: Iterable[int]) -> None:
         """Play an episode for each seed, and print its outcome.
 
         Raises:
-            ConfigError: The settings do not go together.
+            ConfigError: The settings are inconsistent.
             ContractMismatch: The policy does not fit the environment.
         """
         with contextlib.ExitStack() as stack:
@@ -149,7 +149,7 @@ class RobotRun:
             viewer=self._viewer,
             until=ended,
         )
-        counts = f"{robot.steps} steps, {report.interventions} of them a human's; {report.paused} ticks paused"
+        counts = f"{robot.steps} steps, {report.interventions} of them an operator's; {report.paused} ticks paused"
         out.print(f"  {label()}: {counts}")
 
     def _leader(self, contract: Contract, stack: contextlib.ExitStack) -> Leader | None:

@@ -24,7 +24,7 @@ slurm = typer.Typer(
 )
 _BOTH = {"allow_extra_args": True, "ignore_unknown_options": True}
 _FOUND_OUT = "it finds that out for itself"
-_TASK = "%a"  # stands for the number of a task of --array, as in sbatch's file names
+_TASK = "%a"  # the number of a task of --array, as in sbatch's file names
 Print = Annotated[bool, typer.Option("--print", help="Print the script; write and submit nothing.")]
 Parsable = Annotated[bool, typer.Option("--parsable", help="Print the job's number and nothing else.")]
 Setup = Annotated[Path | None, typer.Option(help="File of shell lines that the job begins with: module load, export.")]
@@ -39,10 +39,10 @@ def eval_(
     print_only: Print = False,
     parsable: Parsable = False,
 ) -> None:
-    """Evaluate in a job: what `vlagents-ray eval` takes (see its --help), and sbatch's options.
+    """Evaluate in a job, with the options of `vlagents-ray eval` (see its --help) and sbatch's.
 
-    Results that are there already are gone on with, so the same command after `scancel` or a failure finishes the
-    rest. Without --workers there is one for each CPU but one, and a policy has a replica on each GPU.
+    Existing results are continued, so the same command after `scancel` or a failure finishes the rest. Without
+    --workers there is one for each CPU but one, and a policy has a replica on each GPU.
     """
     with errors():
         words, options = split(context.args, _options(evaluate_command))
@@ -51,7 +51,7 @@ def eval_(
         if "array" in options and config.out == other.out:
             raise ConfigError(f"--array: its tasks write to one folder; want {_TASK} in it, as in --out runs/x/{_TASK}")
         fill = [] if "workers" in config.model_fields_set else [f"--fill={_cpus(config):g}"]
-        folder = Path(os.path.commonpath([config.out, other.out])) / "slurm"  # of an array: above those of its tasks
+        folder = Path(os.path.commonpath([config.out, other.out])) / "slurm"  # of an array: above its tasks
         arguments = ["eval", *fill, f"--closing={closing:g}", "--", *words]
         _submit(Script("eval", folder, arguments, options, resubmit, setup), print_only, parsable)
 
@@ -66,9 +66,9 @@ def serve(
     print_only: Print = False,
     parsable: Parsable = False,
 ) -> None:
-    """Serve a policy in a job, to its end: what `vlagents-ray serve` takes (see its --help), and sbatch's options.
+    """Serve a policy in a job, with the options of `vlagents-ray serve` (see its --help) and sbatch's.
 
-    Once it answers, URL, key and the line for ssh stand in OUT/JOB/server.json and in the job's log.
+    Once it answers, OUT/JOB/server.json and the job's log have URL, key and the line for ssh.
     """
     from vlagents_ray.serve.launch.deployment_file import read_deployment
 
@@ -96,7 +96,7 @@ def _submit(script: Script, print_only: bool, parsable: bool) -> None:
     if parsable:
         typer.echo(job)
         return
-    number = "*" if "array" in script.options else job  # each task has one of its own
+    number = "*" if "array" in script.options else job  # one for each task
     log = script.options.get("output") or f"{script.folder}/{number}.log"
     lines = [
         f"job {job} is queued; its script: {script.file}",
@@ -115,7 +115,7 @@ def _options(command: Callable[..., None]) -> dict[str, bool]:
 
 
 def _parsed(name: str, command: Callable[..., None], words: list[str]) -> dict[str, Any]:
-    """Parse what a command would be called with; wrong words are reported as it reports them."""
+    """Parse the arguments of a command, with the command's own errors."""
     params: dict[str, Any] = _click(command).make_context(f"vlagents-ray slurm {name}", list(words)).params
     return params
 
@@ -133,9 +133,9 @@ def _refuse(given: dict[str, Any], why: str, *names: str) -> None:
 
 
 def _cpus(config: EvalConfig) -> float:
-    """Return how many CPUs of the job each worker takes, at least one, if the job is filled with workers.
+    """Return the CPUs of the job for each worker, at least one, if workers fill the job.
 
-    Raises `ConfigError` where GPUs limit their number: how many of a job's are for policies is not known.
+    Raises `ConfigError` if GPUs limit the number of workers, since the GPUs for policies are not known.
     """
     from vlagents_ray.evaluate import most_cpus, most_gpus
 
@@ -147,7 +147,7 @@ def _cpus(config: EvalConfig) -> float:
 
 
 def _evaluation(words: list[str]) -> EvalConfig:
-    """Build the configuration as `eval` does; raises here what would end the job as soon as it had begun."""
+    """Build the configuration as `eval` does, and raise errors that would end the job at its start."""
     from vlagents_ray.cli.policies import resolve_policies
     from vlagents_ray.evaluate.plan.cases import cells
 

@@ -94,7 +94,7 @@ def _show(head: Sequence[str], rows: Sequence[Sequence[str]], left_out: Sequence
 
 
 def _show_choice(chosen: str, own: str, began: float, where: str, settings: Mapping[str, Any]) -> None:
-    """Print the choice, beside what the file gives as it is, and the settings to change as YAML."""
+    """Print the choice beside the figures of the unchanged file, and the settings to change as YAML."""
     out.print(f"chosen: {chosen}\nthe file as it is: {own}\nafter {time.monotonic() - began:.0f} s")
     if not settings:
         out.print("nothing to change")

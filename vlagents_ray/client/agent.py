@@ -108,7 +108,7 @@ class ClientSession:
                 self.episode.recent.append(copied(obs))
 
     def is_lost(self, reply: Reply) -> bool:
-        """Whether the session must begin again; if not, its replica checks that no answer was lost."""
+        """Return whether the session must begin again; if not, its replica checks that no answer was lost."""
         return isinstance(reply.error, _LOST) or self.episode is None or self.episode.step is None
 
     def begin_again(self, request: Request) -> Request:
@@ -129,7 +129,7 @@ def call_with_recovery(
     """Return the reply to one request of each session, from another replica if theirs is gone.
 
     Retries until `timeout_s` is over; then the reply holds the last error, or `DeadlineExceeded` for a session that has
-    yet to begin again. The first action after an episode was begun again says so in `info["resumed"]`.
+    yet to begin again. The first action after an episode was begun again has `info["resumed"]`.
     """
     deadline = time.monotonic() + timeout_s
     last_attempt = deadline - min(_RESERVE_S, _RESERVE_SHARE * timeout_s)
@@ -161,7 +161,7 @@ def call_with_recovery(
             for i, reply in zip(retry, answers, strict=True):
                 replies[i] = reply
     for session, request, reply in zip(sessions, requests, replies, strict=True):
-        # these errors ask for a reset, which is not needed here
+        # these errors advise a reset, which is not needed here
         if isinstance(reply.error, _LOST) and request.op == "act":
             reply.error = DeadlineExceeded(f"the session did not begin again within {timeout_s:g} s; the next act does")
         if session.resumed and reply.act is not None:
@@ -175,7 +175,7 @@ class RemoteAgent(Agent):
     When the replica stops, dies or has more sessions than others, the session continues on another replica within
     `timeout_s`. If the old replica still runs, the session moves with all its state. Otherwise the client begins it
     again with the same instruction and options and sends the last observations (`Contract.history` of them; see
-    `Agent.observe`); `act.info["resumed"]` then says so. If a replica has not answered for 5 s (in one call, or in
+    `Agent.observe`); `act.info["resumed"]` is then set. If a replica has not answered for 5 s (in one call, or in
     several that reached their deadlines), the next call goes to another replica, if one answers. One session never acts
     twice on an observation.
     """
@@ -199,9 +199,9 @@ class RemoteAgent(Agent):
 
         Args:
             url: `http(s)://HOST:PORT[/APP]`, `ws(s)://…` or, inside a Ray cluster, `serve://APP`.
-            transport: "auto" takes the fastest available: shared memory to a server of the same user on this
-                machine, else a WebSocket; inside the cluster a plasma channel to a replica on this node, else a Serve
-                handle. The others force one. `agent.transport` says which, once connected.
+            transport: "auto" takes the fastest available: shared memory to a server of the same user on this machine,
+                else a WebSocket; inside the cluster a plasma channel to a replica on this node, else a Serve handle.
+                The others force one. `agent.transport` names it, once connected.
             timeout_s: How long a `reset` or `act` may take; an observation's `info["deadline_ms"]` allows its `act`
                 less. 2 to 5 s suit a robot, since a call to a hung replica lasts until its end.
             connect_timeout_s: How long to wait for a server that cannot be reached or is still loading, by default
@@ -269,7 +269,7 @@ class RemoteAgent(Agent):
 
     @property
     def reconnects(self) -> int:
-        """The number of times that it has connected again, as the connection broke or the server asked for it."""
+        """The number of reconnections, after a lost connection or at the server's request."""
         return self._connection.reconnects
 
     @property
@@ -388,7 +388,7 @@ class RemoteAgent(Agent):
 
     @property
     def continues_plans(self) -> bool:
-        """Whether the policy's chunks go on from the plan that is executed; see `Agent.continues_plans`."""
+        """Whether the policy's chunks continue the executed plan; see `Agent.continues_plans`."""
         return bool((self.metadata or {}).get("continues_plans"))
 
     def close(self) -> None:

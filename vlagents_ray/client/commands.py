@@ -22,7 +22,7 @@ _BY = 80  # most characters of a name that are kept
 class Command:
     """A command from the live page."""
 
-    id: str  # by which the server knows the answer
+    id: str  # identifies the answer for the server
     do: str  # one of `COMMANDS`
     by: str = ""  # name of the key whose holder pressed the button; empty on a server without keys
 
@@ -44,7 +44,7 @@ class CommandInbox:
         self._sent: dict[str, str] = {}  # those in the last request
 
     def asking(self, obs: Obs) -> Obs:
-        """Return the observation of a request with what became of the commands before it."""
+        """Return the observation of a request with the outcomes of earlier commands."""
         answers = self._sent = dict(self._answers)
         return replace(obs, info={**obs.info, COMMANDED: answers}) if answers else obs
 

@@ -29,9 +29,9 @@ SILENT_S = 5.0  # s without any answer, in one or several calls, after which the
 
 
 class Connection:
-    """Connects when first needed, and again when the connection broke or the replica asks its clients to reconnect.
+    """Connects on first use, and again after a lost connection or at the replica's request.
 
-    A replica that asks for it still answers: its connection is used until another replica has answered. Only one thread
+    A replica that requests it still answers: its connection is used until another replica has answered. Only one thread
     may use a connection at a time.
     """
 
@@ -133,7 +133,7 @@ class Connection:
             self._next = None
 
     def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
-        """Send requests in one message and return their replies; an error on the way takes the place of a reply."""
+        """Send requests in one message and return their replies; a transport error replaces a reply."""
         begun = time.monotonic()
         try:
             self._move()
@@ -158,7 +158,7 @@ class Connection:
                 self._must_reconnect = self._must_reconnect or (self._silent and self._leaves_silent)
             replies = [Reply(request.request_id, error=error) for request in requests]
         for reply in replies:
-            if reply.act is not None:  # a server has no say in who moves the robot, and why a tick has no action
+            if reply.act is not None:  # a server may not set the keys of the control loop
                 for name in OF_THE_LOOP:
                     reply.act.info.pop(name, None)
         if len(replies) == len(requests) and not any(reply.error or reply.draining for reply in replies):

@@ -79,7 +79,7 @@ ANONYMOUS = Credentials("")
 
 @contextlib.contextmanager
 def withheld() -> Iterator[None]:
-    """Remove the key from the environment for a while, so that processes started meanwhile do not inherit it."""
+    """Remove the key from the environment within the context, so that processes started in it do not inherit it."""
     key = os.environ.pop(KEY_VARIABLE, None)
     try:
         yield
@@ -132,7 +132,7 @@ def _speaks_tls(url: SplitResult, timeout_s: float) -> bool:
         with socket.create_connection((url.hostname, url.port or 80), timeout_s) as connection:
             context.wrap_socket(connection, server_hostname=url.hostname).close()
     except ssl.SSLError as error:
-        return "ALERT" in (error.reason or "")  # which is TLS, too
+        return "ALERT" in (error.reason or "")  # also TLS
     except OSError:
         return False
     return True

@@ -1,4 +1,4 @@
-"""ALOHA in simulation: two ViperX 300 arms over a table in MuJoCo, the two tasks that came with ACT.
+"""ALOHA in simulation: two ViperX 300 arms over a table in MuJoCo, the two tasks of ACT.
 
 Zhao et al. 2023, "Learning Fine-Grained Bimanual Manipulation with Low-Cost Hardware", arXiv 2304.13705, as packaged by
 gym-aloha. Images need OpenGL without a display: EGL, which Mesa also provides in software.

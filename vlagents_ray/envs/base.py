@@ -1,4 +1,4 @@
-"""What an environment looks like to an evaluation, whatever simulates it: alone, or several that step together."""
+"""The interface of environments: one alone, or several that step together."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ class EvalEnv(Environment):
         Returns:
             `(obs, reward, terminated, truncated, info)`, with the meaning of Gymnasium's `Env.step`. `info["success"]`
             is a bool, whether the task is solved in this state. An env may continue after success; `terminated` only
-            says that it cannot. `truncated` says that `max_steps` is reached.
+            reports that it cannot. `truncated` means that `max_steps` is reached.
 
         Raises:
             InvalidAction: The action has a wrong shape or is not finite.
@@ -137,7 +137,7 @@ class EvalEnv(Environment):
 
     @classmethod
     def known_contract(cls, arguments: Mapping[str, Any]) -> Contract | None:  # noqa: ARG003 - for those that override it
-        """Return the contract of an environment before it is made; None if only the simulator knows it.
+        """Return the contract of an environment before it is made; None if it requires the simulator.
 
         A mismatch with a policy is then an error before anything starts.
 
@@ -379,7 +379,7 @@ class SequentialBatch(BatchEnv):
                 closing.callback(env.close)
 
     def _stacked(self, seen: list[Obs], moved: Collection[int]) -> list[Obs]:
-        """The observations with the images of each camera as rows of one array, if they are used.
+        """Return the observations with the images of each camera as rows of one array, if they are used.
 
         An idle environment may have left its images out when it last moved; those of one that moved stand for them.
         """

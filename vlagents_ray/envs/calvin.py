@@ -182,7 +182,7 @@ class Calvin(SimulatorEnv):
 
     The reward is 1 in the step that solves a task. Its sum over an episode is the number of tasks solved in a row,
     whose mean is CALVIN's average length. The episode ends with the fifth task, or with one that takes too long.
-    `info["tasks"]` are CALVIN's names of the chain, `info["solved"]` says how many are solved.
+    `info["tasks"]` are CALVIN's names of the chain, `info["solved"]` is the number of solved ones.
     """
 
     suite = "calvin"
@@ -354,7 +354,7 @@ def make_simulator(checkout: Path, scene: str, renderer: RendererName) -> Any:
         require("pybullet")
         hydra, omegaconf = require("hydra"), require("omegaconf").OmegaConf
         code: Any = importlib.import_module("calvin_env.envs.play_table_env")
-        code.get_git_commit_hash = lambda _: ""  # which wants a repository
+        code.get_git_commit_hash = lambda _: ""  # it needs a repository
         parts = {
             "env": "env/play_table_env",
             "scene": f"scene/calvin_scene_{scene}",

@@ -116,7 +116,7 @@ class Renderer:
 
 
 def has_gpu() -> bool | None:
-    """Whether this process was given a GPU; None if that is not stated."""
+    """Return whether this process was given a GPU; None if that is not stated."""
     visible = os.environ.get(GPUS)
     return None if visible is None else visible.strip() not in ("", "-1")
 
@@ -167,7 +167,7 @@ def opengl_renderer() -> Renderer | None:
 
 
 def vulkan_renderer(name: str, cuda: int | None, *, asked_for: bool = False) -> Renderer:
-    """Return the renderer for the device that SAPIEN uses; `asked_for` says that the env's options named it."""
+    """Return the renderer for the device that SAPIEN uses; `asked_for` is whether the env's options named it."""
     files = filter(None, map(os.environ.get, VULKAN_DRIVERS))
     named = has_gpu() is False and any(_SAPIENS_OWN not in file for file in files)
     return Renderer(name, name.startswith(_SOFTWARE_VULKAN), cuda, asked_for or named)

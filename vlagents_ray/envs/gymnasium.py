@@ -97,9 +97,8 @@ _FETCH = BenchmarkProtocol(
 class Gymnasium(EvalEnv):
     """A Gymnasium environment with a continuous action vector, Box (D,).
 
-    Actions are clipped to the Box. Success is `info["is_success"]` or `info["success"]` where the
-    environment gives one; without it, and without the option `success`, no episode succeeds and
-    only the returns say something.
+    Actions are clipped to the Box. Success is `info["is_success"]` or `info["success"]` where the environment gives
+    one; without it, and without the option `success`, no episode succeeds and only the returns are meaningful.
     """
 
     def __init__(
@@ -281,7 +280,7 @@ class Gymnasium(EvalEnv):
 
 
 _ID = "gym_pusht/PushT-v0"
-# What is observed in each task: options of `Gymnasium`.
+# The observations of each task: options of `Gymnasium`.
 _TASKS: dict[str, Mapping[str, Any]] = {
     "image": {},
     "keypoints": {"kwargs": {"obs_type": "environment_state_agent_pos"}, "cameras": {}},
@@ -293,10 +292,10 @@ class PushT(Gymnasium):
 
     Observation: `state["agent_pos"]`, (2,) in pixels of the field, 512 by 512. With "image" also "front", (96, 96, 3)
     by default; with "keypoints" `state["environment_state"]`, (16,), x and y of eight points of the block, in pixels.
-    In `info["sim_state"]`, (7,) float64, what the simulator knows: x, y of the agent and its velocity, pixels and
+    In `info["sim_state"]`, (7,) float64, the simulator's state: x, y of the agent and its velocity, pixels and
     pixels/s; x, y and angle of the block, pixels and rad.
 
-    Action: (2,) in [0, 512]: where the disc shall go, in the same pixels.
+    Action: (2,) in [0, 512]: the target of the disc, in the same pixels.
     """
 
     def __init__(
@@ -334,7 +333,7 @@ class PushT(Gymnasium):
 
 @dataclass(frozen=True, slots=True)
 class Mapped:
-    """The options of `Gymnasium` that say where things are, which its constructor describes."""
+    """The options of `Gymnasium` with paths in the environment; its constructor describes them."""
 
     cameras: Mapping[str, str] | None
     state: Mapping[str, str] | None
@@ -363,7 +362,7 @@ class View:
             raise ConfigError(f"{name}: gripper_range is {mapped.gripper_range}, want two different numbers")
 
     def observe(self, nested: Any, render: Callable[[], Any]) -> Obs:
-        """Return an observation of the environment as ours; `render` gives the picture of its own renderer."""
+        """Return an observation of the environment as ours; `render` returns the picture of its own renderer."""
         cameras = {
             name: as_image(render() if pick.text == RENDER else pick.value(nested), name, self._options.size)
             for name, pick in self._cameras.items()

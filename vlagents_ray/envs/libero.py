@@ -4,7 +4,8 @@
         obs, _ = env.reset(seed=0, options={"init_state": 3})
         obs, reward, terminated, truncated, info = env.step(Act(action=np.zeros(7, np.float32)))
 
-The scenes' meshes and textures are in no package: `Libero.missing()` says how to download them; nothing here does.
+The scenes' meshes and textures are in no package: `Libero.missing()` returns how to download them; nothing here does
+so.
 """
 
 from __future__ import annotations
@@ -69,7 +70,7 @@ SUITES: Mapping[str, Suite] = {
 
 @dataclass(frozen=True, slots=True)
 class LiberoProtocol:
-    """The conventions of an episode; comments say where openpi and OpenVLA differ.
+    """The conventions of an episode; comments state the differences of openpi and OpenVLA.
 
     `max_steps` counts the policy's actions alone: peers count to `max_steps` plus the settling ones.
 
@@ -129,7 +130,7 @@ class LiberoTask:
 
 
 def task_names() -> list[str]:
-    """Every task, e.g. "libero_spatial/0"; needs no simulator."""
+    """Return every task, e.g. "libero_spatial/0"; needs no simulator."""
     return [f"{name}/{number}" for name, suite in SUITES.items() for number in range(suite.tasks)]
 
 
@@ -147,7 +148,7 @@ def require_suite(name: str) -> tuple[str, str]:
 
 
 def find_task(name: str) -> LiberoTask:
-    """The task `name`, "SUITE/NUMBER" or "SUITE/NAME"; imports LIBERO; raises `UnknownEnv` if there is none."""
+    """Return the task `name`, "SUITE/NUMBER" or "SUITE/NAME"; imports LIBERO; raises `UnknownEnv` if there is none."""
     suite, which = require_suite(name)
     root = import_libero()
     known = require("libero.libero.benchmark").task_maps[suite]
@@ -169,7 +170,7 @@ def find_task(name: str) -> LiberoTask:
 
 
 def read_states(path: Path) -> np.ndarray:
-    """The initial states in a file, (N, D) float64: time, qpos and qvel of MuJoCo.
+    """Return the initial states in a file, (N, D) float64: time, qpos and qvel of MuJoCo.
 
     They are pickled numpy arrays, in torch's archives. LIBERO loads them as any pickle; here nothing but such an array
     is let in.
@@ -234,7 +235,7 @@ class Libero(SimulatorEnv):
             gripper_open: The action's last number that opens the gripper; None is LIBERO's -1. OpenVLA
                 says 1, and 0 to close, which openvla's evaluation turns into LIBERO's as this does.
             gripper_closed: The one that closes it; None is LIBERO's 1.
-            assets: The folder with LIBERO's meshes and textures; None is what LIBERO_ASSETS names.
+            assets: The folder with LIBERO's meshes and textures; None is the one in LIBERO_ASSETS.
         """
         super().__init__(f"libero/{task}", width=width, height=height, max_steps=max_steps)
         if (settling_steps or 0) < 0:
@@ -348,7 +349,7 @@ def _contract_of(protocol: LiberoProtocol) -> Contract:
 
 
 def to_simulator(action: np.ndarray, protocol: LiberoProtocol) -> np.ndarray:
-    """An action under `protocol`, (7,), as robosuite takes it: the gripper -1 to open, 1 to close, 0 to stay.
+    """Return an action under `protocol`, (7,), as robosuite takes it: the gripper -1 to open, 1 to close, 0 to stay.
 
     Closer to `gripper_open` means open, as in openvla's evaluation, which binarises, and as robosuite's own
     gripper does, of whose command only the sign counts.
@@ -359,7 +360,7 @@ def to_simulator(action: np.ndarray, protocol: LiberoProtocol) -> np.ndarray:
 
 
 def axis_angle(quaternion: np.ndarray) -> np.ndarray:
-    """A unit quaternion xyzw to axis times angle, (3,) rad, the angle in [0, 2 pi].
+    """Return a unit quaternion xyzw to axis times angle, (3,) rad, the angle in [0, 2 pi].
 
     As robosuite's `quat2axisangle`, q and -q give different ones: policies were trained on states in which
     no sign was normalised. For a gripper that points down w is near 0, and a state that chose the sign by it
@@ -396,7 +397,7 @@ class LiberoSimulation:
             camera_names=list(protocol.cameras.values()),
             camera_heights=protocol.image_size[0],
             camera_widths=protocol.image_size[1],
-            horizon=protocol.settling_steps + protocol.max_steps + 1,  # robosuite's own limit stays out of the way
+            horizon=protocol.settling_steps + protocol.max_steps + 1,  # so that robosuite's own limit has no effect
         )
         self._cameras = CameraRenderer(self._env.env)
 
@@ -457,7 +458,7 @@ class LiberoSimulation:
 
 
 def package_folder() -> Path:
-    """The package's folder with its problems and initial states; raises `MissingDependency`."""
+    """Return the package's folder with its problems and initial states; raises `MissingDependency`."""
     require("libero")
     spec = importlib.util.find_spec("libero.libero")
     if spec is None or spec.origin is None:
@@ -486,8 +487,8 @@ def import_libero() -> Path:
 def _own_config(folder: Path) -> Iterator[None]:
     """A configuration of this process alone.
 
-    LIBERO reads one from the home, asks on stdin where there is none, and writes it there. Its paths are
-    wanted nowhere but in helpers that are not used here, so it goes with the import.
+    LIBERO reads one from the home, or else asks on stdin and writes it there. Only helpers that are not used here need
+    its paths, so it is removed after the import.
     """
     parts = {"assets": "assets", "bddl_files": "bddl_files", "datasets": "datasets", "init_states": "init_files"}
     paths = {"benchmark_root": str(folder)} | {key: str(folder / name) for key, name in parts.items()}

@@ -107,7 +107,7 @@ class MetaWorld(SimulatorEnv):
 
     @classmethod
     def known_contract(cls, arguments: Mapping[str, Any]) -> Contract:
-        """Return the contract without the control rate, which the simulator knows."""
+        """Return the contract without the control rate, which only the simulator has."""
         return Contract(
             cameras={name: CameraSpec(arguments["height"], arguments["width"]) for name in arguments["cameras"]},
             state={"xyz": StateSpec(3, "m")},

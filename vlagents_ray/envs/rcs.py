@@ -415,7 +415,7 @@ class Arms:
         return commands
 
     def read(self, observation: Mapping[str, Any]) -> tuple[dict[str, np.ndarray], float | None]:
-        """The state, each part (D,) float32, and a single arm's gripper in [0, 1], 1 = open."""
+        """Return the state, each part (D,) float32, and a single arm's gripper in [0, 1], 1 = open."""
         state = {
             self._key(name, part): np.array(observation[name][part], dtype=np.float32)
             for name in self.names

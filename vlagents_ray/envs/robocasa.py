@@ -284,7 +284,7 @@ class RoboCasa(RobosuiteEnv):
 def require_assets(registries: Sequence[str] = REGISTRIES) -> None:
     """Raise `EnvFailed` if textures, appliances or the objects of one of `registries` are not there, with the cure."""
     spec = importlib.util.find_spec("robocasa")
-    if spec is None or spec.origin is None:  # `require` says so better
+    if spec is None or spec.origin is None:  # `require` raises the better error
         return
     folder = Path(spec.origin).parent / "models" / "assets"
     wanted = ["textures", "fixtures/stoves", *(f"objects/{name}" for name in registries)]

@@ -45,7 +45,7 @@ class RobosuiteEnv(SimulatorEnv):
 
     def _begin(self, seed: int, state: int) -> tuple[Obs, dict[str, Any]]:
         with seeded(seed):
-            if hasattr(self._env, "rng"):  # robosuite 1.5 has a generator of its own, which its parts share
+            if hasattr(self._env, "rng"):  # robosuite 1.5 has its own generator, which its parts share
                 self._env.rng.bit_generator.state = np.random.default_rng(seed).bit_generator.state
             self._renderer.make_current()  # the last episode's rendering resources are freed in their own context
             self._renderer.open = True
@@ -198,7 +198,7 @@ _PROTOCOL = BenchmarkProtocol(
 
 @dataclass(frozen=True, slots=True)
 class RobosuiteTask:
-    """A task of robosuite, and what robomimic observes and allows in it."""
+    """A task of robosuite, with robomimic's observations and step limit."""
 
     instruction: str
     max_steps: int = 400  # robomimic's horizon for demonstrations of proficient humans

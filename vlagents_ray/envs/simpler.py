@@ -28,7 +28,7 @@ from vlagents_ray.registry import require
 _TOUCHING = "the object lies on its target and touches it"
 _WITHIN = "the object lies within its target's outline, at most {} m above it"
 
-# What ManiSkill 3 counts as success in each task.
+# The success criteria of ManiSkill 3 for each task.
 TWINS: dict[str, str] = {
     "PutCarrotOnPlateInScene-v1": _TOUCHING,
     "PutEggplantInBasketScene-v1": _WITHIN.format(0.06),

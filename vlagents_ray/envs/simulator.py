@@ -56,7 +56,7 @@ class SimulatorEnv(EvalEnv):
 
     Most constructors have these options, of which None is the task's or the protocol's own value: `width` and `height`
     of each image, pixels; `instruction`, the task in words; `max_steps`, the step limit; `ends_on_success`, whether
-    success ends the episode (without that, success at the end can be measured, too).
+    success ends the episode (without that, success at the end can also be measured).
     """
 
     suite: ClassVar[str]

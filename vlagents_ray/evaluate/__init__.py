@@ -4,7 +4,7 @@ summary = evaluate(
     EvalConfig(policies=[{"url": "http://localhost:8000"}], suites=[{"envs": ["tabletop"]}], out="runs/first")
 )
 
-Configurations and results are read without Ray; what plays or prints is loaded when it is first asked for.
+Configurations and results are read without Ray; code that plays or prints is loaded on first use.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Finds the new checkpoints of a running training when they are whole."""
+"""Finds the new checkpoints of a running training when they are complete."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ class _FoundCheckpoint:
     """A checkpoint in the folder."""
 
     entry: Path  # in the folder itself
-    checkpoint: Path  # what the policy loads: the entry, or something in it
+    checkpoint: Path  # the path that the policy loads: the entry, or one in it
 
 
 @dataclass(slots=True)
 class _SeenFile:
-    """The state of a checkpoint that is not known to be whole yet, since its last change."""
+    """The state of a checkpoint since its last change, until it is complete."""
 
     snapshot: Snapshot
     since: float  # s, when this state was first seen
-    why: str = ""  # the reason for which it does not count yet
-    examined: bool = False  # its files were examined, which need not be repeated until they change
+    why: str = ""  # the reason why it is not complete
+    examined: bool = False  # whether its files were examined since they changed
 
 
 class CheckpointWatcher:
@@ -43,12 +43,12 @@ class CheckpointWatcher:
     def __init__(self, pattern: str, folder: Path | None = None, *, settle_s: float = 10.0, marker: str | None = None):
         """Watch for checkpoints.
 
-        A checkpoint is whole when `vlagents_ray.policies.base.checkpoint_files` finds no fault in it, and either
-        its names, sizes and times have not changed for `settle_s` seconds, or it holds a file called `marker`.
+        A checkpoint is complete when `vlagents_ray.policies.base.checkpoint_files` finds no fault in it, and either its
+        names, sizes and times have not changed for `settle_s` seconds, or it holds a file called `marker`.
 
         Args:
             pattern: A checkpoint's path with `{step}` in it.
-            folder: Where steps are looked for; by default the part of `pattern` before `{step}`.
+            folder: The folder of the steps; by default the part of `pattern` before `{step}`.
             settle_s: Seconds without a change.
             marker: The name of a file that the trainer writes last, if it does.
         """
@@ -65,7 +65,7 @@ class CheckpointWatcher:
         self._complete: set[int] = set()
 
     def scan(self, now: float) -> list[int]:
-        """The steps that have become whole since the last call, ascending; `now` is in s, of any clock."""
+        """Return the steps completed since the last call, ascending; `now` is in s, of any clock."""
         found = self._found()
         self._seen = {step: seen for step, seen in self._seen.items() if step in found}
         new = [step for step in sorted(found.keys() - self._complete) if self._is_complete(step, found[step], now)]
@@ -80,11 +80,11 @@ class CheckpointWatcher:
         return (self.folder / FINISHED).exists()
 
     def is_settled(self, now: float) -> bool:
-        """Whether no unfinished checkpoint has changed for `settle_s` seconds."""
+        """Return whether no unfinished checkpoint has changed for `settle_s` seconds."""
         return all(now - seen.since >= self._settle_s for seen in self._seen.values())
 
     def waiting(self) -> dict[int, str]:
-        """The steps that do not count as whole, with the reason."""
+        """Return the steps that are not complete, each with the reason."""
         return {step: seen.why for step, seen in sorted(self._seen.items())}
 
     def _found(self) -> dict[int, _FoundCheckpoint]:
@@ -94,7 +94,7 @@ class CheckpointWatcher:
             step = int(match[1]) if match else -1
             if match is None or match[1] not in (str(step), f"{step:0{PADDED}d}"):
                 continue
-            if step not in found or match[1] == str(step):  # which is looked for first
+            if step not in found or match[1] == str(step):  # the policy looks for this name first
                 found[step] = _FoundCheckpoint(
                     entry, entry.joinpath(*(at_step(part, match[1]) for part in self._below))
                 )
@@ -114,7 +114,7 @@ class CheckpointWatcher:
         if seen.why:
             return False
         seen.why, seen.examined = unfinished(found.checkpoint) or "", True
-        return not seen.why and _snapshot(found.entry) == snapshot  # what passes stood still while it was looked at
+        return not seen.why and _snapshot(found.entry) == snapshot  # it passed, and has not changed since
 
 
 def rounds(
@@ -123,12 +123,12 @@ def rounds(
     pause: Callable[[], object],
     clock: Callable[[], float] = time.monotonic,
 ) -> Iterator[list[int]]:
-    """Yield the steps that have become whole, up to `until`; `pause` is called between two looks at the folder.
+    """Yield the completed steps up to `until`; `pause` is called between two scans of the folder.
 
-    It ends when a step at or after `until` is whole, or when the training has announced its end.
+    It ends when a step at or after `until` is complete, or when the training has announced its end.
     """
     while True:
-        now, finished = clock(), watcher.finished  # before the look, which then sees all that there will be
+        now, finished = clock(), watcher.finished  # read before the scan, which then finds all checkpoints
         steps = watcher.scan(now)
         if wanted := [step for step in steps if until is None or step <= until]:
             yield wanted
@@ -149,6 +149,6 @@ def _snapshot(entry: Path) -> Snapshot:
 def _line(path: Path) -> Iterator[tuple[str, int, int]]:
     try:
         found = path.stat()
-    except FileNotFoundError:  # renamed meanwhile
+    except FileNotFoundError:  # it has been renamed
         return
     yield str(path), found.st_size, found.st_mtime_ns

@@ -38,7 +38,7 @@ Row = dict[str, Any]
 
 @dataclass(slots=True)
 class _Merged:
-    """The tables of the merged results, by their keys; `home` is the folder of an episode's files."""
+    """The tables of the merged results, by key; `home` is the folder of an episode's files."""
 
     runs: list[Row] = field(default_factory=list)
     policies: dict[str, Row] = field(default_factory=dict)
@@ -50,16 +50,16 @@ class _Merged:
 
 
 def merge(out: Path, folders: Sequence[Path], *, keep_first: bool = False, accept_changes: bool = False) -> Summary:
-    """Put the results of `folders` together in the new folder `out`, which can be resumed.
+    """Merge the results of `folders` into the new folder `out`, which can be resumed.
 
-    An episode with the same outcome in several folders is taken from the first; one that was played replaces one that
-    infrastructure failed.
+    An episode with the same outcome in several folders is taken from the first; a played one replaces one that failed
+    by infrastructure.
 
     Args:
         out: A folder without results; it is made if it is missing.
         folders: Folders of results.
-        keep_first: Of an episode with different outcomes take that of the first folder.
-        accept_changes: Merge although files of a policy or an env, or weights, differ; the report says so.
+        keep_first: Whether the first folder wins for an episode with different outcomes.
+        accept_changes: Merge although files of a policy or an env, or weights, differ; the report shows it.
 
     Returns:
         The summary of the merged results.
@@ -221,7 +221,7 @@ def _link_files(merged: _Merged, out: Path, folders: Sequence[Path]) -> None:
         for diff in sorted((folder / PROVENANCE).glob("*.diff")):
             name = f"{PROVENANCE}/{diff.name}"
             sources[out / name] = inside(folder, name)
-    for target, source in sources.items():  # all of them are there: nothing is written for one that is not
+    for target, source in sources.items():  # check that all exist before anything is written
         link_or_copy(source, target)
 
 
@@ -245,8 +245,8 @@ def _write(merged: _Merged, path: Path) -> None:
 def combined(folders: Sequence[Results]) -> Results:
     """Combine the results of several folders.
 
-    A policy that two folders have in the same env, or with other weights under the same name of its checkpoint, gets
-    the folder's name appended: "pi0 (second)".
+    If two folders have a policy in the same env, or with other weights under the same checkpoint's name, the folder's
+    name is appended: "pi0 (second)".
 
     Raises:
         ConfigError: There is no folder, or two of them are parts of one evaluation, which are merged, not compared.
@@ -276,7 +276,7 @@ def combined(folders: Sequence[Results]) -> Results:
             replace(one, policy=names.get(one.policy, one.policy), run=one.run + len(runs)) for one in each.workers
         ]
         runs += [replace(run, run=run.run + len(runs)) for run in each.runs]
-    parts = tuple(sorted((each.out.resolve() for each in folders), reverse=True))  # a folder before the one it is in
+    parts = tuple(sorted((each.out.resolve() for each in folders), reverse=True))  # subfolders before their parents
     return Results(base, tuple(cells), tuple(runs), policies, tuple(workers), parts)
 
 
@@ -293,7 +293,7 @@ def _require_apart(folders: Sequence[Results]) -> None:
 
 
 def _of_other_weights(folders: Sequence[Results]) -> set[str]:
-    """The policies of which a checkpoint's name stands for several weights."""
+    """Return the policies with several weights under one checkpoint's name."""
     first: dict[tuple[str, str | None], str] = {}  # by policy id and checkpoint
     found = set()
     for cell in (cell for each in folders for cell in each.cells):
@@ -304,7 +304,7 @@ def _of_other_weights(folders: Sequence[Results]) -> set[str]:
 
 
 def _labels(folders: Sequence[Results], base: Path) -> list[str]:
-    """Names of the folders: their last parts, or their paths under `base` if last parts are the same."""
+    """Return names of the folders: their last parts, or their paths under `base` if last parts are the same."""
     names = [each.out.resolve().name for each in folders]
     if len(set(names)) == len(names):
         return names

@@ -33,7 +33,7 @@ class Recorded:
     def config(self, out: Path, *, policy: dict[str, Any] | None = None) -> EvalConfig:
         """Settings of an evaluation of this episode's cell alone into `out`, with video and trajectory.
 
-        They are those of the run in which it was played. `policy` replaces settings of the policy.
+        They are those of its run. `policy` replaces settings of the policy.
         """
         run = next(run for run in self.results.runs if run.run == self.episode.run)
         config = EvalConfig.model_validate(run.config)
@@ -41,9 +41,9 @@ class Recorded:
         cell = next(one for one in cells(config) if one.name == where)
         given = cell.policy.model_dump() | {"steps": [cell.step] if cell.policy.steps else []}
         if cell.policy.source is None:
-            given |= {"config": {}}  # the server has its own configuration, and reports it again
+            given |= {"config": {}}  # the server has its own configuration
         else:
-            given |= {"url": None}  # it was served for that run, and is to be served again
+            given |= {"url": None}  # it was served for that run, and is served again
         if policy is not None:
             given = {name: value for name, value in given.items() if name != "name"} | policy
         suite = cell.suite.model_dump() | {"envs": [cell.env], "worker": cell.worker.model_dump()}
@@ -54,7 +54,7 @@ class Recorded:
 def find(results: Results, name: str) -> Recorded:
     """Find the episode with the key `name`, or the only one with number N in an env, as "ENV#N".
 
-    Raises `ConfigError` if there is none, if there are several, or if infrastructure failed it.
+    Raises `ConfigError` if there is none, if there are several, or if it failed by infrastructure.
     """
     found = [
         Recorded(results, cell, one)
@@ -74,7 +74,7 @@ def find(results: Results, name: str) -> Recorded:
 
 
 def compare(recorded: Recorded, replayed: Results) -> list[str]:
-    """The differences of the replay, a sentence each; empty if it is the same episode.
+    """Return the differences of the replay, a sentence each; empty if it is the same episode.
 
     Actions are compared byte for byte, durations not at all. Raises `ConfigError` if infrastructure failed the replay.
     """

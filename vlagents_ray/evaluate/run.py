@@ -34,17 +34,17 @@ from vlagents_ray.interface import Agent
 from vlagents_ray.ray_tools.signals import stop_signals
 
 log = logging.getLogger(__name__)
-POLL_S = 0.25  # how soon a signal is noticed
-MARGIN = 1.25  # by which the next episode may be longer than the longest so far
+POLL_S = 0.25  # time after which a signal is handled
+MARGIN = 1.25  # assumed factor of the next episode over the longest so far
 CLOSING_S = 10.0  # for workers to close their simulators, and for the report to be written
-SIGNAL_S = 0.2  # s for which a signal that ended a worker may be late in this process: it goes to one after the other
+SIGNAL_S = 0.2  # s by which a signal may reach this process later than a worker
 
 
 class EvaluationInterrupted(KeyboardInterrupt):
-    """Ctrl-C or SIGTERM ended the evaluation. Finished episodes are kept, and `resume` goes on from there.
+    """Ctrl-C or SIGTERM ended the evaluation. Finished episodes are kept, and `resume` continues.
 
     Attributes:
-        summary: The summary of what is finished.
+        summary: The summary of the finished episodes.
     """
 
     why = "interrupted"
@@ -56,7 +56,7 @@ class EvaluationInterrupted(KeyboardInterrupt):
 
 
 class OutOfTime(EvaluationInterrupted):
-    """No further episode would have ended by `end_at`; `resume` goes on, as after an interruption."""
+    """No further episode would have ended by `end_at`; `resume` continues, as after an interruption."""
 
     why = "out of time"
 
@@ -72,18 +72,18 @@ def evaluate(
 ) -> Summary:
     """Play every episode of `config` that has no result yet, and write the results to `config.out`.
 
-    Episodes run in Ray actors: in the cluster that this process is connected to, or else in one
-    that `RAY_ADDRESS` names, or in a local one started for the length of the run. Each worker talks to
-    the policy at its `url`, or to an agent of its own that `agent_factory` makes there. Whatever is raised, each
-    recorded episode is kept, and summary.json and report.html are written if the disk has room.
+    Episodes run in Ray actors: in the cluster of this process, else in that of `RAY_ADDRESS`, else in a local one for
+    the length of the run. Each worker uses the policy at its `url`, or its own agent from `agent_factory`. Even if an
+    exception is raised, recorded episodes are kept, and summary.json and report.html are written if the disk has room.
 
     Args:
         config: The policies, the envs, and the folder of results.
         agent_factory: Called in each worker to make its agent, in place of a connection to the policy's `url`.
         in_process: Play in this process, without Ray: one worker, to which neither `workers` nor the time limits apply.
-        progress: Shows how far the evaluation is (`progress_for`); by default nothing is shown.
+        progress: Shows the progress (`progress_for`); by default nothing is shown.
         only: (number, seed) of the one episode of each env that is played; by default all are.
-        end_at: A time in seconds since 1970. No episode begins that would not end by then, judged by earlier ones.
+        end_at: A time in seconds since 1970. No episode begins that would not end by then, by the durations of earlier
+            ones.
 
     Returns:
         The summary of all results in `config.out`, those of earlier runs included.
@@ -92,7 +92,7 @@ def evaluate(
         ConfigError: The settings are invalid, or contradict the results in `config.out`.
         ContractMismatch: A policy and an env do not fit together.
         StorageFailed: The disk is full, or cannot be written to.
-        EvaluationInterrupted: Ctrl-C or SIGTERM; `OutOfTime`, which is one, if `end_at` left episodes over.
+        EvaluationInterrupted: Ctrl-C or SIGTERM; its subclass `OutOfTime` if `end_at` left episodes.
         VLAgentsError: The last infrastructure error, after `config.abort_after` lost episodes in a row; `PolicyFailed`
             with the last error, after as many in a row that an error of a policy ended.
     """
@@ -121,7 +121,7 @@ def evaluate(
 
 
 def conclude(config: EvalConfig, store: Store, state: str) -> Summary:
-    """Note how the run ended, and write its summary and its report."""
+    """Record the end of the run, and write its summary and its report."""
     with storing(config.out):
         store.end_run(state)
         summary = summarize(Results.load(config.out))
@@ -180,7 +180,7 @@ class _Run:
         self._deadline = Deadline(end_at, played)
 
     def play(self, factory: AgentFactory) -> tuple[str, Summary]:
-        """Play all that is queued, until a signal or the deadline ends it early; returns the run's state and summary.
+        """Play all queued episodes, until a signal or the deadline ends the run; returns its state and summary.
 
         The summary is written before Ray is left: when Slurm cancels a job, Ray stops responding at once and the job is
         killed seconds later.
@@ -216,7 +216,7 @@ class _Run:
         for job, report in pool.wait(POLL_S):
             self._deadline.end(job)
             if report.failure is not None:
-                # A terminal or a service manager signals workers and policies as well: that costs no attempt.
+                # A terminal or a service manager also signals workers and policies: that costs no attempt.
                 if stop.wait(late_s):
                     continue
                 late_s = 0.0  # one wait is for all failures of a poll: a lost policy fails many episodes at once
@@ -256,7 +256,7 @@ class _Run:
                 log.warning(hint)
 
     def _failed(self, job: Job, failure: Failure) -> None:
-        beyond = self._has_stopped(job)  # it is not needed any more
+        beyond = self._has_stopped(job)  # it is no longer needed
         retried = self._attempts.repeats(job, failure) and not beyond
         self._store.record_attempt(job, failure, retried=retried)
         if failure.cause == "user":
@@ -286,7 +286,7 @@ class _Run:
         return stopping is not None and stopping.at is not None
 
     def _stop_if_certain(self, job: Job, result: EpisodeResult) -> None:
-        """Leave out what waits of the cell once its outcomes are enough; what is being played is played to its end."""
+        """Drop the waiting episodes of the cell once its outcomes suffice; running episodes are finished."""
         stopping = self._stopping.get(job.cell.fingerprint)
         if stopping is None or self._has_stopped(job):
             return
@@ -298,7 +298,7 @@ class _Run:
 
 
 class Deadline:
-    """Measures the duration of episodes in the driver: the start of a simulator and waiting for a policy included."""
+    """Measures the duration of episodes in the driver, with the start of a simulator and waiting for a policy."""
 
     def __init__(
         self, end_at: float | None, known_s: Iterable[float] = (), now: Callable[[], float] = time.time
@@ -321,12 +321,12 @@ class Deadline:
 
     @property
     def leaves_room(self) -> bool:
-        """Whether one more episode would end in time."""
+        """Return whether one more episode would end in time."""
         return self._left_s() > self._longest_s * MARGIN
 
     @property
     def is_over(self) -> bool:
-        """Whether the episodes that are being played have to be abandoned."""
+        """Return whether running episodes must be abandoned."""
         return self._left_s() <= 0
 
     def _left_s(self) -> float:

@@ -1,4 +1,4 @@
-"""Trackers, which show an evaluation where training is watched: wandb, trackio, TensorBoard."""
+"""Trackers of evaluations: wandb, trackio, TensorBoard."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class About:
     project: str
     group: str
     name: str  # of the policy
-    id: str  # stays the same when an evaluation resumes this folder
+    id: str  # is kept when an evaluation resumes this folder
     config: dict[str, Any]  # `evaluation`: its settings; `served`: the policy's identity; `code`: git states
     diffs: Sequence[Path]  # of the working trees from their commits
 
@@ -56,7 +56,7 @@ class TrackerRun(ABC):
 
     @abstractmethod
     def videos(self, label: str, paths: Sequence[Path], step: int | None) -> None:
-        """Upload videos of episodes of the suite and env that `label` names, as the names of its values do."""
+        """Upload videos of episodes of the suite and env `label`, the prefix of its values' names."""
 
     @abstractmethod
     def finish(self) -> None:
@@ -69,7 +69,7 @@ class WandbRun(TrackerRun):
     def __init__(self, about: About) -> None:
         self._wandb: Any = require("wandb")
         self._id = about.id
-        # Code is in the config and in an artifact: wandb would look at the driver's folder only.
+        # Code is in the config and in an artifact, as wandb would only read the driver's folder.
         quiet = self._wandb.Settings(silent=True, console="off", disable_git=True, disable_code=True)
         self._run = self._wandb.init(
             project=about.project, group=about.group, name=about.name, id=about.id, dir=str(about.out),
@@ -142,7 +142,7 @@ class TensorboardRun(TrackerRun):
         self._writer.close()
 
     def _text(self, tag: str, text: str, step: int) -> None:
-        indented = "\n".join(f"    {line}" for line in text.splitlines())  # Markdown for text as it stands
+        indented = "\n".join(f"    {line}" for line in text.splitlines())  # Markdown for preformatted text
         tensor = self._tensor(
             dtype="DT_STRING", string_val=[indented.encode()], tensor_shape={"dim": [{"size": 1}]}
         )  # fmt: skip
@@ -160,8 +160,8 @@ _RUNS: dict[str, type[TrackerRun]] = {"wandb": WandbRun, "trackio": TrackioRun, 
 class TrackerFeed:
     """Logs to the trackers from a thread, as a tracker may wait for a network. Use as a context manager around a run.
 
-    A tracker that fails is not used again in this run: a warning is logged, and the results are unaffected. What was
-    logged is noted in the results, so that a run that resumes them logs only what is new.
+    A tracker that fails is not used again in this run: a warning is logged, and the results are unaffected. The results
+    record what was logged, so that a resumed run logs only new values.
     """
 
     def __init__(self, config: EvalConfig) -> None:
@@ -176,7 +176,7 @@ class TrackerFeed:
         self._thread = threading.Thread(target=self._loop, name="vlagents-ray-trackers", daemon=True)
 
     def update(self) -> None:
-        """Look for complete cells soon. Calls while trackers are busy count as one."""
+        """Request a check for complete cells. Calls while trackers are busy count as one."""
         self._updated.set()
 
     def __enter__(self) -> TrackerFeed:
@@ -197,7 +197,7 @@ class TrackerFeed:
         while not over:
             self._updated.wait()
             self._updated.clear()
-            over = self._closing  # read before the results are: whatever is complete by then is logged
+            over = self._closing  # read before the results, so that all cells complete by then are logged
             self._log_to_all()
         for (name, _), run in self._runs.items():
             try:

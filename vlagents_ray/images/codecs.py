@@ -35,7 +35,7 @@ class ImageCodec:
 
     name: str = "jpeg"
     quality: int = 85  # 1 to 100
-    subsampling: str = "444"  # of colour: "444" is none, "422" and "440" half, "420" a quarter of the samples
+    subsampling: str = "444"  # of colour: "444" keeps all, "422" and "440" half, "420" a quarter of the samples
 
     def __post_init__(self) -> None:
         if self.name not in NAMES:
@@ -60,7 +60,7 @@ class PixelBudget(Protocol):
     """The limits of a message; see `vlagents_ray.protocol.messages`."""
 
     serial: bool
-    files: DecodedFiles | None  # gets the files of the images that are decoded; None if nobody needs them
+    files: DecodedFiles | None  # gets the files of decoded images; None if not needed
 
     @property
     def pixels(self) -> int:

@@ -1,7 +1,7 @@
-"""The columns of transitions: Arrow arrays of which numpy and torch get views.
+"""The columns of transitions: Arrow arrays with views for numpy and torch.
 
-A row is one step of one environment: the observation, the action that was executed on it, and what came of it. Rows of
-an episode are in order; a `pyarrow.RecordBatch` of rollouts holds one whole episode. T is the number of its rows.
+A row is one step of one environment: the observation, the executed action, and its outcome. Rows of an episode are in
+order; a `pyarrow.RecordBatch` of rollouts holds one whole episode. T is the number of its rows.
 
 | column | numpy view | |
 |---|---|---|
@@ -14,24 +14,24 @@ an episode are in order; a `pyarrow.RecordBatch` of rollouts holds one whole epi
 | `state.NAME` | (T, D) float32 | in the unit that the env's contract states |
 | `gripper` | (T,) float32 | in [0, 1], 1 = open; only if the env has one |
 | `action` | (T, D) float32 | as executed, in the unit of the env's contract |
-| `reward` | (T,) float32 | of the environment; one without a shaped reward gives 1 for a step that ends in success |
+| `reward` | (T,) float32 | of the environment; without a shaped reward, 1 for a step that ends in success |
 | `terminated` | (T,) bool | the environment ended the episode with this step: the value of what follows is 0 |
 | `truncated` | (T,) bool | a step limit, or the policy (`Act.done`), ended it: bootstrap from the final observation |
 | `success` | (T,) bool | whether the task is solved in the state that the action led to |
 | `final.COLUMN` | (1, ...) | the observation after the last step, for each column of one; a row an episode |
-| `logprob` | (T,) float32 | log-probability of the row, nats, if it is wanted; see below |
-| `value`, `entropy` | (T,) float32 | of the policy at this observation, if wanted; NaN where it was not asked |
-| `replay.NAME` | (A, ...) | of the policy's A answers, to compute log-probabilities again, if wanted; see below |
+| `logprob` | (T,) float32 | log-probability of the row, nats, if requested; see below |
+| `value`, `entropy` | (T,) float32 | of the policy at this observation, if requested; NaN without a new answer |
+| `replay.NAME` | (A, ...) | of the policy's A answers, to compute log-probabilities again, if requested; see below |
 | `version` | (T,) int64 | of the weights that chose the action; 0 if the policy names none |
-| `source` | (T,) str | who chose the action: "policy", or as `act.info["source"]` says ("human", "expert") |
+| `source` | (T,) str | source of the action: "policy", or `act.info["source"]` ("human", "expert") |
 
-The log-probabilities of a chunk's rows add up to that of the chunk. If the policy states one for the whole chunk, it is
-that of the first row, and the others have NaN, as they have in `value` and `entropy`.
+The log-probabilities of a chunk's rows add up to that of the chunk. If the policy states one for the whole chunk, the
+first row has it, and the others have NaN, as in `value` and `entropy`.
 
 With `want=["replay"]` there is a column for each name in `act.info["behaviour"]["replay"]`, such as `replay.tokens`,
 (A, H, D) int64, `replay.chain`, (A, K + 1, H, M) float32, and `replay.noise_level`, (A,). Values are of whole chunks,
-also where only some rows of a chunk are executed; their dtypes are the policy's. In Arrow each is in the first row of
-its answer's chunk. `answers` returns which answer each step is of.
+even if only some rows are executed; their dtypes are the policy's. In Arrow each is in the first row of its answer's
+chunk. `answers` returns the answer of each step.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ REPLAY = "replay"
 def arrays(transitions: Any) -> dict[str, np.ndarray]:
     """Return the columns of transitions as numpy arrays with the shapes that the module lists.
 
-    Numbers and images of a record batch, or of a table of one chunk, are views of its memory, which is read-only;
-    several chunks are put together first, which copies them. Text is an array of objects.
+    Numbers and images of a record batch, or of a table of one chunk, are read-only views of its memory; several chunks
+    are first copied into one. Text is an array of objects.
 
     Args:
         transitions: A `pyarrow.RecordBatch` or a `pyarrow.Table` of rollouts.
@@ -67,7 +67,7 @@ def arrays(transitions: Any) -> dict[str, np.ndarray]:
 
 
 def answers(columns: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return which of the policy's answers each step is of, (T,) int64 from 0: its row of the columns `replay.NAME`.
+    """Return the policy's answer of each step, (T,) int64 from 0: its row of the columns `replay.NAME`.
 
     Args:
         columns: The columns of whole episodes, with `t` and `act`.
@@ -93,7 +93,7 @@ def _view(pa: Any, column: Any) -> np.ndarray:
 def tensors(pa: Any, values: np.ndarray) -> Any:
     """Return (T,) or (T, ...) values as an Arrow array that shares their memory."""
     if values.dtype == np.bool_:
-        return pa.Bool8Array.from_numpy(values)  # Arrow's own booleans are bits, of which there is no view
+        return pa.Bool8Array.from_numpy(values)  # Arrow's own booleans are bits, which allow no view
     if values.ndim == 1:
         return pa.array(values)
     return pa.FixedShapeTensorArray.from_numpy_ndarray(values)
@@ -105,11 +105,11 @@ def constant(pa: Any, text: str, rows: int) -> Any:
 
 
 def words(pa: Any, texts: list[str]) -> Any:
-    """Return a column of texts of which many are equal."""
+    """Return a column of texts with many repetitions."""
     return pa.array(texts, pa.string()).dictionary_encode()
 
 
 def at_rows(pa: Any, values: np.ndarray, rows: np.ndarray) -> Any:
-    """Return a column of lists: the next of (N, ...) `values` where `rows`, (T,) bool, is true, nothing elsewhere."""
+    """Return a column of lists: the next of (N, ...) `values` at each true row of `rows`, (T,) bool, else nothing."""
     offsets = np.append(0, np.cumsum(rows)).astype(np.int32)
     return pa.ListArray.from_arrays(pa.array(offsets), tensors(pa, values))

@@ -1,4 +1,4 @@
-"""A learner's way to the policies that act: `Publisher`, and the three kinds of targets that it pushes to."""
+"""Pushing a learner's weights to served policies: `Publisher`, and its three kinds of targets."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ from vlagents_ray.weights.trainable import is_array, portable
 
 logger = logging.getLogger(__name__)
 
-_ANSWER_S = 10.0  # time limit for the question which versions act
+_ANSWER_S = 10.0  # time limit for the request of the versions
 _PUSH_S = 600.0  # time limit for a push, which includes the transfer to all nodes
 
 
 class Publisher:
-    """Gives new weights to a served policy, from the memory of the learner, without a checkpoint on disk.
+    """Pushes new weights from the learner's memory to a served policy, without a checkpoint on disk.
 
         with Publisher("serve://pi0") as weights:  # or "https://gpu:8000", with a key of the scope "weights"
             version = weights.push(model.state_dict())
@@ -91,11 +91,11 @@ class Publisher:
 
         Args:
             named: The values by name, as `Agent.parameters` names them: numpy or JAX arrays or torch tensors, e.g. a
-                `state_dict`. They are copied before this returns, so that the learner can go on.
+                `state_dict`. They are copied before this returns, so that the learner can continue.
             mode: When sessions change: at their next reset ("next_episode"), or between two acts ("keep").
-            partial: Whether names may be missing, whose values stay, as when only adapters are trained.
-            allow_same: Whether all values may equal those that the policy holds.
-            pin: Whether robots, and others that do not follow, also act with it from their next reset on.
+            partial: Whether names may be missing; their values stay, as when only adapters are trained.
+            allow_same: Whether all values may equal those of the policy.
+            pin: Whether robots and other sessions that do not follow also use it from their next reset on.
             version: The number of the version, such as the step of training; by default the newest one's + 1.
 
         Returns:
@@ -103,7 +103,7 @@ class Publisher:
 
         Raises:
             InvalidWeights: The values do not fit the policy; nothing was changed.
-            UnchangedWeights: The values equal those that the policy holds.
+            UnchangedWeights: The values equal those of the policy.
             InvalidInput: The version is not above the newest one.
             NotTrainable: The policy names no parameters to train.
             Overloaded: Another push is under way.
@@ -123,7 +123,7 @@ class Publisher:
         return sum(newest >= version for newest in self._target.versions())
 
     def close(self) -> None:
-        """End the use of the policy, which keeps its weights; between pushes there is no connection to close."""
+        """End the use of the policy, which keeps its weights."""
 
     def __enter__(self) -> Self:
         return self
@@ -145,7 +145,7 @@ class WeightsTarget(ABC):
 
 
 class EngineTarget(WeightsTarget):
-    """An engine in this process; tensors are copied once, on the device where they are."""
+    """An engine in this process; tensors are copied once, on their device."""
 
     def __init__(self, engine: Engine) -> None:
         """Push to that engine alone."""
@@ -163,9 +163,9 @@ class EngineTarget(WeightsTarget):
 class AppTarget(WeightsTarget):
     """An application of the Ray cluster that this process is in.
 
-    If the learner and all replicas have their weights on the same GPU, the replicas copy them from where they are.
-    Otherwise the values are put into Ray's object store once. All replicas of this node read them there, without a copy
-    where the policy is on the CPU; Ray transfers them to other nodes once each.
+    If the learner and all replicas have their weights on the same GPU, the replicas copy them there. Otherwise the
+    values are put into Ray's object store once. All replicas of this node read them there, without a copy if the policy
+    is on the CPU; Ray transfers them once to each other node.
     """
 
     def __init__(self, app: str) -> None:
@@ -212,7 +212,7 @@ class AppTarget(WeightsTarget):
 
 
 class ServerTarget(WeightsTarget):
-    """A server, also on another machine; the values travel in parts, over a WebSocket that ends with each push."""
+    """A server, also on another machine; each push sends the values in parts over a new WebSocket."""
 
     def __init__(self, url: str, credentials: Credentials) -> None:
         """Push to the server at a URL, "http(s)://HOST:PORT" or one with the path of an application."""
@@ -240,7 +240,7 @@ class ServerTarget(WeightsTarget):
 
     def _ask(self, socket: ProxiedSocket, part: bytes) -> dict[str, Any]:
         try:
-            with suppress(ConnectionClosed, OSError):  # the server has refused the push, and its answer says why
+            with suppress(ConnectionClosed, OSError):  # the server has refused the push; its answer has the reason
                 socket.send(part, _ANSWER_S)
             answer: dict[str, Any] = json.loads(socket.recv(_PUSH_S))
         except (ConnectionClosed, OSError) as error:

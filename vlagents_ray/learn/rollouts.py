@@ -1,4 +1,4 @@
-"""Transitions from the workers of an evaluation, without an end."""
+"""Endless transitions from the workers of an evaluation."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from vlagents_ray.learn.columns import EXTRA
 from vlagents_ray.learn.transitions import WANTED, TransitionRecorder
 from vlagents_ray.registry import require
 
-POLL_S = 0.25  # longest wait for a report, after which workers that are needed are started
+POLL_S = 0.25  # longest wait for a report before missing workers are started
 _CURE = "mend this, and go on with `first=rollouts.position`"
 
 
@@ -40,7 +40,7 @@ class RolloutStats:
     transitions: int = 0  # delivered
     retries: int = 0  # attempts repeated after an infrastructure failure
     stale: int = 0  # episodes played again, as the weights had changed too much
-    lost: int = 0  # episodes that no attempt brought to an end, or that an error of the policy ended
+    lost: int = 0  # episodes that no attempt finished, or that an error of the policy ended
 
 
 @dataclass(slots=True)
@@ -50,8 +50,8 @@ class _PlannedEpisode:
     job: Job  # its first attempt
     over: bool = False
     transitions: Any = None  # if it is over; None if it is lost
-    oldest: int = 0  # version of the weights that chose any of its actions
-    pushed: int = 0  # version that the learner had pushed when the last attempt began
+    oldest: int = 0  # oldest version of the weights among its actions
+    pushed: int = 0  # the learner's version when the last attempt began
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,17 +62,17 @@ class RolloutPlan:
         ConfigError: A setting is wrong.
     """
 
-    env: str | Sequence[str]  # the name, as for an evaluation; of several envs, each has its turn
+    env: str | Sequence[str]  # the name, as for an evaluation; several envs take turns
     policy: str | Callable[[], Agent]  # URL of a server, or a factory that each worker calls to create its own agent
     workers: int = 1
-    num_envs: int = 1  # environments that one worker steps together, with one request to the policy for all of them
+    num_envs: int = 1  # environments that one worker steps together, with one request to the policy for all
     groups: int = 1  # episodes from one start state, one after another, that differ in the seed of the policy (GRPO)
     want: Sequence[str] = ()  # what the policy returns for each act: "logprob", "value", "entropy", "replay"
-    # Deliver no episode with an act of weights that are more than so many versions old: it is played again. 0 is
+    # Largest age, in versions, of the weights of any act of a delivered episode; others are played again. 0 is
     # on-policy; None delivers all.
     max_lag: int | None = 0
     seed: int = 0  # of the first start state; state n has `seed` + n
-    first: int = 0  # number of the first episode: `position` of rollouts that ended, to go on with them
+    first: int = 0  # number of the first episode; to continue earlier rollouts, their `position`
     images: bool = True  # whether there are columns for the cameras
     env_options: Mapping[str, Any] = field(default_factory=dict)  # of the env's constructor
     reset_options: Mapping[str, Any] = field(default_factory=dict)  # of each reset of the env
@@ -110,9 +110,9 @@ class Rollouts:
                 columns = arrays(rollouts.collect(64))
                 ...  # learn from them, and push the new weights
 
-    Episodes are numbered from 0 and delivered in this order, each exactly once, however many workers there are and
-    whichever of them die: a broken attempt is repeated, and has no transitions. So the same seeds and the same weights
-    give the same transitions. The keys are those of an evaluation of these settings.
+    Episodes are numbered from 0 and delivered in this order, each exactly once, whatever the number of workers and even
+    if some die: a broken attempt is repeated, and has no transitions. So the same seeds and weights give the same
+    transitions. The keys are those of an evaluation of these settings.
 
     A record batch is one whole episode with the columns of `vlagents_ray.learn.columns`. Workers on this node write it
     into Ray's object store once, and numpy maps it from there; keeping it keeps its memory in the store.
@@ -122,7 +122,7 @@ class Rollouts:
         """Check the plan. Workers start with the first episode.
 
         Args:
-            plan: What is played.
+            plan: The settings.
 
         Raises:
             ConfigError: A setting is wrong.
@@ -151,8 +151,8 @@ class Rollouts:
     def version(self) -> int:
         """The newest version of the weights, from which the lag is counted.
 
-        It rises by itself with the version that acts name. A learner that iterates may set it after a push, to what the
-        push returned, so that no episode of older weights is delivered from then on.
+        It follows the versions of acts. A learner that iterates may set it to the result of a push, so that no episode
+        of older weights is delivered from then on.
         """
         return self._version
 
@@ -162,14 +162,14 @@ class Rollouts:
 
     @property
     def position(self) -> int:
-        """The number of the next episode, which a learner keeps in its checkpoint, to go on from there (`first`)."""
+        """The number of the next episode: keep it in the learner's checkpoint, to continue with `first`."""
         return self._position
 
     def __iter__(self) -> Self:
         return self
 
     def __next__(self) -> Any:
-        """Return the transitions of the next episode, a `pyarrow.RecordBatch`; workers go on with those after it."""
+        """Return the transitions of the next episode, a `pyarrow.RecordBatch`; workers continue with later ones."""
         delivered: list[Any] = []
         while not delivered:
             start = self._position // self._block * self._block
@@ -183,11 +183,11 @@ class Rollouts:
             episodes: Their number; whole groups, if there are groups.
 
         Returns:
-            Their transitions, a `pyarrow.Table` of one chunk an episode, in their order. Lost episodes are left out; if
-            all are lost, it is as many of the next ones.
+            Their transitions in order, a `pyarrow.Table` with a chunk for each episode. Lost episodes are left out; if
+            all are lost, the result has as many of the next ones.
 
         Raises:
-            ConfigError: The number is not that of whole groups, or the envs have different columns.
+            ConfigError: The number does not make whole groups, or the envs have different columns.
             WeightsLost: The policy acts with older weights than `version`, after a restart: push them, and call again.
             VLAgentsError: The last infrastructure error, after `abort_after` lost episodes in a row.
         """
@@ -205,8 +205,8 @@ class Rollouts:
     def close(self) -> None:
         """End the workers, and the Ray cluster if it was started for them; safe to call twice.
 
-        What was delivered lies in Ray's memory: copy what is used after the end of Ray. If more episodes are asked for,
-        workers start again, and begin the episodes again that were not delivered.
+        Delivered transitions are in Ray's memory: copy those that are needed after the end of Ray. A later request
+        starts workers again, which repeat the episodes that were not delivered.
         """
         if self._pool is not None:
             self._pool.close()
@@ -223,12 +223,12 @@ class Rollouts:
 
     def _end(self, *exc: Any) -> None:
         for episode in self._episodes.values():
-            episode.over, episode.transitions = False, None  # they lie in the memory of a Ray that may end
+            episode.over, episode.transitions = False, None  # they are in the memory of a Ray that may end
         self._pool = None
         self._resources.__exit__(*exc)
 
     def _deliver(self, end: int, limit: int) -> list[Any]:
-        """Play until the episodes before number `end` are over; meanwhile those before number `limit` may begin."""
+        """Play until the episodes before number `end` are over; those before number `limit` may also begin."""
         self._plan(max(end, limit))
         wanted = list(itertools.islice(self._episodes.items(), end - self._position))
         self._replay_stale()
@@ -249,7 +249,7 @@ class Rollouts:
             state, member = divmod(number, self._settings.groups)
             episode, turn = divmod(state, len(self._cells))
             cell = self._cells[turn]
-            # The first of a group is the episode of an evaluation; the others have numbers above its own seed's.
+            # The first of a group is the episode of an evaluation; the others have policy seeds above its own.
             policy_seed = self._settings.seed + number if member else None
             job = Job(EpisodeKey(cell.env, episode, self._settings.seed + episode, cell.fingerprint, policy_seed), cell)
             self._episodes[job.key] = _PlannedEpisode(job)
@@ -292,7 +292,7 @@ class Rollouts:
         versions = transitions.column("version").to_numpy()
         episode.oldest, self._version = int(versions.min()), max(self._version, int(versions.max()))
         most = self._settings.max_lag
-        if most is not None and episode.pushed - episode.oldest > most:  # so it would be forever
+        if most is not None and episode.pushed - episode.oldest > most:  # it would always be too old
             raise WeightsLost(
                 f"version: {job.key} began when rollouts.version had been set to {episode.pushed}, but its acts name "
                 f"{episode.oldest}; set it to what a push returned, after it has (a policy that names none has 0), and "
@@ -300,7 +300,7 @@ class Rollouts:
             )
 
     def _replay_stale(self) -> None:
-        """Queue the episodes again that have acts of weights which are too old by now."""
+        """Queue episodes again whose acts have outdated weights."""
         for episode in self._episodes.values():
             lag = self._version - episode.oldest if episode.transitions is not None else 0
             if self._settings.max_lag is not None and lag > self._settings.max_lag:

@@ -34,7 +34,7 @@ class TrainingEvaluation:
             evaluation.play_if_due(version)
 
     Results are those of `vlagents_ray.evaluate.evaluate`, with a checkpoint for each version: "reach@3". All versions
-    play the same episodes. The trainer waits meanwhile, so that nothing is pushed.
+    play the same episodes. The trainer waits for the end, so that nothing is pushed.
     """
 
     def __init__(
@@ -47,7 +47,7 @@ class TrainingEvaluation:
                 trains. An agent's episodes are played in this process, each by a copy that shares its weights, as a
                 server makes them; those of a URL by the plan's workers.
             plan: The suites, the folder of results, and one policy without `steps`: its name and its options. Its `url`
-                and `source` do not count.
+                and `source` are ignored.
             share: The part of the time since now that evaluations may take, in (0, 1].
             progress: As for `evaluate`.
 
@@ -69,23 +69,23 @@ class TrainingEvaluation:
 
     @property
     def is_due(self) -> bool:
-        """Whether an evaluation that takes as long as the last one keeps to the share. The first is due at once."""
+        """Whether an evaluation as long as the last one would keep to the share. The first is due at once."""
         elapsed_s = monotonic() - self._began
         return self._spent_s + self._last_s <= self._share * (elapsed_s + self._last_s)
 
     def play_if_due(self, version: int) -> Summary | None:
-        """Evaluate the policy if that is due; None if it is not. Otherwise as `play`."""
+        """Evaluate the policy as `play` does if that is due, else return None."""
         return self.play(version) if self.is_due else None
 
     def play(self, version: int) -> Summary:
-        """Evaluate the policy now, as at the end of a training. Episodes that have a result are not played again.
+        """Evaluate the policy now, for example at the end of training. Episodes with a result are not played again.
 
         Args:
-            version: What `Publisher.push` returned; for an agent of this process a number that grows, such as the step
+            version: The result of `Publisher.push`; for an agent of this process an increasing number, such as the step
                 of training.
 
         Returns:
-            The summary of all versions so far, of which the newest is the last of `totals`.
+            The summary of all versions so far; the newest is the last of `totals`.
 
         Raises:
             WeightsLost: The policy acts with another version: push this one, and call again.
@@ -126,7 +126,7 @@ class TrainingEvaluation:
 
 
 class _EvaluatedSession(Agent):
-    """A session of an agent that is trained in this process, with the weights that the agent has meanwhile."""
+    """A session of an agent that is trained in this process, with the agent's present weights."""
 
     def __init__(self, trained: Agent, copies: AgentCopies, pushed: PushedWeights) -> None:
         self._trained, self._copies, self._pushed = trained, copies, pushed
@@ -137,7 +137,7 @@ class _EvaluatedSession(Agent):
         return self._trained.contract
 
     def sessions(self, number: int) -> list[_EvaluatedSession]:
-        """Return further sessions, for episodes side by side."""
+        """Return further sessions, for parallel episodes."""
         return [_EvaluatedSession(self._trained, self._copies, self._pushed) for _ in range(number)]
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""The recorder that a worker keeps transitions with."""
+"""The recorder of a worker's transitions."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from vlagents_ray.registry import require
 
 WANTED = ("logprob", "value", "entropy", REPLAY)  # columns that a policy fills
 
-_FIRST_ROWS = 128  # memory that was never written to costs nothing
+_FIRST_ROWS = 128  # allocated; unwritten memory costs nothing
 
 
 class TransitionRecorder(EpisodeRecorder):
@@ -41,8 +41,8 @@ class TransitionRecorder(EpisodeRecorder):
         self._wanted: dict[str, list[float]] = {name: [] for name in self._want if name != REPLAY}
         self._acts = 0
         self._version, self._source = 0, "policy"
-        self._next: dict[str, list[float]] = {}  # what was wanted, for the next rows of the act
-        self._replay: dict[str, _Rows] = {}  # a row an act of which any was executed
+        self._next: dict[str, list[float]] = {}  # requested values, for the next rows of the act
+        self._replay: dict[str, _Rows] = {}  # a row for each act with executed rows
         self._next_replay: dict[str, np.ndarray] = {}  # until the first row of the act is executed
 
     @property
@@ -128,14 +128,14 @@ class TransitionRecorder(EpisodeRecorder):
         columns = {"key": constant(pa, str(result.key), rows), "instruction": constant(pa, result.instruction, rows)}
         columns |= {name: tensors(pa, values) for name, values in numbers.items()}
         columns |= {FINAL + name: at_rows(pa, values[-1:], last) for name, values in seen.items()}
-        begun = np.diff(acts, prepend=-1) != 0  # rows that are the first of their act
+        begun = np.diff(acts, prepend=-1) != 0  # first rows of each act
         columns |= {f"{REPLAY}.{name}": at_rows(pa, values.all(), begun) for name, values in self._replay.items()}
         columns["source"] = words(pa, list(sources))
         return pa.RecordBatch.from_pydict(columns)
 
 
 class _Rows:
-    """Arrays of one shape, copied into an array that grows, so that none of them is copied twice."""
+    """Arrays of one shape, each copied once into a growing array."""
 
     def __init__(self, first: np.ndarray, dtype: Any) -> None:
         self.shape, self.dtype = first.shape, dtype
@@ -154,9 +154,10 @@ class _Rows:
 
 
 def _by_row(stated: Any, rows: int, name: str) -> list[float]:
-    """Return a number for each row of an act: those stated by row, or the total in the first, and NaN in the others.
+    """Return a number for each row of an act: its own sum, or the act's total in the first and NaN in the others.
 
-    `stated` is a number; or (H,) or (H, D) numbers, H rows; or any others, such as one for each token, which add up.
+    `stated` is a number; or (H,) or (H, D) numbers, H rows; or numbers of any other shape, such as one for each token,
+    which are summed.
     """
     values = np.asarray(stated, np.float64)
     if values.ndim and len(values) == rows:

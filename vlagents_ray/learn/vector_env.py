@@ -23,7 +23,7 @@ Observation = Literal["all", "state"]
 
 
 def action_space(spaces: Any, contract: Contract) -> Any:
-    """Return Box (D,) float32 within the contract's bounds; raises `ConfigError` if it does not state D."""
+    """Return Box (D,) float32 within the contract's bounds; raises `ConfigError` if the contract lacks D."""
     spec = contract.action
     low, high = (-np.inf if spec.low is None else spec.low), (np.inf if spec.high is None else spec.high)
     return spaces.Box(low, high, (_stated(spec.dim, "action.dim"),), np.float32)
@@ -56,7 +56,7 @@ def observed(obs: Obs, observation: Observation) -> Any:
 
     Args:
         obs: The observation of the environment.
-        observation: "all" is a dict of `cameras/NAME`, `state/NAME` and, if there is one, `gripper`, (1,). "state" is
+        observation: "all" is a dict of `cameras/NAME`, `state/NAME` and, with a gripper, `gripper`, (1,). "state" is
             one vector: the parts of the state by name, then the gripper.
     """
     state = {f"state/{name}": np.array(part, np.float32) for name, part in sorted(obs.state.items())}
@@ -88,10 +88,10 @@ def as_vector_env(
     env_options: Mapping[str, Any] | None = None,
     reset_options: Mapping[str, Any] | None = None,
 ) -> BatchVectorEnv:
-    """Make environments that learners written for Gymnasium step together.
+    """Make vector environments for learners that use Gymnasium.
 
-    A simulator that runs many environments at once, such as ManiSkill on a GPU, is one of them; others are stepped one
-    after another in this process.
+    A simulator with many environments, such as ManiSkill on a GPU, steps them at once; other environments are stepped
+    one after another in this process.
 
     Args:
         env: The name of the env, as for `make_env`.
@@ -100,7 +100,8 @@ def as_vector_env(
             (N, 1) float32. "state" is all but the images, as one array (N, D) float32: the parts of the state by name,
             then the gripper.
         autoreset: What follows the end of an episode (https://farama.org/Vector-Autoreset-Mode). With "same_step", the
-            observation is that of the next episode already, and `infos["final_obs"]` has the last one of the old one.
+            observation is already that of the next episode, and `infos["final_obs"]` has the last one of the old
+            episode.
         env_options: The options of the env's constructor.
         reset_options: The options of each reset of an environment.
 
@@ -123,12 +124,12 @@ def as_vector_env(
 class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
     """The environments of a `BatchEnv` with Gymnasium's interface.
 
-    `reset(seed=S)` begins episodes 0 to N - 1. Episode i has the seed S + i, as in an evaluation, and the next one that
-    an environment begins is the next number. Without a seed, numbers go on; the first S is drawn at random.
+    `reset(seed=S)` begins episodes 0 to N - 1. Episode i has the seed S + i, as in an evaluation; each new episode has
+    the next number. Without a seed, numbers continue; the first S is drawn at random.
 
-    `infos["success"]` says whether the task is solved. `infos["instruction"]` and `infos["episode_seed"]` are there
-    whenever an episode begins, the former after each step as well if the episodes have several tasks. A step limit of
-    the environment truncates an episode.
+    `infos["success"]` states whether the task is solved. `infos["instruction"]` and `infos["episode_seed"]` are set
+    whenever an episode begins, the former also after each step if the episodes have several tasks. A step limit of the
+    environment truncates an episode.
     """
 
     def __init__(
@@ -138,7 +139,7 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
         autoreset: Any = vector.AutoresetMode.SAME_STEP,
         reset_options: Mapping[str, Any] | None = None,
     ) -> None:
-        """Wrap environments, which are closed together with this object.
+        """Wrap environments, which `close` closes.
 
         Args:
             batch: The environments.
@@ -170,9 +171,10 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
         """Begin an episode in each environment.
 
         Args:
-            seed: The seed S of episode 0; None to go on with the next numbers. Or, as Gymnasium's vectors take it, the
-                seed of each environment's episode; later episodes go on after the largest of them.
-            options: Options of the environments' resets. `reset_mask`, (N,) bool, is Gymnasium's: only these begin one.
+            seed: The seed S of episode 0; None continues with the next numbers. Or, as in Gymnasium, a seed for each
+                environment's episode; later episodes continue after the largest.
+            options: Options of the environments' resets. `reset_mask`, (N,) bool, is Gymnasium's: only these
+                environments begin one.
 
         Returns:
             The observations, and the infos.
@@ -199,7 +201,7 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
             actions: One action for each environment, (N, D) float32.
 
         Returns:
-            The observations, the rewards (N,) float64, what was terminated and what truncated (N,) bool, and the infos.
+            The observations, rewards (N,) float64, terminated (N,) bool, truncated (N,) bool, and the infos.
         """
         self._require_begun()
         rows = np.asarray(actions, np.float32)
@@ -208,7 +210,7 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
         rewards = np.zeros(self.num_envs)
         terminated, truncated = np.zeros(self.num_envs, np.bool_), np.zeros(self.num_envs, np.bool_)
         infos: dict[str, Any] = {}
-        restarted, moving = self._over.copy(), ~self._over  # some are over in mode "next_step" alone
+        restarted, moving = self._over.copy(), ~self._over  # episodes can be over only in mode "next_step"
         if restarted.any():
             self._begin(restarted, infos)
         for i, step, info in self._moved(rows, moving):
@@ -252,7 +254,7 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
         given: Mapping[str, Any] | None = None,
         stated: Sequence[int] | None = None,
     ) -> None:
-        """Begin an episode in these environments, and add what is said of it to `infos`."""
+        """Begin an episode in these environments, and add its infos."""
         assert self._seed is not None  # noqa: S101 - `reset` has set it
         chosen = np.flatnonzero(which).tolist()
         if not which.all() and not self._batch.restarts:
@@ -297,7 +299,7 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
 
 
 def _seeds(seeds: Sequence[int | None], which: np.ndarray) -> list[int]:
-    """Return the seeds of the environments that begin an episode, from a list with one for each environment."""
+    """Return the seeds of the environments that begin an episode, from a list for all environments."""
     if len(seeds) != which.size:
         raise InvalidInput(f"seed: got {len(seeds)} seeds, want {which.size}, one for each environment")
     found = [seeds[i] for i in np.flatnonzero(which).tolist()]

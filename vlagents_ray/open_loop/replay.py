@@ -172,7 +172,7 @@ class ReplayPlan:
 
     episodes: Sequence[int] | None = None  # of each dataset; None: all
     horizon: int | None = None  # most rows of a chunk that are compared; None: all that both have
-    every: int = 1  # of the frames of a dataset without recorded answers, each so many-th is asked
+    every: int = 1  # stride of the queried frames in a dataset without recorded answers
     at_once: int = 8  # sessions
     names: Names = field(default_factory=Names)
 
@@ -211,7 +211,7 @@ class OpenLoopResult:
 def replay(
     folder: Path, sessions: Sessions, plan: ReplayPlan, progress: Callable[[int, int], None] = lambda *_: None
 ) -> OpenLoopResult:
-    """Ask a policy what it would do at each frame, and compare that with what the dataset has.
+    """Query a policy at each frame, and compare its actions with the dataset's.
 
     A session is reset with its first recorded observation, its instruction and its options, and then gets each of its
     observations in order, whatever it answers.

@@ -104,7 +104,7 @@ class Adapters:
             self._device = weight.device
 
     def named(self, name: object) -> Adapter:
-        """Return the adapter of that name, for None none; raises `UnknownCheckpoint` if there is none."""
+        """Return the adapter of that name, or None for None; raises `UnknownCheckpoint` for an unknown name."""
         if name is None:
             return Adapter()
         if not isinstance(name, str) or name not in self._named:
@@ -118,7 +118,7 @@ class Adapters:
         return list(self._places)[(number + 1) % len(self._places)]
 
     def require(self, fingerprint: str) -> str:
-        """Return the fingerprint; raise `UnknownSession` if a session came here whose adapter is not loaded here."""
+        """Return the fingerprint; raise `UnknownSession` if the adapter of a moved session is not loaded here."""
         if fingerprint not in self._places:
             raise UnknownSession(f"its adapter {fingerprint} is not loaded here; reset the session")
         return fingerprint

@@ -125,7 +125,7 @@ class CaptureLock:
 
     @contextmanager
     def capture(self) -> Iterator[None]:
-        """Wait for running acts and pushes, none of which begins within this context."""
+        """Wait for running acts and pushes, and block new ones within this context."""
         if threading.get_ident() in self._acting:
             raise RuntimeError("a CUDA graph cannot be captured within an act; capture it in Agent.initialize")
         with self.pushes:
@@ -166,7 +166,7 @@ class CudaGraph:
             self._graph = torch.cuda.CUDAGraph()
             with CAPTURES.capture(), warnings.catch_warnings(record=True) as said:
                 warnings.simplefilter("always")
-                # Preparations of acts go on meanwhile, on other threads, whose calls must not end the capture.
+                # Other threads still prepare acts; their calls must not end the capture.
                 with torch.cuda.graph(self._graph, stream=own, capture_error_mode="thread_local"):
                     self._result = function(*self._inputs)
         if any(_EMPTY in str(warning.message) for warning in said):

@@ -237,7 +237,7 @@ def _read(path: Path) -> tuple[Any, Mapping[str, Any]]:
         ) from error
     name = "ema_model" if require("omegaconf").OmegaConf.select(settings, "training.use_ema") else "model"
     if name not in states:
-        raise ConfigError(f"checkpoint {path}: has no {name!r}, which its training.use_ema wants; has {sorted(states)}")
+        raise ConfigError(f"checkpoint {path}: has no {name!r}, which its training.use_ema needs; has {sorted(states)}")
     return settings, states[name]
 
 
@@ -289,7 +289,7 @@ def compile_with(network: DiffusionNetwork, compilation: Compilation) -> None:
 
 
 def _denoising(forward: Callable[..., Any], condition: str, compilation: Compilation) -> Callable[..., Any]:
-    """Return the denoising network as its loop calls it; `condition` is what the network calls what is seen."""
+    """Return the denoising network as its loop calls it; `condition` is its argument for observations."""
 
     def denoise(sample: Any, times: Any, *seen: Any) -> Any:
         return forward(sample, times, **dict(zip([condition], seen, strict=False)))
@@ -341,7 +341,7 @@ def noise_of(rows: Sequence[Row]) -> Any:
     """Return a context in which `torch.randn` draws each row, along the first axis, from its session's generator.
 
     The policies draw their first trajectory with it, and the scheduler the noise of each step; neither accepts one
-    generator for each row. Other draws would come from the process's generator, and are refused.
+    generator for each row. Draws from the process's generator are refused.
     """
     return _mode()(rows)
 

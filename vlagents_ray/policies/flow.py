@@ -25,7 +25,7 @@ from vlagents_ray.policies.base.model_inputs import Row
 from vlagents_ray.policies.compilation import Compilation
 from vlagents_ray.registry import require
 
-OFFERED = ("logprob", "entropy", "replay")  # of chunks that come out of random steps
+OFFERED = ("logprob", "entropy", "replay")  # of chunks from random steps
 _LOG_2_PI = math.log(2 * math.pi)
 
 
@@ -91,7 +91,7 @@ def step_mean(actions: Any, velocity: Any, step: int, steps: int, noise_level: f
 
 
 def logprob_of_chain(velocity: Callable[[Any, float], Any], chain: Any, noise_level: float) -> Any:
-    """Return the log-probability of the steps from noise to actions, given the noise, as a learner's weights have it.
+    """Return the log-probability of the steps from noise to actions, given the noise, under a learner's weights.
 
     Args:
         velocity: Returns the flow's velocity (B, H, D) at noisy actions (B, H, D) and a flow time in (0, 1].
@@ -118,7 +118,7 @@ def chain_entropy(steps: int, noise_level: float) -> float:
 
 
 class RandomSteps:
-    """The random steps of those rows of a batch of which something is wanted; the others keep their velocity.
+    """The random steps of the rows of a batch with requested values; the others keep their velocity.
 
     Each row draws from its session's generator, so that neighbours do not matter. Arrays are torch tensors.
     """
@@ -148,7 +148,7 @@ class RandomSteps:
         return cls(rows, shape, noise_level, convert) if noise_level and any(row.want for row in rows) else None
 
     def change(self, velocity: Any, actions: Any, time: float) -> Any:
-        """Return the velocity (B, H, D) of the next step, which leads the wanted rows to actions that are drawn."""
+        """Return the velocity (B, H, D) of the next step, which moves the requested rows to drawn actions."""
         step, before = len(self._means), actions[self._index]
         mean = step_mean(before, velocity[self._index], step, self._steps, self._level)
         drawn = mean + step_std(step, self._steps, self._level) * self._draws[step]
@@ -221,7 +221,7 @@ class Guide:
         """Return the velocity (B, H, D), corrected by the plan, at the noisy actions of this flow time.
 
         The gain of the correction of a later row is at most `limit`, and at most the number of steps: with that, one
-        step goes all the way. `lower` returns the smaller of two numbers, for libraries whose `time` is not a plain
+        step goes to the end. `lower` returns the smaller of two numbers, for libraries whose `time` is not a plain
         number.
         """
         spread = (1.0 - time) ** 2 + time**2

@@ -46,7 +46,7 @@ _CURE = "save the checkpoint's processor with its dataset's statistics, as GR00T
 class Embodiment:
     """The inputs and the actions of one robot of a checkpoint."""
 
-    value: str  # its name, by which GR00T's code finds it, as it does by that of its own `EmbodimentTag`
+    value: str  # its name, by which GR00T's code finds it, like its own `EmbodimentTag`
     cameras: tuple[str, ...]
     state: Mapping[str, int]  # groups and their widths, in the model's order
     action: Mapping[str, int]
@@ -134,8 +134,8 @@ def _width(folder: Path, numbers: Mapping[str, Any], kind: str, group: str, name
 def _action(groups: Any, dim: int, *, converted: bool) -> ActionSpec:
     """Describe the actions by their relative groups.
 
-    Checkpoints call everything else absolute, displacements such as LIBERO's as well, so that nothing is said of it.
-    GR00T converts relative groups to absolute ones if the processor says `use_relative_action`.
+    Checkpoints call everything else absolute, even displacements such as LIBERO's, so the contract does not state it.
+    GR00T converts relative groups to absolute ones if the processor has `use_relative_action`.
     """
     stated = [group for group in groups if converted and group["rep"] in _CONVERTED]
     deltas = {_CONVERTED[group["rep"]] for group in stated}
@@ -172,8 +172,8 @@ class Gr00tConfig(ModelConfig):
     compile: Literal[False] = Field(default=False, description="not offered for GR00T")
     trust_remote_code: bool = Field(
         default=False,
-        description="run Python code that lies in the checkpoint or its backbone: whoever can write there can do on "
-        "this machine whatever this process can",
+        description="run Python code in the checkpoint or its backbone: write access to them then gives all rights "
+        "of this process",
     )
 
 
@@ -252,7 +252,7 @@ class Gr00tNetwork:
         Args:
             images: Of each moment of the embodiment's video, oldest first, (H, W, 3) uint8 by camera.
             states: Of each moment of its state, (D,) float32 by group.
-            instruction: What the robot is to do.
+            instruction: The task in words.
         """
         types, robot = require("gr00t.data.types"), self.embodiment
         raw = {group: np.stack([one[group] for one in states]) for group in robot.state}
@@ -309,13 +309,13 @@ def _use_checkout(source_dir: str | None) -> Path:
             f"{source_dir or os.environ.get(SOURCE) or 'gr00t'}: is GR00T's code of N1.5 or before, want that of N1.6 "
             f"or N1.7; serve N1.5 by its own server, and the policy `upstream` in front of it"
         )
-    os.environ.setdefault("NO_ALBUMENTATIONS_UPDATE", "1")  # it asks PyPI for a newer version when it is imported
+    os.environ.setdefault("NO_ALBUMENTATIONS_UPDATE", "1")  # on import it queries PyPI for a newer version
     ensure_torchvision()
     return Path(str(require("gr00t.model").__file__)).parent
 
 
 def _converted(model: Any, saved: SavedTensors, device: Any, dtype: Any) -> Any:
-    """Move a model to a device and a dtype; N1.6's backbone was read in bfloat16, which rounds, whatever is wanted."""
+    """Move a model to a device and a dtype; N1.6's backbone is always read in bfloat16, which rounds."""
     rounded, held = require("torch").bfloat16, set(saved)
     names = {name for name, one in model.state_dict().items() if one.dtype == rounded != dtype and name in held}
     model = model.to(device=device, dtype=dtype)
@@ -348,7 +348,7 @@ _CHECK = "_check_and_enable_flash_attn_2"  # of transformers' models, up to 4.5
 
 
 def flash_attention_is_here(device: Any, dtype: Any) -> bool:
-    """Whether flash-attention is installed, and computes on a device in a dtype: on CUDA, in 16 bits."""
+    """Return whether flash-attention is installed, and computes on a device in a dtype: on CUDA, in 16 bits."""
     computes = device.type == "cuda" and dtype.itemsize == 2
     return computes and bool(require("transformers.utils").is_flash_attn_2_available())
 
@@ -369,7 +369,7 @@ def built_without_flash_attention() -> Iterator[None]:
 
 
 def use_torch_attention(model: Any) -> None:
-    """Have parts that ask for flash-attention use torch's; N1.6's vision tower attends within each image."""
+    """Replace flash-attention by torch's attention; N1.6's vision tower attends within each image."""
     transformers = require("transformers.modeling_utils")
     for module in model.modules():
         config: Any = getattr(module, "config", None)

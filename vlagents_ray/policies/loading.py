@@ -1,4 +1,4 @@
-"""What a policy reports while it loads, and the batch sizes for which a compiled one is to be ready.
+"""The report of a policy that loads, and the batch sizes for which it is compiled.
 
 A server opens a `loading_report` around `Agent.initialize`; without one, progress is only logged.
 """
@@ -14,7 +14,7 @@ from typing import Any
 
 logger = logging.getLogger(__name__)
 
-COMPILED_SIZES = (1, 2, 4, 8, 16)  # where no server says how large its batches are
+COMPILED_SIZES = (1, 2, 4, 8, 16)  # without a server's batch size
 
 
 @dataclass(slots=True)
@@ -24,7 +24,7 @@ class LoadingReport:
     on_progress: Callable[[str], None]  # called with each step, on the thread that loads
     batch_sizes: Sequence[int]  # the server's, ascending
     uncompiled: list[str] = field(default_factory=list)  # what runs without compilation, although `compile` is set
-    devices: list[dict[str, Any]] = field(default_factory=list)  # on which models are, see `accelerator.described`
+    devices: list[dict[str, Any]] = field(default_factory=list)  # of the models, see `accelerator.described`
     most_rows: int | None = None  # of a forward pass, if memory was found to hold no more
     on_out_of_memory: Callable[[], None] = lambda: None  # called each time that a forward pass does not fit, also later
 
@@ -72,6 +72,6 @@ def report_device(device: dict[str, Any]) -> None:
 
 
 def report_uncompiled(what: str) -> None:
-    """Report a part that runs without compilation, although its policy's settings ask for it."""
+    """Report a part that runs uncompiled although its policy's settings require compilation."""
     if (report := _report.get()) is not None:
         report.uncompiled.append(what)

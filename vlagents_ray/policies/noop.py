@@ -14,7 +14,7 @@ from vlagents_ray.interface import Act, Agent, Obs
 
 
 class NoopConfig(BaseModel, extra="forbid"):
-    """Size of the zero action, and the latency of the model that it stands in for."""
+    """Size of the zero action, and latency of the simulated model."""
 
     action_dim: int = Field(default=7, ge=1)
     chunk: int = Field(default=1, ge=1, description="rows an `act` returns; 1 gives a single action, (D,)")

@@ -425,7 +425,7 @@ def _is_own_name(module: object, name: object) -> bool:
 
 
 def _is_own_class(module: str, name: str) -> bool:
-    """Whether a class is defined by Octo, and not imported into its module."""
+    """Return whether a class is defined by Octo, and not imported into its module."""
     try:
         found = getattr(importlib.import_module(module), name, None)
     except ImportError as error:

@@ -243,7 +243,7 @@ _LISTED = 5
 
 @dataclass(frozen=True, slots=True)
 class SampleBatch:
-    """What a model computes B chunks from."""
+    """The inputs of a model for B chunks."""
 
     inputs: dict[str, Any]  # of P observations
     noise: np.ndarray  # of each row
@@ -263,7 +263,7 @@ class OpenPiModel(abc.ABC):
         """Compute actions (B, H, action_dim), or tokens (B, T)."""
 
     def random_steps(self, rows: Sequence[Row], noise_level: float) -> RandomSteps | None:
-        """Return the random steps of rows of which something is wanted; None if there are none."""
+        """Return the random steps of rows with requested values; None without any."""
         return None
 
 
@@ -546,7 +546,7 @@ class OpenPi(ModelPolicy):
         spare = next((one for one in read if not isinstance(one, Exception)), None)
         if spare is None:
             return read  # type: ignore[return-value]  # errors all
-        # A valid row stands in for an invalid one, so that the number of rows remains a compiled one.
+        # A valid row replaces an invalid one, so that the number of rows stays a compiled one.
         spare = replace(spare, row=replace(spare.row, want=()))
         flows, stated = self._sample([spare if isinstance(one, Exception) else one for one in read])
         actions = self.loaded().transforms.actions

@@ -132,7 +132,7 @@ def parse_json(
 
 
 def is_plain(dtype: Any) -> bool:
-    """Whether `dtype`, as numpy writes it, names bools, integers or floats."""
+    """Return whether `dtype`, as numpy writes it, names bools, integers or floats."""
     return isinstance(dtype, str) and _PLAIN.fullmatch(dtype) is not None
 
 

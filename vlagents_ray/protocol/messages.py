@@ -83,7 +83,7 @@ class Reply:
     timing: dict[str, float] = field(default_factory=dict)  # ms, by stage
 
     def answers(self, request: Request) -> bool:
-        """Whether this is the reply to that request, not to an earlier one. An unreadable frame has no id."""
+        """Return whether this is the reply to that request, not to an earlier one. An unreadable frame has no id."""
         return self.request_id in ("", request.request_id)
 
     @property
@@ -170,7 +170,7 @@ def peer_uid(connection: socket.socket) -> int:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether `host` is an address of this machine that no other machine can reach."""
+    """Return whether `host` is an address of this machine that no other machine can reach."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:  # a host name
@@ -238,7 +238,7 @@ _ANSWER = struct.Struct("<4sQ")
 
 
 def is_probe(message: bytes | memoryview) -> bool:
-    """Whether a message is a probe, to be answered with `probe_answer`."""
+    """Return whether a message is a probe, to be answered with `probe_answer`."""
     return message[: len(_PROBE_TAG)] == _PROBE_TAG
 
 

@@ -225,7 +225,7 @@ class ShmReader:
 
 
 def _is_plain(request: Request, obs: Obs) -> bool:
-    """Whether a request may have a layout, apart from its arrays."""
+    """Return whether a request may have a layout, apart from its arrays."""
     if request.op != "act" or obs.info or len(request.request_id) > _ID_BYTES:
         return False
     return obs.gripper is None or 0.0 <= obs.gripper <= 1.0  # else an error, for which the act must travel as a frame

@@ -256,7 +256,7 @@ def write_obs(obs: Obs, writer: ValueWriter, codec: ImageCodec) -> dict[str, Any
 
 
 def is_number(value: object) -> bool:
-    """Whether a value is a number that a float can hold; no bool is, since JSON tells the two apart."""
+    """Return whether a value is a number that a float can hold; no bool is, since JSON tells the two apart."""
     if isinstance(value, int):
         return not isinstance(value, bool) and value.bit_length() < 1024
     return isinstance(value, float)

@@ -47,7 +47,7 @@ class HeadMonitor:
         self._looked = self._answered = monotonic()
 
     def answers(self) -> bool:
-        """Whether the head answered the last check, which is repeated every `PERIOD_S`.
+        """Return whether the head answered the last check, which is repeated every `PERIOD_S`.
 
         Raises:
             ClusterLost: The head has not answered for too long, or the daemon on this machine has ended.
@@ -92,7 +92,7 @@ def _address() -> tuple[str, int]:
 
 
 def _exists(unix_socket: str) -> bool:
-    """Whether a Unix socket is open; its file may remain after the listener has ended."""
+    """Return whether a Unix socket is open; its file may remain after the listener has ended."""
     try:
         return any(line.endswith(f" {unix_socket}") for line in _SOCKETS.read_text().splitlines())
     except OSError:  # not Linux

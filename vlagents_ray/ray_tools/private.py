@@ -15,7 +15,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-# The loggers of what Ray and Serve say in the process that started them.
+# The loggers of Ray and Serve in the process that started them.
 LOGGERS = ("ray.serve", "ray._private.worker", "ray._private.authentication.authentication_token_setup")
 START_LOGGER = "ray._private.services"  # of the start of Ray's processes
 
@@ -25,7 +25,7 @@ START_LOGGER = "ray._private.services"  # of the start of Ray's processes
 def node_of_this_process() -> Any:
     """Return Ray's record of the local daemons; None if this process is not connected, or did not import Ray.
 
-    It has what no public function says: the daemons' sockets, the folder of their logs, whether this process started
+    It has data without a public function: the daemons' sockets, the folder of their logs, whether this process started
     them. The record exists before the connection does; a call of Ray from another thread would then start a second
     cluster.
     """
@@ -231,7 +231,7 @@ def start_serve(http: dict[str, Any], location: str) -> tuple[Any, list[Any]]:
 def proxies_now(client: Any) -> list[Any]:
     """Return the refs of the proxies that Serve has now, in place of those that `start_serve` returned.
 
-    `serve.status` says that a proxy failed, but not why.
+    `serve.status` reports that a proxy failed, but not the reason.
     """
     import ray
 
@@ -274,7 +274,7 @@ def http_options() -> Any:
 
 
 def replica_is_ending() -> bool:
-    """Whether Serve has begun to stop the replica that this process is; it has no hook for that."""
+    """Return whether Serve has begun to stop the replica that this process is; it has no hook for that."""
     import ray
 
     worker = ray._private.worker.global_worker

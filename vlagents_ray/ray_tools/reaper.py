@@ -74,7 +74,7 @@ def marked(folder: str) -> list[int]:
 
 
 def is_titled(process: Path) -> bool:
-    """Whether a process, given as a folder of /proc, has a title of Ray's."""
+    """Return whether a process, given as a folder of /proc, has a title of Ray's."""
     return (process / "cmdline").read_bytes().startswith(b"ray::")
 
 

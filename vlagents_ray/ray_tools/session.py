@@ -357,6 +357,6 @@ def _found() -> Iterator[tuple[LocalServer, dict[str, str]]]:
             address = f"{_ADDRESS.decode()}{content['ray_address']}"
         except (OSError, KeyError, ValueError, TypeError):  # it has ended, is another user's, or not announced
             continue
-        # What was killed may have left the folder, and another cluster may use it now.
+        # A killed cluster may have left the folder, and another cluster may use it now.
         if any(address in os.fsdecode(word) for word in words):
             yield LocalServer(content["url"], tuple(content["apps"]), content["ray_address"]), environment

@@ -36,7 +36,7 @@ def interrupts() -> Iterator[None]:
 
 
 def raise_dropped_interrupt() -> None:
-    """Raise `KeyboardInterrupt` if one was raised in `interrupts`, and this process goes on as if none had been."""
+    """Raise `KeyboardInterrupt` if one was raised in `interrupts`, and this process continues as before."""
     if _interrupted.is_set():
         raise KeyboardInterrupt
 

@@ -32,7 +32,7 @@ UNFINISHED = "unfinished"  # folder of the running episodes
 
 
 class Dataset:
-    """A dataset to which episodes are added; opening an existing one continues it, with the columns that it has."""
+    """A dataset to which episodes are added; opening an existing one continues it with the same columns."""
 
     def __init__(self, root: Path, fps: float, *, interventions: bool = False, lossless: bool = False) -> None:
         """Open or begin a dataset of frames at `fps` Hz; `lossless` videos keep each pixel.
@@ -79,7 +79,7 @@ class Dataset:
     def begin(self, instruction: str, meaning: ActionSpec | None = None) -> RobotEpisode:
         """Begin an episode, to which frames are added; it is then passed to `save`, or abandoned.
 
-        Several may run at once. `meaning` is that of the actions' numbers, if it is known.
+        Several may run at once. `meaning` describes the actions' numbers, if it is known.
         """
         unfinished = self.root / UNFINISHED
         unfinished.mkdir(parents=True, exist_ok=True)
@@ -156,7 +156,7 @@ class Dataset:
         self._stats = {key: {name: np.array(value) for name, value in one.items()} for key, one in stats.items()}
         table = self._pq.read_table(self.root / "meta/tasks.parquet")
         self.tasks = table.column("__index_level_0__").to_pylist()[: info["total_tasks"]]
-        if int(self._stats[ACTION]["count"][0]) != info["total_frames"]:  # a crash left an episode that is not counted
+        if int(self._stats[ACTION]["count"][0]) != info["total_frames"]:  # a crash left an uncounted episode
             self._stats = {}
             for number in range(self.episodes):
                 place = {"chunk_index": number // FILES_IN_CHUNK, "file_index": number % FILES_IN_CHUNK}
@@ -169,7 +169,7 @@ class Dataset:
                 self._stats = joined(self._stats, found)
 
     def _sweep(self) -> None:
-        """Remove the files that a crash left: those of the running episode, and of one not counted yet."""
+        """Remove the files of a running or uncounted episode after a crash."""
         shutil.rmtree(self.root / UNFINISHED, ignore_errors=True)
         number = self.episodes
         stray = FILE.format(chunk_index=number // FILES_IN_CHUNK, file_index=number % FILES_IN_CHUNK)
@@ -189,7 +189,7 @@ class Dataset:
         return pa.table(columns)
 
     def _tasks_table(self) -> Any:
-        """Make the table that pandas writes for a frame whose index are the tasks, as LeRobot reads it."""
+        """Make the table of tasks in the format that LeRobot reads: that of a pandas frame indexed by task."""
         pa, name = self._pa, "__index_level_0__"
         text: dict[str, Any] = {"pandas_type": "unicode", "numpy_type": "object"}
         columns: list[dict[str, Any]] = [
@@ -226,7 +226,7 @@ _ARROW = {"float64": "float64", "float32": "float32", "int64": "int64", "bool": 
 
 
 def _move(part: Path, path: Path) -> None:
-    """Rename a complete file to its name, after it has reached the disk; its name has when this returns."""
+    """Rename a complete file durably: the file and its new name are on the disk when this returns."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with part.open("rb") as file:
         os.fsync(file.fileno())

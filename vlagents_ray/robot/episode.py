@@ -27,8 +27,8 @@ MOMENTS = {  # further columns of each recorded frame
 }
 WANTED_ACTION, INTERVENTION_COLUMN = "policy_action", "intervention"
 INTERVENTIONS = {  # further columns of a recording with interventions, beside `WANTED_ACTION`, (D,) float32
-    INTERVENTION_COLUMN: "bool",  # whether the action is a human's
-    "policy_known": "bool",  # whether it is known what the policy wanted; if not, `WANTED_ACTION` is zeros
+    INTERVENTION_COLUMN: "bool",  # whether the action is an operator's
+    "policy_known": "bool",  # whether the policy's action is known; if not, `WANTED_ACTION` is zeros
 }
 Stats = dict[str, np.ndarray]  # "min", "max", "mean", "std", "count", "q01", ...
 Label = Literal["success", "failure", "discard"]
@@ -54,7 +54,7 @@ class Finished:
     videos: dict[str, Path]  # MP4 files with at least N frames, of which the first N count
     about: DatasetContract  # the same for each episode of a dataset
     label: Label | None = None
-    folder: Path | None = None  # of the running episode, which is removed with what is left in it
+    folder: Path | None = None  # of the running episode, which is removed with the rest of its files
 
 
 class RobotEpisode:
@@ -71,7 +71,7 @@ class RobotEpisode:
         lossless: bool = False,
         meaning: ActionSpec | None = None,
     ) -> None:
-        """Begin an episode with its videos in a folder; `features` are those of the earlier ones, None in the first."""
+        """Begin an episode with its videos in a folder; `features` are those of earlier episodes, None in the first."""
         self.instruction = instruction
         self.features: dict[str, Any] = features or {}
         self.rows: dict[str, list[Any]] = {}
@@ -97,8 +97,8 @@ class RobotEpisode:
     ) -> None:
         """Append a frame; raises `InvalidObservation` if cameras or shapes differ from those of the frames before.
 
-        `wanted` is the policy's action, (D,), where another one was executed; None if it is not known. `more` are
-        further columns by name, the same in each frame: a bool, int, float, text, or (D,) float32.
+        `wanted` is the policy's action, (D,), if another one was executed; None if it is not known. `more` are further
+        columns by name, the same in each frame: a bool, int, float, text, or (D,) float32.
         """
         values, names = state_vector(obs.state, None if obs.gripper is None else np.array(obs.gripper))
         if not self.rows:
@@ -196,7 +196,7 @@ class RobotEpisode:
 def parts_of(state: Iterable[str], gripper: bool) -> list[str]:
     """Return the parts of the proprioception in the order of `observation.state`.
 
-    If an observation has `Obs.gripper`, "gripper" means this, and a part of the state of the same name is left out.
+    If an observation has `Obs.gripper`, "gripper" is `Obs.gripper`, and a part of the state of that name is left out.
     """
     return [*sorted(part for part in state if part != GRIPPER or not gripper), *([GRIPPER] if gripper else [])]
 

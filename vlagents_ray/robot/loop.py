@@ -38,7 +38,7 @@ class Robot(Protocol):
 
     A simulated robot may have the attribute `simulated = True`: it starts again by itself after a stop (see `restart`
     of `run_loop`). A robot may have an attribute `holds`, the reason why it must not move now, such as a camera that
-    hangs: then it is stopped, and the loop goes on with a new observation as soon as it is None again.
+    hangs. While it is not None the robot is stopped; then the loop continues with a new observation.
     """
 
     def observe(self) -> Obs:
@@ -84,13 +84,13 @@ class LoopReport:
 
     hz: float
     jitter: dict[str, float] = field(default_factory=dict)  # see `vlagents_ray.robot.pacing.jitter`
-    work_p50_ms: float = 0.0  # from the time a tick was due until its action was applied
+    work_p50_ms: float = 0.0  # from the due time of a tick to its applied action
     work_p99_ms: float = 0.0
     safe: dict[Cause, int] = field(default_factory=dict)  # ticks with the safe action or without any, by cause
     reasons: dict[Cause, str] = field(default_factory=dict)  # the first reason of each cause, in words
-    waiting: int = 0  # ticks at which the robot held still as all rows were used up, and the next answer had not come
-    barks: list[str] = field(default_factory=list)  # why the robot was stopped, by the watchdog or a command
-    interventions: int = 0  # ticks at which a human moved the robot
+    waiting: int = 0  # ticks at which the robot held still, with all rows used up and no new answer
+    barks: list[str] = field(default_factory=list)  # reasons of stops by the watchdog or a command
+    interventions: int = 0  # ticks at which an operator moved the robot
     paused: int = 0  # ticks at which the robot was paused (see `vlagents_ray.chunking.control`); not among `safe`
     done: bool = False  # the policy considered its task finished
     means: list[str] = field(default_factory=list)  # the measures taken against jitter
@@ -158,19 +158,18 @@ def run_loop(
         seconds: The length of the run, s; None runs until the policy or `until` ends it.
         instruction: The task in words.
         reset_options: Further arguments of `agent.reset`.
-        guard: A check that every action has to pass; an action that does not ends the loop. The default is the agent's
-            own `check`, as a chunk player has, which continues with a safe action instead; or else a guard of the
-            agent's contract.
+        guard: Checks every action; a refused one ends the loop. The default is the agent's own `check`, such as a chunk
+            player's, which continues with a safe action instead; else a guard of the agent's contract.
         watchdog: Runs during the loop. Each tick is a sign of life of "loop", and the agent's answers
             (`act.info["silent_s"]`) are those of "server". After it has stopped the robot, nothing is commanded until
             motion is restarted, in this run or a later one. A chunk player then has discarded its plan
             (`ChunkPlayer.interrupt`), so that the first command is computed from new observations; a guard with
             `measure` compares it with the measured pose.
-        restart: With "manual" motion is restarted by a call of `watchdog.restart()`, made by a person who sees the
-            robot; it has no effect while the silence lasts. With "auto" the end of the silence restarts it; a stop by a
+        restart: With "manual", `watchdog.restart()` restarts motion; only an operator who sees the robot may call it,
+            and it has no effect while the silence lasts. With "auto" the end of the silence restarts it; a stop by a
             command still needs the call. The default is "auto" for a simulated robot and "manual" for any other.
-        recorder: Records the run as one episode, also if it ends by an exception. A player with `override` wants one
-            with `interventions=True`.
+        recorder: Records the run as one episode, also if it ends by an exception. A player with `override` needs a
+            recorder with `interventions=True`.
         viewer: Shows the run as one episode (see `vlagents_ray.viewers`).
         real_time: Run the thread with SCHED_FIFO (see `vlagents_ray.robot.pacing.undisturbed`).
         until: Ends the loop when it returns True; called before each tick, and after the last one.
@@ -181,8 +180,8 @@ def run_loop(
 
     Raises:
         ConfigError: `hz`, `seconds` or `restart` has a wrong value, `guard` differs from the agent's own, or the
-            recorder has no place for interventions.
-        InvalidAction: An action is a chunk, or does not pass the guard.
+            recorder has no columns for interventions.
+        InvalidAction: An action is a chunk, or the guard refuses it.
     """
     if restart is None:
         restart = "auto" if getattr(robot, "simulated", False) else "manual"
@@ -245,7 +244,7 @@ class _Run:
         ticks = None if seconds is None else pacer.ticks_in(seconds)
         try:
             while not (until() or self.report.done):
-                # Cycles, which failed requests leave: automatic collection is off.
+                # Collects the cycles of failed requests, as automatic collection is off.
                 if time.monotonic() - collected > _COLLECT_S:
                     gc.collect()
                     collected = time.monotonic()
@@ -276,7 +275,7 @@ class _Run:
 
     def _asked(self) -> tuple[Obs, Act]:
         obs = _observed(self.robot)
-        if self.agent.control is not self.control:  # else `act` decides who moves the robot
+        if self.agent.control is not self.control:  # else `act` has changed it
             self.control.update()
         act = self.agent.act(obs)
         if act.action.ndim != 1:
@@ -285,14 +284,14 @@ class _Run:
         return obs, act
 
     def _held(self, act: Act) -> Held | None:
-        """Obey the commands that have come; return why nothing is commanded at this tick, None if something may be."""
+        """Obey new commands; return why this tick may command nothing, or None."""
         if self.commands is not None:
             self.commands.obey(self.control)
         held, why, safe = self.control.hold(), getattr(self.robot, "holds", None), _safe(act)
         if held is None and why is not None:
             return Held("robot", str(why))
         if held is None and safe is not None and safe.cause in ("stopped", "paused"):
-            return safe  # which is over since the player decided this tick
+            return safe  # its cause ended after the player's decision
         return held
 
     def _stop(self, why: Held) -> None:
@@ -325,7 +324,7 @@ class _Run:
 
 
 def _shared_control(agent: Agent, watchdog: Watchdog | None, commands: CommandInbox | None) -> Control:
-    """Return the one state of this robot: the player's, else the watchdog's, else that of the commands."""
+    """Return the shared state of this robot: the player's, else the watchdog's, else that of the commands."""
     control: Control | None = agent.control
     if control is None:
         control = watchdog.control if watchdog is not None else commands.control if commands is not None else Control()
@@ -338,18 +337,18 @@ def _shared_control(agent: Agent, watchdog: Watchdog | None, commands: CommandIn
 
 
 def _safe(act: Act) -> Held | None:
-    """Return why the action of an agent is the safe one; None if it is the policy's, or a human's."""
+    """Return why the action of an agent is the safe one; None if it is the policy's or an operator's."""
     return Held(act.info.get(CAUSE, "other"), str(act.info[SAFE])) if SAFE in act.info else None
 
 
 def _silent_s(act: Act) -> float:
-    """Return for how long the agent has waited for an answer, s; without a number, the action is an answer of now."""
+    """Return the agent's waiting time for an answer, s; 0 if it states none."""
     silent_s = act.info.get(SILENT)
     return float(silent_s) if isinstance(silent_s, (int, float)) and 0 <= silent_s < math.inf else 0.0
 
 
 def _guard(agent: Agent, given: Guard | None) -> Guard:
-    """Return the guard that actions have to pass; the agent is initialized, so it knows its contract."""
+    """Return the guard of the actions; the agent is initialized, so it has its contract."""
     own = agent.check if isinstance(agent.check, Guard) else None
     if given is not None and own is not None and own is not given:
         raise ConfigError("guard: got one besides the agent's own check=, want one of them; leave one out")

@@ -21,7 +21,7 @@ SPIN_S = 0.001
 ON_TIME_S = 0.002
 KEPT_TICKS = 200_000
 """The number of ticks whose lateness is kept, as a loop may run for days."""
-_SWITCH_S = 0.0005  # the longest time that another thread keeps the interpreter; Python's default is 5 ms
+_SWITCH_S = 0.0005  # longest time for which another thread keeps the interpreter; Python's default is 5 ms
 _NICE = -10
 _FIFO = 10
 
@@ -112,7 +112,7 @@ def undisturbed(*, real_time: bool = False) -> Iterator[list[str]]:
     sys.setswitchinterval(_SWITCH_S)
     done = ["garbage collection off", "switch interval 0.5 ms"]
     with contextlib.ExitStack() as undo:
-        if not frozen:  # else by the process itself, which `unfreeze` would undo
+        if not frozen:  # else the process itself froze objects, which `unfreeze` would undo
             undo.callback(gc.unfreeze)
         if collects:
             undo.callback(gc.enable)
@@ -122,7 +122,7 @@ def undisturbed(*, real_time: bool = False) -> Iterator[list[str]]:
 
 
 def _prioritise(real_time: bool, undo: contextlib.ExitStack) -> str:
-    if not sys.platform.startswith("linux"):  # only there do both calls act on a thread
+    if not sys.platform.startswith("linux"):  # elsewhere both calls do not act on a thread
         return "no priority (only on Linux)"
     thread = threading.get_native_id()
     try:

@@ -56,9 +56,8 @@ class Recorder:
         root: The dataset's folder, which is created or continued.
         fps: The rate of the frames, Hz.
         frames: The largest number of frames in the queue.
-        interventions: Whether a human may take over: frames then also have `intervention` (bool), `policy_action`, what
-            the policy wanted, and `policy_known` (bool), and episodes a label. A dataset that has these columns gets
-            them in any case.
+        interventions: Whether an operator may take over: frames then also have `intervention` (bool), `policy_action`
+            and `policy_known` (bool), and episodes a label. A dataset that has these columns keeps them in any case.
 
     Raises:
         ConfigError: The folder has other files, or a dataset of another rate or version, or without these columns.
@@ -116,7 +115,7 @@ class Recorder:
                 drops the episode.
 
         Raises:
-            ConfigError: There is no such label, or no place for it, as the dataset has no columns of interventions.
+            ConfigError: The label is unknown, or the dataset has no columns of interventions.
         """
         if label not in get_args(Label):
             raise ConfigError(f"label: got {label!r}, want one of {list(get_args(Label))}")
@@ -141,8 +140,8 @@ class Recorder:
             action: The action that was applied after it, (D,) float32.
             tick: The tick of the control loop.
             safe: Whether the action is a safe one, not the policy's.
-            intervention: Whether a human moved the robot at this tick.
-            wanted: The policy's action, (D,), where another one was applied; None if it is not known.
+            intervention: Whether an operator moved the robot at this tick.
+            wanted: The policy's action, (D,), if another one was applied; None if it is not known.
         """
         if self._put - self._got >= self._frames:
             self.dropped += 1

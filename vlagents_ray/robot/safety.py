@@ -152,14 +152,14 @@ class Watchdog:
 
         Watchdog(robot.stop, {"server": 1.0, "loop": 0.2})  # s
 
-    `stop` is called once for each silence, on the watchdog's own thread, so that a control loop that hangs is noticed.
+    `stop` is called once for each silence, on the watchdog's own thread, which also detects a control loop that hangs.
     The time limits begin to run at `start` (or `with`). After a stop, `control.stopped` is true until `restart` is
     called, also in later runs of the control loop. If `stop` raises an exception, it is kept in `error`, and the
     watchdog continues.
 
     Args:
-        stop: Stops the robot; it gets the reason as text, which is also appended to `barks`.
-        silent_s: The sources by name, and how long each may be silent, s.
+        stop: Stops the robot; its argument is the reason as text, which is also appended to `barks`.
+        silent_s: The longest silence of each source by name, s.
 
     Raises:
         ConfigError: A time limit is not above 0.
@@ -180,11 +180,11 @@ class Watchdog:
         self._thread: threading.Thread | None = None
 
     def heard(self, name: str, ago_s: float = 0.0) -> None:
-        """Note a sign of life of a source.
+        """Record a sign of life of a source.
 
         Args:
             name: The source; a name that is not watched is ignored.
-            ago_s: How long ago the sign was seen, s.
+            ago_s: The age of the sign, s.
 
         Raises:
             ConfigError: `ago_s` is negative or not finite.
@@ -202,14 +202,14 @@ class Watchdog:
                 self._changed.notify_all()
 
     def share(self, control: Control) -> None:
-        """Use the state of a chunk player, which gets the stops of before."""
+        """Use the state of a chunk player, to which earlier stops are moved."""
         with self._changed:
             if control is not self.control:
                 control.adopt(self.control)
                 self.control = control
 
     def trip(self, reason: str) -> None:
-        """Stop the robot now, on the caller's thread; motion is restarted by `restart` alone."""
+        """Stop the robot now, on the caller's thread; only `restart` allows motion again."""
         with self._changed:
             self.control.stop(reason)
         self.barks.append(reason)
@@ -219,13 +219,13 @@ class Watchdog:
         """Allow motion again after a stop; may be called from any thread and from a signal handler.
 
         Returns:
-            Whether motion is allowed. It is not while a source is silent (`control.silent`); call this again later.
+            Whether motion is allowed. While a source is silent (`control.silent`), it is not: call this again later.
         """
         with self._changed:
             return self.control.restart()
 
     def start(self) -> None:
-        """Start the thread and the time limits of all sources; does nothing if they run. Stops and silences last."""
+        """Start the thread and the time limits of all sources, unless they run. Stops and silences persist."""
         with self._changed:
             if self._thread is not None:
                 return
@@ -236,7 +236,7 @@ class Watchdog:
         self._thread.start()
 
     def close(self) -> None:
-        """End the thread, after a call of `stop` that is under way."""
+        """End the thread, after any running call of `stop`."""
         with self._changed:
             thread, self._thread = self._thread, None
             self._changed.notify_all()

@@ -1,4 +1,4 @@
-"""Robots without hardware: a simulated arm to try the control loop with, and an environment that it drives."""
+"""Robots without hardware: a simulated arm for trying the control loop, and an environment as a robot."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ _SMOOTHING = 0.5  # share of the distance to its target that a joint moves in a 
 
 
 class SimulatedRobot:
-    """An arm whose joints follow their commands, and whose cameras show it as a dot on a still image.
+    """An arm whose joints follow their commands, shown as a dot on a still image by its cameras.
 
     Actions are those of the policy's contract: `dim` numbers, deltas of the joints or absolute targets (also if neither
-    is stated), the last of them the gripper if the contract states how it is opened. Observations have the cameras,
-    with their sizes, and the parts of the state, filled with the joints, that the contract names; without a contract
-    they have the cameras `front` and `wrist` and the part `joints`.
+    is stated), the last one the gripper if the contract states its opening. Observations have the cameras, with their
+    sizes, and the parts of the state, filled with the joints, that the contract names; without a contract they have the
+    cameras `front` and `wrist` and the part `joints`.
     """
 
     simulated = True
@@ -89,9 +89,9 @@ def _picture(height: int, width: int) -> np.ndarray:
 
 
 class EnvRobot:
-    """One episode of an environment as a `Robot`: each command is a step, and without one, time stands still.
+    """One episode of an environment as a `Robot`: each command is a step; without commands, time does not pass.
 
-    The caller closes `env`. With `endless` its step limit is ignored, as a human takes longer than a policy.
+    The caller closes `env`. With `endless` its step limit is ignored, as an operator takes longer than a policy.
     """
 
     simulated = True
@@ -100,7 +100,7 @@ class EnvRobot:
         self._env, self._endless = env, endless
         self._obs, _ = env.reset(seed=seed)
         self.success = False  # the task was solved
-        self.ended = False  # by success, or as the environment says
+        self.ended = False  # by success, or by the environment
         self.steps = 0
 
     def observe(self) -> Obs:

@@ -33,18 +33,18 @@ class AxesDevice(ABC):
     """A device with axes; its methods return at once."""
 
     _presses = 0  # of the gripper's button
-    _taken = False  # whether the human has taken over
+    _taken = False  # whether the operator has taken over
 
     @abstractmethod
     def engaged(self) -> bool:
-        """Read the device, and return whether the human wants to move the robot."""
+        """Read the device, and return whether the operator moves the robot."""
 
     @abstractmethod
     def axes(self) -> np.ndarray:
         """Return x, y, z, roll, pitch and yaw as read last, (6,), each in [-1, 1]."""
 
     def gripper_presses(self) -> int:
-        """Return how often the gripper's button has been pressed since the last call."""
+        """Return the number of presses of the gripper's button since the last call."""
         presses, self._presses = self._presses, 0
         return presses
 
@@ -53,8 +53,8 @@ class AxesLeader:
     """A leader that turns the axes of a device into actions.
 
     Axis i moves number i of the action: for relative actions of an end effector x, y, z and, if the action has them,
-    rotations; else the first six joints. The gripper is the last number, if the contract says how it is opened. When
-    the human takes over, it is left open if it is fully open; else it is closed, as it may hold something.
+    rotations; else the first six joints. The gripper is the last number, if the contract states its opening. At a
+    takeover it stays open if it is fully open; else it is closed, as it may hold something.
 
     Args:
         contract: The policy's contract, which states `action.dim`, and whether actions are relative.
@@ -65,7 +65,7 @@ class AxesLeader:
             targets begin; default: the state's part `joints`, with the gripper's command after it.
 
     Raises:
-        ConfigError: The contract does not say enough, or `step` is missing or not above 0.
+        ConfigError: The contract is incomplete, or `step` is missing or not above 0.
     """
 
     def __init__(
@@ -92,11 +92,11 @@ class AxesLeader:
         self._dim = spec.dim
         self._measure = measure
         self._engaged = False
-        self._closed: bool | None = None  # None: as the robot has it when the human takes over
+        self._closed: bool | None = None  # None: as at the takeover
         self._target: np.ndarray | None = None  # of absolute actions
 
     def engaged(self) -> bool:
-        """Read the device, and return whether the human wants to move the robot."""
+        """Read the device, and return whether the operator moves the robot."""
         engaged = self._device.engaged()
         if engaged and not self._engaged:
             self._closed = self._target = None
@@ -139,7 +139,7 @@ class AxesLeader:
         return np.array([*joints, *([] if command is None else [command])], np.float32)
 
 
-# A keyboard as a device with axes, read from the terminal, so that it also works over SSH.
+# A keyboard as a device with axes, read from the terminal so that it also works over SSH.
 
 
 HOLD_S = 0.2
@@ -154,7 +154,7 @@ HELP = (
 
 
 class Keyboard(AxesDevice):
-    """The keys of a terminal as six axes; any of them takes over, Enter takes over or gives back.
+    """The keys of a terminal as six axes; any axis key takes over, Enter takes over or gives back.
 
         with Keyboard() as device:
             player = ChunkPlayer(agent, override=AxesLeader(agent.contract, device))
@@ -184,7 +184,7 @@ class Keyboard(AxesDevice):
         self._open.close()
 
     def engaged(self) -> bool:
-        """Read the keys that were pressed, and return whether the human moves the robot."""
+        """Read the pressed keys, and return whether the operator moves the robot."""
         if not self._terminal.read(self._press):
             raise ConnectionError("the terminal is closed")
         return self._taken
@@ -217,11 +217,11 @@ class Keyboard(AxesDevice):
 
 
 _DEAD = 0.1  # of the range: the cap never rests exactly in the middle
-_REPORTS = 64  # the device sends more reports than a loop has ticks; so many are read at one
+_REPORTS = 64  # reports read at one tick, as the device sends more reports than a loop has ticks
 
 
 class SpaceMouse(AxesDevice):
-    """The cap of a SpaceMouse as six axes: pushed forward, left and up is +x, +y, +z, as ROS has them (REP 103).
+    """The cap of a SpaceMouse as six axes: forward, left and up are +x, +y, +z, as in ROS (REP 103).
 
     Moving it takes over, its first button opens and closes the gripper, and its last one takes over or gives back.
 
@@ -249,7 +249,7 @@ class SpaceMouse(AxesDevice):
         self._device.close()
 
     def engaged(self) -> bool:
-        """Read the device, and return whether the human wants to move the robot."""
+        """Read the device, and return whether the operator moves the robot."""
         read = None
         for _ in range(_REPORTS):
             state = self._device.read()
@@ -277,15 +277,15 @@ class SpaceMouse(AxesDevice):
             self._taken = not self._taken
 
 
-# An agent that is a human: demonstrations, in the same loop as a policy.
+# An operator as an agent, for demonstrations in the same loop as a policy.
 
 
 class TeleoperatedAgent(Agent):
     """An agent whose actions are all a leader's, engaged or not; there is no policy.
 
     Args:
-        leader: What the human moves the robot with.
-        contract: What the robot gives and takes, for the loop's guard.
+        leader: The device with which the operator moves the robot.
+        contract: The contract of the robot, for the loop's guard.
     """
 
     contract: Contract | None = None
@@ -295,12 +295,12 @@ class TeleoperatedAgent(Agent):
         self.contract = contract
 
     def act(self, obs: Obs) -> Act:
-        """Return the human's action, (D,) float32, with `info["intervention"]`."""
-        self._leader.engaged()  # reads what has been pressed
+        """Return the operator's action, (D,) float32, with `info["intervention"]`."""
+        self._leader.engaged()  # reads the device
         return Act(self._leader.action(obs), info={INTERVENTION: True})
 
 
-# The terminal, whose only reader this is, so that each key that is typed has exactly one consumer.
+# The only reader of the terminal, so that each typed key has exactly one consumer.
 
 
 _POLL_S = 0.1
@@ -308,11 +308,11 @@ Consumer = Callable[[str], bool]  # gets a key in lower case; returns whether it
 
 
 class Terminal:
-    """A terminal whose keys go to the consumer that began last, such as a keyboard that moves the robot.
+    """A terminal whose keys go to the newest consumer, such as a keyboard that moves the robot.
 
-    A key that has no meaning for it goes to the one before, and last to one that reads in the background. Two objects
-    of one terminal share its consumers. Without a `descriptor`, it is that of standard input; raises `ConfigError` if
-    that is no terminal.
+    A key without meaning for it goes to the consumer before, and last to one that reads in the background. Two objects
+    of one terminal share its consumers. The default `descriptor` is that of standard input; raises `ConfigError` if it
+    is no terminal.
     """
 
     _consumers: dict[tuple[int, int], list[Consumer]] = {}  # noqa: RUF012 - of all terminals of this process
@@ -320,7 +320,7 @@ class Terminal:
 
     def __init__(self, descriptor: int | None = None) -> None:
         if descriptor is None and sys.stdin is not None:
-            with contextlib.suppress(OSError, ValueError):  # what stands in for standard input need not be a file
+            with contextlib.suppress(OSError, ValueError):  # a replacement of standard input need not be a file
                 descriptor = sys.stdin.fileno()
         if descriptor is None or not os.isatty(descriptor):
             raise ConfigError("terminal: got no terminal, want one to read keys from; run this in one")
@@ -330,7 +330,7 @@ class Terminal:
 
     @contextlib.contextmanager
     def keys_at_once(self) -> Iterator[None]:
-        """Deliver keys at once within the context, without echo, and not line by line; Ctrl-C stays."""
+        """Deliver each key at once, without echo, within the context; Ctrl-C still works."""
         import termios
         import tty
 
@@ -353,7 +353,7 @@ class Terminal:
                 self._own.remove(consumer)
 
     def read(self, consumer: Consumer) -> bool:
-        """Give the keys that were typed to their consumers, if this one began last; return whether it is open."""
+        """Pass typed keys to their consumers, if this one is the newest; return whether the terminal is open."""
         with self._lock:
             if consumer not in self._own:
                 raise ConfigError("terminal: this consumer has not begun; want `with` around its use")
@@ -372,7 +372,7 @@ class Terminal:
 
     @contextlib.contextmanager
     def read_in_background(self, consumer: Consumer) -> Iterator[None]:
-        """Pass the keys that no other consumer takes to this one; a thread reads them meanwhile."""
+        """Pass keys without another consumer to this one, from a thread, within the context."""
         over = threading.Event()
 
         def read() -> None:
@@ -392,8 +392,8 @@ class Terminal:
                 self._own.remove(consumer)
 
     def _is_in_foreground(self) -> bool:
-        """Whether this process may read: to read from the terminal in the background would suspend it."""
+        """Return whether this process may read: in the background, reading from the terminal would suspend it."""
         try:
             return os.tcgetpgrp(self.descriptor) == os.getpgrp()
-        except OSError:  # it is not this process's controlling terminal, which suspends none
+        except OSError:  # not this process's controlling terminal, so reading suspends nothing
             return True

@@ -1,4 +1,4 @@
-"""What deployment files name: `import_path: vlagents_ray.serve.app:build`."""
+"""The import path of deployment files: `import_path: vlagents_ray.serve.app:build`."""
 
 from __future__ import annotations
 

@@ -55,7 +55,7 @@ RANKS: Mapping[str, Rank] = {"robot": Rank.ROBOT, "simulation": Rank.SIMULATION}
 
 @dataclass(frozen=True, slots=True)
 class CheckpointChoice:
-    """The checkpoint that a session asked for: by default the deployment's own."""
+    """The checkpoint that a session requested: by default the deployment's own."""
 
     name: str | None = None  # name of one of the deployment's `choices`; None for the deployment's own
     step: int | None = None  # training step of the checkpoint; None for the step that the settings name
@@ -72,12 +72,12 @@ DEFAULT = CheckpointChoice()
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """Where the requests of one sender come from."""
+    """The origin of one sender's requests."""
 
     transport: str = ""  # for the metrics
     owner: str = ""  # connection with which its sessions end; empty if it has none
     connection: str = ""  # the sender, whose requests share one turn in the queue; empty: each session has a turn
-    caller: Caller | None = None  # None if no key is asked for
+    caller: Caller | None = None  # None if no key is required
     prefix: str = ""  # of the session ids of the caller's key
     sessions: set[str] = field(default_factory=set)  # those of the owner, as the engine names them
 
@@ -87,7 +87,7 @@ NOWHERE = Origin()
 
 @dataclass(slots=True)
 class Opening:
-    """What the server decides about the episode that a reset begins."""
+    """The server's settings of the episode that a reset begins."""
 
     choice: CheckpointChoice
     kwargs: dict[str, Any]  # those of the request that are for the policy
@@ -113,7 +113,7 @@ class PendingRequest:
     over: bool = False  # whether it was answered, or its caller no longer waits
     begun: bool = False  # whether a batch has taken it, so that the policy acts on it; set under the queue's lock
     sought: bool = False  # whether its session was looked for at other replicas
-    session: Any = None  # the `Session` of an act, as it was when the request came
+    session: Any = None  # the `Session` of an act at its arrival
     opening: Opening | None = None  # of a reset
     # Time at which the checkpoint was loaded, s, if a reset had to wait for it. Such a reset is run even if it is over,
     # to give the checkpoint back.
@@ -121,7 +121,7 @@ class PendingRequest:
     preparation: Preparation | None = None  # of its observation, on another thread
     return_s: float | None = None  # recent time from an answer to the session's next request, s, if known
     place: int = 0  # among the requests of its message
-    # Set where somebody observes: the files of its message's images, and what observers keep for the answer.
+    # Set for observers: the files of its message's images, and their data until the answer.
     files: DecodedFiles = None  # type: ignore[assignment]
     kept: dict[Any, Any] = None  # type: ignore[assignment]
 

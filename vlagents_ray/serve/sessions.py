@@ -25,7 +25,7 @@ logger = logging.getLogger(__name__)
 
 _REMEMBERED = 4096  # number of remembered sessions that left, whose older states are refused (some 500 bytes each)
 _ANY = 2**63  # number of moves with which a version is newer than any other state of its step
-_UNSEEN = 2**20  # largest number of acts at other replicas that neither the client nor this replica knows of
+_UNSEEN = 2**20  # largest number of acts at other replicas unknown to the client and this replica
 _MOST_STEP = 2**62  # steps from here on are ignored if a client reports them
 
 
@@ -193,7 +193,7 @@ class SessionTable(Generic[M]):
     def enter(self, arriving: Session[M]) -> None:
         """Add a session from another replica, in place of an older state of it.
 
-        Its old replica has released it already, so it is added even if the table has become full meanwhile.
+        Its old replica has already released it, so it is added even if the table has become full.
 
         Raises:
             Outdated: This replica has, or had, a state that is at least as new.
@@ -252,7 +252,7 @@ class SessionTable(Generic[M]):
             return True
 
     def close_owned(self, connection: str, session_ids: Iterable[str]) -> None:
-        """Close those of the sessions that still end with the connection."""
+        """Close the given sessions, except any that no longer end with the connection."""
         with self._lock:
             for session_id in session_ids:
                 session = self._sessions.get(session_id)
@@ -309,7 +309,7 @@ class SessionTable(Generic[M]):
 
 
 class DrainList:
-    """The connections that shall move to another replica; the next reply of each asks for that once. Thread-safe.
+    """The connections to move to another replica; the next reply of each requests that once. Thread-safe.
 
     `vlagents_ray.serve.scaling.rebalancer` marks them.
     """
@@ -323,7 +323,7 @@ class DrainList:
         self._marked = connections
 
     def ask(self, connection: str) -> bool:
-        """Return whether the current reply asks the connection to reconnect; if so, record that it was asked."""
+        """Return whether the current reply requests a reconnection; if so, record the request."""
         if not self._marked or connection not in self._marked:
             return False
         self._marked.discard(connection)

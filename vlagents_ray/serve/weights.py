@@ -78,14 +78,14 @@ class WeightsVersion:
 
 
 class FollowingSession(Protocol):
-    """What the versions need of a session."""
+    """The interface of a session for versions."""
 
     weights: WeightsVersion | None  # with which it acts; None without an episode
     follows: bool  # whether it takes the newest version, otherwise the pinned one
 
 
 class ModelWeights:
-    """The versions of one model. Thread-safe, but for `use`, which runs on the policy's thread."""
+    """The versions of one model. Thread-safe, except `use`, which runs on the policy's thread."""
 
     def __init__(self, agent: Agent, busy: threading.Lock, digest: str = "", model: tuple[str, str] = ("", "")) -> None:
         """Take the weights of an initialized agent as version 0.
@@ -94,7 +94,7 @@ class ModelWeights:
             agent: The agent, which acts with one version at a time.
             busy: The lock that is held while the agent runs.
             digest: The fingerprint for an agent that names no parameters, whose files may be known.
-            model: What is equal in replicas that loaded the same checkpoint with the same settings.
+            model: A value that is equal in replicas with the same checkpoint and settings.
         """
         self.model = model
         self._agent, self._busy = agent, busy
@@ -106,7 +106,7 @@ class ModelWeights:
             first, self._in_place, self.gpu = WeightsVersion(0, digest, None), False, ""
         else:
             self._refusal = None
-            # An agent of its own ways may copy as well, so that references to old values do not last.
+            # An agent with its own `load_parameters` may also copy, so that references to old values do not last.
             self._in_place = type(agent).load_parameters is not Agent.load_parameters or is_copied(values or {})
             first = WeightsVersion(0, fingerprint(values or {}), None if self._in_place else values)
             self.gpu = gpu_of(values or {})
@@ -266,7 +266,7 @@ class ModelWeights:
     def _values(self, version: WeightsVersion) -> dict[str, Any]:
         if (values := version.values) is not None:
             return values
-        with self._busy:  # otherwise another version could become the agent's own meanwhile
+        with self._busy:  # otherwise another version could become the agent's own
             return self._copies() if version.values is None else version.values
 
     def _copies(self) -> dict[str, Any]:
@@ -288,7 +288,7 @@ class NewestVersion:
 
     number: int
     model: tuple[str, str]  # equal in replicas that loaded the same checkpoint with the same settings
-    gpu: str = ""  # UUID of the GPU on which its weights are; empty if it is none, or more than one
+    gpu: str = ""  # UUID of the GPU that holds all its weights; empty if there is no single one
 
 
 @dataclass(frozen=True, slots=True)

@@ -74,7 +74,7 @@ class Ports:
 
 @dataclass(frozen=True, slots=True)
 class Allocation:
-    """The resources of a job, as a process on one of its nodes sees them."""
+    """The resources of a job, as visible to a process on one of its nodes."""
 
     job: int
     nodes: int
@@ -265,7 +265,7 @@ def announce(words: Sequence[str]) -> None:
     deadline = time.monotonic() + _MOST_S
     server = os.getppid()
     while not all(_answers(f"http://127.0.0.1:{port}{route.rstrip('/')}/healthz") for route in apps.values()):
-        if time.monotonic() > deadline or os.getppid() != server:  # the server has ended, and its log says why
+        if time.monotonic() > deadline or os.getppid() != server:  # the server has ended, and its log has the reason
             return
         time.sleep(_POLL_S)
     found = connection_info(apps, port, os.environ)

@@ -75,7 +75,7 @@ def _submit_once(words: list[str], checkpoint: str, step: int, record: Path, pyt
 
 
 def _is_claimed(mark: Path, claim: dict[str, Any]) -> bool:
-    """Whether this process submits the checkpoint: the first to claim it, or another one if that was killed."""
+    """Return whether this process submits the checkpoint: the first to claim it, or another one if that was killed."""
     try:
         mark.open("x").close()
     except FileExistsError:
@@ -100,7 +100,7 @@ def _abandoned_since(mark: Path) -> int | None:
 
 
 def _submit_abandoned(record: Path, mark: Path, python: str) -> None:
-    """Submit other checkpoints, claimed by processes that were killed, as no other call may come for them."""
+    """Submit other checkpoints, claimed by processes that were killed, as no other call may follow for them."""
     for other in sorted(record.glob("step-*.json")):
         claim = _read(other)
         if other == mark or "words" not in claim or _abandoned_since(other) is None:

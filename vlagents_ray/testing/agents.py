@@ -49,13 +49,13 @@ def check_agent(
     Args:
         agent: The agent, not initialized yet.
         obs: The observations of the sessions, in turn; by default random values that fit the contract.
-        instructions: The instructions of the sessions, in turn; give some that the policy knows, if it parses them.
+        instructions: The instructions of the sessions, in turn; give valid ones, if the policy parses them.
         reset_kwargs: Further arguments of each `reset`, beside `seed`.
         steps: The number of calls of `act` in a session.
         atol: The largest difference between an action in a batch and the same action of a session alone.
 
     Raises:
-        ContractViolation: The agent does not implement the interface; the message says where.
+        ContractViolation: The agent does not implement the interface; the message names the place.
     """
     agent.initialize()
     contract = agent.contract

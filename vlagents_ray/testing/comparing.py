@@ -1,4 +1,4 @@
-"""The error of both test suites, and comparisons that say where two values differ."""
+"""The error of both test suites, and comparisons that report where two values differ."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _SCALARS = (bool, int, float, str, bytes)
 
 
 class ContractViolation(VLAgentsError):
-    """A policy or an environment does not implement its interface; the message says where."""
+    """A policy or an environment does not implement its interface; the message names the place."""
 
 
 def require_wireable(value: object, where: str) -> None:

@@ -40,7 +40,7 @@ def check_env(
         step_limit: Whether one episode runs until `env.max_steps`; False if that takes too long.
 
     Raises:
-        ContractViolation: The environment does not implement the interface; the message says where.
+        ContractViolation: The environment does not implement the interface; the message names the place.
     """
     suite = _Suite(env, _check_static(env), options)
     actions = suite.random_actions(steps)

@@ -54,7 +54,7 @@ class SharedValues:
 
 
 def gpu_of(named: Mapping[str, Any]) -> str:
-    """Return the UUID of the GPU on which values are; empty if it is none, or more than one."""
+    """Return the UUID of the GPU that holds all values; empty if there is no single one."""
     gpus = {_MEMORY.gpu(value) for value in named.values()} - {""}
     return gpus.pop() if len(gpus) == 1 else ""
 

@@ -27,7 +27,7 @@ _KINDS = (("float", "bfloat"), ("int", "uint"), ("bool",), ("complex",))
 def named_values(trainable: Any) -> dict[str, Any]:
     """Return references to the values of a torch module or nested dicts and lists, by name; raises `NotTrainable`."""
     if _is_module(trainable):
-        # A module may add state of its own that is no tensor (`get_extra_state`), which a learner does not train.
+        # A module may add state that is no tensor (`get_extra_state`), which a learner does not train.
         return {name: value for name, value in trainable.state_dict().items() if is_array(value)}
     return {name: container[key] for name, container, key in _leaves(trainable)}
 
@@ -36,7 +36,7 @@ def set_values(trainable: Any, named: Mapping[str, Any]) -> None:
     """Replace values of a trainable object by those of the same shapes, types and devices; other names keep theirs.
 
     Values on a GPU are copied to where the old ones are, since a CUDA graph may have recorded these addresses. All
-    others are replaced by reference, which takes no time and no memory; so nobody may write into `named` afterwards.
+    others are replaced by reference, which takes no time and no memory; so `named` must not be changed afterwards.
     """
     if _is_module(trainable):
         _set_tensors(trainable, named)

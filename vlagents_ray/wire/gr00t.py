@@ -321,7 +321,7 @@ _PACKED = "__ModalityConfig__"  # older servers write `__ModalityConfig_class__`
 
 @dataclass(frozen=True, slots=True)
 class Modality:
-    """What a server says about one modality: its keys, and the time steps of each."""
+    """A server's description of one modality: its keys, and the time steps of each."""
 
     keys: tuple[str, ...]
     steps: tuple[int, ...]

@@ -42,7 +42,7 @@ _SHOWN = 40  # maximum number of a client's keys in an error, and of characters 
 
 @dataclass(frozen=True, slots=True)
 class PolicyInstructions:
-    """What a client says of itself and of the policy before its first observation."""
+    """A client's settings of itself and of the policy, before its first observation."""
 
     policy_type: str
     checkpoint: str  # the checkpoint that LeRobot's own server would load

@@ -224,7 +224,7 @@ def reads(key: str, path: str) -> bool:
 
 
 def matches(name: str, pattern: str) -> bool:
-    """Whether `pattern`, which may end with `*`, stands for `name`."""
+    """Return whether `pattern`, which may end with `*`, stands for `name`."""
     return name.startswith(pattern[:-1]) if pattern.endswith("*") else name == pattern
 
 

@@ -47,7 +47,7 @@ def encode_observation(observation: Mapping[str, Any]) -> bytes:
 
 
 def decode_action(body: bytes, limits: Limits = DEFAULT_LIMITS) -> np.ndarray | None:
-    """Return the action in a reply, (D,) or (H, D); None if the reply is "error", as OpenVLA's own server says it."""
+    """Return the action in a reply, (D,) or (H, D); None if the reply is "error", the error of OpenVLA's own server."""
     value = json_numpy.loads(body, limits)
     if isinstance(value, str) and value != "error":  # encoded twice
         value = json_numpy.loads(value, limits)

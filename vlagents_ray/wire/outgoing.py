@@ -1,8 +1,8 @@
 """Conversion of our observation to another system's, and of its actions to ours: a `KeyMapping` read backwards.
 
-Each entry of a mapping then says where a value goes. The vectors of several entries with one key are joined by their
-`start` and `stop`; of `a|b` the first key is used; the `*` of a name stands for all cameras or states that no other
-entry names.
+Each entry of a mapping is then the destination of a value. The vectors of several entries with one key are joined by
+their `start` and `stop`; of `a|b` the first key is used; the `*` of a name stands for all cameras or states that no
+other entry names.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ class Outgoing:
     Attributes:
         mapping: The mapping.
         is_nested: Whether a key `a/b` is the key `b` within `a`, and not one key.
-        text_key: What the `*` of the instruction's key stands for.
+        text_key: The text in place of the `*` of the instruction's key.
 
     Raises:
-        ConfigError: A state has several parts without `stop`, of which nothing says how long each is.
+        ConfigError: A state has several parts without `stop`, so that their lengths are unknown.
     """
 
     mapping: KeyMapping
@@ -111,7 +111,7 @@ class Outgoing:
         )
 
     def _own_gripper(self) -> bool:
-        """Whether the gripper's number is not one of a state's, which then sets it."""
+        """Return whether the gripper's number is not one of a state's, which then sets it."""
         gripper = self.mapping.gripper
         return gripper is not None and not any(
             _first(part.key) == _first(gripper.key)
@@ -166,7 +166,7 @@ def _rest(name: str, pattern: str) -> str:
 def _matching(
     name: str, key: str, values: Mapping[str, np.ndarray], entries: Mapping[str, Any]
 ) -> list[tuple[str, np.ndarray]]:
-    """Return the keys and values of one entry: of its name, or of all that its `*` stands for and no entry names."""
+    """Return the keys and values of one entry: of its name, or of all matches of its `*` without an entry."""
     if _named(name):
         return [(key, values[name])] if name in values else []
     return [
@@ -177,7 +177,7 @@ def _matching(
 
 
 def _width(parts: tuple[StateKey, ...]) -> int | None:
-    """Return the length of a state, if the mapping says it."""
+    """Return the length of a state, if the mapping states it."""
     widths = [None if part.stop is None else part.stop - (part.start or 0) for part in parts]
     known = [width for width in widths if width is not None]
     return sum(known) if len(known) == len(widths) else None

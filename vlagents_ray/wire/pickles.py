@@ -194,7 +194,7 @@ class _StackMachine:
         return group
 
     def name(self) -> None:
-        """Replace module and name by the entry of the closed list that they stand for."""
+        """Replace module and name by their entry of the closed list."""
         name, module = self.pop(), self.pop()
         if not (type(module) is str and type(name) is str):
             raise MalformedMessage("pickle: a name that is no text")

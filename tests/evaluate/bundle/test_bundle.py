@@ -246,7 +246,7 @@ def test_options_that_could_name_files_or_code_are_not_taken_from_a_stranger(
 )
 def test_a_path_that_no_bundle_has_is_refused_and_nothing_is_written(bundle: Path, tmp_path: Path, name: str) -> None:
     hostile = rewritten(bundle, tmp_path / "b.zip", {name: b"x"}, honest=True)
-    with pytest.raises(ConfigError, match=r"got the file .*do not trust whoever made this bundle"):
+    with pytest.raises(ConfigError, match=r"got the file .*do not trust the author of this bundle"):
         verify(hostile, into=tmp_path / "deep" / "kept")
     assert not list((tmp_path / "deep").iterdir())
 

@@ -53,5 +53,5 @@ def test_between_two_episodes_nobody_gives_up_but_where_nothing_is_played_for_as
     clock.now = 1100.0
     capacity.report_shortage(WANTED, running=1)
     clock.now = 1101.0
-    with pytest.raises(ConfigError, match=r"no room for a worker in 100 s: each wants .*64.* lower `workers`"):
+    with pytest.raises(ConfigError, match=r"no room for a worker in 100 s: each needs .*64.* lower `workers`"):
         capacity.report_shortage(WANTED, running=1)

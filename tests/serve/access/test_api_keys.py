@@ -160,7 +160,7 @@ def test_no_nonsense_in_the_file_gets_out_and_before_long_nobody_gets_in(
     assert caller.refusal() is not None
     with pytest.raises(Unauthorized):
         keys.check(token, "noop")
-    assert "nobody is let in any more: for 300 s" in caplog.text
+    assert "all keys are refused: for 300 s" in caplog.text
     file.write_bytes(good)
     keys.check(token, "noop")
     assert keys.unreadable_s == 0

@@ -1,1 +1,1 @@
-"""How requests reach a server: shared memory, plasma, WebSocket, HTTP, or a Serve handle."""
+"""The transports of requests: shared memory, plasma, WebSocket, HTTP, and the Serve handle."""

@@ -16,8 +16,8 @@ logger = logging.getLogger(__name__)
 CodecName = Literal["auto", "exact", "raw", "lossless", "jpeg"]
 _OVER_A_NETWORK = {"auto": JPEG, "exact": LOSSLESS}  # the codecs whose choice depends on where the server is
 
-_ANSWER_S = 2.0  # most s that the first replica asked may take to send anything
-_SILENT_S = 2.0  # s after which an attempt to connect that goes on is reported
+_ANSWER_S = 2.0  # s, time limit for the first byte of the first replica
+_SILENT_S = 2.0  # s after which an unfinished attempt to connect is reported
 
 
 class RequestChannel(Protocol):
@@ -77,7 +77,7 @@ class ConnectReport:
 def first_timeout_s(timeout_s: float) -> float:
     """Return how long, s, the first replica may take of `timeout_s` to send anything; the next gets twice that.
 
-    So every attempt to connect, however short, asks at least two replicas, of which the first may hang.
+    So every attempt to connect, however short, tries at least two replicas, of which the first may hang.
     """
     return min(_ANSWER_S, timeout_s / 3)
 
@@ -88,7 +88,7 @@ def left_s(deadline: float) -> float:
 
 
 class CodecChoice:
-    """The codec of a connection's cameras: the one that the user names, or one that depends on where the server is.
+    """The codec of a connection's cameras: the user's, or one that depends on the location of the server.
 
     Within a machine, "auto" and "exact" take raw pixels; over a network, "auto" takes JPEG and "exact" PNG. On one core
     of a server, JPEG costs 3 ns for a byte of pixels, encoded and decoded, and leaves 7 to 10 % of the bytes, so
@@ -104,7 +104,7 @@ class CodecChoice:
             self.codec = ImageCodec(requested)
 
     def connected(self, *, near: bool) -> None:
-        """Choose for a new connection; `near` says whether its server is on this machine."""
+        """Choose the codec of a new connection; `near` is whether its server is on this machine."""
         if self._compressed is not None:
             self.codec = RAW if near else self._compressed
 

@@ -37,7 +37,7 @@ from vlagents_ray.protocol.messages import (
     Request,
 )
 
-_UNKNOWN_APP_S = 10.0  # a starting server knows no path until its first replica exists
+_UNKNOWN_APP_S = 10.0  # a starting server has no path until its first replica exists
 
 
 class HttpTransport:
@@ -183,7 +183,7 @@ def http_url(url: str) -> SplitResult:
 
 
 def _closed_by_peer(sock: socket.socket | None) -> bool:
-    """Whether the server closed an idle connection: only then is there anything to read."""
+    """Return whether the server closed an idle connection: only then is there anything to read."""
     if sock is None:
         return True
     poller = select.poll()

@@ -41,7 +41,7 @@ class ClientApi(Protocol):
     """
 
     async def attach(self, node: str = "", boot_id: str = "", must_be_near: bool = False) -> tuple[dict[str, Any], Any]:
-        """Return the metadata of the replica that suits a client on that node best, and its actor."""
+        """Return metadata and actor of the best replica for a client on that node."""
         ...
 
     async def call(self, session_id: str, frame: Any) -> bytes:
@@ -190,7 +190,7 @@ class ReplicaNodes:
                 self._nodes = self._answer.result(timeout_s=wait_s)
                 self._answer = None
         except TimeoutError:
-            pass  # the answer comes later
+            pass  # the answer follows later
         except (RayServeException, ray.exceptions.RayError):
             self._nodes, self._answer = {}, None
         return self._nodes

@@ -30,7 +30,7 @@ from vlagents_ray.protocol.messages import LocalAddress, Reply, Request, boot_id
 _MESSAGE_BYTES = 128 * 1024  # the longest reply that fits in a message, and a margin
 _CONTROL = socket.CMSG_SPACE(4)
 _SPIN_S = 150e-6  # s to poll for an answer before sleeping
-_FAST_S = 600e-6  # s; if the last answer took less, wake-up included, the next one may come while polling
+_FAST_S = 600e-6  # s; after an answer that took less, wake-up included, the next one is polled for
 _PAGE = mmap.PAGESIZE
 
 
@@ -47,11 +47,11 @@ class UnixTransport(ABC):
         self._poller = select.poll()  # polls the socket
         self._buffer = bytearray(_MESSAGE_BYTES)
         self._writer = shm_layout.ShmWriter()
-        self._answers_fast = True  # whether the last answer came at once
+        self._answers_fast = True  # whether the last answer was immediate
 
     @abstractmethod
     def _is_free(self) -> bool:
-        """Whether the next requests can be written."""
+        """Return whether the next requests can be written."""
 
     @abstractmethod
     def _write(self, requests: Sequence[Request], deadline: float) -> tuple[bytes, int | None]:
@@ -66,7 +66,7 @@ class UnixTransport(ABC):
 
     @abstractmethod
     def _answered(self, freed: int) -> None:
-        """Handle a reply. Bit n of `freed` says that the server no longer reads memory n."""
+        """Handle a reply. Bit n of `freed` is set if the server no longer reads memory n."""
 
     def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
         """Write requests for the server, send it a message and return its replies; late replies are discarded."""
@@ -112,8 +112,8 @@ class UnixTransport(ABC):
     def _await(self, connection: socket.socket, requests: Sequence[Request], deadline: float) -> list[Reply]:
         """Return the replies to these requests, and to no earlier ones.
 
-        If the last answer came at once, poll for a moment before sleeping: waking up takes as long as all the rest.
-        Other processes can still use the core meanwhile.
+        If the last answer was immediate, poll for a moment before sleeping: waking up takes as long as all the rest.
+        Other processes can still use the core.
         """
         begun = time.perf_counter()
         spin_until = begun + (_SPIN_S if self._answers_fast else 0.0)

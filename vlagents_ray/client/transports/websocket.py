@@ -1,8 +1,8 @@
 """The WebSocket transport: binary frames to a replica's own port, or through the proxy.
 
-Sessions end with the connection. The metadata says where the replica listens. Where that port cannot be reached
-(because of a firewall, a tunnel of one port, or TLS, which ends at the proxy), `WS /v1/stream` on the server's port
-does the same, a little slower.
+Sessions end with the connection. The metadata has the replica's port. If that port cannot be reached (because of a
+firewall, a tunnel of one port, or TLS, which ends at the proxy), `WS /v1/stream` on the server's port does the same, a
+little slower.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ from vlagents_ray.protocol.messages import (
 
 logger = logging.getLogger(__name__)
 
-# Statuses of a proxy that are worth a retry; HAProxy says 500 for its own 502 to 504, and 404 while it restarts.
+# Statuses of a proxy that are worth a retry; HAProxy sends 500 for its own 502 to 504, and 404 while it restarts.
 _TRANSIENT = (404, 408, 500, 502, 503, 504)
 _PAUSE_S = 0.2
 _DIRECT_S = 1.0  # s for a replica's own port to answer: a firewall may drop the packets
@@ -338,7 +338,7 @@ class WebSocketTransport:
         return None
 
     def _proxied(self, timeout_s: float) -> ProxiedSocket:
-        """Connect through the proxy; retries while the proxy says that a replica is starting or stopping.
+        """Connect through the proxy; retry while the proxy reports that a replica is starting or stopping.
 
         Also retries without an answer: the replica that the proxy chose may hang while the next one works.
         """

@@ -4,7 +4,7 @@
         obs, _ = env.reset(seed=0)
         obs, reward, terminated, truncated, info = env.step(Act(action=np.zeros(7, np.float32)))
 
-It needs a Vulkan device, be it Mesa's software one; `ManiSkill.missing()` says whether there is one.
+It needs a Vulkan device, for example Mesa's software one; `ManiSkill.missing()` reports a missing one.
 """
 
 from vlagents_ray.envs.maniskill.env import ManiSkill

@@ -117,7 +117,7 @@ class ManiSkill(SimulatorEnv):
 
     @classmethod
     def require_task(cls, task: str | None) -> None:
-        """Do nothing: only ManiSkill knows which other ids are registered."""
+        """Do nothing, since the registered ids are only known to ManiSkill."""
 
     @classmethod
     def missing(cls) -> str | None:

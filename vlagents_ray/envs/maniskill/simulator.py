@@ -28,7 +28,7 @@ from vlagents_ray.registry import require
 
 DEFAULT_CONTROL_MODE = "pd_ee_delta_pose"
 
-# The tasks whose assets come with the package.
+# The tasks whose assets are in the package.
 INSTRUCTIONS: dict[str, str] = {
     "LiftPegUpright-v1": "lift the peg and stand it upright on the table",
     "PegInsertionSide-v1": "pick up the peg and insert its orange end into the hole in the box",
@@ -53,7 +53,7 @@ def instruction_for(task: str) -> str:
 
 
 def registered_limit(task: str) -> int | None:
-    """The step limit that ManiSkill registers for `task`; imports ManiSkill and readies the process for it."""
+    """Return the step limit that ManiSkill registers for `task`; imports ManiSkill and readies the process for it."""
     prepare_rendering()
     require("sapien")
     require("mani_skill.envs")
@@ -80,13 +80,13 @@ def chosen_backend(wanted: str) -> str:
         return wanted
     try:
         require("sapien").Device("cuda")
-    except RuntimeError:  # how SAPIEN says that there is none
+    except RuntimeError:  # SAPIEN's error without a device
         return "cpu"
     return "gpu" if require("torch").cuda.is_available() else "cpu"
 
 
 def make_bare(task: str, control_mode: str | None, *, sim_backend: str, render_backend: str, **options: Any) -> Any:
-    """The bare environment, without Gymnasium's wrappers; options that are None are left to ManiSkill.
+    """Return the bare environment, without Gymnasium's wrappers; options that are None are left to ManiSkill.
 
     `control_mode` None is the default one, or the robot's own if it lacks that. Raises `ConfigError`
     for a control mode that the robot lacks, else `EnvFailed`.
@@ -240,7 +240,7 @@ class ManiSkillRobot:
 
 
 def _tool(agent: Any) -> Any:
-    """The link whose pose is the tool's; None if there is none."""
+    """Return the link whose pose is the tool's; None if there is none."""
     tcp = getattr(agent, "tcp", None)
     return agent.robot.links_map.get(_TOOL_LINK) if tcp is None else tcp
 
@@ -316,7 +316,7 @@ class Simulator:
         reward_mode: str | None = None,
         sensors: Mapping[str, Any],
     ) -> None:
-        """`name` stands in errors. Raises `ConfigError`, or `EnvFailed` with its cure."""
+        """Make the simulator, with `name` in errors; raises `ConfigError`, or `EnvFailed` with its cure."""
         self.name = name
         self._task = task
         self._asked_for = render_backend != "auto"

@@ -1,4 +1,4 @@
-"""Draws the table as the camera "front" sees it.
+"""Renders the table for the camera "front".
 
 Objects at rest are drawn once; a step copies that image and adds the gripper, the object that it holds, and their
 shadows. The camera's geometry is in the package's docstring.
@@ -241,7 +241,7 @@ class Canvas:
         return np.clip(0.5 - (outside + np.minimum(np.maximum(across, down), 0) - corner), 0, 1)
 
     def glow(self, u: float, v: float, radius_u: float, radius_v: float) -> FloatArray:
-        """A soft blob around (u, v): 1 in the middle, 0 from the radii on."""
+        """Return a soft blob around (u, v): 1 in the middle, 0 from the radii on."""
         distance = np.clip(np.hypot((self.u - u) / radius_u, (self.v - v) / radius_v), 0, 1)
         fade: FloatArray = 1 - distance * distance * (3 - 2 * distance)
         return fade

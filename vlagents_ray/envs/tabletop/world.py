@@ -37,7 +37,7 @@ class Puck:
     x: float
     y: float
     z: float = 0.0  # m, of its underside
-    lifted: bool = False  # has it left the table in this episode?
+    lifted: bool = False  # whether it has left the table in this episode
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,7 +169,7 @@ class TabletopWorld:
             puck.lifted = puck.lifted or puck.z > _LIFTED
 
     def _support(self, puck: Puck) -> float:
-        """Height in m of what lies under `puck`: the table, or a puck under its centre of mass."""
+        """Return the height of the support of `puck`, m: the table, or a puck under its centre of mass."""
         height = 0.0
         for other in self.pucks:
             top = other.z + PUCK_HEIGHT
@@ -257,7 +257,7 @@ class Goal:
         return TEMPLATES[self.task].format(puck=self.puck, target=self.target)
 
     def reached(self, world: TabletopWorld) -> bool:
-        """Whether the puck is at the instruction's target and released."""
+        """Return whether the puck is at the instruction's target and released."""
         puck = world.puck(self.puck)
         if self.target is None:
             return puck is world.held and puck.z >= _LIFT_HEIGHT

@@ -26,15 +26,15 @@ class Artifacts:
     footage: Footage = field(default_factory=Footage)
     trajectory: bytes | None = None  # a `Trajectory` as .npz
     transitions: Any = None  # a pyarrow.RecordBatch, for a learner
-    not_repeatable: str | None = None  # why images are missing that were to be rendered in a second pass
+    not_repeatable: str | None = None  # reason for images that the second pass did not render
 
 
 class EpisodeRecorder(EpisodeObserver):
-    """Records one episode. Use as a context manager, which frees what it holds. This one keeps nothing."""
+    """Records one episode. Use as a context manager, which frees its resources. This class records nothing."""
 
     @property
     def wants_images(self) -> EpisodeChoice:
-        """The episodes of which the images of every step are needed."""
+        """The episodes that need the images of every step."""
         return "none"
 
     def finish(self, result: EpisodeResult, second_pass: SecondPass) -> Artifacts:
@@ -52,7 +52,7 @@ RecorderFactory = Callable[[EvalConfig, float | None], EpisodeRecorder]  # calle
 
 
 class Recording(EpisodeRecorder):
-    """Records one episode as `config` says, for people and for files."""
+    """Records one episode by the settings `video` and `record`."""
 
     def __init__(self, config: EvalConfig, fps: float | None) -> None:
         self._wants_video, self._wants_trajectory = config.video, config.record

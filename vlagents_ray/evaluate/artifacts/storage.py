@@ -1,4 +1,4 @@
-"""The files of an episode: where they are, how they are written whole, and what is raised if the disk is full."""
+"""The files of an episode: their paths, atomic writing, and errors of the disk."""
 
 from __future__ import annotations
 
@@ -54,12 +54,12 @@ def episode_folder(out: Path, kind: str, cell: EvalCase) -> Path:
 
 
 def stem(key: EpisodeKey) -> str:
-    """The beginning of the names of an episode's files, before "_" or "."."""
+    """Return the beginning of the names of an episode's files, before "_" or "."."""
     return f"ep{key.episode:04d}_seed{key.seed}"
 
 
 def require_below(path: str) -> str:
-    """Return `path`, of an episode's file in results.db, or raise `ConfigError` if it leads out of the folder.
+    """Return the `path` of an episode's file in results.db, or raise `ConfigError` if it leads out of the folder.
 
     The folder may come from another machine.
     """
@@ -67,13 +67,13 @@ def require_below(path: str) -> str:
     if not parts or path.startswith("/") or ".." in parts or "\0" in path:
         raise ConfigError(
             f"got {path!r} as a file of an episode, want a path below the folder of results; "
-            f"no evaluation writes another: do not trust whoever made this results.db"
+            f"no evaluation writes another: do not trust the author of this results.db"
         )
     return path
 
 
 def inside(home: Path, path: str) -> Path:
-    """The absolute path of the file `path` in the folder of results `home`, whether it exists or not.
+    """Return the absolute path of the file `path` in the folder of results `home`; it need not exist.
 
     Raises `ConfigError` if it leads out of that folder, also by a symbolic link: its target is neither read, copied nor
     published.
@@ -88,7 +88,7 @@ def inside(home: Path, path: str) -> Path:
 
 
 def require_there(path: Path) -> Path:
-    """Return `path`, of an episode's file, or raise `ConfigError` if it is missing, as in a folder copied in part."""
+    """Return the `path` of an episode's file, or raise `ConfigError` if it is missing, as in a partial copy."""
     if not path.is_file():
         raise ConfigError(
             f"{path}: got no file, want the one that results.db names there; copy the folder again from where it was "
@@ -104,7 +104,7 @@ def remove_old(folder: Path, key: EpisodeKey) -> None:
 
 
 def outcome(result: EpisodeResult) -> str:
-    """The outcome of an episode: "success", "failure", "policy_error" or "infra_failed"."""
+    """Return the outcome of an episode: "success", "failure", "policy_error" or "infra_failed"."""
     if result.status != "done":
         return result.status
     return "success" if result.success_once else "failure"
@@ -112,7 +112,7 @@ def outcome(result: EpisodeResult) -> str:
 
 @contextmanager
 def whole(path: Path) -> Iterator[Path]:
-    """A path to write a file to, which is renamed to `path` when it is whole; missing folders are made.
+    """Yield a path for writing, which is renamed to `path` when the file is complete; make missing folders.
 
     If writing fails, the file is removed: others need the room on a full disk.
     """
@@ -129,7 +129,7 @@ def whole(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def whole_folder(path: Path) -> Iterator[Path]:
-    """A folder to write into, which becomes `path`, an empty folder or none so far, when all of it is written.
+    """Yield a folder for writing, which becomes `path`, missing or empty so far, when it is complete.
 
     It is beside `path` until then, and removed if writing fails.
     """
@@ -153,7 +153,7 @@ def link_or_copy(source: Path, target: Path) -> None:
 
 @contextmanager
 def storing(folder: Path) -> Iterator[None]:
-    """Raise `StorageFailed` in place of an error of the disk that `folder` is on, with its cause and its cure.
+    """Raise `StorageFailed` in place of an error of the disk of `folder`, with cause and cure.
 
     Use it around code in which only the disk raises `OSError`. Other errors pass.
     """
@@ -168,7 +168,7 @@ def storing(folder: Path) -> Iterator[None]:
 
 
 def _number(error: sqlite3.OperationalError, folder: Path) -> int | None:
-    """The errno of an error of SQLite; None if it is not about the disk."""
+    """Return the errno of an error of SQLite; None if it is not about the disk."""
     number = _SQLITE.get(str(error))
     disk = os.statvfs(next(one for one in (folder, *folder.absolute().parents) if one.exists()))
     if number == errno.EACCES and disk.f_flag & os.ST_RDONLY:
@@ -177,12 +177,12 @@ def _number(error: sqlite3.OperationalError, folder: Path) -> int | None:
 
 
 def driver_code() -> dict[str, GitState | None]:
-    """The git state of the working directory and of this package; None where there is no git repository."""
+    """Return the git state of the working directory and of this package; None where there is no git repository."""
     return {"folder": code_in(Path.cwd()), "vlagents_ray": code_of("vlagents_ray")}
 
 
 def versions() -> dict[str, Any]:
-    """The versions of Python, of packages and of the platform in the driver, and `driver_code` as JSON."""
+    """Return the versions of Python, of packages and of the platform in the driver, and `driver_code` as JSON."""
     packages = {}
     for name in ("vlagents-ray", "ray", "numpy", "av"):
         try:
@@ -194,7 +194,7 @@ def versions() -> dict[str, Any]:
 
 
 def policy_code(metadata: dict[str, Any]) -> GitState | None:
-    """The git state of a policy's code, diff included, if it is the same here as on its server; else None."""
+    """Return the git state of a policy's code, diff included, if it is the same here as on its server; else None."""
     policy = metadata.get("policy")
     here = code_of(names("policies").get(policy, policy)) if isinstance(policy, str) else None
     return here if here is not None and here.to_json() == metadata.get("code") else None

@@ -40,11 +40,11 @@ class Trajectory:
 
     actions: np.ndarray  # (T, D) float32, as executed
     rewards: np.ndarray  # (T,) float64
-    success: np.ndarray  # (T,) bool: was the task solved in the state that the action led to?
+    success: np.ndarray  # (T,) bool: whether the task was solved in the state after the action
     state: dict[str, np.ndarray]  # (T + 1, D) float32, in the contract's units
     gripper: np.ndarray | None  # (T + 1,) float32 in [0, 1], 1 = open
     cameras: tuple[str, ...]
-    versions: np.ndarray  # (T,) int64, of the weights that chose each action; NO_VERSION where none did
+    versions: np.ndarray  # (T,) int64, of the weights that chose each action, or NO_VERSION
 
     def to_bytes(self) -> bytes:
         """Encode the trajectory as an .npz file, in which nothing is pickled."""
@@ -117,7 +117,7 @@ class TrajectoryRecorder(EpisodeObserver):
         self._success.append(success)
 
     def finish(self) -> Trajectory:
-        """The trajectory; if no action was executed, the shape of `actions` is (0, 0)."""
+        """Return the trajectory; if no action was executed, the shape of `actions` is (0, 0)."""
         return Trajectory(
             np.stack(self._actions) if self._actions else np.zeros((0, 0), np.float32),
             np.array(self._rewards, np.float64),
@@ -134,8 +134,8 @@ def save_trajectory(
 ) -> str | None:
     """Write `out/trajectories/POLICY/SUITE/ENV/epNNNN_seedS.npz` and `_CAMERA.mp4`; returns the first's path in `out`.
 
-    `videos` are the paths at which `footage.shown` was saved, in its order: the same file is not there twice. The .npz
-    comes last: where it is, the rest is. What an earlier attempt at the episode left is removed.
+    `videos` are the paths of `footage.shown`, in its order, so that no file is written twice. The .npz is written last:
+    if it exists, the other files do. Files of an earlier attempt at the episode are removed.
     """
     saved = dict(zip(footage.shown, videos, strict=True))
     folder = episode_folder(out, TRAJECTORIES, cell)
@@ -156,7 +156,7 @@ def save_trajectory(
 
 
 def videos_of(trajectory: Path, cameras: Iterable[str]) -> dict[str, Path]:
-    """The MP4s of what the policy saw, by camera; `cameras` are all of the trajectory's. Frame i is observation i."""
+    """Return the MP4s of the policy's images by camera; `cameras` are the trajectory's. Frame i is observation i."""
     return {camera: trajectory.with_name(f"{trajectory.stem}_{name}.mp4") for camera, name in distinct(cameras).items()}
 
 

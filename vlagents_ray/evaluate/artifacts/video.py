@@ -1,9 +1,8 @@
 """Videos of episodes, as H.264 in MP4, which browsers play.
 
-Frames are encoded as they come, in the worker: at 224x224 a frame takes about 0.3 ms, less than
-keeping it as a JPEG would, so there is no thread and no backlog. The file is made in memory and travels
-to the driver with the episode's result; that works on any node, and nothing half-written is left
-by a worker that dies.
+Frames are encoded at once, in the worker: at 224x224 a frame takes about 0.3 ms, less than a JPEG, so there is no
+thread and no backlog. The file is made in memory and sent to the driver with the episode's result, which works on any
+node and leaves no partial files of a worker that dies.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ class Footage:
 
 
 class VideoRecorder:
-    """Videos of one episode, one a camera. Use as a context manager: leaving it frees the encoders."""
+    """Videos of one episode, one for each camera. Use as a context manager, whose end frees the encoders."""
 
     def __init__(self, fps: float | None = None) -> None:
         self._fps = fps or DEFAULT_FPS
@@ -74,8 +73,7 @@ def save_videos(out: Path, cell: EvalCase, result: EpisodeResult, videos: dict[s
 
     A suite without a name has no folder. Two cameras never share a file (`vlagents_ray.naming.distinct`).
 
-    Each file is whole from the moment it has its name, and what an earlier attempt at the episode
-    left is removed.
+    Each file is complete once it has its name. Files of an earlier attempt at the episode are removed.
     """
     folder = episode_folder(out, VIDEOS, cell)
     remove_old(folder, result.key)

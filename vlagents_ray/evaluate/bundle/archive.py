@@ -1,8 +1,8 @@
 """The file of a bundle: a ZIP archive whose first member lists the others with their digests.
 
-An archive may come from a stranger. Its list of members is checked before one of them is read: every name is one that
-`pack` could have written, so that none leads out of the folder; no member is a link; the sizes are bounded, and no
-member yields more bytes than it states. Nothing is unpickled, and nothing of it is imported.
+An archive may come from a stranger. Its list of members is checked before any is read: `pack` could have written every
+name, so that none leads out of the folder; no member is a link; the sizes are bounded, and no member yields more bytes
+than it states. Nothing is unpickled or imported.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ _KNOWN = re.compile(
     rf"|{TRAJECTORIES}/({_PART}/){{1,3}}{_PART}\.(npz|mp4)|{VIDEOS}/({_PART}/){{1,3}}{_PART}\.mp4"
 )
 _BROKEN = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError)
-_DISTRUST = "no `vlagents-ray bundle` writes that: do not trust whoever made this bundle"
+_DISTRUST = "no `vlagents-ray bundle` writes that: do not trust the author of this bundle"
 
 
 class FileDigest(BaseModel):
@@ -84,7 +84,7 @@ def pack(folder: Path, archive: Path) -> str:
     """Write all files of `folder` into the bundle `archive`, whole or not at all; the same files give the same bytes.
 
     Returns:
-        The SHA-256 of the manifest, which stands for everything in the bundle.
+        The SHA-256 of the manifest, which identifies the content of the bundle.
     """
     paths = sorted(path for path in folder.rglob("*") if path.is_file())
     names = {path.relative_to(folder).as_posix(): path for path in paths}
@@ -103,7 +103,7 @@ def pack(folder: Path, archive: Path) -> str:
 
 
 def _member(name: str, how: int = zipfile.ZIP_DEFLATED) -> zipfile.ZipInfo:
-    member = zipfile.ZipInfo(name)  # of 1980: the time is no part of the results
+    member = zipfile.ZipInfo(name)  # of 1980: the time is not part of the results
     member.compress_type, member.external_attr = how, (stat.S_IFREG | 0o644) << 16
     return member
 
@@ -115,7 +115,7 @@ def unpack(archive: Path, folder: Path, *, most_bytes: int = MOST_BYTES) -> tupl
         The manifest, its SHA-256, and the differences between the manifest and the files, a sentence each.
 
     Raises:
-        ConfigError: The file is no bundle, or is larger than allowed; nothing that it names leads out of `folder`.
+        ConfigError: The file is no bundle, or is larger than allowed, or has a name that leads out of `folder`.
     """
     with _opened(archive) as file:
         members = _checked(archive, file, most_bytes)
@@ -143,7 +143,7 @@ def _opened(archive: Path) -> Iterator[zipfile.ZipFile]:
 
 
 def _checked(archive: Path, file: zipfile.ZipFile, most_bytes: int) -> dict[str, zipfile.ZipInfo]:
-    """The members by their names, all of them checked as far as is possible without reading them."""
+    """Return the members by their names, after all checks that need not read them."""
     listed = file.infolist()
     if len(listed) > _MOST_MEMBERS:
         raise ConfigError(f"{archive}: got {len(listed)} files, want at most {_MOST_MEMBERS}; {_DISTRUST}")
@@ -206,17 +206,17 @@ def _differences(stated: dict[str, FileDigest], found: dict[str, FileDigest]) ->
 def write_bundle(folder: Path, archive: Path, *, videos: bool = False) -> str:
     """Write the results in `folder` as one file that others can check (`verify`).
 
-    It holds results.db as it is now, the differences from the commits, and the trajectories, with which episodes are
-    played again. Nothing that is computed from these is in it. The database names the files that are in the bundle, so
-    that its results can be merged with others.
+    It holds the present results.db, the differences from the commits, and the trajectories, by which episodes are
+    played again, but nothing that is computed from these. The database names only files in the bundle, so that its
+    results can be merged with others.
 
     Args:
-        folder: A folder of results, which may be written to meanwhile; nothing in it is changed.
+        folder: A folder of results, to which an evaluation may be writing; nothing in it is changed.
         archive: The file.
-        videos: Whether the bundle also holds the videos: of the report, and of what the policy saw.
+        videos: Whether the bundle also holds the videos: those of the report, and of the policy's images.
 
     Returns:
-        The SHA-256 of its manifest, which stands for all that is in it.
+        The SHA-256 of its manifest, which identifies its content.
 
     Raises:
         ConfigError: The folder has no results, or one of its files is outside of it.
@@ -226,7 +226,7 @@ def write_bundle(folder: Path, archive: Path, *, videos: bool = False) -> str:
         archive.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=f"{archive.name}.part-", dir=archive.parent) as temporary:
             stage = Path(temporary)
-            # One consistent state, also while an evaluation writes to it.
+            # One consistent state, even while an evaluation writes to it.
             with reading(folder) as source, closing(sqlite3.connect(stage / DATABASE)) as target:
                 source.backup(target)
             _link_files(folder, stage, Results.load(stage), videos=videos)
@@ -253,7 +253,7 @@ def _link_files(folder: Path, stage: Path, results: Results, *, videos: bool) ->
 
 
 def _name_what_is_there(stage: Path) -> None:
-    """Leave out the names of files that the bundle does not have."""
+    """Remove the names of files that are not in the bundle."""
     with closing(sqlite3.connect(stage / DATABASE)) as db, db:
         for key, videos, trajectory in db.execute("SELECT key, videos, trajectory FROM episodes").fetchall():
             there = [path for path in json.loads(videos) if (stage / path).is_file()]

@@ -1,4 +1,4 @@
-"""Checks a bundle: its digests, its tables, its recordings, the software, and some of its episodes by playing them.
+"""Verification of a bundle: digests, tables, recordings, software, and some episodes by playing them.
 
 A replay plays the recorded actions in their environment, and compares. No policy is needed.
 """
@@ -41,15 +41,15 @@ MOST_TRAJECTORY = 2**30  # bytes of one, unpacked
 _TOLERANCE = 1e-9  # relative: sums of floating-point numbers may differ in their last bits
 _SHOWN = 3  # differences in a finding
 _LENGTH = 80  # characters of a value in a finding
-_SOFTWARE = ("python", "platform", "vlagents-ray", "ray", "numpy", "av")  # those that `versions` names
+_SOFTWARE = ("python", "platform", "vlagents-ray", "ray", "numpy", "av")  # keys of `versions`
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
     """One check.
 
-    "differs" means that the bundle contradicts itself, or that a replay had another outcome; "other here" that software
-    or numbers here are not those there, which alone is no fault of the bundle.
+    "differs" means that the bundle contradicts itself, or that a replay had another outcome; "other here" means other
+    software or numbers here, which alone is no fault of the bundle.
     """
 
     subject: str
@@ -61,7 +61,7 @@ class Finding:
 class Verification:
     """The findings on a bundle."""
 
-    digest: str  # SHA-256 of the bundle's manifest, which stands for all that is in it
+    digest: str  # SHA-256 of the bundle's manifest, which identifies its content
     findings: list[Finding]
 
     @property
@@ -75,22 +75,22 @@ def verify(
 ) -> Verification:
     """Check a bundle, which may come from a stranger.
 
-    None of its text is run, imported or unpickled. Its environments are only made if they are registered here, and
-    with options that are numbers and words, unless `trust` is set.
+    None of its text is run, imported or unpickled. Its environments are only made if they are registered here and their
+    options are numbers and words, unless `trust` is set.
 
     Args:
         bundle: The file.
-        into: A new folder for its results, which then can be read, merged and exported as any others; None: they are
-            removed again. Summary and report there are written from the database.
+        into: A new folder for its results, which can be read, merged and exported as any others; None: they are
+            removed. Summary and report in it are written from the database.
         replay: The number of episodes whose recorded actions are played again.
-        trust: Whether its environments are made whatever code and files they name.
+        trust: Whether its environments may name any code and files.
         most_bytes: The most bytes that its files may have together.
 
     Returns:
         The findings.
 
     Raises:
-        ConfigError: The file is no bundle, is larger than allowed, or its database cannot be read; or `into` is there.
+        ConfigError: The file is no bundle, is larger than allowed, or its database cannot be read; or `into` exists.
         StorageFailed: The disk is full, or cannot be written to.
     """
     if into is not None and into.exists():
@@ -100,7 +100,7 @@ def verify(
         if parent is not None:
             parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix="bundle.part-", dir=parent) as temporary:
-            folder = Path(temporary) / (into or bundle).name  # which is in the page
+            folder = Path(temporary) / (into or bundle).name  # the name is in the report
             folder.mkdir()
             manifest, digest, odd = unpack(bundle, folder, most_bytes=most_bytes)
             fine = f"{len(manifest.files)} files have the SHA-256 that {MANIFEST} states"
@@ -112,7 +112,7 @@ def verify(
             except (ArithmeticError, LookupError, RecursionError, TypeError, ValueError, AttributeError) as error:
                 raise ConfigError(
                     f"{bundle}: its database holds values that no evaluation writes ({type(error).__name__}: {error}); "
-                    f"do not trust whoever made it"
+                    f"do not trust its author"
                 ) from error
             if into is not None:
                 os.replace(folder, into)
@@ -120,7 +120,7 @@ def verify(
 
 
 def _check(folder: Path, replay: int, *, trust: bool) -> Iterator[Finding]:
-    """All findings but that of the digests; summary and report are written on the way."""
+    """Yield all findings except that of the digests; also write summary and report."""
     if not (folder / DATABASE).is_file():
         raise ConfigError(f"got no {DATABASE} in the bundle; want one that `vlagents-ray bundle` wrote")
     results = Results.load(folder)
@@ -151,7 +151,7 @@ def _check_cells(results: Results) -> Finding:
 
 
 def _check_trajectories(results: Results) -> Finding:
-    """Check that each recording has the actions, steps, rewards and success that the table says of its episode."""
+    """Check that each recording has the actions, steps, rewards and success of its episode in the table."""
     odd: list[str] = []
     checked, missing = 0, 0
     for cell in results.cells:
@@ -170,7 +170,7 @@ def _check_trajectories(results: Results) -> Finding:
 
 
 def _recorded(results: Results, episode: Episode) -> Trajectory | None:
-    """The recording of an episode; None if the bundle has none. Raises `ConfigError` if it cannot be read."""
+    """Return the recording of an episode; None if the bundle has none. Raises `ConfigError` if it cannot be read."""
     if episode.trajectory is None or not (path := results.file(episode.trajectory)).is_file():
         return None
     try:
@@ -182,7 +182,7 @@ def _recorded(results: Results, episode: Episode) -> Trajectory | None:
         raise ConfigError(f"{episode.trajectory}: unpacks to {size} bytes, want at most {MOST_TRAJECTORY}")
     try:
         return Trajectory.load(path)
-    except MemoryError as error:  # its header states a size that it does not have
+    except MemoryError as error:  # its header states a wrong size
         raise ConfigError(f"{episode.trajectory}: states a size that does not fit into memory") from error
 
 
@@ -213,7 +213,7 @@ def _finding(subject: str, odd: list[str], fine: str) -> Finding:
 
 
 def _check_versions(results: Results) -> Finding:
-    """Compare what the last run was made with to what is here."""
+    """Compare the software of the last run with that here."""
     there, here = results.runs[-1].versions, versions()
     stated = {name: (there.get(name), here[name]) for name in _SOFTWARE} | {"commit": (_commit(there), _commit(here))}
     odd = [f"{name} {was} there, {now} here" for name, (was, now) in stated.items() if was != now]
@@ -230,7 +230,7 @@ def _commit(found: Mapping[str, Any]) -> str:
     return f"{state['commit']} with changes" if state.get("diff_sha256") else str(state["commit"])
 
 
-_CODE = re.compile("trust.*|module|source_dir")  # options that say whose code is run, though they may be words
+_CODE = re.compile("trust.*|module|source_dir")  # options that choose code, although they may be words
 _WORD = re.compile(r"\w[\w.+-]{0,63}")  # a value that is text, and no path, URL or "module:Class"
 
 
@@ -240,7 +240,7 @@ class Replayed:
 
     steps: int
     outcome: tuple[bool, bool, int | None]  # success once, success at the end, steps after which it was first solved
-    differs_from: int | None  # the first step whose state, reward or success is another; 0 is the reset
+    differs_from: int | None  # first step with another state, reward or success; 0 is the reset
     largest: float  # difference of a number of the state or of a reward
     described: Mapping[str, Any]  # by the environment here
 
@@ -272,7 +272,7 @@ def replay_actions(cell: CellResults, episode: Episode, trajectory: Trajectory) 
     Images are neither rendered nor compared. State, gripper, rewards and success are, bit by bit.
 
     Raises:
-        ConfigError: The environment does not take these options, or is unknown here; also `MissingDependency`.
+        ConfigError: The environment refuses these options, or is unknown here; also `MissingDependency`.
         EnvFailed: The simulator failed.
     """
     key = episode.result.key
@@ -295,7 +295,7 @@ def replay_actions(cell: CellResults, episode: Episode, trajectory: Trajectory) 
 
 
 class _Comparison:
-    """Compares what the environment gives with a recording, step by step."""
+    """Compares an environment with a recording, step by step."""
 
     def __init__(self, recorded: Trajectory) -> None:
         self._recorded = recorded
@@ -357,7 +357,7 @@ def _check_replays(results: Results, most: int, *, trust: bool) -> Iterator[Find
 
 
 def _chosen(results: Results, most: int) -> list[tuple[CellResults, Episode, Trajectory]]:
-    """The first episode with a recording of each cell in turns, then the second of each, and so on."""
+    """Return the first episode with a recording of each cell in turns, then the second of each, and so on."""
     left = [
         (cell, iter([one for one in cell.episodes if one.result.status == "done" and one.trajectory is not None]))
         for cell in results.cells

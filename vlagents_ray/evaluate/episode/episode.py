@@ -46,8 +46,8 @@ class EpisodeSettings:
     """The settings of episodes of one cell."""
 
     execute: int | None = None  # rows of each action chunk that are executed, open loop; None: all
-    # Real-time mode, in which time passes while the policy computes, for each episode by itself (see `latency`); None:
-    # the environments wait for the policy.
+    # Real-time mode, in which each episode's time passes while the policy computes (see `latency`); None: the
+    # environments wait for the policy.
     clock: ClockConfig | None = None
     reset_options: Mapping[str, Any] = field(default_factory=dict)  # of each reset of an environment
     policy_options: Mapping[str, Any] = field(default_factory=dict)  # of each reset of the policy
@@ -76,7 +76,7 @@ def run_episodes(
         agent: The policy.
         sessions: The session of each episode.
         keys: Environment, number and seed of each episode.
-        settings: What the episodes have in common.
+        settings: The common settings of the episodes.
         observers: The observer of each episode, or none.
         watch: Called before each phase that may take long.
         images: Whether the observers need the images of every step. If not, the environments may leave out those
@@ -171,7 +171,7 @@ class _Episode:
             self.failed(error)
 
     def instructed(self, instruction: str) -> None:
-        """Take up a further task; what is left of the plan was for the last one."""
+        """Begin a further task, and drop the rest of the plan, which was for the last one."""
         self.stats.instructed(instruction)
         self.ticks.clear()
         self._executor, self._done = self.new_executor(), False
@@ -189,7 +189,7 @@ class _Episode:
                 latency_s = self._executor.latency_s(seconds)
                 self.stats.acted(answer, seconds, latency_s)
             rows = Act(check_action(answer.action, contract)).rows()
-            if self._width not in (None, rows.shape[1]):  # the environment's contract states no size
+            if self._width not in (None, rows.shape[1]):  # if the environment's contract states no size
                 raise InvalidAction(f"action: got {rows.shape}, want {self._width} numbers a row, as in the first")
             self._width = rows.shape[1]
             ticks = list(self._executor.ticks(rows, latency_s or 0.0))
@@ -228,12 +228,12 @@ def _instructed(env: BatchEnv, playing: Sequence[_Episode]) -> list[_Episode]:
 
 
 def _reset_policy(agent: Agent, episodes: Sequence[_Episode], contract: Contract, options: Mapping[str, Any]) -> None:
-    """Reset the session of each episode with its observation; a server gets all of them in one message."""
+    """Reset the session of each episode with its observation, in one message to a server."""
     keys, sessions = [one.stats.key for one in episodes], [one.session for one in episodes]
     first, texts = [_for_policy(one.obs, {}) for one in episodes], [one.stats.instruction for one in episodes]
     seeds = [key.seed if key.policy_seed is None else key.policy_seed for key in keys]
     given = {**options, "env": keys[0].env}
-    if hasattr(agent, "metadata"):  # a server compares the contract, too, and answers 409
+    if hasattr(agent, "metadata"):  # a server also compares the contract, and answers 409
         given["contract"] = contract.to_json()
     answers: Iterable[dict[str, Any] | Exception]
     if isinstance(agent, RemoteAgent):

@@ -57,18 +57,18 @@ _USER = (
 )
 _POLICY = (PolicyUnavailable, DeadlineExceeded, UnknownSession, NotReset)
 _WORKER = (EnvFailed, InvalidInput)  # InvalidInput here: an unusable observation of the environment
-# By these errors an environment does not say that it broke, but reports its settings, a breach of its contract, a
-# missing package, or an action that it refuses.
+# These errors of an environment are no breakdown: they report settings, a breach of its contract, a missing package, or
+# a refused action.
 _FROM_ENV = (ConfigError, ContractMismatch, EnvFailed, InvalidAction, MissingDependency)
 
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """Why an attempt failed, and which side can correct it.
+    """The cause of a failed attempt, and the side that can correct it.
 
     "user": a mistake in the settings, which stops the evaluation; "policy": the connection to the policy; "worker": the
-    simulator or its process, which is then replaced, or a real robot; "operator": a person had a trial of a real robot
-    repeated.
+    simulator or its process, which is then replaced, or a real robot; "operator": the operator repeats a trial of a
+    real robot.
     """
 
     cause: Cause
@@ -184,7 +184,7 @@ def checked_obs(obs: object, contract: Contract, where: str, *, images: bool = T
         if _has_diverged(obs):
             wrong = EnvFailed
         raise wrong(f"env {where}: the observation does not fit the env's own contract: {error}") from error
-    except TypeError as error:  # a gripper that cannot be compared with 0 and 1
+    except TypeError as error:  # such as a gripper that is not a number
         raise wrong(f"env {where}: got {obs.gripper!r} as the gripper, want a number in [0, 1]") from error
     return obs
 
@@ -204,7 +204,7 @@ def _number(reward: Any) -> float:
 
 
 def _truth(value: object, name: str) -> bool:
-    """Return the bool that `value` is, also as a number, 0 or 1; raises for text: "no" would be true."""
+    """Return `value` as a bool, also from 0 or 1; raises for text, as "no" would be true."""
     if value is True or value is False:  # the usual case
         return value
     if isinstance(value, bool | np.bool_) or (isinstance(value, Real) and value in (0, 1)):

@@ -1,9 +1,9 @@
 """Real-time evaluation: the environment's clock runs while the policy computes.
 
-The clock is simulated, so no machine has to keep up. An answer that took L seconds comes ceil(L * hz) ticks after its
-observation. The environment is stepped through these ticks with the actions that `ClockConfig.meanwhile` selects, and
-then with the answer's rows, beginning with the row that the chunk player would begin with
-(`vlagents_ray.chunking.buffer.ChunkBuffer`). A synchronous evaluation is the case L = 0.
+The clock is simulated, so the speed of the machine does not matter. An answer that took L seconds comes ceil(L * hz)
+ticks after its observation. The environment is stepped through these ticks with the actions that
+`ClockConfig.meanwhile` selects, and then with the answer's rows, beginning with the row that the chunk player would
+begin with (`vlagents_ray.chunking.buffer.ChunkBuffer`). A synchronous evaluation is the case L = 0.
 """
 
 from __future__ import annotations
@@ -35,19 +35,18 @@ class Tick(NamedTuple):
 
 
 class ChunkExecutor:
-    """Decides which actions are executed from one request to the next, during one episode."""
+    """Chooses the executed actions between two requests, in one episode."""
 
     def __init__(self, execute: int | None, clock: ClockConfig | None, env: Contract) -> None:
         """Begin an episode.
 
         Args:
-            execute: Rows of a chunk before the policy is asked again; None: all.
+            execute: Rows of a chunk before the next request; None: all.
             clock: Real-time mode; None: the environment waits for the policy.
             env: The contract of the environment.
 
         Raises:
-            ConfigError: The rate of the clock is unknown, or the action that keeps the robot still before the first
-                answer.
+            ConfigError: The rate of the clock, or the action that holds the robot before the first answer, is unknown.
         """
         self._execute = execute
         self._real_time = clock is not None
@@ -65,17 +64,17 @@ class ChunkExecutor:
         self._delays: deque[int] = deque(maxlen=DELAYS)  # ticks that answers took
 
     def latency_s(self, measured_s: float) -> float | None:
-        """Return the latency that an answer counts as, s, if it took `measured_s`; None without a clock."""
+        """Return the latency of an answer that took `measured_s`, s; None without a clock."""
         if not self._real_time:
             return None
         return measured_s if self._clock.latency == "measured" else self._clock.latency
 
     def request_info(self) -> dict[str, Any]:
-        """Return the `Obs.info` for real-time chunking: the rows that are left; {} if there are none or it is off."""
+        """Return the `Obs.info` for real-time chunking: the remaining rows; {} if there are none or it is off."""
         return self._plan.continuation(self._delays) if self._clock.real_time_chunking else {}
 
     def ticks(self, rows: np.ndarray, latency_s: float) -> Iterator[Tick]:
-        """Return the ticks until the next request, after an answer of `rows`, (H, D), that counts as `latency_s`."""
+        """Return the ticks until the next request, after an answer of `rows`, (H, D), with `latency_s`."""
         if not self._real_time:
             yield from map(Tick, rows[: self._execute])
             return
@@ -85,7 +84,7 @@ class ChunkExecutor:
         for tick in self._waiting(wait, rows.shape[1]):
             self._last = tick.action
             yield tick
-        # The last row is executed however late it comes: a policy slower than its chunks would else never act.
+        # The last row is always executed, else a policy slower than its chunks would never act.
         late = self._plan.executed - len(rows) + 1
         self._plan.replace(rows, max(asked, late) if self._clock.align else None)
         first = self._plan.take()
@@ -109,7 +108,7 @@ class ChunkExecutor:
                 yield Tick(step.action, waited=True)
 
     def _goes_on(self) -> bool:
-        """Whether holding an action moves the robot; then the held action counts as a row."""
+        """Return whether holding an action moves the robot; then the held action counts as a row."""
         return self._clock.meanwhile == "hold" and self._plan.executed > 0 and stopping(self._spec) == "zero"
 
     def _held(self, dim: int) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The records of an episode and of its worker in the results, and what observes an episode."""
+"""The records of an episode and of its worker in the results, and the observer of an episode."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class EpisodeResult:
     steps: int = 0  # actions executed
     episode_return: float = 0.0  # sum of rewards
     ending: Ending = "error"
-    instruction: str = ""  # several one after another with semicolons
+    instruction: str = ""  # several are joined with semicolons
     error: str | None = None
     seconds: float = 0.0  # from reset to the last step
     reset_ms: float | None = None  # reset of the environment
@@ -39,29 +39,29 @@ class EpisodeResult:
     acts: int = 0  # answers of the policy; fewer than steps with action chunks
     policy_ms: float | None = None  # median of one act, transport included
     policy_p95_ms: float | None = None
-    policy_seconds: float | None = None  # in which the policy computed for this episode
-    latency_ms: float | None = None  # real-time mode: median of the latency that an act counted as
+    policy_seconds: float | None = None  # computing time of the policy for this episode
+    latency_ms: float | None = None  # real-time mode: median of the latencies of acts
     ticks_waited: int = 0  # real-time mode: steps between an observation and its answer
-    ticks_held: int = 0  # the ticks among them for which no row of a chunk was left
+    ticks_held: int = 0  # of these, ticks with no row of a chunk left
     timing_ms: dict[str, float] = field(default_factory=dict)  # medians of the times in `act.info["timing"]`
     transport: str = "local"
     checkpoint: str | None = None  # the checkpoint that the policy's reset returned
     weights: str | None = None  # digest of the loaded weights, for a policy that reports it
-    revision: str | None = None  # the hub's commit of them, if they were in its cache
+    revision: str | None = None  # their commit on the hub, if they were in its cache
     policy_version: int | None = None  # of the weights that computed the last act; 0 is the loaded checkpoint
-    policy_fingerprint: str | None = None  # of that version, computed by the replica from what it holds
+    policy_fingerprint: str | None = None  # of that version, computed by the replica from the weights in memory
     first_policy_version: int | None = None  # of the weights that computed the first act
     actions_sha256: str | None = None  # digest of the executed actions, (steps, D) little-endian float32, row by row
 
     @property
     def full_key(self) -> str:
-        """The key, and the beginning of the digest of the weights that played it, which no plan can know."""
+        """The key with the beginning of the digest of its weights, which are not known before the episode."""
         digits = (self.weights or "").rpartition(":")[2][:_DIGITS]
         return f"{self.key}~{digits}" if digits else str(self.key)
 
     @property
     def outcome(self) -> dict[str, Any]:
-        """Return the fields that two runs of one key must agree in: all but the times and the transport."""
+        """Return the fields that are equal in all runs of one key: all except times and transport."""
         return {one.name: getattr(self, one.name) for one in fields(self) if one.name not in _CIRCUMSTANCES}
 
 
@@ -100,11 +100,11 @@ class WorkerInfo:
     pid: int
     policy: str  # name of the policy in the evaluation
     transport: str
-    renderer: str | None  # name by its driver; None if no device draws
+    renderer: str | None  # name by its driver; None if no device renders
 
 
 class EpisodeObserver:
-    """Is called with what happens in one episode. This one ignores it: override some methods."""
+    """The callbacks of one episode. This class ignores all: override some methods."""
 
     request_info: Mapping[str, Any] = {}
     """Added to the `Obs.info` of every request to the policy."""

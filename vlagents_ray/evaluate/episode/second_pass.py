@@ -31,7 +31,7 @@ def play_actions(
         The observation of the reset with None, then that of each step with all its outputs.
 
     Raises:
-        EnvFailed: The simulator failed, or is over sooner.
+        EnvFailed: The simulator failed, or its episode ended earlier.
     """
     env.looked_at = images
     watch("env reset", 0)
@@ -49,7 +49,7 @@ def play_actions(
 
 
 class PlayedEpisode(EpisodeObserver):
-    """The actions of an episode and what came of them, with digests in place of images."""
+    """The actions and outcomes of an episode, with digests in place of images."""
 
     def __init__(self) -> None:
         self._seen: list[tuple[dict[str, Any], dict[str, Any]]] = []  # numbers and images of each observation, by name
@@ -71,11 +71,11 @@ class PlayedEpisode(EpisodeObserver):
     ) -> str | None:
         """Begin the episode in the first environment again, execute its actions, and render each observation.
 
-        State, gripper, reward and success of every step, and the images that were rendered before, must be the same to
-        the bit. The images between them then show this episode.
+        State, gripper, reward and success of every step, and the images of the first pass, must be equal to the bit, so
+        that the new images show this episode.
 
         Returns:
-            What differs, upon which nothing more is executed; None if nothing does.
+            The first difference, which ends the pass; None if there is none.
         """
         played = play_actions(env, seed, options, (action for action, _, _ in self._done), images=True, watch=watch)
         try:
@@ -86,7 +86,7 @@ class PlayedEpisode(EpisodeObserver):
                 if differs is not None:
                     steps = "the last step" if number == len(self._done) else f"{number} steps"
                     return f"after {steps}, {differs} differs"
-        except VLAgentsError as error:  # as of an environment that is over sooner
+        except VLAgentsError as error:  # such as an earlier end of the episode
             return str(error)
         return None
 

@@ -60,14 +60,14 @@ class EpisodeStats:
         self.instruction = instruction
 
     def acted(self, act: Act, seconds: float, latency_s: float | None) -> None:
-        """Record an answer of the policy, its duration and, in real-time mode, the latency that it counts as."""
+        """Record an answer of the policy, its duration and, in real-time mode, its latency."""
         self.act_ms.append(1e3 * seconds)
         timing = act.info.get("timing", {})
-        # Of a batch, each answer has its part; a policy in this process computes for as long as it is waited for.
+        # Each answer counts its share of a batch; a policy in this process computes during the whole wait.
         computed_ms = timing.get("inference_ms", 1e3 * seconds)
         self.policy_seconds += computed_ms / 1e3 / max(1, timing.get("batch_size", 1))
         for stage, spent in timing.items():
-            if stage.endswith("_ms"):  # the batch size is among them
+            if stage.endswith("_ms"):  # the batch size is not a time
                 self.timing_ms.setdefault(stage, []).append(float(spent))
         if (version := version_of(act)) is not None:
             self.policy_version, self.policy_fingerprint = version, act.info[POLICY].get("fingerprint") or None

@@ -47,7 +47,7 @@ from vlagents_ray.robot.episode import (
 
 GRIPPER_FEATURE = "observation.gripper"
 VERSION = "policy_version"
-# LeRobot's own names for what an action led to; `success` is that of the state after it.
+# LeRobot's own names for the outcome of an action; `success` is that of the state after it.
 OUTCOMES = {"next.reward": "float32", "next.success": "bool", "next.done": "bool"}
 
 
@@ -61,14 +61,14 @@ def to_lerobot(
     successes: bool = False,
     cut_idle: bool = False,
 ) -> int:
-    """Write the recorded episodes as a LeRobotDataset v3.0 into the new folder `path`, or leave nothing there.
+    """Write the recorded episodes as a LeRobotDataset v3.0 into the new folder `path`, or write nothing.
 
     Needs the extra "record". One episode at a time is in memory.
 
-    A frame is what the policy saw and the action that followed: the last observation of an episode, which none
-    followed, is left out. Angles and rotation vectors of the state that jump by a full turn are written about another
-    centre. The dataset's contract (`vlagents_ray.dataset_contract`) names it, so that the policy's server does the
-    same. If a policy named the version of its weights, each frame has that of its action, -1 where it is unknown.
+    A frame is an observation and the action after it; the last observation of an episode is left out. Angles and
+    rotation vectors of the state that jump by a full turn are written about another centre. The dataset's contract
+    (`vlagents_ray.dataset_contract`) names it, so that the policy's server does the same. If a policy named the version
+    of its weights, each frame has that of its action, or -1 if it is unknown.
 
     Args:
         cameras: The cameras of the dataset; by default all.
@@ -77,14 +77,14 @@ def to_lerobot(
         environment_state: The parts of `observation.environment_state` in this order: LeRobot's policies need it if
             they get no camera.
         successes: Leave out episodes in which the task was never solved.
-        cut_idle: End each episode where, after the task was solved, neither state nor action changes any more.
+        cut_idle: End each episode when, after the task was solved, neither state nor action changes any more.
 
     Returns:
         The number of episodes in the dataset.
 
     Raises:
-        ConfigError: No such trajectory was recorded, a file is missing, a camera or part is unknown, or the episodes do
-            not fit one dataset.
+        ConfigError: There is no such trajectory, a file is missing, a camera or part is unknown, or the episodes do not
+            fit one dataset.
     """
     recorded = [(cell, one) for cell in results.cells for one in cell.episodes if one.trajectory is not None]
     if not recorded:
@@ -104,7 +104,7 @@ def to_lerobot(
     def demonstrations() -> Iterator[_Demonstration]:
         for cell, episode in recorded:
             one = _demonstration(results, cell, episode, cameras, state, environment_state, cut_idle, with_versions)
-            if len(one.actions):  # a policy that failed before it acted leaves an empty episode, which no dataset has
+            if len(one.actions):  # a policy that failed before it acted leaves an empty episode
                 yield one
 
     angles = _angles(demonstrations())
@@ -123,7 +123,7 @@ def to_lerobot(
 
 
 _CURE = "export env by env (--env)"
-# Rest is a change from one frame to the next below this share of the range of a part of the state, or of the action.
+# At rest, changes between frames are below this share of the range of a part of the state, or of the action.
 _STILL = 0.01
 
 
@@ -207,9 +207,9 @@ def _chosen(option: str, wanted: Sequence[str] | None, known: Sequence[str], env
 
 
 def _frames_until_rest(success: np.ndarray, moving: Sequence[np.ndarray]) -> int:
-    """The number of frames until nothing moves any more after the task was solved; all frames if it never was.
+    """Return the number of frames until the robot is at rest after success; all frames without success.
 
-    One frame at rest is kept, from which the policy learns to stop.
+    One frame at rest is kept, so that the policy learns to stop.
     """
     frames = len(success)
     if not success.any():
@@ -223,7 +223,7 @@ def _frames_until_rest(success: np.ndarray, moving: Sequence[np.ndarray]) -> int
 
 
 def _angles(demonstrations: Iterable[_Demonstration]) -> dict[int, Centre]:
-    """The places in `observation.state` of angles and rotation vectors that jump, with the centres of their values."""
+    """Return the indices in `observation.state` of angles and rotation vectors that jump, with their centres."""
     angles: dict[int, list[np.ndarray]] = {}  # by place; each (N,)
     vectors: dict[int, list[np.ndarray]] = {}  # by their first place; each (N, 3)
     for one in demonstrations:
@@ -244,7 +244,7 @@ def _angles(demonstrations: Iterable[_Demonstration]) -> dict[int, Centre]:
 
 
 def _finished(one: _Demonstration, angles: Mapping[int, Centre], folder: Path) -> Finished:
-    """The episode in the form that the dataset takes; its videos are put into `folder` first."""
+    """Return the episode in the dataset's form, after putting its videos into `folder`."""
     keys = camera_keys(one.videos)
     names = {key: camera for camera, key in keys.items()}
     about = DatasetContract(_policy_contract(one), one.parts, names, angles, one.environment)
@@ -261,7 +261,7 @@ def _finished(one: _Demonstration, angles: Mapping[int, Centre], folder: Path) -
 
 
 def _policy_contract(one: _Demonstration) -> Contract:
-    """The contract of a policy that is trained on the dataset: its actions are the env's, without bounds."""
+    """Return the contract of a policy that is trained on the dataset: its actions are the env's, without bounds."""
     env = one.contract
     specs = env.state or {}
     return Contract(
@@ -274,7 +274,7 @@ def _policy_contract(one: _Demonstration) -> Contract:
 
 
 def _numbers(one: _Demonstration, about: DatasetContract) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Rows and features: the state in one vector and part by part, the action, and its outcome."""
+    """Return rows and features: the state in one vector and part by part, the action, and its outcome."""
     frames, dim = one.actions.shape
     together, names = state_vector(one.state, one.gripper, one.parts)
     together = about.wrapped(together)
@@ -312,7 +312,7 @@ def _numbers(one: _Demonstration, about: DatasetContract) -> tuple[dict[str, np.
 
 
 def _statistics(video: Path, frames: int) -> tuple[Stats, tuple[int, int]]:
-    """The statistics of the first `frames` images, and their (height, width) in pixels."""
+    """Return the statistics of the first `frames` images, and their (height, width) in pixels."""
     seen = ImageStatistics()
     with require("av").open(str(video)) as container:
         stream = container.streams.video[0]

@@ -1,4 +1,4 @@
-"""Success rates as others quote them: with the episodes, the interval, the protocol, the weights and the code.
+"""Success rates to publish, with episodes, interval, protocol, weights and code.
 
 `to_hub` writes them for a model repository of the Hugging Face Hub, in the format of
 https://huggingface.co/docs/hub/eval-results, which `huggingface_hub` 2.4 reads.
@@ -33,12 +33,12 @@ class Score:
     """The success rate of one policy id in one benchmark, or in a part of it."""
 
     results: Results
-    name: str  # "libero/libero_spatial", "tabletop"; after the name of a suite, or with the task, where that is needed
-    cells: tuple[CellResults, ...]  # that have a common rate
+    name: str  # "libero/libero_spatial", "tabletop"; with the suite or the task if needed
+    cells: tuple[CellResults, ...]  # with a common rate
 
     @property
     def metric(self) -> Metric:
-        """The success that the benchmark's protocol counts: after some step, unless it says after the last."""
+        """The success that the benchmark's protocol counts: after some step, or after the last."""
         at_end = any(_protocol(one).get("success") == _AT_END for one in self.cells)
         return "success_at_end" if at_end else "success_once"
 
@@ -60,7 +60,7 @@ class Score:
 
     @property
     def note(self) -> str:
-        """All that pools or doubts the rate, in one line of text."""
+        """Everything that qualifies the rate, in one line of text."""
         rate, counted = self.rate, [one for cell in self.cells for one in cell.counted]
         low, high = (f"{100 * bound:.1f}" for bound in rate.interval)
         kind = "95 % interval (Wilson)"
@@ -88,13 +88,13 @@ _WHEN = {"success_once": "solved after some step", "success_at_end": "solved aft
 
 
 def scores(results: Results) -> list[Score]:
-    """The scores of the only policy id in `results`, by benchmark, those of suites with other options apart."""
+    """Return the scores of the only policy id in `results`, by benchmark; suites with other options are separate."""
     if len(results.contenders) != 1:
         raise ConfigError(f"got the policies {results.contenders}, want one: name it with --policy NAME, or NAME@STEP")
     groups: dict[tuple[str, str], list[CellResults]] = {}
     for cell in results.cells:
         groups.setdefault((cell.suite, benchmark_of(cell.env)), []).append(cell)
-    # A task all of whose episodes were lost stays with its benchmark, whose score has it among the deviations.
+    # A task without episodes stays with its benchmark, whose score lists it among the deviations.
     groups = {name: cells for name, cells in groups.items() if any(cell.counted for cell in cells)}
     if not groups:
         raise ConfigError(f"{results.out}: has no finished episode, want results that a rate can be made of")
@@ -110,7 +110,7 @@ def scores(results: Results) -> list[Score]:
 
 
 def benchmark_of(env: str) -> str:
-    """The benchmark that an env's name belongs to: "libero/libero_spatial" of "libero/libero_spatial/3"."""
+    """Return the benchmark of an env: "libero/libero_spatial" of "libero/libero_spatial/3"."""
     return env if ":" in env else env.rpartition("/")[0] or env
 
 
@@ -151,7 +151,7 @@ class HubSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
-    dataset: str = Field(examples=["OWNER/NAME"])  # the benchmark's on the Hub, where its leaderboard is
+    dataset: str = Field(examples=["OWNER/NAME"])  # the benchmark's on the Hub, with its leaderboard
     task_id: str | None = None  # of that benchmark's eval.yaml; None: the name of the score, without its simulator
     source_url: str | None = None  # of the bundle, or of a paper
 
@@ -166,11 +166,11 @@ class HubSettings(BaseModel):
 def to_hub(results: Results, path: Path, **settings: Any) -> int:
     """Write the new folder `path`, whose `.eval_results/DATASET.yaml` goes into the model's repository.
 
-    It has an entry for each score. Its `value` is in per cent, and its `notes` say the episodes, the interval, the
+    It has an entry for each score. Its `value` is in per cent, and its `notes` have the episodes, the interval, the
     protocol, the deviations, the digest of the weights and the commit in one line.
 
     Args:
-        results: Of one policy id.
+        results: The results of one policy id.
         path: A folder that does not exist, or is empty.
         settings: The fields of `HubSettings`.
 
@@ -178,7 +178,7 @@ def to_hub(results: Results, path: Path, **settings: Any) -> int:
         The number of episodes that the scores count.
 
     Raises:
-        ConfigError: There are several policy ids, `task_id` stands for several scores, or `path` has files.
+        ConfigError: There are several policy ids, several scores for one `task_id`, or `path` has files.
     """
     given = HubSettings.model_validate(settings)
     found = scores(results)
@@ -210,6 +210,6 @@ def _entry(score: Score, task: str, given: HubSettings) -> dict[str, Any]:
 
 
 def _task_ids(names: list[str]) -> dict[str, str]:
-    """The names without their simulator, "libero_spatial" of "libero/libero_spatial", where that tells them apart."""
+    """Return the names without their simulator, "libero_spatial" of "libero/libero_spatial", if they stay distinct."""
     short = [plain(name.rpartition("/")[2]) for name in names]
     return dict(zip(names, short, strict=True)) if len(set(short)) == len(short) else distinct(names)

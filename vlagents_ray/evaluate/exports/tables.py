@@ -23,7 +23,7 @@ Type = Literal["string", "integer", "number", "boolean", "time", "json"]
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """One column. Any may be empty: little is known of an episode that infrastructure failed."""
+    """One column. Any may be empty, as for an episode that failed by infrastructure."""
 
     name: str
     type: Type
@@ -95,7 +95,7 @@ COLUMNS = (
 
 
 def rows(results: Results) -> Iterator[dict[str, Any]]:
-    """Every recorded episode as Python values by the names of the columns; those of type "json" are still nested."""
+    """Yield every recorded episode as Python values by column; those of type "json" are still nested."""
     for cell in results.cells:
         for episode in cell.episodes:
             yield {column.name: column.value(cell, episode) for column in COLUMNS}
@@ -117,7 +117,7 @@ def to_json(results: Results, path: Path) -> int:
 
 
 def to_csv(results: Results, path: Path) -> int:
-    """Write a head of names, and a line for each episode; None is an empty field, a boolean `true` or `false`.
+    """Write a header, and a line for each episode; None is an empty field, a boolean `true` or `false`.
 
     Returns the number of episodes.
     """

@@ -45,7 +45,7 @@ class EvalCase:
 
     @property
     def contender(self) -> str:
-        """The policy at its checkpoint, in a word: "pi0", or "pi0@20000" in a sweep."""
+        """The policy id with its checkpoint: "pi0", or "pi0@20000" in a sweep."""
         return contender(self.policy.name, self.step)
 
     @property
@@ -95,7 +95,7 @@ class EvalCase:
 
     @cached_property
     def program(self) -> Program:
-        """The files that its environment is made of, as they are now: its code, and what its settings name."""
+        """The present files of its environment: its code, and the files that its settings name."""
         return env_program(self)
 
     @property
@@ -105,12 +105,12 @@ class EvalCase:
 
 
 def env_program(cell: EvalCase, code: Callable[[str], Program] = code_of_class) -> Program:
-    """Return the files of a cell's environment, or of its robot; `code` finds those of a class."""
+    """Return the files of a cell's environment, or of its robot; `code` returns those of a class."""
     if cell.robot is not None:
         return code(cell.on_robot[0].arm or "")
     cls = env_class(cell.env)
     settings = with_defaults(cls, cell.suite.env_options) | {"reset_options": cell.suite.reset_options}
-    namespace = (env_task(cell.env) or "").rpartition("/")[0]  # of an id of Gymnasium, which is registered there
+    namespace = (env_task(cell.env) or "").rpartition("/")[0]  # of an id of Gymnasium; this module registers it
     modules = [f"{cls.__module__}:{cls.__name__}", cell.suite.env_options.get("module") or namespace]
     found = {name: digest for module in modules if isinstance(module, str) for name, digest in code(module).items()}
     return found | files_named(settings, folders=False)
@@ -121,16 +121,16 @@ def _settings(robot: RobotConfig, task: RobotTask) -> dict[str, Any]:
 
 
 def contender(policy: str, step: int | None) -> str:
-    """A policy at its checkpoint, in a word."""
+    """Return the id of a policy at its checkpoint."""
     return policy if step is None else f"{policy}@{step}"
 
 
 def cells(config: EvalConfig) -> list[EvalCase]:
-    """Every cell that `config` asks for: checkpoint by checkpoint, in each suite by suite and env by env.
+    """Return every cell of `config`: by checkpoint, then by suite and env.
 
-    Raises `UnknownEnv` for an unknown env, `ConfigError` for one that stands twice under one name, or
-    in two suites that do not differ: their episodes would have the same keys; and for names that differ only by signs
-    that a file's name cannot have: their episodes would have the same files.
+    Raises `UnknownEnv` for an unknown env. Raises `ConfigError` for an env that is listed twice under one name, or in
+    two equal suites, as their episodes would have the same keys; and for names that differ only in characters that file
+    names cannot have, as their episodes would have the same files.
     """
     robot = config.real_robot
     envs = [
@@ -166,14 +166,14 @@ def cells(config: EvalConfig) -> list[EvalCase]:
 
 
 def require_envs(config: EvalConfig) -> None:
-    """Raise `UnknownEnv` for an unknown task, `ConfigError` for options that its env does not take."""
+    """Raise `UnknownEnv` for an unknown task, `ConfigError` for options that its env refuses."""
     for cell in cells(config):
         if cell.robot is None:
             env_arguments(cell.env, cell.suite.env_options)
 
 
 def expand(pattern: str) -> list[str]:
-    """The envs that a name stands for: itself, or with `*` those of the simulator's tasks that match.
+    """Return the envs of a name: itself, or with `*` the simulator's matching tasks.
 
     Raises `UnknownEnv` for a simulator that is not registered, or if no task matches.
     """

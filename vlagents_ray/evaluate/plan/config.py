@@ -56,22 +56,22 @@ class PushedWeights(_PlanModel):
 
 
 class PolicyConfig(_PlanModel):
-    """A policy, how it is reached, and which of its checkpoints are evaluated."""
+    """A policy, its source or address, and the checkpoints to evaluate."""
 
     name: Name = "policy"  # in the results; two policies of one evaluation have different names
     # A registered policy or a deployment file, which `vlagents-ray eval` serves for the length of the run.
     source: str | None = None
-    url: str | None = None  # of a server that runs already: "http://gpu-box:8000", or "serve://NAME" in this cluster
-    config: dict[str, JsonValue] = {}  # what it is served with, over a deployment file's own
+    url: str | None = None  # of a running server: "http://gpu-box:8000", or "serve://NAME" in this cluster
+    config: dict[str, JsonValue] = {}  # settings of the policy, over a deployment file's own
     options: dict[str, JsonValue] = {}  # passed to every `reset` of the policy
-    checkpoint: str | None = None  # that the server loads; each episode's result names the one it was played by
+    checkpoint: str | None = None  # that the server loads; each episode's result names its own
     # A sweep over checkpoints: a list, or {first, last, every}; each is chosen by the reset option `checkpoint_step`.
     steps: list[NonNegativeInt] = []
-    # That the policy acts with now; their version stands for the checkpoint. Episodes of others are refused.
+    # The policy's present weights; their version replaces the checkpoint. Episodes of other weights are refused.
     pushed_weights: PushedWeights | None = None
     execute: PositiveInt | None = None  # rows executed of each action chunk; None = all
-    # How images reach a policy over a network. JPEG changes them a little, so it has to be asked for; the others
-    # do not, and "exact" takes the faster of raw and lossless, so that results never depend on the link.
+    # The codec of images over a network. JPEG changes them a little, so it must be set explicitly; the others do not,
+    # and "exact" takes the faster of raw and lossless, so that results never depend on the link.
     codec: Literal["exact", "raw", "lossless", "jpeg"] = "exact"
     transport: TransportName = "auto"
 
@@ -109,8 +109,8 @@ class WorkerConfig(_PlanModel):
     cpus: NonNegativeFloat = 0.5  # low, so that workers and policy fit on a small machine
     gpus: NonNegativeFloat = 0.0
     threads: PositiveInt = 1  # of OpenMP, MKL, llvmpipe and the like
-    # Ray's; its env_vars win over the thread settings. A simulator with packages of its own names their Python,
-    # with Ray in it: {"py_executable": "/envs/rcs/bin/python"}.
+    # Ray's; its env_vars override the thread settings. A simulator with other packages names their Python, with Ray in
+    # it: {"py_executable": "/envs/rcs/bin/python"}.
     runtime_env: dict[str, JsonValue] = {}
 
     @field_validator("runtime_env")
@@ -121,19 +121,19 @@ class WorkerConfig(_PlanModel):
 
 
 class ClockConfig(_PlanModel):
-    """Real-time mode: the env's clock runs on while the policy thinks (see `vlagents_ray.evaluate.episode.latency`)."""
+    """Real-time mode: the env's clock runs while the policy computes (see `vlagents_ray.evaluate.episode.latency`)."""
 
     # s that each answer takes: "measured" as it comes, transport included, or injected, which repeats exactly.
     latency: Literal["measured"] | Annotated[FiniteFloat, Field(ge=0)] = "measured"
-    # What is executed between observation and answer. "chunk": what is left of the last chunk, then what stops the
-    # robot: "zero" for relative actions, else "hold"; "hold": the last action again; "zero": no motion, the gripper
-    # as it was commanded.
+    # The action between observation and answer. "chunk": the rest of the last chunk, then a stop of the robot: "zero"
+    # for relative actions, else "hold"; "hold": the last action again; "zero": no motion, the gripper as it was
+    # commanded.
     meanwhile: Literal["chunk", "hold", "zero"] = "chunk"
     hz: Annotated[FiniteFloat, Field(gt=0)] | None = None  # ticks per second; None: the env's control_hz
-    align: bool = True  # drop the rows in place of which others were executed until the answer came
-    # Send the policy the rest of the last chunk, and for how many ticks it will be executed (`interface.DELAY`).
+    align: bool = True  # drop the rows for ticks at which others were executed before the answer
+    # Send the policy the rest of the last chunk, and its number of ticks (`interface.DELAY`).
     real_time_chunking: bool = False
-    # The action that is executed before the first answer, and by "zero"; None: zeros, and the gripper open at first.
+    # The action before the first answer, and of "zero"; None: zeros, and the gripper open at first.
     neutral: list[FiniteFloat] | None = None
 
 
@@ -161,8 +161,8 @@ class SuiteConfig(_PlanModel):
     reset_options: dict[str, JsonValue] = {}  # passed to every `reset` of the env
     episodes: PositiveInt = 10  # of each env and seed
     seeds: list[NonNegativeInt] = Field(default=[0], min_length=1)  # episode i uses seed + i
-    num_envs: PositiveInt = 1  # that one worker steps together, in one simulator where that can be (ManiSkill on a GPU)
-    worker: WorkerConfig | None = None  # None: as `EvalConfig.worker` says
+    num_envs: PositiveInt = 1  # that one worker steps together, in one simulator if it can (ManiSkill on a GPU)
+    worker: WorkerConfig | None = None  # None: `EvalConfig.worker`
     clock: ClockConfig | None = None  # real-time mode; None: the env waits for the policy
 
     @field_validator("envs")
@@ -205,7 +205,7 @@ class RobotTask(_PlanModel):
     """A task of a real robot, which suites name in their `envs`."""
 
     instruction: Name  # to the policy, and to the operator
-    setup: str = ""  # how the operator sets the scene
+    setup: str = ""  # instructions for setting the scene
     max_steps: PositiveInt = 600  # control ticks after which a trial ends
     rubric: dict[Name, PositiveFloat] = {}  # the points of each part of the task, for a partial success
 
@@ -215,7 +215,7 @@ class RobotConfig(_PlanModel):
 
     arm: str | None = None  # "module:Class" of the robot; None: the plan is played in simulation
     tasks: dict[Name, RobotTask] = Field(min_length=1)
-    # Draws which policy plays when; None: one is drawn, and kept in the folder of results.
+    # Draws the order of policies; None: a key is drawn, and kept in the folder of results.
     key: Annotated[str, Field(min_length=8)] | None = None
     hz: PositiveFloat = 10.0  # control rate
     # As in `ChunkPlayer` and `Guard`:
@@ -236,12 +236,12 @@ class EvalConfig(_PlanModel):
     out: Path
     workers: PositiveInt = 1  # environments rolled out in parallel
     video: EpisodeChoice = "failures"  # of which episodes there are videos
-    record: EpisodeChoice = "none"  # and of which trajectories: states, actions, rewards, and what the policy saw
+    record: EpisodeChoice = "none"  # of which there are trajectories: numbers and the policy's images
     resume: bool = False
-    accept_changes: bool = False  # resume although files of policy or environment changed; the report says so
+    accept_changes: bool = False  # resume although files of policy or environment changed; the report shows it
     worker: WorkerConfig = WorkerConfig()
     stop: StopConfig | None = None  # early stopping; None: every episode is played
-    track: list[Tracker] = []  # where rates and videos are shown beside `out`, against the training step
+    track: list[Tracker] = []  # trackers that show rates and videos beside `out`, against the training step
     tracking: TrackingConfig = TrackingConfig()
     robot: RobotConfig | None = None  # a real robot and its tasks
 
@@ -269,10 +269,10 @@ class EvalConfig(_PlanModel):
 
 
 def canonical(value: object) -> str:
-    """JSON with sorted keys and no spaces: equal values give equal text."""
+    """Return JSON with sorted keys and no spaces, so that equal values give equal text."""
     return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
 
 
 def fingerprint(settings: object) -> str:
-    """16 hexadecimal digits that stand for `settings`."""
+    """Return 16 hexadecimal digits that identify `settings`."""
     return hashlib.sha256(canonical(settings).encode()).hexdigest()[:16]

@@ -1,4 +1,4 @@
-"""Episodes as keyed jobs, and the one queue that all workers draw from."""
+"""Episodes as keyed jobs, and the common queue of all workers."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from vlagents_ray.evaluate.plan.cases import EvalCase
 
 @dataclass(frozen=True, slots=True)
 class EpisodeKey:
-    """All that decides an episode: two runs of one key give the same episode, wherever they run."""
+    """Everything that determines an episode: two runs of one key give the same episode on any machine."""
 
     env: str  # full name, suite and task
     episode: int  # its number within the env, from 0
-    seed: int  # of the env's reset, and handed to the policy's
+    seed: int  # of the resets of env and policy
     settings: str  # fingerprint of everything else that changes the outcome
     policy_seed: int | None = None  # of the policy's reset, for episodes that share the env's; None: `seed`
 
@@ -34,12 +34,12 @@ class Job:
     attempt: int = 1
 
     def again(self) -> Job:
-        """The next attempt at the same episode."""
+        """Return the next attempt at the same episode."""
         return replace(self, attempt=self.attempt + 1)
 
 
 def plan(cells: Iterable[EvalCase]) -> list[Job]:
-    """Every episode of `cells`, cell by cell; those of a further seed follow those of the one before."""
+    """Return every episode of `cells`, cell by cell and seed by seed."""
     return [
         Job(EpisodeKey(cell.env, i, seed + i, cell.fingerprint), cell)
         for cell in cells
@@ -49,7 +49,7 @@ def plan(cells: Iterable[EvalCase]) -> list[Job]:
 
 
 class JobQueue:
-    """Jobs that wait, by the environment they need, so that a worker can go on with the one it has made."""
+    """Waiting jobs by environment, so that a worker can keep its environment."""
 
     def __init__(self, jobs: Iterable[Job]) -> None:
         self._waiting: dict[str, deque[Job]] = {}  # by place
@@ -69,10 +69,10 @@ class JobQueue:
         self._of(job).appendleft(job)
 
     def take(self, kind: str, made: str | None, working: Mapping[str, int]) -> tuple[Job, ...]:
-        """The next jobs for a worker of `kind` that has made the env at place `made`; none if none of its kind waits.
+        """Return the next jobs for a worker of `kind` with the env at place `made`; none if no job of its kind waits.
 
-        They are of one cell, as many as it plays at once. A worker stays with its env while that has episodes; then
-        it goes where most wait for each worker, counting `working`: how many workers are busy at which place.
+        They are of one cell, as many as it plays at once. A worker keeps its env while that has episodes; then it takes
+        the place with the most waiting jobs for each worker, by `working`, the number of busy workers at each place.
         """
         if made is not None and self._waiting.get(made):
             return self._first(made)
@@ -82,9 +82,10 @@ class JobQueue:
         return self._first(max(waiting, key=lambda one: waiting[one] / (1 + working.get(one, 0))))
 
     def needs_worker(self, workers: Mapping[str, int], unoccupied: Mapping[str, int]) -> EvalCase | None:
-        """A cell that one more worker would be for; None if those that are `unoccupied` suffice.
+        """Return a cell for one more worker; None if the `unoccupied` ones suffice.
 
-        Both count workers by kind. It is of the kind of which most wait for each of the `workers`.
+        Both arguments count workers by kind. The cell is of the kind with the most waiting jobs for each of the
+        `workers`.
         """
         waiting: Counter[str] = Counter()
         for place, jobs in self._waiting.items():
@@ -97,7 +98,7 @@ class JobQueue:
         return next(jobs[0].cell for place, jobs in self._waiting.items() if jobs and self._kinds[place] == kind)
 
     def drop(self, settings: str) -> int:
-        """Take out what waits of the cell with this fingerprint; returns how many."""
+        """Remove the waiting jobs of the cell with this fingerprint; returns their number."""
         before = len(self)
         for place, jobs in self._waiting.items():
             self._waiting[place] = deque(job for job in jobs if job.key.settings != settings)

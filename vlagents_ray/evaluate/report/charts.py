@@ -1,7 +1,7 @@
 """Geometry of the page's charts, in SVG's units; `templates/charts.html.j2` draws them.
 
-Colours are the classes c0 to c5 of the stylesheet, so that light, dark and paper each have their own. Lines differ in
-their dashes too, for readers who cannot tell the colours apart.
+Colours are the classes c0 to c5 of the stylesheet, which has them for light, dark and print. Lines also differ in their
+dashes, for readers who cannot distinguish the colours.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from vlagents_ray.evaluate.results.statistics import Rate
 NONE, MINUS = "\u2013", "\u2212"
 _COLOURS = 6
 _DASHES = (None, "7 3", "2 3", "9 3 2 3", "12 4", "4 4")
-_GLYPH, _EDGE = 96, 6  # width of a glyph, and what a dot takes beyond the ends of its axis
+_GLYPH, _EDGE = 96, 6  # width of a glyph, and margin of a dot beyond the ends of its axis
 
 
 def percent(rate: Rate) -> str:
-    """The rate in per cent, with one decimal."""
+    """Return the rate in per cent, with one decimal."""
     return NONE if rate.rate is None else f"{100 * rate.rate:.1f}"
 
 
 def interval(rate: Rate) -> str:
-    """The interval of the rate, in per cent."""
+    """Return the interval of the rate, in per cent."""
     if rate.rate is None:
         return NONE
     low, high = rate.interval
@@ -34,14 +34,14 @@ def interval(rate: Rate) -> str:
 
 
 def interval_name(rate: Rate) -> str:
-    """The kind of that interval: a confidence sequence where cells could stop early, else Wilson's."""
+    """Return the kind of that interval: a confidence sequence if cells could stop early, else Wilson's."""
     if rate.error_rate is None:
         return "95 % Wilson interval"
     return f"{100 * (1 - rate.error_rate):g} % confidence sequence"
 
 
 def points(difference: float | None) -> str:
-    """A difference of rates, in percentage points, with its sign."""
+    """Return a difference of rates, in percentage points, with its sign."""
     if difference is None:
         return NONE
     text = f"{100 * difference:+.1f}".replace("-", MINUS)
@@ -49,24 +49,24 @@ def points(difference: float | None) -> str:
 
 
 def p_value(p: float) -> str:
-    """A p-value with its significant digits; never 0."""
+    """Return a p-value with its significant digits; never 0."""
     if p < 1e-4:
         return "< 0.0001"
     return f"{p:.4f}" if p < 0.01 else f"{p:.3f}" if p < 0.1 else f"{p:.2f}"
 
 
 def number(value: float | None, digits: int = 1) -> str:
-    """A number with thin spaces between thousands; a dash for None."""
+    """Return a number with thin spaces between thousands; a dash for None."""
     return NONE if value is None else f"{value:,.{digits}f}".replace(",", "\u202f")
 
 
 def quantity(n: int, thing: str) -> str:
-    """A number of things: "1 episode", "2 episodes"."""
+    """Return a number of things: "1 episode", "2 episodes"."""
     return f"{number(n, 0)} {thing}" if n == 1 else f"{number(n, 0)} {thing}s"
 
 
 def duration(seconds: float) -> str:
-    """A duration in at most two units: "1 h 12 min"."""
+    """Return a duration in at most two units: "1 h 12 min"."""
     if seconds < 60:
         return f"{seconds:.1f} s"
     minutes = round(seconds / 60)
@@ -74,7 +74,7 @@ def duration(seconds: float) -> str:
 
 
 def moment(seconds: float) -> str:
-    """A time in seconds since 1970, to the minute, in UTC."""
+    """Return a time in seconds since 1970, to the minute, in UTC."""
     return datetime.fromtimestamp(seconds, timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
 
 
@@ -89,7 +89,7 @@ class PlotArea(NamedTuple):
     bottom: int = 240
 
     def y(self, share: float) -> float:
-        """The height at which `share`, in [0, 1], is drawn."""
+        """Return the height at which `share`, in [0, 1], is drawn."""
         return self.top + (self.bottom - self.top) * (1 - share)
 
 
@@ -154,7 +154,7 @@ class Glyph:
 
 
 def rate_chart(series: Sequence[Series], x_label: str, title: str) -> RateChart:
-    """The lines of `series` in the order in which they are given, on a common axis from the least x to the largest."""
+    """Return the lines of `series`, in their order, on a common axis from the least x to the largest."""
     most = max((x for one in series for x, _ in one.points), default=0.0)
     least = min((x for one in series for x, _ in one.points), default=0.0)
     left, right = (least - 1, most + 1) if least == most else (least, most)
@@ -181,7 +181,7 @@ def rate_chart(series: Sequence[Series], x_label: str, title: str) -> RateChart:
 
 
 def bar_chart(rows: Mapping[str, Mapping[str, float]], title: str) -> BarChart:
-    """A bar for each of `rows`, of which there is at least one."""
+    """Return a bar for each of `rows`, at least one."""
     names = dict.fromkeys(part for parts in rows.values() for part in parts)
     styles = {name: Style(name, f"c{index % _COLOURS}") for index, name in enumerate(names)}
     longest = max(sum(parts.values()) for parts in rows.values())
@@ -197,7 +197,7 @@ def bar_chart(rows: Mapping[str, Mapping[str, float]], title: str) -> BarChart:
 
 
 def interval_glyph(rate: Rate) -> Glyph:
-    """The rate and its interval on an axis from 0 to 100 %."""
+    """Return the rate and its interval on an axis from 0 to 100 %."""
     axis = f"M{_EDGE} 8H{_GLYPH - _EDGE}"
     if rate.rate is None:
         return Glyph(axis, None, None)
@@ -206,7 +206,7 @@ def interval_glyph(rate: Rate) -> Glyph:
 
 
 def difference_glyph(difference: float, low: float, high: float, *, decided: bool) -> Glyph:
-    """A difference of rates and its interval on an axis from -100 to 100 percentage points."""
+    """Return a difference of rates and its interval on an axis from -100 to 100 percentage points."""
     middle = _GLYPH / 2
     left, dot, right = (middle + (middle - _EDGE) * value for value in (low, difference, high))
     axis = f"M{_EDGE} 8H{_GLYPH - _EDGE}M{middle:.1f} 2V14"
@@ -214,7 +214,7 @@ def difference_glyph(difference: float, low: float, high: float, *, decided: boo
 
 
 def ticks(low: float, high: float, most: int = 6) -> list[float]:
-    """Round numbers within [low, high], at most `most` or one more, at equal distances."""
+    """Return round numbers within [low, high], at most `most` or one more, at equal distances."""
     if high <= low:
         return [low]
     rough = (high - low) / most
@@ -225,7 +225,7 @@ def ticks(low: float, high: float, most: int = 6) -> list[float]:
 
 
 def short(value: float) -> str:
-    """A number for an axis: 20000 -> "20k"."""
+    """Return a number for an axis: 20000 -> "20k"."""
     for size, suffix in ((1e6, "M"), (1e3, "k")):
         if abs(value) >= size:
             return f"{value / size:g}{suffix}"
@@ -233,7 +233,7 @@ def short(value: float) -> str:
 
 
 def px(value: float) -> str:
-    """A coordinate with at most two decimals."""
+    """Return a coordinate with at most two decimals."""
     return f"{value:.2f}".rstrip("0").rstrip(".")
 
 

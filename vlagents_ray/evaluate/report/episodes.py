@@ -1,4 +1,4 @@
-"""The episodes: a table of all, videos of the solved and the unsolved ones, and what broke."""
+"""The episodes: a table of all, videos of solved and unsolved ones, and errors."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ POSTER = 224  # the most pixels of a poster's side
 SMALL = 128  # a video whose sides have fewer pixels is enlarged without blurring
 MOST_UNSOLVED, MOST_SOLVED = 24, 12  # videos
 MOST_LISTED = 20_000  # episodes
-AT_ONCE = 500  # of them are laid out when the page opens; its script shows more
+AT_ONCE = 500  # rows when the page opens; its script shows more
 MOST_ERRORS = 500
 MOST_LOGS = 50
 _OUTCOMES = {"success": "solved", "failure": "not solved", "policy_error": "policy error", "infra_failed": "lost"}
@@ -81,10 +81,10 @@ class Failures:
 
 @dataclass(frozen=True, slots=True)
 class Errors:
-    """Errors of the policies, and what infrastructure failed."""
+    """Errors of the policies, and failures of infrastructure."""
 
     of_policies: list[tuple[tuple[str, str, str], int]]  # ((policy id, task, error), episodes)
-    attempts: list[tuple[CellResults, Attempt]]  # the first `MOST_LOGS` that infrastructure failed
+    attempts: list[tuple[CellResults, Attempt]]  # the first `MOST_LOGS` that failed by infrastructure
     failed: int  # attempts
     repeated: int  # attempts
     lost: int  # episodes
@@ -102,12 +102,12 @@ class Gallery:
         self.outside: set[str] = set()  # paths that are symbolic links out of their folder of results: not shown
 
     def cards(self, found: Sequence[Found], most: int) -> list[Card]:
-        """At most so many of these episodes that have a video, taken from tasks and policies in turns."""
+        """Return at most `most` of these episodes with a video, from tasks and policies in turns."""
         drawn = (self._card(cell, one) for cell, one in _in_turns(found))
         return list(itertools.islice(filter(None, drawn), most))
 
     def player(self, video: str, label: str) -> Player | None:
-        """A player for `video`, a path of an episode; None if the file is not there."""
+        """Return a player for `video`, a path of an episode; None if the file is missing."""
         path = self._file(video)
         if path is None:
             return None
@@ -118,7 +118,7 @@ class Gallery:
         return Player(label, self._source(video, path), still, style, tall)
 
     def link(self, video: str) -> str | None:
-        """Where the page finds the file; None if it has none to link to."""
+        """Return the page's link to the file; None without one."""
         path = self._file(video)
         return None if path is None else quote(Path(os.path.relpath(path, self._page.parent.resolve())).as_posix())
 
@@ -159,7 +159,7 @@ def episodes(results: Results, gallery: Gallery) -> Episodes | None:
 
 
 def failures(results: Results, gallery: Gallery) -> Failures | None:
-    """The episodes that were not solved; None if there are none."""
+    """Return the episodes that were not solved; None if there are none."""
     found = [
         (cell, one) for cell in results.cells for one in cell.episodes if one.counts and not one.result.success_once
     ]
@@ -186,7 +186,7 @@ def errors(results: Results) -> Errors | None:
 
 
 def last_frame(video: Path) -> np.ndarray | None:
-    """(H, W, 3) uint8 RGB; None of a file that does not play."""
+    """Return the last frame, (H, W, 3) uint8 RGB; None if the file does not play."""
     av = require("av")
     try:
         with av.open(str(video)) as container:
@@ -197,18 +197,18 @@ def last_frame(video: Path) -> np.ndarray | None:
 
 
 def poster(frame: np.ndarray) -> str:
-    """A data: URL of `frame`, (H, W, 3) uint8 RGB, as a JPEG; a large frame is made smaller."""
+    """Return a data: URL of `frame`, (H, W, 3) uint8 RGB, as a JPEG; a large frame is scaled down."""
     stride = -(-max(frame.shape[:2]) // POSTER)
     return data_url("image/jpeg", encode_jpeg(np.ascontiguousarray(frame[::stride, ::stride]), quality=75))
 
 
 def data_url(kind: str, data: bytes) -> str:
-    """A URL that holds `data`, which is of the media type `kind`."""
+    """Return a URL with `data` of the media type `kind`."""
     return f"data:{kind};base64,{base64.b64encode(data).decode()}"
 
 
 def _in_turns(found: Sequence[Found]) -> Iterator[Found]:
-    """One episode of each cell that has videos, then the second of each, and so on."""
+    """Yield one episode of each cell with videos, then the second of each, and so on."""
     by_cell: dict[str, list[Found]] = {}
     for cell, one in found:
         if one.videos:

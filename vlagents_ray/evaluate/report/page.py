@@ -1,8 +1,8 @@
 """`report.html`: an evaluation as one self-contained page.
 
-Python computes what the page shows: this module, `success`, `episodes` and `provenance`, with the geometry of `charts`.
+Python computes the content: this module, `success`, `episodes` and `provenance`, with the geometry of `charts`.
 `templates/page.html.j2` is the page, `sections.html.j2` has a macro for each of its sections, `elements.html.j2` and
-`charts.html.j2` hold what these share. `report.css` and `report.js` are written into the page.
+`charts.html.j2` have their common parts. `report.css` and `report.js` are written into the page.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from vlagents_ray.evaluate.results.reader import Results, by_timing, rate_of
 from vlagents_ray.evaluate.results.summary import Summary, median, summarize
 
 FILE = "report.html"
-STAGES = {  # of `act.info["timing"]`, in the order in which a request meets them
+STAGES = {  # of `act.info["timing"]`, in their order
     "decode_ms": "decode",
     "queue_ms": "queue",
     "inference_ms": "inference",
@@ -63,7 +63,7 @@ class Figure(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """A part of the page with a heading that the table of contents leads to."""
+    """A part of the page with a heading in the table of contents."""
 
     title: str
     macro: str  # of sections.html.j2
@@ -80,8 +80,8 @@ def write_report(results: Results, path: Path, *, inline: bool = False) -> Path:
 
     Args:
         results: Of one folder, or of several (`combined`).
-        path: The file; folders that are missing are made.
-        inline: Whether videos are in the page, up to `episodes.BUDGET` bytes; the others are links, relative to `path`.
+        path: The file; missing folders are made.
+        inline: Whether videos are in the page, up to `episodes.BUDGET` bytes; others are links, relative to `path`.
 
     Returns:
         `path`.
@@ -93,7 +93,7 @@ def write_report(results: Results, path: Path, *, inline: bool = False) -> Path:
 
 
 def report(summary: Summary, gallery: Gallery) -> str:
-    """The page as text."""
+    """Return the page as text."""
     results = summary.results
     sections = [
         Section("Success", "success", success_table(summary)),
@@ -133,7 +133,7 @@ def _figures(summary: Summary) -> list[Figure]:
 
 
 def _solved(summary: Summary) -> Figure:
-    """The headline: one rate only if its cells have one in common, and of synchronous episodes if there are any."""
+    """Return the headline: a rate if its cells have a common one, of synchronous episodes if there are any."""
     best = summary.best[0]
     timing, part = next(iter(summary.parts(best).items()))
     name = "solved" if len(summary.results.contenders) == 1 else f"solved by the best, {best}"
@@ -150,31 +150,31 @@ def _solved(summary: Summary) -> Figure:
 
 @cache
 def _templates() -> Environment:
-    # Names and errors are text of others, so whatever a template is given is escaped.
+    # Names and errors are foreign text, so every value in a template is escaped.
     loader = PackageLoader(__package__ or "")
     env = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     formats = ("duration", "interval", "interval_name", "moment", "number", "p_value", "percent", "points", "quantity")
     env.filters.update({name: getattr(charts, name) for name in formats})
     env.filters.update(interval_glyph=charts.interval_glyph, px=charts.px, json=partial(json.dumps, ensure_ascii=False))
     env.globals.update(PLOT=charts.PLOT, AT_ONCE=AT_ONCE, NONE=charts.NONE, MINUS=charts.MINUS)
-    for kind in ("css", "js"):  # ours, and no template: nothing in them is escaped
+    for kind in ("css", "js"):  # our own files, not templates: nothing in them is escaped
         env.globals[kind] = Markup((files(__package__ or "") / f"report.{kind}").read_text("utf-8").strip())  # noqa: S704
     return env
 
 
 @dataclass(frozen=True, slots=True)
 class Latency:
-    """One answer of each policy in its stages, and the env's share: medians over the episodes of each one's median."""
+    """The stages of an answer of each policy, and the env's times: medians over the episodes' medians."""
 
     chart: BarChart | None  # None: no server reported its stages
     stages: list[str]  # that any policy has
     rows: list[tuple[str, list[float | None], float | None, int]]  # (policy id, ms, the env's reset in ms, answers)
     transports: list[str]
-    timed: int  # policy ids with stages, of which the chart shows the first `MOST_BARS`
+    timed: int  # policy ids with stages; the chart shows the first `MOST_BARS`
 
 
 def latency(summary: Summary) -> Latency | None:
-    """The latencies; None if no episode was played."""
+    """Return the latencies; None if no episode was played."""
     results = summary.results
     by_name = {name: [one for cell in results.of(name) for one in cell.counted] for name in results.contenders}
     played = {name: counted for name, counted in by_name.items() if counted}

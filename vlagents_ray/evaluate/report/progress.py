@@ -24,7 +24,7 @@ MOST_ROWS = 12
 
 
 class Progress:
-    """The calls of a running evaluation, which it makes from one thread. This one shows nothing: override some.
+    """The callbacks of a running evaluation, from one thread. This class shows nothing: override some.
 
     The classes of `progress_for` show them: live on a terminal, in plain lines elsewhere.
     """
@@ -47,11 +47,11 @@ class Progress:
         """
 
     def retry(self, job: Job, failure: Failure) -> None:
-        """Note that infrastructure failed an attempt; the episode will be played again.
+        """Note that an attempt failed by infrastructure; the episode will be played again.
 
         Args:
             job: The episode.
-            failure: What failed.
+            failure: The failure.
         """
 
     def stopped(self, cell: EvalCase, at: int, spared: int) -> None:
@@ -59,8 +59,8 @@ class Progress:
 
         Args:
             cell: The cell.
-            at: The number of episodes that were played.
-            spared: The number of those that were still to come, and will not be played.
+            at: The number of played episodes.
+            spared: The number of episodes that will not be played.
         """
 
     def end(self) -> None:
@@ -68,7 +68,7 @@ class Progress:
 
 
 class _CountedProgress(Progress):
-    """Counts what both displays show, and prints errors and retries as lines."""
+    """Counts for both displays, and prints errors and retries as lines."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
@@ -124,7 +124,7 @@ class _CountedProgress(Progress):
         self._console.print(text, markup=False, highlight=False, soft_wrap=not self._console.is_terminal)
 
     def _rows(self) -> list[tuple[str, str, str]]:
-        """(name, "done/planned", success so far); if there are many cells, of those that are being played."""
+        """Return (name, "done/planned", success so far), of many cells only for those being played."""
         done = {cell: self._rates[cell].episodes + self._infra_failed[cell] for cell in self._cells}
         cells = list(self._cells)
         if len(cells) > MOST_ROWS:
@@ -152,7 +152,7 @@ class _CountedProgress(Progress):
 
 
 class LiveProgress(_CountedProgress):
-    """Draws a table on a terminal again and again; errors and retries stand above it."""
+    """Updates a table on a terminal, with errors and retries above it."""
 
     def __init__(self, console: Console) -> None:
         super().__init__(console)
@@ -206,5 +206,5 @@ def progress_for(console: Console) -> Progress:
 
 
 def seconds_left(episodes: int, played: int, elapsed_s: float) -> float | None:
-    """Estimate how long so many further episodes take, s; None if nothing is left or nothing was played yet."""
+    """Estimate the time of `episodes` further episodes, s; None if none are left or none was played."""
     return episodes * elapsed_s / played if episodes > 0 and played else None

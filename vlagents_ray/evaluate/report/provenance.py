@@ -1,4 +1,4 @@
-"""Where the numbers come from: protocol, contracts, settings, versions; and how to repeat them."""
+"""Provenance of the numbers: protocol, contracts, settings, versions, and commands to repeat them."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from vlagents_ray.evaluate.results.changes import Change
 from vlagents_ray.evaluate.results.reader import CellResults, Results, Run
 from vlagents_ray.evaluate.results.summary import checkpoint_of, pushed_of, revision_of, weights_of
 
-PROTOCOL = "protocol"  # of what an env describes: the constants of its benchmark
+PROTOCOL = "protocol"  # key of an env's description: the constants of its benchmark
 _SETTINGS = ("env_options", "reset_options", "clock")
 
 
 @dataclass(frozen=True, slots=True)
 class Env:
-    """Envs that described themselves alike, with their contract."""
+    """Envs with equal descriptions, and their contract."""
 
     tasks: list[str]
     constants: Mapping[str, Any] | None  # of the benchmark
@@ -45,7 +45,7 @@ class Configuration:
 
 @dataclass(frozen=True, slots=True)
 class Again:
-    """The settings of a run as a file; a policy that Python code made cannot be in it."""
+    """The settings of a run as a file, without policies made by Python code."""
 
     yaml: str
     lacks_a_policy: bool
@@ -53,14 +53,14 @@ class Again:
 
 @dataclass(frozen=True, slots=True)
 class Repeat:
-    """What the commands that repeat the evaluation and this page need."""
+    """The arguments of the commands that repeat the evaluation and this page."""
 
     runs: list[Again]
     folders: list[str]
 
 
 def protocol(results: Results) -> list[Env]:
-    """The description and contract of the envs; envs with the same ones are one entry."""
+    """Return the description and contract of the envs; envs with the same ones are one entry."""
     alike: dict[str, tuple[CellResults, list[str]]] = {}
     for cell in results.cells:
         settings = {name: cell.settings.get(name) for name in _SETTINGS}
@@ -110,12 +110,12 @@ def _env(cell: CellResults, tasks: list[str]) -> Env:
 
 
 def _last_runs(results: Results) -> list[Run]:
-    """The last run of each folder: those before had the same settings, as far as results depend on them."""
+    """Return the last run of each folder; earlier runs had the same settings, as far as results depend on them."""
     return list({run.config.get("out"): run for run in results.runs}.values())
 
 
 def _again(run: Run) -> Again:
-    """The settings as a file. A policy that was served for the run is served again: its address is left out."""
+    """Return the settings as a file, without addresses of policies that were served for the run."""
     config = EvalConfig.model_validate(run.config)
     document = config.model_dump(mode="json", exclude_defaults=True, exclude={"out", "resume", "accept_changes"})
     for policy in document["policies"]:

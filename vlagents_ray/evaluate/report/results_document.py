@@ -27,10 +27,10 @@ WAITING, ENDED, STOPPED = "waiting", "ended", "stopped"
 
 
 class ResultsDocument:
-    """Describes the results of an evaluation, or of those of a training, which any process may be writing.
+    """Describes the results of an evaluation or a training, which any process may be writing.
 
-    `read` and `video` are called on one thread. Numbers come from the folder, by the code that makes the report: so
-    they include earlier runs and, in a training, earlier versions. Results are read only when `read` is called.
+    `read` and `video` are called on one thread. Numbers are computed from the folder by the report's code, so they
+    include earlier runs and, in a training, earlier versions. Results are read only when `read` is called.
     """
 
     reason = ""
@@ -40,7 +40,7 @@ class ResultsDocument:
     """Whether further evaluations follow each other, as those of a training's checkpoints."""
 
     def __init__(self, out: Path) -> None:
-        """Describe the results in the folder `out`, which may not be there yet."""
+        """Describe the results in the folder `out`, which need not exist yet."""
         self._out = out
         self._videos: list[str] = []  # paths of the videos by their number
         self._numbers: dict[str, int] = {}  # the reverse
@@ -50,7 +50,7 @@ class ResultsDocument:
     def read(self) -> dict[str, Any]:
         """Return {"evaluation": the document}; the same object as before if nothing in it has changed.
 
-        It may take as long as reading the folder of results, for which it takes at most 4 % of a core.
+        It may take as long as reading the folder of results, on average at most 4 % of a core.
         """
         since = time.monotonic() - self._read_at
         if self.is_due(rested=since >= max(_EVERY_S, self._took_s / _SHARE)):
@@ -71,18 +71,18 @@ class ResultsDocument:
         return path if path.is_file() else None
 
     def is_due(self, *, rested: bool) -> bool:
-        """Return whether the results are to be read; `rested` is whether that keeps to the share of a core."""
+        """Return whether to read the results; `rested` is whether that keeps to the share of a core."""
         return rested
 
     def state(self, results: Results | None) -> str:
-        """Return how the evaluation stands: "starting", or as its last run says."""
+        """Return the state of the evaluation: "starting", or that of its last run."""
         return results.runs[-1].state if results is not None and results.runs else STARTING
 
     def results(self) -> Results | None:
         """Return the results as they are now; None if there are none yet."""
         try:
             return Results.load(self._out) if (self._out / FILE).is_file() else None
-        except ConfigError:  # the file is just being made
+        except ConfigError:  # the file is being made
             return None
 
     def _describe(self) -> dict[str, Any]:
@@ -134,7 +134,7 @@ class ResultsDocument:
 
 
 def _left_s(results: Results) -> float | None:
-    """Return how long the last run takes from now on, if episodes go on to take as long as those of it so far."""
+    """Return the remaining time of the last run, s, if episodes take as long as its earlier ones."""
     run = results.runs[-1]
     played = sum(one.run == run.run for cell in results.cells for one in cell.episodes)
     left = sum(_planned(cell) - _done(cell) for cell in results.cells)
@@ -174,7 +174,7 @@ def _curves(results: Results) -> list[dict[str, Any]]:
 
 
 class ProgressDocument(ResultsDocument, Progress):
-    """Describes an evaluation that calls it as its `Progress`. The page's thread may read it meanwhile."""
+    """Describes an evaluation as its `Progress`; the page's thread may read it concurrently."""
 
     def __init__(self, out: Path, shown: Progress | None = None, *, goes_on: bool = False) -> None:
         """Describe the results in a folder."""

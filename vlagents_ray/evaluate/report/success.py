@@ -13,7 +13,7 @@ from vlagents_ray.evaluate.results.statistics import ERROR_RATE, Pairs, Rate
 from vlagents_ray.evaluate.results.summary import TOTAL, Group, Summary, group_of
 
 MOST_PAIRS = 15  # shown unfolded: those of six policy ids
-MOST_COMPARED = 780  # pairs, those of 40 policy ids; of more, as of a whole training's, only those asked for most
+MOST_COMPARED = 780  # pairs, those of 40 policy ids; of more, such as a whole training's, only the main ones
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +27,7 @@ class Block:
 
 @dataclass(frozen=True, slots=True)
 class SuccessTable:
-    """Each task, each suite where there are several, and all."""
+    """Each task, each suite if there are several, and all."""
 
     blocks: list[Block]
     several: bool  # policy ids
@@ -44,7 +44,7 @@ class LearningCurve:
 
 
 def success_table(summary: Summary) -> SuccessTable:
-    """The table that the page begins with."""
+    """Return the first table of the page."""
     total = summary.total
     parts = [part for name in summary.results.contenders for part in summary.parts(name).values()]
     return SuccessTable(
@@ -56,12 +56,12 @@ def success_table(summary: Summary) -> SuccessTable:
 
 
 def learning_curves(summary: Summary) -> list[LearningCurve]:
-    """Success over the training steps of each policy that has several; empty if none has."""
+    """Return success over the training steps of each policy with several; empty if none has."""
     return [curve for title, cells in _parts_with_a_rate(summary) if (curve := _learning_curve(title, cells))]
 
 
 def _blocks(summary: Summary) -> Iterator[Block]:
-    """Tasks in the order of the plan, after those of each suite their sum, and last the sum of all."""
+    """Yield tasks in the order of the plan, the sum of each suite after its tasks, and last the sum of all."""
     cells: dict[str, dict[str, list[Group]]] = {}
     order = {name: number for number, name in enumerate(summary.results.contenders)}
 
@@ -96,7 +96,7 @@ def _by_policy_id(cells: Sequence[CellResults], suite: str) -> list[Group]:
 
 
 def _parts_with_a_rate(summary: Summary) -> Iterator[tuple[str, list[CellResults]]]:
-    """The cells of one chart each: all, and each suite; single tasks where a suite has no common rate."""
+    """Yield the cells of each chart: all, and each suite; single tasks if a suite has no common rate."""
     timings = by_timing(summary.results.cells)
     for timing, cells in timings.items():
         suffix = "" if len(timings) == 1 else f", {timing}"
@@ -119,7 +119,7 @@ def _all_have_rates(cells: Sequence[CellResults]) -> bool:
 
 
 def _learning_curve(title: str, cells: Sequence[CellResults]) -> LearningCurve | None:
-    """A curve for each policy with several steps, a level line for each without; None if no policy has several."""
+    """Return a curve for each policy with several steps, a level line for each other; None if no policy has several."""
     by_policy: dict[str, dict[int, list[CellResults]]] = {}
     without_steps: dict[str, list[CellResults]] = {}
     for cell in cells:
@@ -176,16 +176,16 @@ class ComparisonPart:
 
 @dataclass(frozen=True, slots=True)
 class Comparisons:
-    """The pairs of policy ids, the ones that are asked for most first."""
+    """The pairs of policy ids, the main ones first."""
 
     parts: list[ComparisonPart]
-    left_out: int  # pairs beyond those asked for most, where there are very many
+    left_out: int  # pairs beyond the main ones, if there are very many
     several_timings: bool
-    reasons: list[str]  # why other pairs are not compared
+    reasons: list[str]  # reasons why other pairs are not compared
 
 
 def compare_all(summary: Summary) -> Comparisons | None:
-    """All comparisons; None for a single policy id."""
+    """Return all comparisons; None for a single policy id."""
     if len(summary.results.contenders) < 2:
         return None
     reasons: list[str] = []
@@ -207,7 +207,7 @@ def compare_all(summary: Summary) -> Comparisons | None:
 
 
 def real_time_gaps(summary: Summary) -> list[Difference]:
-    """A clock that runs on while the policy thinks (A) against one that waits (B); empty without such suites."""
+    """Return the differences of real time (A) and synchronous play (B); empty without such suites."""
     return _totals(clock_gaps(summary.results))
 
 
@@ -222,7 +222,7 @@ def _difference(one: Comparison, line: Line) -> Difference:
 
 
 def _asked_first(summary: Summary, pairs: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
-    """Each checkpoint against the one before it, and of the policies' best ones the best against the others."""
+    """Return each checkpoint with the one before it, and the best of all with the best of each other policy."""
     cells = {cell.contender: (cell.policy, cell.step) for cell in summary.results.cells}
     known = dict.fromkeys(_later_first(summary.results, pairs))
     asked = [
@@ -239,6 +239,6 @@ def _asked_first(summary: Summary, pairs: Sequence[tuple[str, str]]) -> list[tup
 
 
 def _later_first(results: Results, pairs: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
-    """The pairs with the later checkpoint as A, so that what training brought is a gain."""
+    """Return the pairs with the later checkpoint as A, so that progress is a gain."""
     order = {name: number for number, name in enumerate(results.contenders)}
     return [(a, b) if order[a] > order[b] else (b, a) for a, b in pairs]

@@ -1,4 +1,4 @@
-"""The table of results that is printed at the end of an evaluation."""
+"""The table of results at the end of an evaluation."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ def print_summary(console: Console, summary: Summary) -> None:
     """Print the table of results, failures of infrastructure, and the paths of all files written.
 
     Args:
-        console: Where to print.
-        summary: As `evaluate` returns it.
+        console: The console.
+        summary: The result of `evaluate`.
     """
     console.print(results_table(summary))
     if summary.total.policy_errors:
@@ -108,7 +108,7 @@ def _stopped(group: Group) -> str:
 
 
 def _gap(gap: Comparison) -> str:
-    """The gap to the synchronous score as the report has it: on the episodes that both clocks have."""
+    """Return the gap to the synchronous score, as in the report: on the episodes of both clocks."""
     played = [one for cell in gap.cells for one in cell.counted]
     steps = max(1, sum(one.steps for one in played))  # 0 if the policy failed before the first step of each
     waited, held = (sum(getattr(one, what) for one in played) for what in ("ticks_waited", "ticks_held"))

@@ -9,17 +9,17 @@ from typing import Any
 from vlagents_ray.evaluate.plan.config import fingerprint
 
 IDENTITY = ("policy", "checkpoint", "weights")  # of a policy's metadata
-_SWEPT = "checkpoint: "  # begins the name of a file that each step of a sweep has for itself
+_SWEPT = "checkpoint: "  # prefix of a file that each step of a sweep has
 _DIGITS = 12  # of a digest that a person reads
 MIX = "bring the old files back, give a new folder (--out), or mix both and have the report say so (--accept-changes)"
 
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """A file, a digest or a setting that is not what the earlier episodes were played with."""
+    """A file, a digest or a setting that differs from that of earlier episodes."""
 
     subject: str  # "env my_envs:Reach", "policy pi0", or "plan"
-    name: str  # of the file, or of what it is
+    name: str  # of the file or the setting
     was: str | None  # its digest; None if there was none
     now: str | None
 
@@ -28,12 +28,12 @@ class Change:
 
 
 def listed(changes: Sequence[Change]) -> str:
-    """A line for each change, for an error."""
+    """Return a line for each change, for an error."""
     return "\n".join(f"- {one}" for one in changes)
 
 
 def program_changes(subject: str, was: Mapping[str, str] | None, now: Mapping[str, str] | None) -> list[Change]:
-    """Compare two programs by file; nothing is known to have changed where one of them is None."""
+    """Compare two programs by file; no changes are known if one of them is None."""
     if was is None or now is None:
         return []
     names = sorted(name for name in was.keys() | now.keys() if was.get(name) != now.get(name))
@@ -41,7 +41,7 @@ def program_changes(subject: str, was: Mapping[str, str] | None, now: Mapping[st
 
 
 def changed(known: Mapping[str, Any], now: Mapping[str, Any], *, swept: bool) -> str | None:
-    """The field of a policy's identity that differs between two metadata of its server; None if none does.
+    """Return the field of a policy's identity that differs between two metadata of its server, or None.
 
     In a sweep (`swept`) sessions choose their checkpoint, whatever the server's is.
     """
@@ -62,7 +62,7 @@ def policy_changes(subject: str, known: Mapping[str, Any], now: Mapping[str, Any
 
 
 def policy_program(metadata: Mapping[str, Any], *, swept: bool) -> dict[str, str] | None:
-    """The program that a policy's server states; None if it states none."""
+    """Return the program in the metadata of a policy's server, or None."""
     program = metadata.get("program")
     if program is None:
         return None
@@ -70,7 +70,7 @@ def policy_program(metadata: Mapping[str, Any], *, swept: bool) -> dict[str, str
 
 
 def program_id(program: Mapping[str, str] | None) -> str | None:
-    """16 digits that stand for a program; None for one without files of its own."""
+    """Return 16 digits that identify a program; None for one without files."""
     return fingerprint(dict(program)) if program else None
 
 

@@ -12,7 +12,7 @@ from vlagents_ray.evaluate.results.changes import listed, program_changes
 from vlagents_ray.evaluate.results.reader import CellResults, Results, synchronous_twin
 from vlagents_ray.evaluate.results.statistics import Pairs, difference_interval, holm
 
-# Those of a cell's settings that are the policy's, in which compared cells may differ. All others are the env's.
+# The policy's settings among a cell's, in which compared cells may differ. All others are the env's.
 OF_POLICY = frozenset({"policy", "policy_config", "policy_options", "checkpoint", "pushed_weights", "execute", "codec"})
 ALL = "all"
 
@@ -38,7 +38,7 @@ class Line:
         return difference_interval(self.strata)
 
     def to_json(self) -> dict[str, Any]:
-        """The fields for JSON."""
+        """Return the fields for JSON."""
         beside = {"interval_95": list(self.interval), "p_holm": self.adjusted}
         return {"suite": self.suite} | self.pairs.to_json() | beside
 
@@ -54,7 +54,7 @@ class Comparison:
     cells: tuple[CellResults, ...] = ()  # of `clock_gaps`: the cells in real time
 
     def to_json(self) -> dict[str, Any]:
-        """The fields for JSON; `lines` has one entry for each suite, and the total last."""
+        """Return the fields for JSON; `lines` has one entry for each suite, and the total last."""
         return {"a": self.a, "b": self.b, "lines": [line.to_json() for line in (*self.suites, self.total)]}
 
 
@@ -77,7 +77,7 @@ def compare(results: Results, a: str, b: str) -> Comparison:
 
 
 def comparisons(results: Results, which: Sequence[tuple[str, str]]) -> list[Comparison]:
-    """`compare` each of these pairs of policy ids, with p-values that are adjusted for one another.
+    """Return `compare` for each of these pairs of policy ids, with p-values adjusted for one another.
 
     Those of one suite are one family for Holm's method, and those of all suites together another.
     """
@@ -95,7 +95,7 @@ def comparisons(results: Results, which: Sequence[tuple[str, str]]) -> list[Comp
 def comparable(
     results: Results, which: Sequence[tuple[str, str]] | None = None
 ) -> tuple[list[tuple[str, str]], list[str]]:
-    """The pairs of policy ids that `compare` accepts, and the reason for each that it refuses; by default of all."""
+    """Return the pairs of policy ids that `compare` accepts, and the reason for each refused one; by default of all."""
     pairs, reasons = [], []
     for a, b in itertools.combinations(results.contenders, 2) if which is None else which:
         try:
@@ -126,7 +126,7 @@ def clock_gaps(results: Results) -> list[Comparison]:
 
 
 def gap_to_synchronous(results: Results, cell: CellResults) -> float | None:
-    """The success rate of a real-time cell minus that of its synchronous counterpart, on the episodes that both have.
+    """Return the success rate of a real-time cell minus that of its synchronous counterpart, on their common episodes.
 
     It is in [-1, 1]; None without a counterpart, or without such episodes.
     """
@@ -178,7 +178,7 @@ def _of_env(cell: CellResults) -> dict[str, Any]:
 
 
 def _pairs(a: CellResults, b: CellResults) -> Pairs:
-    """The episodes of both cells, by success once."""
+    """Return the episodes of both cells, by success once."""
     theirs = {(one.key.episode, one.key.seed): bool(one.success_once) for one in b.counted}
     outcomes = [
         (bool(one.success_once), theirs[one.key.episode, one.key.seed])

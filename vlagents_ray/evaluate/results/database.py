@@ -1,7 +1,7 @@
-"""results.db: its tables, its lock, and how it is opened, by the one evaluation that writes it and by all that read it.
+"""results.db: its tables, its lock, and its opening for the one writing evaluation and for readers.
 
-Its journal is SQLite's rollback journal, whose locks are the file system's: hosts may share the folder, which a
-write-ahead log forbids (https://www.sqlite.org/wal.html). A commit takes a few milliseconds, and one comes an episode.
+Its journal is SQLite's rollback journal, with locks of the file system: hosts may share the folder, which a write-ahead
+log forbids (https://www.sqlite.org/wal.html). A commit takes a few milliseconds, and each episode has one.
 """
 
 from __future__ import annotations
@@ -69,16 +69,16 @@ def insert(db: sqlite3.Connection, table: str, row: Mapping[str, Any]) -> None:
 
 
 def require_readable(out: Path, db: sqlite3.Connection) -> None:
-    """Raise `ConfigError` for a results file of another version, or with other columns than this version has.
+    """Raise `ConfigError` for a results file of another version, or with other columns than this version's.
 
-    A file from elsewhere may have any text as the names of columns, by which `merge` inserts rows, and views or
-    triggers, which would compute whatever they like when a table is read or written.
+    A file from elsewhere may have any text as names of columns, by which `merge` inserts rows, and views or triggers,
+    which would run arbitrary SQL when a table is read or written.
     """
-    begins = {"table": "CREATE TABLE", "index": "CREATE INDEX"}  # a virtual table is listed as a table, too
+    begins = {"table": "CREATE TABLE", "index": "CREATE INDEX"}  # a virtual table is also listed as a table
     for kind, name, sql in db.execute("SELECT type, name, sql FROM sqlite_master WHERE sql IS NOT NULL"):
         if kind not in begins or not str(sql).startswith(begins[kind]):
             raise ConfigError(
-                f"{out / FILE}: got {name!r}, which is a {kind} that no evaluation makes: do not trust whoever made it"
+                f"{out / FILE}: got {name!r}, which is a {kind} that no evaluation makes: do not trust its author"
             )
     version = db.execute("PRAGMA user_version").fetchone()[0]
     if version != VERSION:
@@ -96,7 +96,7 @@ def require_readable(out: Path, db: sqlite3.Connection) -> None:
 
 @functools.cache
 def _known_columns() -> dict[str, set[str]]:
-    """The columns of this version, by table."""
+    """Return the columns of this version, by table."""
     with contextlib.closing(sqlite3.connect(":memory:")) as db:
         db.executescript(SCHEMA)
         tables = [name for (name,) in db.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
@@ -111,7 +111,7 @@ WAIT_S = 60.0  # for another process's transaction to end
 
 
 def read_only(out: Path) -> sqlite3.Connection:
-    """Open `out/results.db` so that nothing can change it; it may be on a read-only file system."""
+    """Open `out/results.db` read-only; it may be on a read-only file system."""
     return sqlite3.connect(f"{(out / FILE).resolve().as_uri()}?mode=ro", uri=True, timeout=WAIT_S)
 
 
@@ -150,7 +150,7 @@ def lock(out: Path) -> int:
 
 
 def is_locked(out: Path) -> bool:
-    """Whether an evaluation holds the lock of the folder `out`; it is taken to, where that cannot be known."""
+    """Return whether an evaluation holds the lock of the folder `out`; True if that cannot be determined."""
     try:
         file = os.open(out / LOCK, os.O_RDONLY)
     except FileNotFoundError:

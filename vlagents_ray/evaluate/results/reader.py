@@ -36,13 +36,13 @@ class Episode:
     attempts: int
     run: int
     finished: float  # seconds since 1970
-    env_program: str | None = None  # stands for the files of its environment, None if it has none of its own
-    policy_program: str | None = None  # the same of its policy
-    beyond: bool = False  # it is after the point at which its cell stopped, or no longer planned
+    env_program: str | None = None  # digest of the files of its environment, None if installed
+    policy_program: str | None = None  # the same for its policy
+    beyond: bool = False  # whether it comes after the end of its stopped cell, or is no longer planned
 
     @property
     def counts(self) -> bool:
-        """Whether the episode is in the rates: it is unless infrastructure failed it, or it is `beyond`."""
+        """Whether the episode is in the rates: not if it failed by infrastructure, or is `beyond`."""
         return self.result.status != "infra_failed" and not self.beyond
 
 
@@ -65,7 +65,7 @@ class Attempt:
 
 @dataclass(frozen=True, slots=True)
 class Worker:
-    """A worker that connected to a policy or made an env. One that did so twice has two entries."""
+    """A worker's connection to a policy or creation of an env; a worker may have several entries."""
 
     run: int
     at: float  # seconds since 1970
@@ -74,7 +74,7 @@ class Worker:
     pid: int
     policy: str
     transport: str
-    renderer: str | None  # with which its env draws
+    renderer: str | None  # of its env
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +87,7 @@ class Run:
     state: str  # "complete", "interrupted", "out of time", "stopped" by an error, "running", or "killed"
     config: dict[str, Any]
     versions: dict[str, Any]
-    changes: tuple[Change, ...] = ()  # in the program since earlier runs, which this one was told to accept
+    changes: tuple[Change, ...] = ()  # accepted changes in the program since earlier runs
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +117,7 @@ class CellResults:
 
     @property
     def task(self) -> str:
-        """The env, after the name of its suite if that has one: an env may be in several suites."""
+        """The env, with the name of its suite, if any, as an env may be in several suites."""
         return f"{self.suite} {self.env}".strip()
 
     @property
@@ -127,13 +127,13 @@ class CellResults:
 
     @property
     def missing(self) -> int:
-        """The number of planned episodes that have no result; a cell that stopped early misses none."""
+        """The number of planned episodes without a result; 0 for a cell that stopped early."""
         return self.planned - len(self.counted) if self.stopped_at is None else 0
 
 
 @dataclass(frozen=True, slots=True)
 class Results:
-    """The results of an evaluation, as its folder has them. They are read with `Results.load`, without Ray."""
+    """The results of an evaluation from its folder; `Results.load` reads them, without Ray."""
 
     out: Path  # the folder
     cells: tuple[CellResults, ...]  # in the order of the plan
@@ -170,7 +170,7 @@ class Results:
             for row in table(db, "attempts"):
                 attempts.setdefault(row["cell"], []).append(Attempt(**row | {"retried": bool(row["retried"])}))
             runs = [_run(row) for row in table(db, "runs")]
-            written = written or is_locked(out)  # it may have begun meanwhile
+            written = written or is_locked(out)  # it may have begun by now
             return cls(
                 out,
                 tuple(
@@ -193,20 +193,20 @@ class Results:
         return list(dict.fromkeys(cell.contender for cell in ordered))
 
     def of(self, contender: str) -> list[CellResults]:
-        """The cells of one policy id, in the order of the plan."""
+        """Return the cells of one policy id, in the order of the plan."""
         return [cell for cell in self.cells if cell.contender == contender]
 
     def file(self, path: str) -> Path:
-        """The absolute path of an episode's file, whose path relative to `out` is `path`, whether it exists or not.
+        """Return the absolute path of an episode's file with the relative `path`; it need not exist.
 
         Raises:
-            ConfigError: It is outside of its folder of results, by its path or by a symbolic link.
+            ConfigError: The path leads out of the folder of results, or follows a symbolic link out of it.
         """
         home = next((one for one in self.parts if (self.out / path).is_relative_to(one)), self.out)
         return inside(home, str((self.out / path).relative_to(home)))
 
     def among(self, cells: Sequence[CellResults]) -> Results:
-        """The same results with these cells only."""
+        """Return the same results with these cells only."""
         return dataclasses.replace(self, cells=tuple(cells))
 
     def only(self, contender: str | None = None, env: str | None = None) -> Results:
@@ -231,7 +231,7 @@ class Results:
 
 @contextmanager
 def reading(out: Path) -> Iterator[sqlite3.Connection]:
-    """Read one consistent state of all tables in `out`, which may be written to meanwhile."""
+    """Read one consistent state of all tables in `out`, even while an evaluation writes."""
     if not (out / FILE).is_file():
         raise ConfigError(f"{out}: got no {FILE} there, want a folder that an evaluation wrote its results to")
     try:
@@ -249,12 +249,12 @@ def reading(out: Path) -> Iterator[sqlite3.Connection]:
 
 
 def table(db: sqlite3.Connection, name: str, order: str = "rowid") -> Iterator[dict[str, Any]]:
-    """The rows of a table, by its columns' names."""
+    """Yield the rows of a table, by its columns' names."""
     return (dict(row) for row in db.execute(f"SELECT * FROM {name} ORDER BY {order}"))  # noqa: S608 (constants)
 
 
 def episode_of(row: dict[str, Any]) -> Episode:
-    """The episode of a row of the table; raises `ConfigError` for a path that leads out of the folder."""
+    """Return the episode of a row of the table; raises `ConfigError` for a path that leads out of the folder."""
     names = {field.name for field in dataclasses.fields(EpisodeResult)}
     known = {name: value for name, value in row.items() if name in names and name != "key"}
     for name in ("success_once", "success_at_end"):
@@ -284,9 +284,9 @@ def _cell(row: dict[str, Any], episodes: tuple[Episode, ...], attempts: tuple[At
 
 
 def _is_planned(key: EpisodeKey, seeds: Sequence[int], each: int) -> bool:
-    """Whether an episode is still planned.
+    """Return whether an episode is still planned.
 
-    After a resumption with fewer episodes, those that happened to be played of the others would be a selection.
+    After a resumption with fewer episodes, the others that were already played would be a biased selection.
     """
     return key.episode < each and key.seed - key.episode in seeds
 
@@ -297,7 +297,7 @@ def _run(row: dict[str, Any]) -> Run:
 
 
 def rate_of(cells: Sequence[CellResults], what: Literal["success_once", "success_at_end"]) -> Rate:
-    """The success rate of one cell, or of several together, with bounds that hold where cells could stop early.
+    """Return the success rate of one cell, or of several together, with bounds that hold if cells could stop early.
 
     Cells without a common rate (`have_common_rate`) are counted, and their rate is None.
     """
@@ -311,10 +311,10 @@ def rate_of(cells: Sequence[CellResults], what: Literal["success_once", "success
 
 
 def have_common_rate(cells: Sequence[CellResults]) -> bool:
-    """Whether the episodes of these cells may be put into one rate.
+    """Return whether the episodes of these cells may be counted in one rate.
 
-    Cells that stopped after different numbers of episodes have none, as their outcomes would decide their weights, nor
-    have cells with different clocks: success in real time and success while the env waits are two questions.
+    Cells that stopped after different numbers of episodes may not, as their outcomes would determine their weights; nor
+    may cells with different clocks, as success in real time differs from success while the env waits.
     """
     return len({cell.stopped_at for cell in cells}) <= 1 and len(by_timing(cells)) <= 1
 
@@ -337,10 +337,10 @@ def by_timing(cells: Sequence[CellResults]) -> dict[str, list[CellResults]]:
 
 
 def synchronous_twin(results: Results, cell: CellResults) -> CellResults | None:
-    """Find the synchronous counterpart of a cell in real time: the cell that differs in its clock alone.
+    """Find the synchronous counterpart of a cell in real time: the cell that differs only in its clock.
 
     Args:
-        results: The results that hold both.
+        results: The results with both cells.
         cell: Any cell of them.
 
     Returns:

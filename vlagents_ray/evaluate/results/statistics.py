@@ -1,4 +1,4 @@
-"""Statistics of success: rates, their paired comparison, and how success comes with time."""
+"""Statistics of success: rates and their paired comparison."""
 
 from __future__ import annotations
 
@@ -19,9 +19,8 @@ _PSEUDO_EPISODES = 2.0
 def wilson(successes: int, trials: int, z: float = Z_95) -> tuple[float, float]:
     """Compute the Wilson score interval of a success probability.
 
-    E. B. Wilson, "Probable Inference, the Law of Succession, and Statistical Inference", JASA 22
-    (1927). Unlike the textbook interval it stays inside [0, 1] and is honest for few episodes and
-    for rates of 0 % and 100 %.
+    E. B. Wilson, "Probable Inference, the Law of Succession, and Statistical Inference", JASA 22 (1927). Unlike the
+    textbook interval it stays inside [0, 1] and is accurate for few episodes and for rates of 0 % and 100 %.
 
     Args:
         successes: The number of trials that succeeded.
@@ -54,7 +53,7 @@ class Rate:
 
     successes: int
     episodes: int
-    # Where an evaluation could stop early: the confidence sequence (`confidence_sequence`), and its error rate.
+    # If an evaluation could stop early: the confidence sequence (`confidence_sequence`), and its error rate.
     bounds: tuple[float, float] | None = None
     error_rate: float | None = None
     pooled: bool = True  # False: the cells of these episodes have no common rate, so that `rate` is None
@@ -72,9 +71,9 @@ class Rate:
         return wilson(self.successes, self.episodes) if self.bounds is None else self.bounds
 
     def to_json(self) -> dict[str, Any]:
-        """The fields for JSON: `successes`, `episodes`, `rate`, and the interval.
+        """Return the fields for JSON: `successes`, `episodes`, `rate`, and the interval.
 
-        That is `wilson_95` or, where an evaluation could stop early, `confidence_sequence` with its `error_rate`.
+        The interval is `wilson_95` or, if the evaluation could stop early, `confidence_sequence` with its `error_rate`.
         """
         counts = {"successes": self.successes, "episodes": self.episodes, "rate": self.rate}
         if self.bounds is None:
@@ -90,7 +89,7 @@ class Rate:
 
 @dataclass(frozen=True, slots=True)
 class Pairs:
-    """Numbers of episodes that both A and B played, by which of them solved the task. Two of these can be added.
+    """Counts of the episodes that both A and B played, by the policy that solved the task. Counts can be added.
 
     Raises:
         InvalidInput: A number is negative.
@@ -126,7 +125,7 @@ class Pairs:
         return mcnemar(self.only_a, self.only_b)
 
     def to_json(self) -> dict[str, Any]:
-        """The four numbers, with `pairs` (their sum), `difference` and `p_value`, for JSON."""
+        """Return the four numbers, with `pairs` (their sum), `difference` and `p_value`, for JSON."""
         counts = {"both": self.both, "only_a": self.only_a, "only_b": self.only_b, "neither": self.neither}
         return counts | {"pairs": self.total, "difference": self.difference, "p_value": self.p_value}
 
@@ -154,7 +153,7 @@ def mcnemar(only_a: int, only_b: int, *, mid: bool = False) -> float:
     if min(only_a, only_b) < 0:
         raise InvalidInput(f"mcnemar: got {only_a} and {only_b} episodes, want no count below 0")
     n = only_a + only_b
-    ways = tail = 1  # to choose k of n, and up to k of n: integers, so that nothing is lost however many episodes
+    ways = tail = 1  # to choose k of n, and up to k of n: integers, exact for any number of episodes
     for k in range(min(only_a, only_b)):
         ways = ways * (n - k) // (k + 1)
         tail += ways
@@ -168,9 +167,9 @@ def difference_interval(strata: Sequence[Pairs]) -> tuple[float, float]:
     (a stratum each), as an evaluation has the same number of episodes of an env however often it is repeated. B. Efron,
     R. J. Tibshirani, "An Introduction to the Bootstrap" (1993), chapters 8 and 13.
 
-    It draws as if two more episodes had been seen, half a one of each outcome: else 20 of 20 against none, or no
-    episode that tells A from B, would give an interval of no width, which claims certainty. A. Agresti, Y. Min, "Simple
-    improved confidence intervals for comparing matched proportions", Statistics in Medicine 24 (2005).
+    It adds two episodes, half a one of each outcome: else 20 of 20 against none, or no episode that distinguishes A
+    from B, would give an interval of zero width, which claims certainty. A. Agresti, Y. Min, "Simple improved
+    confidence intervals for comparing matched proportions", Statistics in Medicine 24 (2005).
 
     No random generator is used: the limit of infinitely many draws is the distribution of a sum of independent steps of
     +1, -1 and 0, whose characteristic function is a product.
@@ -187,7 +186,7 @@ def difference_interval(strata: Sequence[Pairs]) -> tuple[float, float]:
     turns = np.exp(2j * np.pi * np.arange(2 * n + 1) / (2 * n + 1))  # (2n + 1,), one for each sum from -n to n
     transformed = np.ones_like(turns)
     for one in strata:
-        more = _PSEUDO_EPISODES / 4 * one.total / n  # of each outcome: as many of an env as it has of all episodes
+        more = _PSEUDO_EPISODES / 4 * one.total / n  # of each outcome: in proportion to the env's episodes
         a, b = ((only + more) / (one.total + 4 * more) if one.total else 0.0 for only in (one.only_a, one.only_b))
         transformed *= (a * turns + b / turns + (1 - a - b)) ** one.total
     chances = np.fft.fftshift(np.fft.fft(transformed).real).clip(min=0.0)  # in proportion, of -n, …, n

@@ -1,11 +1,11 @@
-"""Early stopping that stays honest: confidence sequences, and an order of episodes that no worker decides.
+"""Valid early stopping: confidence sequences, and an order of episodes that is independent of workers.
 
-A confidence sequence holds at all numbers of episodes together: the chance that it ever misses the true rate is at
-most the error rate, so one may look after each episode and stop whenever one likes. An interval for a fixed number
-of episodes, such as Wilson's, is not honest after that.
+A confidence sequence holds at all numbers of episodes together: the chance that it ever misses the true rate is at most
+the error rate, so the evaluation may stop after any episode. An interval for a fixed number of episodes, such as
+Wilson's, is not valid then.
 
-Quick episodes come back first, and failures take longest: what has come back is no fair sample. So only an unbroken
-beginning of the planned order counts, and where a cell stops depends on its outcomes alone.
+Quick episodes end first, and failures take longest, so the finished episodes are a biased sample. Therefore only an
+unbroken prefix of the planned order counts, and the end of a cell depends on its outcomes alone.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _HALVINGS = 60  # of an interval of length 1: below the resolution of a float
 
 
 def confidence_sequence(successes: int, trials: int, error_rate: float = 0.05) -> tuple[float, float]:
-    """Compute an interval of a success probability that stays valid if one looks after every trial.
+    """Compute an interval of a success probability that is valid after every trial together.
 
     It is {p : (n + 1) C(n, s) p^s (1 - p)^(n - s) > error_rate}: H. Robbins, "Statistical Methods Related to the Law of
     the Iterated Logarithm", Ann. Math. Statist. 41 (1970). It is the beta-binomial mixture martingale with a
@@ -44,7 +44,7 @@ def confidence_sequence(successes: int, trials: int, error_rate: float = 0.05) -
             f"confidence_sequence: got {successes} successes in {trials} trials, want 0 <= successes <= trials"
         )
     failures = trials - successes
-    # log of (n + 1) C(n, s) / error_rate: what s log p + (n - s) log(1 - p) must not fall below the negative of
+    # log of (n + 1) C(n, s) / error_rate; s log p + (n - s) log(1 - p) must be at least its negative
     room = math.lgamma(trials + 2) - math.lgamma(successes + 1) - math.lgamma(failures + 1) - math.log(error_rate)
 
     def possible(p: float) -> bool:
@@ -59,10 +59,10 @@ def confidence_sequence(successes: int, trials: int, error_rate: float = 0.05) -
 
 
 def pooled(counts: Sequence[tuple[int, int]], error_rate: float) -> tuple[float, float]:
-    """Bounds (low, high) of the success rate of several cells together, each weighted by its episodes.
+    """Return bounds (low, high) of the success rate of several cells, each weighted by its episodes.
 
-    `counts` are the (successes, trials) of each cell. Stopping decides the weights, so each cell gets an equal share of
-    the error rate: then all their bounds hold at once, and so does any weighted mean of them.
+    `counts` are the (successes, trials) of each cell. Stopping determines the weights, so each cell gets an equal share
+    of the error rate: then all their bounds hold at once, and so does any weighted mean.
     """
     counts = [one for one in counts if one[1]]
     total = sum(trials for _, trials in counts)
@@ -73,7 +73,7 @@ def pooled(counts: Sequence[tuple[int, int]], error_rate: float) -> tuple[float,
 
 
 class Stopping:
-    """Decides when one cell stops, from its episodes in whatever order they come."""
+    """Decides when one cell stops, from its episodes in any order."""
 
     def __init__(self, stop: StopConfig, seeds: Sequence[int], planned: int) -> None:
         """Start without an outcome; `seeds` and `planned` episodes (of all seeds together) are those of the cell."""
@@ -81,7 +81,7 @@ class Stopping:
         self._seeds = list(seeds)
         self._each = planned // len(seeds)
         self._outcomes: dict[int, bool] = {}  # by place in the plan
-        self._begun = 0  # length of the unbroken beginning
+        self._begun = 0  # length of the unbroken prefix
         self._successes = 0  # in it
         self.at: int | None = None  # after so many episodes the cell stops; None: not yet
 
@@ -90,7 +90,7 @@ class Stopping:
             self.add(result)
 
     def add(self, result: EpisodeResult) -> None:
-        """Add the outcome of an episode. One that infrastructure failed has none yet, and is waited for."""
+        """Add the outcome of an episode. One that failed by infrastructure has none yet, and is awaited."""
         place = self._place(result.key)
         if place is not None and result.success_once is not None:
             self._outcomes[place] = result.success_once
@@ -101,12 +101,12 @@ class Stopping:
                 self.at = self._begun
 
     def counts(self, key: EpisodeKey) -> bool:
-        """Whether the episode is before the point at which the cell stopped, so that it counts."""
+        """Return whether the episode counts, as it comes before the end of the cell."""
         place = self._place(key)
         return self.at is None or (place is not None and place < self.at)
 
     def _place(self, key: EpisodeKey) -> int | None:
-        """The index of an episode in the cell's part of `jobs.plan`; None if it is no longer planned."""
+        """Return the index of an episode in the cell's part of `jobs.plan`; None if it is no longer planned."""
         first = key.seed - key.episode
         if first not in self._seeds or key.episode >= self._each:
             return None
@@ -119,7 +119,7 @@ class Stopping:
 
 
 def _boundary(possible: Callable[[float], bool], inside: float, outside: float) -> float:
-    """The first point that is not `possible` on the way from `inside`, which is, to `outside`, which is not."""
+    """Return the first point from `inside` to `outside` that is not `possible`."""
     for _ in range(_HALVINGS):
         middle = (inside + outside) / 2
         if middle in (inside, outside):

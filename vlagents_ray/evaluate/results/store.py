@@ -1,7 +1,7 @@
 """Writes `results.db`: the state of an evaluation in SQLite, with one transaction for each episode.
 
-A commit survives the death of the process that made it, whenever that comes; so an evaluation
-that is killed and resumed has each episode exactly once. Read it with `vlagents_ray.evaluate.results.reader`.
+A commit survives the end of its process at any time, so an evaluation that is killed and resumed has each episode
+exactly once. Read it with `vlagents_ray.evaluate.results.reader`.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ class Store:
 
         Raises:
             ConfigError: There are results and `config.resume` is off, they have other settings or another program and
-                `config.accept_changes` is off, or another evaluation is writing there.
-            StorageFailed: Nothing can be written there.
+                `config.accept_changes` is off, or another evaluation is writing to them.
+            StorageFailed: The folder cannot be written to.
         """
         self.cells = cells(config)
         self._pushed = {cell.fingerprint: cell.policy.pushed_weights for cell in self.cells}
@@ -101,7 +101,7 @@ class Store:
             self._db.execute("UPDATE runs SET ended = ?, state = ? WHERE run = ?", (time.time(), state, self._run))
 
     def finished(self) -> set[str]:
-        """The keys of the episodes that will not be played again."""
+        """Return the keys of the episodes that will not be played again."""
         return {key for (key,) in self._db.execute("SELECT key FROM episodes WHERE status != 'infra_failed'")}
 
     def record(
@@ -114,10 +114,10 @@ class Store:
     ) -> None:
         """Record an episode, finished now or at `finished`, s since 1970.
 
-        It replaces one that infrastructure failed; any other stays as it is.
+        It replaces one that failed by infrastructure; any other is not changed.
 
-        Raises `ConfigError` if it was played by another checkpoint than the episodes of its cell before, as after a
-        swap, or by other weights of the same name or than the pushed ones of its cell: a rate is that of one
+        Raises `ConfigError` if it was played by another checkpoint than earlier episodes of its cell, as after a swap,
+        by other weights of the same name, or by other weights than the pushed ones of its cell: a rate has one
         checkpoint.
         """
         self._require_pushed_weights(result)
@@ -125,7 +125,7 @@ class Store:
         self._require_same_weights(result)
         row = asdict(result)
         key = row.pop("key")
-        del key["policy_seed"]  # every episode of an evaluation has the one of its environment
+        del key["policy_seed"]  # in an evaluation, it is that of the environment
         row |= {
             "key": str(result.key),
             "cell": key.pop("settings"),
@@ -184,9 +184,10 @@ class Store:
                 self._weights[of] = result.weights
 
     def _accept_or_raise(self, what: Hashable, changes: list[Change], where: str, cure: str = MIX) -> None:
-        """Note changes since earlier runs, once for each `what` in a run; raise `ConfigError` unless they are accepted.
+        """Record changes since earlier runs, once for each `what` in a run; raise `ConfigError` unless they are
+        accepted.
 
-        A second change within a run comes from processes that have different files.
+        A second change within a run means that processes have different files.
         """
         if not changes:
             return
@@ -204,7 +205,7 @@ class Store:
         self._db.execute("UPDATE runs SET changes = ? WHERE run = ?", (value, self._run))
 
     def record_attempt(self, job: Job, failure: Failure, *, retried: bool) -> None:
-        """Record an attempt that infrastructure failed."""
+        """Record an attempt that failed by infrastructure."""
         where = (str(job.key), job.key.settings, job.attempt, self._run, time.time())
         why = (failure.cause, failure.code, failure.message, failure.traceback, failure.log, retried)
         with self._db:
@@ -223,7 +224,7 @@ class Store:
         """
         [cell, *_] = [cell for cell in self.cells if cell.place == place]
         odd = program_changes(f"env {cell.env}", cell.program, made.program)
-        if any(one.was is not None for one in odd):  # the environment may write a file that its settings name
+        if any(one.was is not None for one in odd):  # the environment itself may write a file that its settings name
             raise ConfigError(
                 f"the worker on {made.host} has other files than this process, or they were edited since the start:\n"
                 f"{listed(odd)}\ngive both the same files, and go on with --resume"
@@ -238,7 +239,7 @@ class Store:
             )
 
     def _require_same_env(self, cell: EvalCase, made: EnvInfo) -> None:
-        if cell.place in self._made:  # by another worker of this run; nodes may differ in what they describe
+        if cell.place in self._made:  # by another worker of this run; descriptions may differ between nodes
             return
         self._made.add(cell.place)
         query = "SELECT described, contract FROM cells WHERE cell = ? AND described IS NOT NULL"
@@ -318,10 +319,10 @@ class Store:
         self._accept_or_raise("program", programs, "the environment is not that of the results in")
 
     def _other_plan(self, db: sqlite3.Connection) -> list[Change]:
-        """Return the cells of the results that this plan lacks: a plan may grow, and steps of a policy may follow.
+        """Return the cells of the results that this plan lacks; a plan may grow, also by steps of a policy.
 
-        A trainer evaluates one version of one policy after the other into one folder, each with its plan: of
-        the other policies its plan lacks nothing.
+        A trainer evaluates versions of policies one after the other into one folder, each with its plan, so cells of
+        other policies are not missing.
         """
         trained = all(self._pushed.values())
         policies = {cell.policy.name for cell in self.cells}
@@ -331,7 +332,7 @@ class Store:
         return [Change("plan", name, "in it", None) for name in gone]
 
     def _other_programs(self, db: sqlite3.Connection) -> list[Change]:
-        """The files of environments that are not what the results were played with."""
+        """Return the files of environments that differ from those of the results."""
         found: dict[Change, None] = {}  # in the order of the plan
         for cell in self.cells:
             query = "SELECT program FROM cells WHERE env = ? AND program IS NOT NULL AND cell = ?"
@@ -355,7 +356,7 @@ class Store:
 
 
 def _differences(db: sqlite3.Connection, cell: EvalCase) -> list[str]:
-    """The settings of `cell` that differ from those in the results, a sentence each; none if the cell is new.
+    """Return the settings of `cell` that differ from those in the results, a sentence each; none for a new cell.
 
     The first seeds must be the same: else episode 3 would be two episodes.
     """

@@ -25,7 +25,7 @@ TOTAL = "total"
 class Group:
     """Aggregates over the episodes of one cell, or of several.
 
-    Rates count an error of the policy as no success. Episodes that infrastructure failed are in no rate.
+    Rates count an error of the policy as a failure. Episodes that failed by infrastructure are in no rate.
     """
 
     contender: str  # the policy id: its name, with "@STEP" in a sweep; or "total"
@@ -36,8 +36,8 @@ class Group:
     success_once: Rate
     success_at_end: Rate
     policy_errors: int  # episodes that an error of the policy ended; not successes
-    infra_failures: int  # episodes that infrastructure failed; in no rate
-    retries: int  # attempts that infrastructure failed and that were repeated
+    infra_failures: int  # episodes that failed by infrastructure; in no rate
+    retries: int  # attempts that failed by infrastructure and were repeated
     steps: int  # actions executed in all episodes
     mean_steps: float | None
     mean_return: float | None  # of the sums of rewards
@@ -51,7 +51,7 @@ class Group:
         return self.success_once.episodes
 
     def to_json(self) -> dict[str, Any]:
-        """The fields for JSON, with `episodes`."""
+        """Return the fields for JSON, with `episodes`."""
         rates = {"success_once": self.success_once.to_json(), "success_at_end": self.success_at_end.to_json()}
         return asdict(self) | {"episodes": self.episodes} | rates
 
@@ -82,7 +82,7 @@ class Summary:
         return group_of((TOTAL, "", TOTAL), self.results.cells)
 
     def parts(self, contender: str) -> dict[str, Group]:
-        """The totals of a policy id, by the clock of their episodes (`by_timing`)."""
+        """Return the totals of a policy id, by the clock of their episodes (`by_timing`)."""
         return {
             timing: group_of((contender, "", TOTAL), cells)
             for timing, cells in by_timing(self.results.of(contender)).items()
@@ -90,7 +90,7 @@ class Summary:
 
     @property
     def best(self) -> list[str]:
-        """The policy ids, the best first, by the mean of the success rates of their cells."""
+        """The policy ids, the best first, by the mean success rate of their cells."""
         rates = {
             name: [group.success_once.rate or 0.0 for group in self.cells if group.contender == name]
             for name in self.results.contenders
@@ -128,7 +128,7 @@ class Summary:
         return [result for cell in self.results.cells for result in cell.counted]
 
     def to_json(self) -> dict[str, Any]:
-        """The content of summary.json."""
+        """Return the content of summary.json."""
         cells = [
             group.to_json()
             | {"checkpoint": checkpoint_of(cell), "weights": weights_of(cell), "revision": revision_of(cell)}
@@ -170,24 +170,24 @@ def summarize(results: Results) -> Summary:
 
 
 def checkpoint_of(cell: CellResults) -> str | None:
-    """The checkpoint that the episodes of a cell were played by; None if no reset named one."""
+    """Return the checkpoint of a cell's episodes; None if no reset named one."""
     return next((one.checkpoint for one in cell.counted if one.checkpoint is not None), None)
 
 
 def weights_of(cell: CellResults) -> str | None:
-    """The digest of the weights that the episodes of a cell were played by; None if no server reported it."""
+    """Return the digest of the weights of a cell's episodes; None if no server reported it."""
     return next((one.weights for one in cell.counted if one.weights is not None), None)
 
 
 def revision_of(cell: CellResults) -> str | None:
-    """The hub's commit of these weights; None if they are not of the hub's cache."""
+    """Return the hub's commit of these weights; None if they are not from the hub's cache."""
     return next((one.revision for one in cell.counted if one.revision is not None), None)
 
 
 def pushed_of(cell: CellResults) -> str | None:
-    """The pushed weights that the episodes of a cell were played by, in words; None if the checkpoint's alone acted.
+    """Return the pushed weights of a cell's episodes, in words; None if only the checkpoint's weights acted.
 
-    The rate of a cell that was played by several versions is that of no one of them.
+    The rate of a cell of several versions describes none of them.
     """
     named = {one.policy_version: one.policy_fingerprint for one in cell.counted if one.policy_version is not None}
     numbers = {one.first_policy_version for one in cell.counted if one.first_policy_version is not None} | named.keys()
@@ -198,12 +198,12 @@ def pushed_of(cell: CellResults) -> str | None:
 
 
 def cause_of(error: str) -> str:
-    """The first line of an error, without the numbers and ids in which errors of one cause differ."""
+    """Return the first line of an error, without the numbers and ids in which errors of one cause differ."""
     return re.sub(r"[0-9a-f]{8,}|\d+(\.\d+)?", "…", error.strip().partition("\n")[0])
 
 
 def errors_of_policies(results: Results) -> list[tuple[tuple[str, str, str], int]]:
-    """Errors that ended episodes: (policy id, task, an error of the cause), and how many episodes it ended."""
+    """Return errors that ended episodes: (policy id, task, an error of the cause), and the number of episodes."""
     found: dict[tuple[str, str, str], list[str]] = {}
     for cell in results.cells:
         for one in cell.counted:
@@ -214,13 +214,13 @@ def errors_of_policies(results: Results) -> list[tuple[tuple[str, str, str], int
 
 
 def failing_cells(results: Results) -> list[CellResults]:
-    """The cells of which every episode ended by an error of the policy."""
+    """Return the cells in which an error of the policy ended every episode."""
     outcomes = [(cell, {one.status for one in cell.counted}) for cell in results.cells]
     return [cell for cell, statuses in outcomes if statuses == {"policy_error"}]
 
 
 def write_summary(summary: Summary) -> Path:
-    """Write `summary.json`, whole or not at all."""
+    """Write `summary.json` atomically."""
     path = summary.out / FILE
     with whole(path) as part:
         part.write_text(json.dumps(summary.to_json(), indent=2) + "\n")
@@ -255,7 +255,7 @@ def _mean(values: Sequence[float]) -> float | None:
 
 
 def median(values: Iterable[float | None]) -> float | None:
-    """Return the median of the values that are known; None if none is."""
+    """Return the median of the known values; None without any."""
     known = [value for value in values if value is not None]
     return float(np.median(known)) if known else None
 
@@ -266,7 +266,7 @@ def _share(parts: Sequence[float | None], whole_s: float) -> float | None:
 
 
 def _wall_seconds(results: Results, run: Run) -> float:
-    """The duration of a run; of one that was killed, until its last episode."""
+    """Return the duration of a run; of a killed one, until its last episode."""
     if run.ended is not None:
         return run.ended - run.started
     return max((finished for finished, _ in _played(results, run)), default=run.started) - run.started
@@ -278,6 +278,6 @@ def _rollout_seconds(results: Results, run: Run) -> float:
 
 
 def _played(results: Results, run: Run) -> list[tuple[float, float]]:
-    """When each episode of a run ended and began, in seconds since 1970."""
+    """Return the end and begin of each episode of a run, in seconds since 1970."""
     mine = [one for cell in results.cells for one in cell.episodes if one.run == run.run]
     return [(one.finished, one.finished - one.result.seconds) for one in mine]

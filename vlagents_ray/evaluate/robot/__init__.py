@@ -1,6 +1,6 @@
-"""Blind evaluation on a real robot: a person resets the scene and judges, and does not see which policy plays.
+"""Blind evaluation on a real robot: an operator resets the scene and judges, without seeing which policy plays.
 
-`evaluate_on_robot` plays a plan's trials in an order that the plan's key draws (`schedule`). The person is an
+`evaluate_on_robot` plays a plan's trials in an order that the plan's key draws (`schedule`). The operator is an
 `Operator`: at a page in the browser (`PageOperator`), at a terminal (`TerminalOperator`), or any class with the same
 methods.
 """

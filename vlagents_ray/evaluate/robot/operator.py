@@ -34,7 +34,7 @@ from vlagents_ray.naming import distinct
 
 Outcome = Literal["success", "failure", "partial", "repeat"]
 SCENES = "scenes"
-_KEPT_QUALITY = 92  # JPEG, of the picture that trials are compared with
+_KEPT_QUALITY = 92  # JPEG, of the start pictures
 _OUTCOMES: dict[str, Outcome] = {"s": "success", "f": "failure", "p": "partial", "r": "repeat"}
 _Phase = Literal["scene", "playing", "verdict", "next", "end"]
 _CHOICES = {
@@ -44,8 +44,8 @@ _CHOICES = {
     "next": set[str](),
     "end": set[str](),
 }
-_AWAY_S = 3.0  # without a request of the page, after which the operator counts as away
-_LOOK_S = 0.1  # between two live pictures while the scene is set
+_AWAY_S = 3.0  # time without a request of the page after which the operator counts as away
+_LOOK_S = 0.1  # period of live pictures while the scene is set
 _BODY = 10_000  # bytes of an answer
 _PAGE_QUALITY = 80
 _FILES = {"operator.html": "text/html", "operator.css": "text/css", "operator.js": "text/javascript"}
@@ -60,22 +60,22 @@ _HEADERS = {
 
 @dataclass(frozen=True, slots=True)
 class VisibleTrial:
-    """All that an operator is shown of a trial; nothing in it depends on the policy."""
+    """The operator's view of a trial, which does not depend on the policy."""
 
     number: int  # from 1
-    total: int  # of trials that are planned
+    total: int  # number of planned trials
     task: str
     scene: int  # from 1
     attempt: int  # from 1; higher after a repetition
     instruction: str
-    setup: str  # how the scene is to be set
+    setup: str  # instructions for setting the scene
     seconds: float  # after which the trial ends
     rubric: Mapping[str, float]  # points by part of the task
     start: Mapping[str, Path] = field(default_factory=dict)  # the JPEG of each camera at the scene's first start
-    message: str = ""  # how the attempt before ended, if it has no verdict
+    message: str = ""  # end of the last attempt, if it has no verdict
 
     def to_json(self) -> dict[str, Any]:
-        """The fields for JSON; of the start pictures the names of the cameras."""
+        """Return the fields for JSON; for the start pictures, the names of the cameras."""
         names = ("number", "total", "task", "scene", "attempt", "instruction", "setup", "seconds", "message")
         fields = {name: getattr(self, name) for name in names}
         return fields | {"rubric": dict(self.rubric), "start": sorted(self.start)}
@@ -87,7 +87,7 @@ class Verdict:
 
     outcome: Outcome
     earned: tuple[str, ...] = ()  # the parts of the rubric that were reached, in a partial success
-    note: str = ""  # for "repeat" the reason, which has to be given
+    note: str = ""  # for "repeat" the reason, which is required
 
     def score(self, rubric: Mapping[str, float]) -> float:
         """Return the share of the rubric's points that were earned: 1 for a success, 0 for a failure.
@@ -96,8 +96,8 @@ class Verdict:
             rubric: The points by part of the task.
 
         Raises:
-            ConfigError: A partial success earned a part that the rubric does not have, or no rubric is there; or a
-                repetition has no reason.
+            ConfigError: A partial success has a part that is not in the rubric, or there is no rubric; or a repetition
+                has no reason.
         """
         if self.outcome == "repeat" and not self.note.strip():
             raise ConfigError("verdict: got a repetition without a reason, want one in words")
@@ -110,7 +110,7 @@ class Verdict:
 
 
 class Operator(Protocol):
-    """The person at the robot, however they are reached; the methods are called from one thread, in this order."""
+    """The interface of the operator; the methods are called from one thread, in this order."""
 
     def prepare(self, trial: VisibleTrial, observe: Callable[[], Obs]) -> bool:
         """Wait until the scene is set. The robot stays still.
@@ -124,20 +124,20 @@ class Operator(Protocol):
         """
 
     def watch(self, obs: Obs) -> None:
-        """Show an observation of the running trial; called in each control tick, so it must return at once."""
+        """Show an observation of the running trial; called at each control tick, so it must return at once."""
 
     def stops(self) -> bool:
-        """Return whether the running trial is to be stopped, which also happens when the operator's page is closed."""
+        """Return whether to stop the running trial, also because the operator's page was closed."""
 
     def judge(self, trial: VisibleTrial, ending: str) -> Verdict:
         """Ask for the verdict. The robot stays still.
 
         Args:
             trial: The trial that was played.
-            ending: How it ended, in words.
+            ending: The end of the trial, in words.
 
         Returns:
-            The verdict; one to repeat the trial has its reason in the note.
+            The verdict; to repeat the trial, its note has the reason.
 
         Raises:
             KeyboardInterrupt: The operator has left. The trial will be played again.
@@ -157,7 +157,7 @@ def save_start(out: Path, place: str, obs: Obs) -> None:
 
 
 def save_overlay(start: Path, now: np.ndarray) -> Path:
-    """Save the mean of a start picture and the same camera's picture now, beside the former's folder.
+    """Save the mean of a start picture and the camera's present picture, beside the former's folder.
 
     Returns:
         The new JPEG; it has the size of `now`, and only `now` if the sizes differ.
@@ -176,7 +176,7 @@ class TerminalOperator(Operator):
     Args:
         ask: Prints a question and returns the typed line, as `input` does; raises `EOFError` at the end of the input.
         say: Prints a line.
-        stopping: Returns whether the running trial is to be stopped; by default, whether Enter was pressed.
+        stopping: Returns whether to stop the running trial; by default, whether Enter was pressed.
     """
 
     def __init__(
@@ -249,7 +249,7 @@ class TerminalOperator(Operator):
 
 
 def _enter_pressed() -> bool:
-    """Whether a line was typed at the terminal; False for an input that is no terminal, which is not read ahead."""
+    """Return whether a line was typed at the terminal; False if the input is no terminal, which is not read ahead."""
     if not sys.stdin.isatty() or not select.select([sys.stdin], [], [], 0)[0]:
         return False
     sys.stdin.readline()
@@ -259,13 +259,13 @@ def _enter_pressed() -> bool:
 class PageOperator(Operator):
     """An operator at a page in the browser. Use as a context manager: the page is served within it.
 
-    The page is on the loopback interface, and its address has a random part, without which there is no answer. A
-    running trial is stopped if the page has asked for nothing for 3 s, as when it was closed. At the end of the context
-    an open page says whether the evaluation is complete.
+    The page is on the loopback interface, and requires the random part of its address. A running trial is stopped if
+    the page has sent no request for 3 s, as when it was closed. At the end of the context an open page shows whether
+    the evaluation is complete.
 
     Args:
         say: Prints a line: the page's address.
-        port: The port; 0 takes a free one.
+        port: The port; 0 chooses a free one.
     """
 
     def __init__(self, say: Callable[[str], None] = print, port: int = 0) -> None:
@@ -277,7 +277,7 @@ class PageOperator(Operator):
         self._ending = ""
         self._answer: dict[str, Any] | None = None
         self._obs: Obs | None = None
-        self._asked_at = 0.0  # when the page asked last
+        self._asked_at = 0.0  # time of the page's last request
         self._end_shown = threading.Event()
         self.url = ""
         """The page's address within the context."""
@@ -385,7 +385,7 @@ class PageOperator(Operator):
         return PlainTextResponse("not found", 404) if path is None else FileResponse(path, headers=_HEADERS)
 
     async def _take(self, http: Request) -> Response:
-        """Take an answer, unless it is for another trial or another question than the present one."""
+        """Accept an answer, unless it is for another trial or question than the present one."""
         if not http.headers.get("content-type", "").startswith("application/json"):
             return PlainTextResponse("want application/json", 415)
         body = b""

@@ -33,9 +33,9 @@ _LOGGERS = ("vlagents_ray", "ray", "ray.serve", "websockets", "asyncio")  # thei
 
 
 class TrialsInterrupted(KeyboardInterrupt):
-    """The operator or a signal ended an evaluation on a robot; `resume` goes on with the next trial.
+    """The operator or a signal ended an evaluation on a robot; `resume` continues with the next trial.
 
-    It says nothing of the results, as the trials to come would not be blind.
+    It has no results, as further trials would not be blind.
     """
 
 
@@ -44,14 +44,14 @@ def evaluate_on_robot(
 ) -> Summary:
     """Play every trial of `config` that has no result yet, and write the results to `config.out`.
 
-    A trial's policy is drawn (`schedule`). Until the last verdict the folder, and what is printed and logged, do not
-    tell it: verdicts go to `trials.jsonl` (`TrialLog`), and results.db, summary.json and report.html are written at the
-    end, as those of a simulation are. With `config.stop`, a task ends once all its cells have stopped, since trials of
-    the others alone would name their policy.
+    A trial's policy is drawn (`schedule`). Until the last verdict neither the folder nor any output or log names it:
+    verdicts go to `trials.jsonl` (`TrialLog`), and results.db, summary.json and report.html are written at the end, as
+    for a simulation. With `config.stop`, a task ends once all its cells have stopped, since trials of the remaining
+    ones would reveal their policy.
 
     Args:
         config: The policies, with their URLs, and the plan, with `robot`.
-        operator: The person at the robot.
+        operator: The operator at the robot.
         robot: The robot; by default one of the class `config.robot.arm`.
         agent_factory: Called with a policy to make its agent for a trial, in place of a connection to its `url`.
 
@@ -87,11 +87,11 @@ def evaluate_on_robot(
 
 
 def unblind(out: Path, key: str | None = None) -> Summary:
-    """Write the results of the trials that have a verdict, before all have one; trials after it are not blind.
+    """Write the results of the trials judged so far; later trials are not blind.
 
     Args:
         out: The folder of an evaluation on a robot.
-        key: The plan's key; None: the one that was drawn for the folder.
+        key: The plan's key; None: the folder's own.
 
     Returns:
         The summary of these results.
@@ -107,10 +107,10 @@ def unblind(out: Path, key: str | None = None) -> Summary:
 
 
 def planned_cells(config: EvalConfig) -> list[EvalCase]:
-    """The cells of a plan on a robot.
+    """Return the cells of a plan on a robot.
 
     Raises:
-        ConfigError: The plan has no robot, or settings that have no meaning on one.
+        ConfigError: The plan has no robot, or settings without meaning on one.
     """
     if config.real_robot is None:
         raise ConfigError("robot: got no robot, want `robot: {tasks: …}` in the plan and the class of one (--robot)")
@@ -123,7 +123,7 @@ def planned_cells(config: EvalConfig) -> list[EvalCase]:
 
 @dataclasses.dataclass(slots=True)
 class _RemainingTrials:
-    """The trials that are left, one after the other."""
+    """The remaining trials, one after the other."""
 
     _config: EvalConfig
     _operator: Operator
@@ -131,7 +131,7 @@ class _RemainingTrials:
     _factory: AgentFactory
     _log: TrialLog
     _trials: Sequence[Trial]
-    _message: str = ""  # for the operator, of the trial before
+    _message: str = ""  # for the operator, about the last trial
     _stopping: dict[tuple[str, str], dict[str, Stopping]] = dataclasses.field(default_factory=dict)  # by task and cell
 
     def __post_init__(self) -> None:
@@ -150,7 +150,7 @@ class _RemainingTrials:
             return
         obs = self._robot.observe()
         policies = {trial.job.cell.contender: trial.job.cell for trial in left}
-        for _, cell in sorted(policies.items(), key=lambda one: one[0]):  # which tells nothing of the trials' order
+        for _, cell in sorted(policies.items(), key=lambda one: one[0]):  # an order that reveals nothing
             try:
                 rehearse(cell, self._factory, self._operator, obs)
             except VLAgentsError as error:
@@ -235,7 +235,7 @@ class _RemainingTrials:
         return self._config.out / RECORDINGS / f"trial{trial.number:04d}-{attempt}"
 
     def _require_same_policy(self, trial: Trial, played: PlayedTrial) -> None:
-        """Raise `ConfigError` if the policy is another than before; it names neither the policy nor its trials."""
+        """Raise `ConfigError` if the policy has changed, without naming the policy or its trials."""
         cell = trial.job.cell
         now = {name: getattr(played.result, name) for name in ("checkpoint", "weights")}
         for number, logged in self._log.finished.items():
@@ -276,7 +276,7 @@ def _quiet() -> Iterator[None]:
 
 
 def _write_results(config: EvalConfig, planned: Sequence[EvalCase], log: TrialLog, state: str) -> Summary:
-    """Write results.db as an evaluation in simulation does, from all that the log has; it replaces an earlier one."""
+    """Write results.db from the whole log, as an evaluation in simulation does, in place of an earlier one."""
     trials = schedule(planned, log.key)
     with storing(config.out):
         (config.out / RESULTS).unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""The trials of an evaluation on a robot: their order, and how one is played."""
+"""The trials of an evaluation on a robot: their order, and the run of one."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _WAIT_S = 1.0  # deadline of a tick in the modes that wait for an answer
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """A trial, and what its operator must not see: the policy, which is `job.cell.policy`."""
+    """A trial, with its policy, `job.cell.policy`, which the operator must not see."""
 
     number: int  # from 1, in the order in which they are played
     scene: int  # from 1; each policy plays each scene of a task once
@@ -61,13 +61,13 @@ def schedule(cells: Iterable[EvalCase], key: bytes) -> list[Trial]:
     """Draw the order of all trials: task by task, scene by scene, and in each scene every policy once.
 
     With k policies, each k scenes in a row (of one seed) have the rows of a k x k Latin square in a drawn order, whose
-    columns are the policies in a drawn order. So each policy is first, second, and so on equally often in them, and
-    after an incomplete rest the counts differ by one at most. What is drawn depends on the key, the names of policies,
-    suites and environments, and the seeds, by HMAC-SHA256.
+    columns are the policies in a drawn order. So each policy is first, second, and so on equally often, and the counts
+    differ by at most one with an incomplete rest. The draw depends on the key, the names of policies, suites and
+    environments, and the seeds, by HMAC-SHA256.
 
     Args:
         cells: The cells of the plan, all on a robot.
-        key: Who has it knows which policy plays in which trial.
+        key: The plan's key, which reveals the policy of each trial.
 
     Returns:
         The trials in the order in which they are played.
@@ -92,7 +92,7 @@ def schedule(cells: Iterable[EvalCase], key: bytes) -> list[Trial]:
 
 
 def _drawn(key: bytes, what: list[str | int], names: Iterable[str]) -> list[str]:
-    """The names in the order of their authentication codes, whatever order they have in the plan."""
+    """Return the names in the order of their authentication codes, independent of the plan's order."""
     return sorted(names, key=lambda name: hmac.digest(key, canonical([*what, name]).encode(), hashlib.sha256))
 
 
@@ -120,7 +120,7 @@ class PlayedTrial:
 
 
 class WatchedRobot(Robot):
-    """A robot whose errors are `EnvFailed`, and whose observations the operator sees."""
+    """A robot whose errors become `EnvFailed`, and whose observations the operator sees."""
 
     def __init__(self, robot: Robot, operator: Operator) -> None:
         self._robot = robot
@@ -145,7 +145,7 @@ class WatchedRobot(Robot):
 
 
 class _CountingPlayer(ChunkPlayer):
-    """A chunk player that records what the policy's answers say of themselves."""
+    """A chunk player that records the metadata of the policy's answers."""
 
     def __init__(
         self, agent: Agent, stats: EpisodeStats, operator: Operator, settings: PlayerSettings, check: Guard
@@ -175,7 +175,7 @@ class _CountingPlayer(ChunkPlayer):
 def play(
     trial: Trial, robot: WatchedRobot, factory: AgentFactory, operator: Operator, recording: Path | None
 ) -> PlayedTrial:
-    """Play one attempt at a trial. The robot is stopped however it ends.
+    """Play one attempt at a trial, and always stop the robot at its end.
 
     Returns:
         The trial; with the status "policy_error" if the policy failed.
@@ -220,7 +220,7 @@ def play(
         stats.ending = "policy_done" if report.done else "terminated" if stopped else "truncated"
         stats.ticks_held = report.safe_ticks
         result = stats.result(transport_of(agent), failed)
-        # Not whether the policy considered the task finished: only some policies ever do.
+        # Without whether the policy considered the task finished, as only some policies ever do.
         over = "stopped by the operator" if stopped else "the trial is over"
         ending = over if failed is None else "the policy failed"
         return PlayedTrial(replace(result, env_seconds=None), dict(getattr(agent, "metadata", {})), ending)
@@ -236,7 +236,7 @@ def rehearse(cell: EvalCase, factory: AgentFactory, operator: Operator, obs: Obs
     unused = EpisodeStats(EpisodeKey(cell.env, 0, 0, cell.fingerprint))
     with _player(cell, factory, unused, operator) as (_, player):
         player.initialize()
-        with contextlib.suppress(InvalidAction):  # which is a failure of the policy in a trial
+        with contextlib.suppress(InvalidAction):  # in a trial it is a failure of the policy
             player.reset(obs, task.instruction, **cell.policy_options)
             player.act(obs)
 
@@ -276,7 +276,7 @@ def _deadline_s(settings: RobotConfig) -> float:
 
 
 def _require_alive(report: LoopReport) -> None:
-    """Raise for a trial that the connection or the robot decided: infrastructure failures are not the policy's."""
+    """Raise if the connection or the robot ended a trial: infrastructure failures are not the policy's."""
     for bark in report.barks:
         if bark.startswith("server"):
             raise PolicyUnavailable(f"the policy's server was silent: {bark}")

@@ -1,8 +1,8 @@
-"""The log of an evaluation on a robot: one line a trial, in which the name of the policy is sealed.
+"""The log of an evaluation on a robot: one line a trial, with the policy's name encrypted.
 
-`trials.jsonl` is written while the evaluation runs, in place of results.db. Its verdicts can be read by anybody; the
-policy, its checkpoint and its timing are encrypted with the key that draws the order of trials, in parts of one length.
-That protects an operator from seeing it by accident; the holder of the key can open it.
+`trials.jsonl` is written while the evaluation runs, in place of results.db. Its verdicts are plain text; the policy,
+its checkpoint and its timing are encrypted with the key that draws the order of trials, in parts of one length. This
+prevents the operator from seeing them by accident; the key opens them.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ from vlagents_ray.evaluate.results.database import FILE as RESULTS
 
 LOG, KEY = "trials.jsonl", "trials.key"
 _NONCE = 16  # bytes
-_BLOCK = 16384  # bytes: sealed parts have a multiple of this length, which says nothing of the policy
+_BLOCK = 16384  # bytes: sealed parts have a multiple of this length, which hides the policy
 _KILLED = "the evaluation ended before the verdict"
 
 
 @dataclass(frozen=True, slots=True)
 class LoggedTrial:
-    """An attempt at a trial, as the log has it."""
+    """An attempt at a trial in the log."""
 
     trial: int
     attempt: int
     at: float  # s since 1970, of its end
-    seen: dict[str, Any]  # what everybody may read: outcome, earned, score, note; or `again`, why it is played again
-    sealed: dict[str, Any]  # what tells the policy
+    seen: dict[str, Any]  # in plain text: outcome, earned, score, note; or `again`, the reason of a repetition
+    sealed: dict[str, Any]  # the parts that reveal the policy
 
     @property
     def finished(self) -> bool:
@@ -55,9 +55,9 @@ class TrialLog:
         """Open or begin the log in `config.out`.
 
         Raises:
-            ConfigError: There is a log and `config.resume` is off, or it is of another plan or key; there are results
-                of a simulation; or another evaluation writes there.
-            StorageFailed: Nothing can be written there.
+            ConfigError: There is a log and `config.resume` is off, or it has another plan or key; there are results of
+                a simulation; or another evaluation writes to the folder.
+            StorageFailed: The folder cannot be written to.
         """
         self._path = config.out / LOG
         self.attempts: list[LoggedTrial] = []
@@ -93,11 +93,11 @@ class TrialLog:
         return 1 + sum(one.trial == trial for one in self.attempts)
 
     def why_again(self, trial: int) -> str:
-        """Return the reason for which a trial is played again; "" if it has not been played."""
+        """Return the reason why a trial is repeated; "" if it has not been played."""
         return next((one.seen["again"] for one in reversed(self.attempts) if one.trial == trial), "")
 
     def begin(self, trial: int, attempt: int) -> None:
-        """Record that an attempt begins. If no end follows, the evaluation was killed in between."""
+        """Record that an attempt begins. If no end follows, the evaluation was killed."""
         self._write({"trial": trial, "attempt": attempt, "begun": time.time()})
 
     def end(self, trial: int, attempt: int, seen: dict[str, Any], sealed: dict[str, Any]) -> LoggedTrial:
@@ -122,7 +122,7 @@ class TrialLog:
     def _read(self, config: EvalConfig, identity: str) -> None:
         self._file.seek(0)
         data = self._file.read()
-        whole = data.rfind(b"\n") + 1  # a line without its end was being written when the process was killed
+        whole = data.rfind(b"\n") + 1  # the process was killed while it wrote an incomplete line
         self._file.truncate(whole)
         lines = [json.loads(line) for line in data[:whole].splitlines()]
         if not lines:
@@ -191,7 +191,7 @@ def _identity(cells: Sequence[EvalCase]) -> bytes:
 
 
 def _key(config: EvalConfig) -> bytes:
-    """The plan's key, or one that is drawn for this folder."""
+    """Return the plan's key, or the one drawn for this folder."""
     given = config.real_robot.key if config.real_robot is not None else None
     if given is not None:
         return given.encode()

@@ -48,20 +48,20 @@ def ray_cluster(config: EvalConfig) -> Iterator[None]:
         if os.environ.get("RAY_ADDRESS"):
             stack.enter_context(joined())
         else:
-            # The number of CPUs is only an account: the user's number of workers must fit.
+            # CPUs are logical: the user's number of workers must fit.
             cpus = max(os.cpu_count() or 1, ceil(config.workers * most_cpus(config)))
-            with withheld():  # workers get the key when they are ready; Ray's daemons do not need it
+            with withheld():  # workers get the key when they are ready; Ray's daemons need none
                 stack.enter_context(joined("local", num_cpus=cpus))
         yield
 
 
 def most_cpus(config: EvalConfig) -> float:
-    """The largest number of CPUs that any worker of the evaluation requests; a share of one may be requested."""
+    """Return the largest number of CPUs that any worker of the evaluation requests; a share of one may be requested."""
     return max(worker.cpus for worker in _kinds(config))
 
 
 def most_gpus(config: EvalConfig) -> float:
-    """The largest number of GPUs that any worker of the evaluation requests; a share of one may be requested."""
+    """Return the largest number of GPUs that any worker of the evaluation requests; a share of one may be requested."""
     return max(worker.gpus for worker in _kinds(config))
 
 
@@ -102,7 +102,7 @@ def _kinds(config: EvalConfig) -> list[WorkerConfig]:
 
 
 class Placement:
-    """Chooses the node of a worker: that of a replica which it will use, as long as there is room.
+    """Chooses the node of a worker: that of its replica, as long as there is room.
 
     Only the replicas of policies that this cluster serves are known, `serve://APP`.
     """
@@ -135,9 +135,9 @@ def strategy(node: str | None) -> Any:
 
 
 class CapacityMonitor:
-    """Decides whether an evaluation goes on while the cluster has no room for some of its workers.
+    """Decides whether an evaluation continues while the cluster has no room for some of its workers.
 
-    It goes on as long as other workers play: a worker's node may have been lost, and may return.
+    It continues as long as other workers play: a worker's node may have been lost, and may return.
     """
 
     def __init__(self, config: EvalConfig, now: Callable[[], float] = monotonic) -> None:
@@ -153,7 +153,7 @@ class CapacityMonitor:
         self._warned = False
 
     def timed_out(self, since: float) -> bool:
-        """Whether a worker that was requested at `since` has waited for too long."""
+        """Return whether a worker that was requested at `since` has waited for too long."""
         return self._now() - since > self._config.place_timeout_s
 
     def report_shortage(self, worker: WorkerConfig, running: int) -> None:
@@ -167,7 +167,7 @@ class CapacityMonitor:
         self._warned = True
         want = {"CPU": worker.cpus, "GPU": worker.gpus}
         message = (
-            f"the cluster found no room for a worker in {self._config.place_timeout_s:g} s: each wants {want}, "
+            f"the cluster found no room for a worker in {self._config.place_timeout_s:g} s: each needs {want}, "
             f"free are {ray.available_resources()} of {ray.cluster_resources()}; lower `workers` or "
             f"`worker.cpus`, or raise `place_timeout_s` if the cluster is still growing"
         )

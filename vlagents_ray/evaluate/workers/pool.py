@@ -1,4 +1,4 @@
-"""The worker pool: Ray actors that play episodes, and that are killed when they hang. It does not handle results."""
+"""The worker pool: Ray actors that play episodes, and are killed if they hang. It does not handle results."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ log = logging.getLogger(__name__)
 KILL_S = 3.0  # s for Ray to register that workers are to be killed
 CLOSE_S = 10.0  # s for workers to close their simulators when they end
 MOST_FAILED_STARTS = 3  # in a row; workers that fail together, as with their node, count as one
-UNREACHABLE_S = 60.0  # s for which a host is not asked again after it did not return a lost worker's logs
+UNREACHABLE_S = 60.0  # s without further requests to a host that did not return a lost worker's logs
 
 
 class WorkerPool(Workers):
     """Up to `config.workers` workers. Use it as a context manager: its end kills every worker.
 
-    While the head of the cluster does not answer, the existing workers play on, and no others are started.
+    While the head of the cluster does not answer, the existing workers continue, and no others are started.
     """
 
     def __init__(self, config: EvalConfig, agent_factory: AgentFactory, recorders: RecorderFactory = Recording) -> None:
@@ -53,13 +53,13 @@ class WorkerPool(Workers):
         self._placement = Placement()
         self._failed_starts = 0
         self._failed_start = 0.0  # time of the last one
-        self._unreachable: dict[str, float] = {}  # by host that does not answer: until when it is not asked
+        self._unreachable: dict[str, float] = {}  # by silent host: time until which no request is sent
         self._capacity = CapacityMonitor(config)
         self._limits = PhaseTimeouts(config)
         self._leaving: list[tuple[Any, float]] = []  # actors that are ending, and since when
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if kind is ClusterLost:  # nothing can kill them; Ray ends them, too, when the head is gone
+        if kind is ClusterLost:  # nothing can kill them; Ray ends them when the head is lost
             return
         actors = [worker.actor for worker in self._workers] + [actor for actor, _ in self._leaving]
         # A Ray cluster that is being stopped, for instance with its job, does not answer; the results must still be
@@ -209,7 +209,7 @@ class WorkerPool(Workers):
         self._leaving = [one for one in self._leaving if now - one[1] <= CLOSE_S]
 
     def _with_log(self, failure: Failure, worker: WorkerHandle) -> Failure:
-        """Add the worker's log to the failure; a lost node is waited for once only, however many workers it had."""
+        """Add the worker's log to the failure; a lost node is awaited only once, whatever its number of workers."""
         host: str = worker.process["host"]
         if monotonic() < self._unreachable.get(host, 0.0) or not self._head.answers():
             return failure

@@ -101,7 +101,7 @@ class Rollout:
         self._policy: str | None = None  # the policy of the agent
         self._described: dict[str, Any] = {}  # of an agent without a server: its weights
         self._broken_agents = 0  # in a row
-        self._sessions: list[Agent] = []  # further sessions of the agent, for episodes side by side
+        self._sessions: list[Agent] = []  # further sessions of the agent, for parallel episodes
         self._env: BatchEnv | None = None
         self._place: str | None = None  # the place of the environment
         self._repeatable = True  # as far as is known of the environment
@@ -126,7 +126,7 @@ class Rollout:
         return Heartbeat(phase, age_s, steps, "".join(traceback.format_stack(frame)) if frame else "")
 
     def run(self, jobs: tuple[Job, ...]) -> list[Report]:
-        """Play the episodes of one cell, side by side if there are several; return a report for each."""
+        """Play the episodes of one cell, in parallel if there are several; return a report for each."""
         self._thread = threading.get_ident()
         setup = _Setup()
         try:
@@ -175,7 +175,7 @@ class Rollout:
             ]
 
     def _finished(self, env: BatchEnv, job: Job, result: EpisodeResult, recording: EpisodeRecorder) -> Artifacts:
-        """Return the artifacts of an episode; where images are missing, it is played again."""
+        """Return the artifacts of an episode; if images are missing, play it again."""
         options = options_of_reset(env, job.key.episode, job.cell.suite.reset_options)
         kept = recording.finish(
             result, lambda played, record: played.play_again(env, job.key.seed, options, self._set_phase, record)
@@ -185,7 +185,7 @@ class Rollout:
         return kept
 
     def _renders_at_once(self, agent: Agent, env: BatchEnv, policy: PolicyConfig) -> bool:
-        """Whether each step is rendered as it is played, if images are wanted of failures alone.
+        """Return whether each step is rendered as it is played, if only failures need images.
 
         The alternative is to play the failed ones again. That saves nothing if the policy gets each image, and costs
         more than it saves if most fail; environments that one simulator runs together cannot be played again alone.
@@ -231,7 +231,7 @@ class Rollout:
         try:
             with policy_side("initialize"), used_checkpoints() as found:
                 agent.initialize()
-                _metadata(agent)  # fetches the metadata, which checks that the server runs and knows the policy
+                _metadata(agent)  # fetches the metadata, which checks that the server runs and has the policy
         except VLAgentsError:
             agent.close()
             raise

@@ -152,7 +152,7 @@ class FailedAttempts:
         self._policy_errors = 0  # episodes in a row
 
     def repeats(self, job: Job, failure: Failure) -> bool:
-        """Whether the episode of a failed attempt is to be played again."""
+        """Return whether the episode of a failed attempt is to be played again."""
         return failure.cause != "user" and job.attempt <= self._config.retries
 
     def note_played(self) -> None:

@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 STEP = "{step}"  # the placeholder in a checkpoint's name
 _HUB_ID = re.compile(r"[\w.-]+/[\w.-]+")
 _INDEX = ".safetensors.index.json"
-_COMPARED = 64  # compared elements of each tensor: enough to tell trained weights from random ones
+_COMPARED = 64  # compared elements of each tensor: enough to distinguish trained weights from random ones
 _LISTED = 8
 
 
@@ -77,7 +77,7 @@ def find_checkpoint(name: str, step: int | None = None, needs: Iterable[str] = (
 
 
 def _holds(folder: Path, path: Path) -> bool:
-    """Whether `path` is in the folder, or the folder itself under another name, as behind a link `last`."""
+    """Return whether `path` is in the folder, or the folder itself under another name, as behind a link `last`."""
     if not folder.is_dir():
         return False
     # A file of the hub's cache is a link out of its folder.
@@ -102,7 +102,7 @@ def find_adapter(source: str, checkpoint: str, base: Sequence[Path], digest_of_b
 def _is_other(trained_on: str, checkpoint: str, base: Sequence[Path], digest_of_base: str) -> bool:
     """Whether the base that an adapter names is known to be another one than `checkpoint`, at the paths `base`."""
     path = Path(os.path.expanduser(trained_on))  # unlike a Path's own, these raise nothing, neither for a user nor
-    if os.path.exists(path):  # for a folder of the trainer's that is not to be seen from here
+    if os.path.exists(path):  # for a folder of the trainer that is not visible here
         ours = {parent for one in base for parent in (one.resolve(), *one.resolve().parents)}
         return path.resolve() not in ours and digest([path]) != digest_of_base
     names = [name.partition("@")[0] for name in (trained_on, checkpoint)]

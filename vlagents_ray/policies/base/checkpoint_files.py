@@ -1,7 +1,7 @@
 """Checks of a checkpoint's files, without a model: whether they are complete, and which weights they hold.
 
-`unfinished` judges by the files alone, and in doubt reports nothing. `weights_of` tells weights apart by a digest that
-takes seconds, and by the commit on the hub.
+`unfinished` judges by the files alone, and in doubt reports nothing. `weights_of` distinguishes weights by a digest
+that takes seconds, and by the commit on the hub.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ _BESIDE = (".md", ".gitattributes", ".log")  # files about a checkpoint, which d
 
 
 def is_temporary(name: str) -> bool:
-    """Whether the name of a file or folder says that it will be renamed when it is complete."""
+    """Return whether the name of a file or folder marks it as incomplete, to be renamed later."""
     return any(fnmatch.fnmatchcase(name, pattern) for pattern in TEMPORARY)
 
 
 def unfinished(path: Path) -> str | None:
     """Return the sign that a checkpoint, a file or a folder, is incomplete; None if there is no sign.
 
-    A .safetensors file must be as long as its header says, an index may name only existing files, JSON must be valid,
+    A .safetensors file must have the length in its header, an index may name only existing files, JSON must be valid,
     and a zip file, as torch.save writes it, must end with its directory. Files of other kinds show nothing: the caller
     must also check that they no longer grow. A folder without weights is incomplete.
     """
@@ -66,7 +66,7 @@ def _trouble(file: Path) -> str | None:
     check = next((check for suffix, check in _CHECKS.items() if file.name.endswith(suffix)), None)
     try:
         return None if check is None else check(file)
-    # truncated, or of another format than its name says
+    # truncated, or not of its name's format
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         return f"cannot be read ({error})"
 

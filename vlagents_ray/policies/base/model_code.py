@@ -16,7 +16,7 @@ from typing import Any, NoReturn
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.registry import require
 
-CURE = "if you trust whoever can write there, set trust_remote_code: true"
+CURE = "if you trust everyone with write access to it, set trust_remote_code: true"
 
 
 def use_source(package: str, variable: str, source_dir: str | None = None, within: Sequence[str] = (".",)) -> None:

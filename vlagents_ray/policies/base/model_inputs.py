@@ -36,8 +36,8 @@ class Row:
     info: Mapping[str, Any] = field(default_factory=dict)  # the observation's info
     # the session's memory, for families that keep more than frames
     memory: dict[str, Any] = field(default_factory=dict)
-    want: tuple[str, ...] = ()  # names of what is to be stated of the chunk, out of the contract's `behaviour`
-    # drawn from the distribution, as samples and chunks of which something is wanted are, and not the likeliest chunk
+    want: tuple[str, ...] = ()  # requested values of the chunk, out of the contract's `behaviour`
+    # drawn from the distribution, for samples and requested values; else the likeliest chunk
     sample: bool = False
     adapter: str = ""  # fingerprint of the session's adapter, see `ModelPolicy.adapters`; empty: none
 
@@ -46,7 +46,7 @@ class Row:
         return self.rng.standard_normal(shape, dtype=np.float32)
 
     def history(self, length: int) -> tuple[Any, ...]:
-        """Return the last `length` frames; at the beginning of an episode its first one stands for the missing ones."""
+        """Return the last `length` frames; at the beginning of an episode, repeat its first one."""
         return (self.frames[0],) * (length - len(self.frames)) + self.frames[-length:]
 
 
@@ -56,10 +56,10 @@ def drawn(row: Row, draws: np.random.Generator) -> Row:
 
 
 def shared_frames(rows: Sequence[Row]) -> tuple[list[int], list[int]]:
-    """Return which rows to encode, as the samples of a session see what its own row sees.
+    """Return the rows to encode, since the samples of a session share its row's observations.
 
     Returns:
-        The indices of rows with observations of their own, and for each row the place of its observations among them.
+        The indices of rows with distinct observations, and for each row the index of its observations among them.
     """
     places: dict[int, int] = {}
     firsts: list[int] = []
@@ -119,7 +119,7 @@ def camera_specs(cameras: Mapping[str, str]) -> dict[str, CameraSpec]:
 
 
 def needs_gripper(parts: Sequence[str]) -> bool:
-    """Whether `Obs.gripper` is among the parts, for a contract."""
+    """Return whether `Obs.gripper` is among the parts, for a contract."""
     return GRIPPER in parts or CLOSED in parts
 
 
@@ -145,7 +145,7 @@ def wanted_samples(obs: Obs, config: ModelConfig) -> int:
 
 
 def wanted_behaviour(obs: Obs) -> tuple[str, ...]:
-    """Return the names of what the act is to state beside its action."""
+    """Return the names of the values that the act returns beside its action."""
     if WANT not in obs.info:
         return ()
     if obs.info.get(LEFTOVER) is not None:

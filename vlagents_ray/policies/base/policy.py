@@ -71,7 +71,8 @@ class ModelPolicy(Agent, abc.ABC):
     """The base class of the model families. A family defines `load`, `perceive`, `predict` and its contract.
 
     The model computes one row for each observation, all sessions of a batch in one forward pass of at most
-    `config.rows` rows. A session's noise comes from its own generator, seeded by the config's seed and the episode's.
+    `config.rows` rows. A session's noise is drawn from its own generator, seeded by the config's seed and the
+    episode's.
     """
 
     shared: ClassVar[tuple[str, ...]] = ("config", "model", "compilation", "adapters", "report")
@@ -110,7 +111,7 @@ class ModelPolicy(Agent, abc.ABC):
         return None
 
     def offered(self, names: tuple[str, ...]) -> tuple[str, ...] | None:
-        """Return the names for the contract's `behaviour`; None if there are none, or if an act is no whole chunk."""
+        """Return the names for the contract's `behaviour`; None without any, or if an act is not a whole chunk."""
         return names if names and self.config.actions == "chunk" else None
 
     def chunk(self, horizon: int) -> int:

@@ -1,4 +1,4 @@
-"""Digests of the files that make a policy or an environment: the code of its class, and what its settings name."""
+"""Digests of the files of a policy or an environment: the code of its class, and the files in its settings."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def digest_of(files: Program) -> str:
 
 
 def with_defaults(cls: type[Any], settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return `settings` and, where they say nothing, the defaults of the class's `Config` or of its constructor."""
+    """Return `settings` over the defaults of the class's `Config` or of its constructor."""
     fields = getattr(getattr(cls, "Config", None), "model_fields", {})
     defaults = {name: field.default for name, field in fields.items()}
     parameters = inspect.signature(cls.__init__).parameters.values()
@@ -115,7 +115,7 @@ def with_defaults(cls: type[Any], settings: Mapping[str, Any]) -> dict[str, Any]
 
 
 def _file(name: str) -> Path | None:
-    """Return the file that `import name` would execute; None if there is none, or if it is below an installed one."""
+    """Return the file that `import name` would execute; None without one, or if it is installed."""
     if name == "__main__":
         path = getattr(sys.modules[name], "__file__", None)
         return None if path is None else Path(path)
@@ -139,7 +139,7 @@ def _spec(name: str) -> ModuleSpec | None:
 
 
 def _is_own(file: Path) -> bool:
-    """Whether a file is in no installed package, nor in this one or the standard library."""
+    """Return whether a file is in no installed package, nor in this one or the standard library."""
     path = file.resolve()
     here = Path(__file__).resolve().parents[2]
     return not _SITES & set(path.parts) and not any(path.is_relative_to(one) for one in (*_LIBRARIES, here))

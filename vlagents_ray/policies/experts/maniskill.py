@@ -90,7 +90,7 @@ class PickCube:
             return self._hand.move(tool, cube, _OPEN, limit=0.5)
         if self._phase == "grasp":
             return self._hand.move(tool, tool, _CLOSED)
-        # the cube, not the tool, has to arrive; shorter steps let the arm come to rest
+        # the cube, not the tool, must reach the target; shorter steps let the arm settle
         return self._hand.move(tool, tool + 0.8 * (goal - cube), _CLOSED, limit=0.6)
 
 

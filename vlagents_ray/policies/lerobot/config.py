@@ -41,8 +41,8 @@ class LeRobotConfig(ModelConfig):
     trust_remote_code: bool = Field(
         default=False,
         description="run the code that the checkpoint names: processor steps that are not LeRobot's nor an installed "
-        "plugin's, and what LeRobot takes from the hub as code (action tokenizers of pi0_fast and wall_x); whoever can "
-        "write there can do on this machine whatever this process can",
+        "plugin's, and what LeRobot takes from the hub as code (action tokenizers of pi0_fast and wall_x); write "
+        "access to these then gives all rights of this process",
     )
 
 
@@ -71,7 +71,7 @@ def installed() -> str:
 
 
 def is_new() -> bool:
-    """Whether this environment has LeRobot 0.6 or newer."""
+    """Return whether this environment has LeRobot 0.6 or newer."""
     return tuple(int(part) for part in installed().split(".")[:2]) >= (0, 6)
 
 

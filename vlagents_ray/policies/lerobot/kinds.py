@@ -276,7 +276,7 @@ class SmolVLAPasses(FlowPasses):
     """The passes of SmolVLA, whose images are encoded from their patches."""
 
     def __init__(self, model: Any, compilation: Compilation) -> None:
-        """Use the passes of a `VLAFlowMatching`, which takes patches in place of images from here on, too."""
+        """Use the passes of a `VLAFlowMatching`, which from here on also takes patches in place of images."""
         super().__init__(model, compilation)
         self._vlm = model.vlm_with_expert.get_vlm_model()
         # LeRobot 0.4 keeps keys and values by name, (B, L, heads, D), later ones in a cache of transformers.

@@ -152,7 +152,7 @@ class LeRobot(ModelPolicy):
     def adapt(self, adapter: str, folder: Path) -> None:
         """Keep the processors beside an adapter, if there are any, for the state and the actions of its rows.
 
-        A base that says nothing about its dataset, such as one of many robots, gets the contract of the adapter's.
+        A base that does not describe its dataset, such as one of many robots, gets the contract of the adapter's.
         """
         model: LoadedLeRobot = self.model
         own = own_processors(folder, model.kind.config, self.config, model.processors)

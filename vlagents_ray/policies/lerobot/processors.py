@@ -84,7 +84,7 @@ class Processors:
             self._keep_tokens()
         self._groot = settings.type == "groot"
         absolute = [step for step in self._after.steps if type(step).__name__ == _ABSOLUTE and step.enabled]
-        self._relative = absolute[0].relative_step if absolute else None  # which knows the states of the last batch
+        self._relative = absolute[0].relative_step if absolute else None  # it holds the states of the last batch
         self.whole = self._groot or bool(absolute)  # whether actions are converted by chunks, and not row by row
         self._back = self._inverse()
 
@@ -97,7 +97,7 @@ class Processors:
         return {}
 
     def normalises(self, feature: Any) -> bool:
-        """Whether the pre-processor changes numbers of that feature by their statistics."""
+        """Return whether the pre-processor changes numbers of that feature by their statistics."""
         maps = [step.norm_map for step in self._before.steps if hasattr(step, "norm_map")]
         return any(getattr(one.get(feature.type), "name", "IDENTITY") != "IDENTITY" for one in maps)
 
@@ -166,7 +166,7 @@ class Processors:
         return self._back(rows)
 
     def width(self, dim: int) -> int:
-        """Return D', the number of values of the robot's actions, for a policy with `dim` of its own."""
+        """Return D', the number of values of the robot's actions, for a policy with `dim` values."""
         return dim if self.whole else int(self._after(require("torch").zeros(1, dim)).shape[-1])
 
     def _keep_tokens(self) -> None:

@@ -2,7 +2,7 @@
 
 Upstream's `predict_action` takes one prompt and calls `generate`. Here prompts of different lengths are padded on the
 left, with masks and positions that give each the same result as alone, and share every forward pass. Keys and values
-are one tensor of a fixed length, with a place for each token to come, which is masked until then.
+are one tensor of a fixed length, with a masked place for each future token.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ class OpenVLA(PrismaticPolicy):
         return row.frames[-1], self.model.base.tokens(row.instruction)
 
     def _compute(self, prepared: Sequence[PreparedRow]) -> list[DecodedChunk]:
-        """Decode all answers: a session's own greedily unless something is wanted of it, samples at temperature 1."""
+        """Decode all answers: a session's own greedily unless values are requested, samples at temperature 1."""
         firsts, owners = shared_frames([entry.row for entry in prepared])
         draws = np.full((len(prepared), max(entry.scale.dim for entry in prepared)), np.nan)
         for numbers, entry in zip(draws, prepared, strict=True):

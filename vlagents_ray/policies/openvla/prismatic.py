@@ -1,4 +1,4 @@
-"""The model of both policies, and what they share: the checkpoint, its statistics, images and prompts."""
+"""The common parts of both policies: the model, the checkpoint, its statistics, images and prompts."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ class Statistics:
 _NEEDS = ("config.json", "preprocessor_config.json", "tokenizer_config.json", "*.safetensors")
 _SPACE = 29871  # Llama's token of an empty word, which is between "Out:" and the action in training
 _PROMPT = "In: What action should the robot take to {}?\nOut:"
-_PROMPT_V01 = (  # OpenVLA v0.1 was fine-tuned from Vicuna; upstream, too, recognises it by the checkpoint's name
+_PROMPT_V01 = (  # OpenVLA v0.1 was fine-tuned from Vicuna; upstream also recognises it by the checkpoint's name
     "A chat between a curious user and an artificial intelligence assistant. The assistant gives helpful, detailed, "
     "and polite answers to the user's questions. USER: What action should the robot take to {}? ASSISTANT:"
 )
@@ -240,8 +240,8 @@ class PrismaticConfig(ModelConfig):
     )
     trust_remote_code: bool = Field(
         default=False,
-        description="run the Python code that lies in the checkpoint's folder instead: whoever can write there, or in "
-        "the hub's repository, can do on this machine whatever this process can",
+        description="run the Python code in the checkpoint's folder instead: write access to it, or to the hub's "
+        "repository, then gives all rights of this process",
     )
     attention: Literal["sdpa", "eager", "flash_attention_2"] = Field(
         default="sdpa", description="of the language model; flash_attention_2 needs the package flash-attn and a GPU"
@@ -407,7 +407,7 @@ class DecodedChunk:
     values: np.ndarray
     mean: np.ndarray | None = None
     spread: np.ndarray | None = None
-    behaviour: dict[str, Any] = field(default_factory=dict)  # what is wanted of the row
+    behaviour: dict[str, Any] = field(default_factory=dict)  # requested values of the row
 
     def prediction(self, scale: Scale) -> Prediction:
         return Prediction(
@@ -505,7 +505,7 @@ class PrismaticPolicy(ModelPolicy):
         return checkpoint.own.get(adapter, checkpoint.statistics)
 
     def _default(self, adapter: str) -> str | None:
-        """Return the dataset of the settings; None for an adapter with datasets of its own."""
+        """Return the dataset of the settings; None for an adapter with its own datasets."""
         return None if self._statistics(adapter) is not self._statistics() else self.config.unnorm_key
 
     def _named(self, options: Mapping[str, Any], adapter: str) -> str | None:

@@ -1,4 +1,4 @@
-"""What the clients of all protocols have in common."""
+"""The common parts of the clients of all protocols."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _LOGGED = 8000  # characters of an upstream's error
 
 @dataclass(frozen=True, slots=True)
 class ClientOptions:
-    """What a client needs to know about its upstream."""
+    """The address and the settings of an upstream."""
 
     url: str
     timeout_s: float  # s: an answer that takes longer counts as lost
@@ -65,7 +65,7 @@ class UpstreamClient(abc.ABC):
 
     @abc.abstractmethod
     def connect(self, timeout_s: float) -> dict[str, Any]:
-        """Connect, and return what the upstream says about itself; raises `PolicyUnavailable` if it does not answer."""
+        """Connect, and return the upstream's metadata; raises `PolicyUnavailable` if it does not answer."""
 
     @property
     @abc.abstractmethod
@@ -83,18 +83,18 @@ class UpstreamClient(abc.ABC):
         """
 
     def begin(self) -> None:  # noqa: B027 - not abstract: a protocol may have no such message
-        """Say that an episode begins, if the protocol can; raises what `ask` raises."""
+        """Announce the begin of an episode, if the protocol can; raises as `ask` does."""
 
     @abc.abstractmethod
     def close(self) -> None:
         """Close the connection; it may be called twice."""
 
     def differences(self, metadata: Mapping[str, Any], outgoing: Outgoing) -> list[str]:
-        """Return in what the upstream, by what it said about itself, differs from the mapping, with a remedy each."""
+        """Return the differences of the upstream's metadata from the mapping, with a remedy each."""
         return []
 
     def chunk(self, metadata: Mapping[str, Any]) -> int | None:
-        """Return the number of rows of the upstream's actions, if it said so."""
+        """Return the number of rows of the upstream's actions, if its metadata states it."""
         return None
 
     def failed(self, text: object) -> PolicyFailed:
@@ -118,7 +118,7 @@ class UpstreamClient(abc.ABC):
         return ConnectionLost(f"upstream {self.options.url}: {text}")
 
     def unreadable(self, got: object, want: str) -> MalformedMessage:
-        """Return the error for an answer that is not what the protocol says."""
+        """Return the error for an answer that violates the protocol."""
         return MalformedMessage(
             f"upstream {self.options.url}: got {got}, want {want}; does it speak the protocol of the deployment?"
         )
@@ -128,14 +128,14 @@ _LOG = logging.getLogger("vlagents_ray.upstream.websocket")
 _LOG.setLevel(logging.CRITICAL)  # it logs each lost connection as an error, which is raised as well
 _CLOSE_S = 1
 _REFUSED = (401, 403)
-# An upstream that computes on its event loop answers no pings meanwhile. Older versions of `websockets` send none.
+# While an upstream computes on its event loop, it answers no pings. Older versions of `websockets` send none.
 _NO_PINGS: dict[str, Any] = {"ping_interval": None} if "ping_interval" in inspect.signature(connect).parameters else {}
 
 
 class WebSocketClient(UpstreamClient):
     """A client over a WebSocket, which bounds the size of messages and the time of waiting.
 
-    A thread of its own answers the upstream's pings, so that a connection stays open while no session acts.
+    A separate thread answers the upstream's pings, so that a connection stays open while no session acts.
     """
 
     schemes: ClassVar[tuple[str, ...]] = ("ws", "wss")
@@ -184,7 +184,7 @@ class WebSocketClient(UpstreamClient):
             raise self.lost(error) from error
 
     def recv(self, timeout_s: float | None = None) -> bytes | str:
-        """Return the next message; raises `ConnectionLost` if the connection broke, or none came in time."""
+        """Return the next message; raises `ConnectionLost` if the connection broke or timed out."""
         wait_s = self.options.timeout_s if timeout_s is None else timeout_s
         try:
             return self._opened().recv(timeout=wait_s)

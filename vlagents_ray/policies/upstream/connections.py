@@ -32,18 +32,18 @@ Check = Callable[[UpstreamClient, Mapping[str, Any]], None]
 
 @dataclass(slots=True)
 class _Share:
-    """Rows of a batch that are asked together."""
+    """Rows of a batch that are sent together."""
 
     rows: range
     attempts: int = 0
 
 
 class Lanes:
-    """The shared connections; a lost one is opened again in the background, while the others go on.
+    """The shared connections; a lost one is opened again in the background, while the others continue.
 
     Args:
         clients: The clients, which are not connected yet.
-        check: Raises an error if an upstream, by what it says about itself, is not the one that is wanted.
+        check: Raises an error if an upstream, by its metadata, is the wrong one.
         retry_s: How long a batch waits for a lost upstream if there is no other, s.
     """
 
@@ -59,7 +59,7 @@ class Lanes:
         self._pool = ThreadPoolExecutor(max(1, len(clients) - 1), "upstream")
 
     def start(self, timeout_s: float) -> None:
-        """Return when one upstream answers; raises `ContractMismatch` if it is another one than is wanted."""
+        """Wait until one upstream answers; raises `ContractMismatch` if it is the wrong one."""
         for client in self._clients:
             self._connect_in_background(client)
         with self._changed:
@@ -72,8 +72,8 @@ class Lanes:
     def ask(self, observations: Sequence[Mapping[str, Any]]) -> list[Answer | Exception]:
         """Return the answer to each observation, or the error in its place.
 
-        A row whose connection is lost is asked again over another one, or over the same once it is open again, since
-        an upstream without sessions keeps nothing of it.
+        A row whose connection is lost is sent again over another one, or over the same once it is open again, since an
+        upstream without sessions keeps nothing of it.
         """
         results: list[Answer | Exception] = [NoReplica("upstream: not asked")] * len(observations)
         deadline = time.monotonic() + self._retry_s
@@ -114,7 +114,7 @@ class Lanes:
         return [_Share(range(rows * i // parts, rows * (i + 1) // parts)) for i in range(parts)]
 
     def _wait_ready(self, deadline: float) -> list[UpstreamClient]:
-        """Return the open connections, as soon as there is one; none if there is none until `deadline`."""
+        """Return the open connections as soon as there is one; none after `deadline`."""
         with self._changed:
             self._changed.wait_for(lambda: self._ready or self._closed, max(0.0, deadline - time.monotonic()))
             return list(self._ready)
@@ -203,13 +203,13 @@ class Lanes:
 
 
 def _is_passing(reason: VLAgentsError) -> bool:
-    """Whether waiting may help: the upstream is not there, in contrast to another one than is wanted."""
+    """Return whether waiting may help: the upstream is missing, rather than the wrong one."""
     return reason.status == NoReplica.status
 
 
 # Connections to upstreams that keep sessions: one for each session's episode.
 
-_AT_ONCE = 32  # sessions of a batch that are asked at the same time
+_AT_ONCE = 32  # sessions of a batch that are sent at the same time
 
 
 class SessionConnections:
@@ -218,7 +218,7 @@ class SessionConnections:
     Args:
         urls: The addresses of the upstreams.
         make: Returns a client of an address.
-        check: Raises an error if an upstream, by what it says about itself, is not the one that is wanted.
+        check: Raises an error if an upstream, by its metadata, is the wrong one.
         retry_s: How long the begin of an episode waits for an upstream, s.
     """
 

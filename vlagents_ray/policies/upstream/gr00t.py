@@ -16,7 +16,7 @@ from vlagents_ray.wire.outgoing import Outgoing
 
 
 class GR00TClient(UpstreamClient):
-    """A client of N1.6 and newer, or of N1.5, whose modalities say so: their keys are like `video.front`.
+    """A client of N1.6 and newer, or of N1.5, recognised by modality keys such as `video.front`.
 
     If the mapping's keys are like that, so are those of the observation, as `Gr00tSimPolicyWrapper` reads it.
     """

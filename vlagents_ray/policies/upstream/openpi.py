@@ -111,7 +111,7 @@ class RoboArenaClient(OpenPiClient):
         return found
 
     def _read(self, data: bytes | str) -> Any:
-        """Return a map, or the array that older servers answer; vLLM-Omni says an error in a map."""
+        """Return a map, or the array that older servers answer; vLLM-Omni sends an error as a map."""
         reply = self._map(data) if isinstance(data, str) else openpi.decode_any(data, self.options.limits)
         if isinstance(reply, dict) and reply.get("type") == "error":
             raise self.failed(reply.get("message"))

@@ -40,7 +40,7 @@ PROTOCOLS: dict[str, type[UpstreamClient]] = {
 
 
 class UpstreamConfig(BaseModel, extra="forbid"):
-    """Where the other policy server is, how it is asked, and how long it is waited for."""
+    """The address, protocol and time limits of the other policy server."""
 
     protocol: Literal["openpi", "openpi-batch", "roboarena", "gr00t", "openvla", "vla_eval", "vlagents"]
     urls: list[str] = Field(
@@ -113,7 +113,7 @@ class UpstreamConfig(BaseModel, extra="forbid"):
 
     @property
     def keeps_sessions(self) -> bool:
-        """Whether each session has a connection of its own."""
+        """Whether each session has its own connection."""
         return self.client.keeps_sessions if self.sessions is None else self.sessions == "connection"
 
     def keys(self) -> KeyMapping:
@@ -126,7 +126,7 @@ UPSTREAM_MS = "upstream_ms"  # in `Act.info`: the time that the upstreams needed
 class Upstream(Agent):
     """Asks the servers of another system for the actions of each batch.
 
-    The observation is sent with the upstream's own keys, as the mapping says. Its actions are returned as they are; the
+    The observation is sent with the upstream's own keys, by the mapping. Its actions are returned as they are; the
     contract states its gripper's commands.
     """
 
@@ -222,7 +222,7 @@ class Upstream(Agent):
 
 
 def _contract(mapped: Contract, stated: Mapping[str, Any]) -> Contract:
-    """Return the contract of a mapping, with what the deployment states in place of it."""
+    """Return the contract of a mapping, overridden by the deployment's."""
     own = {name: value for name, value in stated.items() if value is not None}
     whole: dict[str, Any] = mapped.to_json() | own
     whole["action"] = mapped.to_json()["action"] | own.get("action", {})

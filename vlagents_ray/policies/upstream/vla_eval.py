@@ -19,7 +19,7 @@ _STATED = ("model_server", "harness_version", "protocol_version", "observation_p
 
 
 class VlaEvalClient(WebSocketClient):
-    """A client that says where episodes begin, and asks for one action a step."""
+    """A client that announces episodes, and requests one action a step."""
 
     keeps_sessions: ClassVar[bool] = True
     mapping: ClassVar[str | None] = "vla-eval"
@@ -67,7 +67,7 @@ class VlaEvalClient(WebSocketClient):
         params = metadata.get("observation_params")
         wants_state = isinstance(params, dict) and params.get("send_state") is True
         if wants_state and not outgoing.mapping.state:
-            return ["state: the upstream wants it (send_state), the mapping has none; add it to mapping.state"]
+            return ["state: the upstream needs it (send_state), the mapping has none; add it to mapping.state"]
         return []
 
     def _send(self, kind: vla_eval.Kind, payload: dict[str, Any]) -> None:

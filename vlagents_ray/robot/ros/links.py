@@ -1,6 +1,6 @@
-"""The two ways to topics of ROS 2: rclpy, where ROS 2 is installed, and a rosbridge.
+"""Links to topics of ROS 2: rclpy, if ROS 2 is installed, or a rosbridge.
 
-A rosbridge speaks version 2 of its protocol over a WebSocket, as specified in ROSBRIDGE_PROTOCOL.md of
+A rosbridge uses version 2 of its protocol over a WebSocket, as specified in ROSBRIDGE_PROTOCOL.md of
 https://github.com/RobotWebTools/rosbridge_suite.
 """
 
@@ -27,13 +27,13 @@ logger = logging.getLogger(__name__)
 _OPEN_S = 5.0
 _AGAIN_S = 0.5
 _SILENT_S = 2.0
-# The kernel's limit of a send, which websockets has none for: a dead link would hold up the control loop for minutes.
+# The kernel's time limit for a send, which websockets lacks: a dead link would block the control loop for minutes.
 _SEND_LIMIT = struct.pack("@ll", 0, 200_000)
 _LARGEST = 64 << 20  # bytes of a frame; a 4K image in base64 has 34 million
 
 
 class Link(Protocol):
-    """A way to the topics: `Ros2` or `Rosbridge`."""
+    """The interface of `Ros2` and `Rosbridge`."""
 
     name: str
 
@@ -58,7 +58,7 @@ class Ros2:
     """A node of ROS 2, which a thread spins; raises `MissingDependency` without rclpy, or if ROS was not sourced."""
 
     name = "ros2"
-    up = True  # there is no connection to be lost; a peer that is gone is silent
+    up = True  # it has no connection; a lost peer is silent
     connections = 1
 
     def __init__(self, node: str = "vlagents_ray") -> None:
@@ -71,10 +71,9 @@ class Ros2:
         self._thread: threading.Thread | None = None
 
     def subscribe(self, topic: str, kind: str, take: Callable[[Any], None]) -> None:
-        """Have messages of a topic given to `take`, on the link's thread; before `open`.
+        """Pass messages of a topic to `take` on the link's thread; call it before `open`.
 
-        The newest message is wanted and a lost one is not sent again; such a subscription also matches a reliable
-        publisher.
+        Only the newest message is kept, and a lost one is not sent again; this also matches reliable publishers.
         """
         qos = require("rclpy.qos")
         newest = qos.QoSProfile(depth=1, reliability=qos.ReliabilityPolicy.BEST_EFFORT)
@@ -111,7 +110,7 @@ class Ros2:
 
 
 def message_class(kind: str) -> type[Any]:
-    """Return the class of a message type, "sensor_msgs/msg/Image"; raises `ConfigError` if it is not installed."""
+    """Return the class of a message type such as "sensor_msgs/msg/Image"; raises `ConfigError` if it is missing."""
     package, _, name = kind.split("/")
     try:
         found: type[Any] = getattr(import_module(f"{package}.msg"), name)
@@ -123,7 +122,7 @@ def message_class(kind: str) -> type[Any]:
 
 
 def filled(instance: Any, message: Mapping[str, Any]) -> Any:
-    """Fill in fields of a message, of which the others keep their values, and return it.
+    """Set fields of a message and return it; other fields keep their values.
 
     Lists of mappings are lists of the messages that the type of the field names.
     """
@@ -164,10 +163,10 @@ class Rosbridge:
         self.connections = 0  # since `open`
 
     def subscribe(self, topic: str, kind: str, take: Callable[[Any], None]) -> None:
-        """Have messages of a topic given to `take`, on the link's thread; before `open`.
+        """Pass messages of a topic to `take` on the link's thread; call it before `open`.
 
-        The topic is subscribed to again while it is silent: the server chooses the quality of service by the
-        publishers that it knows at that moment, and gets nothing from one with best effort that it found later.
+        While the topic is silent, it is subscribed to again: the server sets the quality of service by the present
+        publishers, and would miss a later one with best effort.
         """
         self._take[topic], self._types[topic] = take, kind
         self._heard[topic] = 0.0
@@ -184,7 +183,7 @@ class Rosbridge:
 
     @property
     def up(self) -> bool:
-        """Whether the connection stands, as far as is known here."""
+        """Whether the connection is up, as far as is known here."""
         return self._socket is not None
 
     def publish(self, topic: str, message: dict[str, Any]) -> bool:
@@ -204,13 +203,13 @@ class Rosbridge:
         self._closing.set()
         socket, self._socket = self._socket, None
         if socket is not None:
-            socket.close()  # with the closing handshake, so that what was sent last arrives
+            socket.close()  # with the closing handshake, so that the last messages arrive
         if self._thread is not None:
             self._thread.join()
         self._open.close()
 
     def _connect(self) -> None:
-        self._open.close()  # the connection before
+        self._open.close()  # the previous connection
         try:
             opening = connect(self._url, compression=None, max_size=_LARGEST, open_timeout=_OPEN_S, close_timeout=1)
             socket = self._open.enter_context(opening)
@@ -242,7 +241,7 @@ class Rosbridge:
                 self._lose(socket)
 
     def _ask_for(self, topic: str, socket: ClientConnection) -> None:
-        # The newest message alone, as it replaces what a slow link has not carried yet.
+        # Only the newest message: it replaces unsent ones on a slow link.
         request = {"op": "subscribe", "topic": topic, "type": self._types[topic], "queue_length": 1}
         socket.send(json.dumps(request))
         self._heard[topic] = time.monotonic()
@@ -254,7 +253,7 @@ class Rosbridge:
                 self._ask_for(topic, socket)
 
     def _probe(self, socket: ClientConnection) -> None:
-        """Lose a connection whose other end is gone without a word, as after a power cut."""
+        """Drop a connection whose other end ended without closing it, as after a power failure."""
         try:
             if socket.ping().wait(_SILENT_S):
                 self._ask_silent_again(socket)
@@ -270,12 +269,12 @@ class Rosbridge:
             self._closing.wait(_AGAIN_S)
             return
         if self._closing.is_set() and (socket := self._socket) is not None:
-            self._lose(socket)  # as `close` may have looked before it was connected
+            self._lose(socket)  # since `close` may have run before it was connected
             return
         logger.warning("%s: connected again", self._url)
 
     def _lose(self, socket: ClientConnection) -> None:
-        """Use a connection no more; without the closing handshake, in which a dead peer would be waited for."""
+        """Drop a connection without the closing handshake, which would wait for a dead peer."""
         if self._socket is socket:
             self._socket = None
             if not self._closing.is_set():

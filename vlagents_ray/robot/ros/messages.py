@@ -1,8 +1,8 @@
 """ROS 2 messages to numbers and images, and actions to messages; nothing here needs ROS.
 
-A message that comes in is a mapping, as rosbridge sends it, or an object with the same fields, as rclpy gives it. One
-that goes out is a mapping of its fields. The fields and their units are those of ROS 2's packages `sensor_msgs`,
-`geometry_msgs`, `std_msgs` and `trajectory_msgs`.
+A received message is a mapping, as from rosbridge, or an object with the same fields, as from rclpy. A message to send
+is a mapping of its fields. The fields and their units are those of ROS 2's packages `sensor_msgs`, `geometry_msgs`,
+`std_msgs` and `trajectory_msgs`.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ TWIST = ("linear.x", "linear.y", "linear.z", "angular.x", "angular.y", "angular.
 
 
 def field(message: Any, path: str) -> Any:
-    """Return a field of a message, "header.stamp.sec"; raises `MalformedMessage` if there is none."""
+    """Return a field of a message, such as "header.stamp.sec"; raises `MalformedMessage` if it is missing."""
     for name in path.split("."):
         try:
             message = message[name] if isinstance(message, Mapping) else getattr(message, name)
@@ -48,13 +48,13 @@ def stamp(message: Any) -> float | None:
 
 
 def image(message: Any) -> np.ndarray:
-    """Return the pixels of a `sensor_msgs/msg/Image`, (H, W, 3) uint8 RGB, in memory of its own.
+    """Return the pixels of a `sensor_msgs/msg/Image`, (H, W, 3) uint8 RGB, as a copy.
 
-    Rows may be longer than the pixels need (`step`). Of "mono16" the upper 8 bits count.
+    Rows may be longer than their pixels (`step`). Of "mono16" the upper 8 bits are used.
 
     Raises:
         InvalidObservation: The encoding is not one of colours or greys.
-        MalformedMessage: The data do not have the size that the fields declare.
+        MalformedMessage: The size of the data differs from the fields.
         MessageTooLarge: It has more pixels than 4096 x 4096.
     """
     encoding = field(message, "encoding")
@@ -94,12 +94,12 @@ def joints(message: Any, names: Sequence[str] = (), values: Values = "position")
 
     Args:
         message: The message, whose order does not matter.
-        names: The joints in the order wanted; all of them in the message's order, if empty.
+        names: The joints in the order of the result; if empty, all in the message's order.
         values: The field to read: positions (rad or m), velocities or efforts.
 
     Raises:
         MissingState: The message lacks one of the joints.
-        MalformedMessage: It has not as many numbers as names, or numbers that are not finite.
+        MalformedMessage: Names and numbers differ in count, or a number is not finite.
     """
     came = field(message, "name")
     if not isinstance(came, Sequence) or not all(isinstance(name, str) for name in came):
@@ -119,9 +119,9 @@ def joints(message: Any, names: Sequence[str] = (), values: Values = "position")
 def pose(message: Any, rotation: PoseRotation = "quat_xyzw") -> np.ndarray:
     """Return position (m) and rotation of a `geometry_msgs/msg/Pose` or `PoseStamped`, (7,), (6,) or (3,) float32.
 
-    `rotation` says how it is written after the position: "quat_xyzw" or "quat_wxyz" (of unit length), "euler_xyz"
-    (roll, pitch and yaw about fixed axes, rad), or "none". Raises `MalformedMessage` if a number is not finite, or the
-    quaternion has no length.
+    `rotation` is its form after the position: "quat_xyzw" or "quat_wxyz" (of unit length), "euler_xyz" (roll, pitch and
+    yaw about fixed axes, rad), or "none". Raises `MalformedMessage` if a number is not finite, or the quaternion is
+    zero.
     """
     stamped = "pose" in message if isinstance(message, Mapping) else hasattr(message, "pose")
     at = field(message, "pose") if stamped else message
@@ -132,7 +132,7 @@ def pose(message: Any, rotation: PoseRotation = "quat_xyzw") -> np.ndarray:
     length = float(np.linalg.norm(quaternion))
     if not length > 1e-6:
         raise MalformedMessage(
-            f"pose: got the quaternion {quaternion.tolist()}, want one of unit length; has nobody filled it in?"
+            f"pose: got the quaternion {quaternion.tolist()}, want one of unit length; is the field unset?"
         )
     quaternion = quaternion / length
     if rotation == "quat_wxyz":
@@ -169,14 +169,14 @@ def twist(row: np.ndarray, fields: Sequence[str] = TWIST) -> dict[str, Any]:
 def joint_trajectory(row: np.ndarray, names: Sequence[str], reach_s: float) -> dict[str, Any]:
     """Return a `trajectory_msgs/msg/JointTrajectory` of one point: positions, (D,) in the order of `names`.
 
-    The arm is to reach it `reach_s` seconds after the controller gets the message.
+    The arm should reach it `reach_s` seconds after the controller receives the message.
     """
     nanoseconds = round(reach_s * 1e9)
     point = {
         "positions": row.astype(np.float64).tolist(),
         "time_from_start": {"sec": nanoseconds // 10**9, "nanosec": nanoseconds % 10**9},
     }
-    now = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}  # as controllers read a stamp of zero
+    now = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}  # controllers read a stamp of zero as now
     return {"header": now, "joint_names": list(names), "points": [point]}
 
 
@@ -192,7 +192,7 @@ def _whole(name: str, value: Any) -> int:
 
 
 def _bytes(name: str, value: Any) -> bytes | memoryview:
-    """Return an array of uint8: rclpy gives an array, rosbridge base64 or, from some servers, a list."""
+    """Return the bytes of a uint8 array: an array from rclpy; base64, or from some servers a list, from rosbridge."""
     try:
         if isinstance(value, str):
             return base64.b64decode(value, validate=True)
@@ -212,7 +212,7 @@ def _numbers(name: str, values: Any) -> np.ndarray:
 
 
 def _finite(name: str, values: np.ndarray) -> np.ndarray:
-    """Return numbers as float32; rosbridge writes those that are not finite as null, which numpy reads as NaN."""
+    """Return finite numbers as float32; rosbridge writes others as null, which numpy reads as NaN."""
     with np.errstate(over="ignore"):
         found = values.astype(np.float32)
     if not np.isfinite(found).all():

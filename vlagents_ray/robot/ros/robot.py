@@ -1,4 +1,4 @@
-"""A robot behind topics of ROS 2, whose topics are parts of the observation and of the action."""
+"""A robot behind topics of ROS 2, which are parts of the observation and of the action."""
 
 from __future__ import annotations
 
@@ -50,16 +50,16 @@ class TopicReader:
         self._by_stamp = by_stamp
         self._clock = CaptureClock()
         self._seen_at = -math.inf  # s of `time.monotonic`
-        self._lock = threading.Lock()  # a watchdog that stops the robot reads where it is, beside the control loop
+        self._lock = threading.Lock()  # a stop by the watchdog reads the pose beside the control loop
         self._came: tuple[Any, float] | None = None
         self._looked_at: tuple[Any, float] | None = None
 
     def take(self, message: Any) -> None:
-        """Note a message; on the link's thread. It is read only if it is the newest when the control loop looks."""
+        """Keep a message, on the link's thread; the control loop decodes only the newest one."""
         self._came = message, time.time()
 
     def refresh(self) -> None:
-        """Read the newest message, if there is one. One that cannot be read counts as not sent, so the reading ages."""
+        """Decode the newest message, if any. An unreadable one is ignored, so that the reading ages."""
         with self._lock:
             came = self._came
             if came is not None and came is not self._looked_at:
@@ -82,7 +82,7 @@ class TopicReader:
 
     @property
     def age_s(self) -> float:
-        """How old the reading is, s; infinite if its time lies in the future, as its age is then unknown."""
+        """The age of the reading, s; infinite if its time is in the future."""
         return time.monotonic() - self._seen_at
 
 
@@ -104,7 +104,7 @@ def _state(reading: InputTopic, message: Any) -> np.ndarray:
 
 
 def _opening(reading: InputTopic, message: Any) -> float:
-    """Return how far the gripper is open, 0 to 1, by the first number of a message."""
+    """Return the opening of the gripper, 0 to 1, from the first number of a message."""
     first = float(_state(reading, message)[0])
     share = (first - (reading.closed or 0.0)) / ((reading.open or 0.0) - (reading.closed or 0.0))
     return min(1.0, max(0.0, share))
@@ -113,15 +113,14 @@ def _opening(reading: InputTopic, message: Any) -> float:
 class RosRobot:
     """A `Robot` whose cameras, state and actions are topics.
 
-    An observation has the newest message of each topic, and the time of the oldest of them as `captured_at`. While one
-    is older than its `max_age_s`, or the link is lost, `holds` says so: the control loop then stops the robot and goes
-    on by itself. After `silent_s` without a new message the watchdog stops it.
-
-    Use it as a context manager: that connects, and waits for the first message of each topic.
+    An observation has the newest message of each topic, and the time of the oldest of them as `captured_at`. While a
+    message is older than its `max_age_s`, or the link is lost, `holds` is the reason: the control loop stops the robot,
+    and continues by itself later. After `silent_s` without a new message the watchdog stops it. Use it as a context
+    manager, which connects and waits for the first message of each topic.
 
     Args:
         settings: The topics.
-        link: The way to them; by default what the settings name.
+        link: The link to them; by default that of the settings.
     """
 
     def __init__(self, settings: RosSettings, link: Link | None = None) -> None:
@@ -160,7 +159,7 @@ class RosRobot:
 
     @property
     def silent_s(self) -> dict[str, float]:
-        """The sources for a `Watchdog`: each topic, and how long it may be without a new message, s."""
+        """The sources for a `Watchdog`: each topic, and its longest time without a new message, s."""
         limits: dict[str, float] = {}
         for reading in self.settings.sensors:
             limit = self.settings.silent_of(reading)
@@ -169,7 +168,7 @@ class RosRobot:
 
     @property
     def contract(self) -> Contract:
-        """What the topics provide and take, by the messages that have come."""
+        """The contract of the topics, from the messages received so far."""
         cameras = {name: self._value(one) for name, one in self.settings.cameras.items()}
         state = {name: self._value(one) for name, one in self.settings.state.items()}
         return Contract(
@@ -197,7 +196,7 @@ class RosRobot:
         """Publish an action.
 
         Raises:
-            InvalidAction: It has another number of values than the topics take.
+            InvalidAction: The number of values differs from that of the topics.
         """
         if action.shape != (self.settings.dim,):
             raise InvalidAction(f"action: got {action.shape}, want ({self.settings.dim},), as the topics take")
@@ -207,8 +206,8 @@ class RosRobot:
             first += command.dim
 
     def stop(self) -> None:
-        """Publish what stops the robot, on each topic: zeros, or the measured pose if that is not old."""
-        self._stop_unsent = not self._link.up  # then it is sent when the link is back
+        """Publish the stop of each topic: zeros, or the measured pose if that is recent."""
+        self._stop_unsent = not self._link.up  # if so, it is sent on reconnection
         for command in self.settings.actions:
             if command.stop in ("", ZEROS):
                 self._publish(command, np.zeros(command.dim, np.float32))
@@ -219,7 +218,7 @@ class RosRobot:
         reader = self._readers[id(reading)]
         reader.refresh()
         if reader.age_s > self.settings.max_age_of(reading) or self._from_before_loss(reader):
-            self._stop_unsent = True  # until it is known where the robot is
+            self._stop_unsent = True  # until a pose is known
             logger.warning("%s: not told where to stop, as %s is old", command.topic, reading.topic)
         else:
             self._publish(command, reader.value)
@@ -240,9 +239,9 @@ class RosRobot:
 
     def _hold_if_old(self) -> None:
         up, connections = self._link.up, self._link.connections
-        if not up or connections != self._connections:  # or it was lost between two ticks
+        if not up or connections != self._connections:  # or the link was lost between two ticks
             self._connections, self._lost_at = connections, time.monotonic()
-            self._stop_unsent = True  # the last may have been sent while nobody knew of the loss
+            self._stop_unsent = True  # the last stop may have been sent before the loss was detected
         lost = any(self._from_before_loss(reader) for reader in self._readers.values())
         self.holds = f"the connection to the {self._link.name} was lost" if lost else None
         for reading in self.settings.sensors:

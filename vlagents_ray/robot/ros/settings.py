@@ -1,4 +1,4 @@
-"""The file that says which topics of ROS 2 a robot's cameras, state and actions are."""
+"""The file of the ROS 2 topics of a robot's cameras, state and actions."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ class InputTopic:
     """A topic that a part of the observation is read from."""
 
     topic: str
-    type: str = ""  # "sensor_msgs/msg/Image"; "" is that of its place in the file
-    names: tuple[str, ...] = ()  # joints of a JointState, in the policy's order; all of them, if empty
+    type: str = ""  # such as "sensor_msgs/msg/Image"; "" is the default of its place in the file
+    names: tuple[str, ...] = ()  # joints of a JointState, in the policy's order; all if empty
     values: Values = "position"  # field of a JointState
-    rotation: PoseRotation = "quat_xyzw"  # how the rotation of a pose is written
-    open: float | None = None  # of the gripper: the number where it is open
+    rotation: PoseRotation = "quat_xyzw"  # form of the rotation of a pose
+    open: float | None = None  # of the gripper: the number at which it is open
     closed: float | None = None
     max_age_s: float | None = None  # without a newer message the robot holds still; None: the file's
     silent_s: float | None = None  # without a newer message the robot is stopped; None: the file's
@@ -42,16 +42,16 @@ class ActionTopic:
 
     topic: str
     type: str
-    stop: str = ""  # what is published to stop: the part of the state with the measured pose, "zeros" or "nothing"
-    numbers: int | None = None  # how many numbers a Float64MultiArray takes
+    stop: str = ""  # to stop: "zeros", "nothing", or the part of the state with the measured pose
+    numbers: int | None = None  # count of numbers of a Float64MultiArray
     names: tuple[str, ...] = ()  # joints of a JointState or JointTrajectory
     values: Values = "position"  # field of a JointState
     fields: tuple[str, ...] = TWIST  # of a Twist
-    reach_s: float = 0.1  # time in which the point of a JointTrajectory is to be reached
+    reach_s: float = 0.1  # time in which the arm should reach the point of a JointTrajectory
 
     @property
     def dim(self) -> int:
-        """How many numbers of an action it takes."""
+        """The count of an action's numbers that it takes."""
         if self.type == ARRAY:
             return self.numbers or 0
         return len(self.fields) if self.type == TWIST_TYPE else len(self.names)
@@ -59,7 +59,7 @@ class ActionTopic:
 
 @dataclass(frozen=True)
 class HeartbeatTopic:
-    """A `std_msgs/msg/Bool` that says that the control loop runs, and whether it may move the robot."""
+    """A `std_msgs/msg/Bool`, published while the control loop runs: whether it may move the robot."""
 
     topic: str
     hz: float = 10.0
@@ -67,7 +67,7 @@ class HeartbeatTopic:
 
 @dataclass(frozen=True)
 class RosSettings:
-    """All of the file; see docs/ros.md."""
+    """The settings of the file; see docs/ros.md."""
 
     link: str  # "ros2", or the address of a rosbridge: "ws://arm-pc:9090"
     actions: tuple[ActionTopic, ...]  # together they take the numbers of an action, in this order
@@ -78,24 +78,24 @@ class RosSettings:
     max_age_s: float = 0.3
     silent_s: float = 1.0
     clock: str = "stamp"  # whether a message's age counts from its header's time stamp, or from its arrival ("arrival")
-    ready_s: float = 10.0  # how long the first message of each topic is waited for
+    ready_s: float = 10.0  # time limit for the first message of each topic
 
     @property
     def sensors(self) -> list[InputTopic]:
-        """The readings that must not be old."""
+        """The topics whose readings must be recent."""
         return [*self.cameras.values(), *self.state.values(), *([self.gripper] if self.gripper else [])]
 
     @property
     def dim(self) -> int:
-        """How many numbers an action has."""
+        """The count of numbers of an action."""
         return sum(command.dim for command in self.actions)
 
     def max_age_of(self, reading: InputTopic) -> float:
-        """After how long without a newer message the robot holds still, s."""
+        """Return the time without a newer message after which the robot holds still, s."""
         return self.max_age_s if reading.max_age_s is None else reading.max_age_s
 
     def silent_of(self, reading: InputTopic) -> float:
-        """After how long without a newer message the robot is stopped, s."""
+        """Return the time without a newer message after which the robot is stopped, s."""
         return self.silent_s if reading.silent_s is None else reading.silent_s
 
 
@@ -103,7 +103,7 @@ def read_settings(file: Path | str) -> RosSettings:
     """Read a YAML file of topics, as docs/ros.md explains it.
 
     Raises:
-        ConfigError: It cannot be read, or a setting is unknown, missing or has a wrong value.
+        ConfigError: The file cannot be read, or a setting is unknown, missing or wrong.
         MissingDependency: PyYAML is not installed.
     """
     yaml = require("yaml", extra="ros")

@@ -66,7 +66,7 @@ class Keys:
         self._checked = float("-inf")
         self._unreadable: float | None = None  # time since which the file is unreadable, s; None if it is readable
         self._reminded = 0.0
-        self._hung: threading.Thread | None = None  # a check that has not come back
+        self._hung: threading.Thread | None = None  # a check that has not returned
         self._lock = threading.Lock()
         self.audit = Audit()
         self._state: object = self._changed()
@@ -105,13 +105,13 @@ class Keys:
                 found = known
         if found is None:
             self.audit.refused("", "an unknown key")
-            raise Unauthorized("this API key is not known here; ask whoever runs the server for one")
+            raise Unauthorized("this API key is not known here; ask the operator of the server for one")
         caller = Caller(self, found, keys[found].name, app)
         caller.admit(free=True)
         return caller
 
     def key(self, digest: bytes) -> Key | None:
-        """Return the key with this SHA-256 as the file has it now; None if there is none."""
+        """Return the key with this SHA-256 in the present file, or None."""
         self._refresh()
         return self._keys.get(digest)
 
@@ -133,7 +133,7 @@ class Keys:
             raise error
 
     def throttled_s(self, name: str) -> float:
-        """Return for how long no sender with the key is read, s: over 0 if one of them was over the key's rate."""
+        """Return the time for which the key's senders are not read, s; 0 unless one exceeded the key's rate."""
         bucket = self._buckets.get(name)
         return 0.0 if bucket is None else max(0.0, bucket.unread_until - time.monotonic())
 
@@ -173,7 +173,7 @@ class Keys:
                 self._hung = None
 
     def _read_again(self, now: float) -> None:
-        """Read the file if it has changed; on a thread of its own, which a network drive may hold up."""
+        """Read the file if it has changed, on a separate thread, which a network drive may block."""
         try:
             state = self._changed()
             if state == self._state:
@@ -195,9 +195,9 @@ class Keys:
         left_s = _CLOSE_S - (now - since)
         if left_s <= 0 and self._keys:
             self._keys = {}
-            logger.critical("nobody is let in any more: for %g s no key file could be read: %s", _CLOSE_S, error)
+            logger.critical("all keys are refused: for %g s no key file could be read: %s", _CLOSE_S, error)
         elif first or now - self._reminded >= _REMIND_S:
-            until = f"the keys stay as they were for {left_s:.0f} s more" if left_s > 0 else "nobody is let in"
+            until = f"the keys stay as they were for {left_s:.0f} s more" if left_s > 0 else "all keys are refused"
             logger.error("the key file cannot be read; %s: %s", until, error)
         else:
             return
@@ -280,9 +280,9 @@ class Caller:
     def _admit(self, free: bool, scope: str | None = None) -> None:
         key = self._keys.key(self._digest)
         if key is None or key.revoked:
-            raise Unauthorized(f"key {self.name!r} was revoked; ask whoever runs the server for another")
+            raise Unauthorized(f"key {self.name!r} was revoked; ask the operator of the server for another")
         if key.expires is not None and time.time() >= key.expires:
-            raise Unauthorized(f"key {self.name!r} has expired; ask whoever runs the server for another")
+            raise Unauthorized(f"key {self.name!r} has expired; ask the operator of the server for another")
         if key.apps and self.app not in key.apps:
             raise Forbidden(f"key {self.name!r} is for {sorted(key.apps)}, not for {self.app!r}")
         if scope is not None and scope not in key.scopes:
@@ -369,8 +369,8 @@ def require_access(host: str, keys: Keys | None, insecure: bool) -> None:
     """Raise `ConfigError` if the server would accept other machines without keys and `insecure` does not allow that."""
     if keys is None and not insecure and not is_loopback(host):
         raise ConfigError(
-            f"host {host}: whoever reaches this server could command the policy. Make keys (`vlagents-ray keys new "
-            f"NAME --file keys.json`) and serve with `--keys keys.json` (in a deployment file: "
+            f"host {host}: any client that reaches this server could command the policy. Make keys "
+            f"(`vlagents-ray keys new NAME --file keys.json`) and serve with `--keys keys.json` (in a deployment file: "
             f"`access: {{keys_file: PATH}}` under `args`); or say `--insecure` (`access: {{insecure: true}}`)"
         )
 
@@ -392,8 +392,8 @@ class ScopeCheck:
     """The check of one endpoint.
 
     Args:
-        subject: What the endpoint is about, for the error message.
-        open_to_network: Whether other machines reach this server without a key; then nobody may do it.
+        subject: The subject of the endpoint, for the error message.
+        open_to_network: Whether other machines reach this server without a key; then it is refused.
     """
 
     def __init__(self, subject: str, *, open_to_network: bool) -> None:

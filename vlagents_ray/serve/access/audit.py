@@ -34,7 +34,7 @@ def write_audit() -> None:
 
 
 def log_pressed(name: str, what: str) -> None:
-    """Log that the key `name` commanded a session, each time; an empty name stands for a server without keys."""
+    """Log that the key `name` commanded a session, each time; an empty name means a server without keys."""
     logger.info("key %s: pressed %s", name or "(none)", what)
 
 
@@ -57,7 +57,7 @@ class Audit:
             logger.info("key %s: %s %s%s", name, what, of, more)
 
     def refused(self, name: str, why: str) -> None:
-        """Log that the key `name` was refused; an empty name stands for a missing or an unknown key."""
+        """Log that the key `name` was refused; an empty name means a missing or an unknown key."""
         if (more := self._due(name, why)) is not None:
             logger.warning("key %s: refused: %s%s", name or "(none)", why, more)
 

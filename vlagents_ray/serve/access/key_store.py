@@ -26,7 +26,8 @@ from vlagents_ray.protocol.messages import RANKS, RankName
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _SHA256 = re.compile(r"[0-9a-f]{64}")
-# What a key may do besides commanding the policy: push new weights, watch all sessions on the live page, and press its
+# Further rights of a key besides commanding the policy: push new weights, watch all sessions on the live page, and
+# press its
 # buttons, which pause, stop, mark or, where a robot offers that, move them.
 SCOPES = ("weights", "watch", "operate")
 _PREFIX = "vlr_"  # lets scanners of repositories and logs find leaked keys

@@ -1,6 +1,6 @@
 """Check of requests from pages in a browser, which can reach a server on their machine like any other program.
 
-A server with API keys needs no such check, since the page needs a key, too.
+A server with API keys needs no such check, since the page also needs a key.
 
 A browser states the site of the requesting page in `origin`, and the host name of the server in `host`. Only pages at
 this server's address count as its own: another site can let its own name resolve to this machine once its page is

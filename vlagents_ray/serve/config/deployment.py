@@ -29,7 +29,7 @@ class _DeploymentModel(BaseModel):
 
 
 class LiveArgs(_DeploymentModel):
-    """The last seconds of each session, which a press on the live page saves; see `vlagents_ray.serve.observers`."""
+    """The last seconds of each session, which a button of the live page saves; see `vlagents_ray.serve.observers`."""
 
     folder: AbsolutePath = Field(
         description="folder of the datasets, on each replica's own node or shared; each replica writes its own below it"
@@ -60,7 +60,7 @@ class EnvironmentArgs(_DeploymentModel):
     def _one(self) -> EnvironmentArgs:
         if self.python is None and self.process != "auto":
             raise ValueError(f"process: got {self.process!r} without `python`; name an interpreter, or leave it out")
-        # The check covers a child process, too: Serve shows the deployment, and a child may become a replica.
+        # The check also covers a child process: Serve shows the deployment, and a child may become a replica.
         require_no_secrets({"env_vars": self.env_vars})
         return self
 
@@ -239,7 +239,7 @@ class AccessArgs(_DeploymentModel):
         description="path of the API keys, on every node the same; unset: what VLAGENTS_RAY_KEYS_FILE or "
         "VLAGENTS_RAY_KEYS say where the replica runs",
     )
-    insecure: bool = Field(default=False, description="let in anybody who reaches the port from another machine")
+    insecure: bool = Field(default=False, description="accept clients on other machines without keys")
     plain_http: bool = Field(
         default=False, description="keys may cross the network unencrypted: no warning (TLS ends elsewhere, a VPN)"
     )

@@ -43,7 +43,7 @@ class DialectConfig(BaseModel):
         return value
 
     def keys(self) -> KeyMapping | None:
-        """The mapping; None if the client uses our names."""
+        """Return the mapping; None if the client uses our names."""
         return None if self.mapping is None else read_mapping(self.mapping)
 
 

@@ -241,8 +241,8 @@ class PortDialect(Dialect):
         super().__init__(name, config, context)
         if isinstance(config, KeylessPortConfig) and not (isinstance(context.check, NoKey) or config.without_key):
             raise ConfigError(
-                f"dialects.{name}: the server wants API keys, and this protocol has none; remove the dialect, or "
-                "accept whoever reaches its port, with without_key: true"
+                f"dialects.{name}: the server requires API keys, and this protocol has none; remove the dialect, or "
+                "accept all clients that reach its port, with without_key: true"
             )
 
     @classmethod
@@ -320,7 +320,7 @@ class ImplicitEpisode:
         self.begun = False  # whether there was an observation of this episode
 
     def begins(self, instruction: str | None) -> bool:
-        """Whether an observation with that instruction begins an episode."""
+        """Return whether an observation with that instruction begins an episode."""
         return not self.begun or (instruction is not None and instruction != self.instruction)
 
     def opening(self, instruction: str | None, contract: Contract | None) -> str | None:

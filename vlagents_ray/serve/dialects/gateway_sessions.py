@@ -171,7 +171,7 @@ def _raise_first(found: Sequence[object]) -> None:
             raise one
 
 
-# Clients of a dialect whose protocol does not say when they are gone.
+# Clients of a dialect whose protocol does not announce their end.
 
 
 class GatewayClient(abc.ABC):
@@ -197,7 +197,7 @@ C = TypeVar("C", bound=GatewayClient)
 
 
 class GatewayClients(Generic[K, C]):
-    """The clients by what the protocol tells them apart by, at most `sessions` of the context. Thread-safe."""
+    """The clients by the protocol's identity of a client, at most `sessions` of the context. Thread-safe."""
 
     def __init__(self, context: GatewayContext) -> None:
         self._context = context

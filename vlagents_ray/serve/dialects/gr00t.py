@@ -356,7 +356,7 @@ class _Strangers:
                 self._add(event["value"])
 
     def note_client(self, descriptor: int, client: GR00TConnection) -> None:
-        """Take the client whose message came over a connection; its key is checked on another thread."""
+        """Take the client of a connection's message; its key is checked on another thread."""
         if descriptor in self._since:
             self._clients[descriptor] = client
 

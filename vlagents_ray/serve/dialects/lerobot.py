@@ -72,7 +72,7 @@ class _Waiting:
 
 
 class LeRobotConnection(GatewayClient):
-    """One client, from its `Ready` on. Its requests come on several threads; the session is used by one at a time."""
+    """One client, from its `Ready` on. Its requests arrive on several threads; one at a time uses the session."""
 
     def __init__(self, context: GatewayContext, mapping: KeyMapping, checkpoint: str | None) -> None:
         super().__init__(context)
@@ -134,7 +134,7 @@ class LeRobotConnection(GatewayClient):
             earlier.admission.release()
 
     def actions(self) -> bytes | None:
-        """Return the pickle of the actions for the newest observation; None if there is none for two seconds."""
+        """Return the pickle of the actions for the newest observation; None after two seconds without one."""
         deadline = time.monotonic() + _WAIT_S
         if not self._acting.acquire(timeout=_WAIT_S):
             return None
@@ -281,7 +281,7 @@ class LeRobotDialect(PortDialect):
     def _ready(self, _: bytes, context: Any) -> bytes:
         if self._closing.is_set():
             raise PolicyUnavailable("the server is stopping; connect again")
-        if self._ipv4 and context.peer().startswith("ipv6:"):  # gRPC listens there, too, if the host is 0.0.0.0
+        if self._ipv4 and context.peer().startswith("ipv6:"):  # gRPC also listens there if the host is 0.0.0.0
             raise Forbidden("this server is for IPv4; connect to such an address, or set dialects.lerobot.host to '::'")
         make = partial(LeRobotConnection, self.context, self.mapping, self.config.checkpoint)
         self._clients.add(context.peer(), make)
@@ -313,7 +313,7 @@ class LeRobotDialect(PortDialect):
 
     @contextlib.contextmanager
     def _client(self, context: Any) -> Iterator[LeRobotConnection]:
-        """Yield the client of a request, which is told apart by its connection."""
+        """Yield the client of a request, identified by its connection."""
         client = self._clients.get(context.peer())
         if client is None:
             raise NotReset("Ready: got none over this connection, or it was idle for too long; start the client again")
@@ -331,7 +331,7 @@ class LeRobotDialect(PortDialect):
 
 
 def _joined(messages: Iterator[bytes], admission: MessageAdmission) -> bytes:
-    """Return the pickle whose parts come in messages; each is counted when it arrives."""
+    """Return a pickle that arrives in several messages; each counts on arrival."""
     parts: list[memoryview] = []
     size, limit = 0, admission.limits.body_bytes
     for message in messages:

@@ -64,7 +64,7 @@ class MapDialect(RouteDialect):
 
     @abc.abstractmethod
     def speaks(self, message: dict[str, Any]) -> bool:
-        """Return whether a message comes from a client of this dialect."""
+        """Return whether a message is from a client of this dialect."""
 
     def begins(self, message: dict[str, Any], connection: MapConnection) -> bytes | str | None:
         """Begin an episode if the message requires it.
@@ -115,7 +115,7 @@ class OpenPiDialect(MapDialect):
     """openpi's protocol: a session begins with the connection, and an episode with each new prompt.
 
     The observations of a batch are those of further sessions, in order. A batch of another size ends all their
-    episodes, as nothing says which of its observations is whose.
+    episodes, as the owner of each observation is unknown.
     """
 
     Config = OpenPiDialectConfig

@@ -239,7 +239,7 @@ def _builtin(error: VLAgentsError) -> str:
 
 
 def _is_same_machine(connection: socket.socket) -> bool:
-    """Whether the client is on this machine, in which case both ends have the same address."""
+    """Return whether the client is on this machine, in which case both ends have the same address."""
     try:
         return bool(connection.getpeername()[0] == connection.getsockname()[0])
     except OSError:  # the client is gone already

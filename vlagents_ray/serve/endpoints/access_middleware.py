@@ -116,7 +116,7 @@ def _is_public(scope: Scope) -> bool:
 
 
 def _has_body(scope: Scope, most: int = 0) -> bool:
-    """Whether a body of more than `most` bytes, or of unstated length, follows the headers."""
+    """Return whether a body of more than `most` bytes, or of unstated length, follows the headers."""
     headers = headers_of(scope)
     stated = headers.get("content-length", "0")
     return "transfer-encoding" in headers or not stated.isdecimal() or int(stated) > most
@@ -240,7 +240,7 @@ class _TimedWebSocket:
 
     async def _close(self, code: int, reason: str) -> None:
         logger.info("a WebSocket is closed: %s", reason)
-        with suppress(asyncio.TimeoutError, RuntimeError):  # the client does not read, or has closed meanwhile
+        with suppress(asyncio.TimeoutError, RuntimeError):  # the client does not read, or has closed
             closing = self._send({"type": "websocket.close", "code": code, "reason": reason[:120]})
             await asyncio.wait_for(closing, _TICK_S)
 
@@ -248,14 +248,14 @@ class _TimedWebSocket:
 def _cancel_again(over: bool) -> None:
     """Cancel the receiver again if it missed its cancellation.
 
-    Before Python 3.12, `asyncio.wait_for` drops a cancellation that comes together with what it waits for, such as
-    the message of a client whose key has just been revoked.
+    Before Python 3.12, `asyncio.wait_for` drops a cancellation that coincides with the awaited event, such as the
+    message of a client whose key has just been revoked.
     """
     if over:
         raise asyncio.CancelledError
 
 
 def _uncancel(task: asyncio.Task[object] | None) -> None:
-    """Undo the task's cancellation, which came from this module and has been handled."""
+    """Undo the task's cancellation by this module, which has been handled."""
     if task is not None and hasattr(task, "uncancel"):  # since Python 3.11
         task.uncancel()

@@ -105,11 +105,11 @@ class PolledConnection(ABC):
         self._name = server.name
         self._connection = connection
         self.caller: Identity | None = None  # None until the client has shown its key
-        self._sender: Sender | None = None  # None until then, too
+        self._sender: Sender | None = None  # also None until then
         self._sending = threading.Lock()  # guards the sending: other threads send answers, or end the connection
         self._ended = False
         self._polled = True  # whether the poller watches the connection
-        self._unpolled_for: set[str] = set()  # reasons for which it shall not
+        self._unpolled_for: set[str] = set()  # reasons against it
 
     @abstractmethod
     def _read(self) -> None:

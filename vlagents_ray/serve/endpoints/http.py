@@ -1,10 +1,9 @@
 """The HTTP endpoint: HTTP and WebSocket on one port, as an ASGI application over an engine.
 
-    POST /v1/reset, /v1/act, /v1/close   multipart/form-data, application/json, or one binary frame
-    WS   /v1/stream                      sessions that end with the connection; binary frames or probes
-    WS   /v1/weights                     new weights from a learner, see `vlagents_ray.serve.endpoints.weights`
-    GET  /live, /v1/live, WS /v1/live    what the sessions do, see `vlagents_ray.serve.observers.live_page`
-    GET  /healthz, /v1/metadata, /docs
+    POST /v1/reset, /v1/act, /v1/close multipart/form-data, application/json, or one binary frame WS /v1/stream sessions
+    that end with the connection; binary frames or probes WS /v1/weights new weights from a learner, see
+    `vlagents_ray.serve.endpoints.weights` GET /live, /v1/live, WS /v1/live the state of the sessions, see
+    `vlagents_ray.serve.observers.live_page` GET /healthz, /v1/metadata, /docs
 
 Errors over HTTP are problem+json with a stable code; over WebSocket they are reply frames.
 """
@@ -253,7 +252,7 @@ async def _no_such_path(of_http: ASGIApp, scope: Scope, receive: Receive, send: 
 
 
 async def _http_problem(http: HttpRequest, error: Exception) -> Response:
-    """Reply to what the router refuses: an unknown path, or a method that the path does not support."""
+    """Reply to a request that the router refuses: an unknown path, or an unsupported method."""
     refused = cast(HTTPException, error)
     if refused.status_code == 404:
         return problem_response(UnknownApp("no such path; GET /docs lists what there is"), request_id(http))

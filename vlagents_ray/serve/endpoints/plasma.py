@@ -63,7 +63,7 @@ class Channel:
     leased: float = 0.0  # time of the latest lease, s, monotonic
 
     def read(self) -> bytes:
-        """Return a copy of the frame that was written, without waiting; raise `MalformedMessage` if there is none."""
+        """Return a copy of the written frame, without waiting; raise `MalformedMessage` if there is none."""
         found = self._take()
         if found.metadata != PlasmaAddress.TAG:  # Ray's parser below trusts its input, as it does everywhere
             raise MalformedMessage("plasma: what the channel holds is no frame; is this a client of vlagents_ray?")
@@ -215,7 +215,7 @@ class LeasedChannel:
         self._channel: Channel | None = None
 
     def read(self, message: memoryview, descriptors: list[int]) -> tuple[np.ndarray, bool, memoryview]:
-        """See `Payload`; the memory is a copy of the frame in the channel that the message names."""
+        """Return a copy of the frame in the message's channel, whether it is compact, and the rest of the message."""
         if len(message) < PlasmaAddress.REQUEST.size:
             raise MalformedMessage(f"plasma: got {len(message)} bytes, want at least {PlasmaAddress.REQUEST.size}")
         key, flags = PlasmaAddress.REQUEST.unpack_from(message)
@@ -226,11 +226,11 @@ class LeasedChannel:
         return memory, bool(flags & LocalAddress.COMPACT), message[PlasmaAddress.REQUEST.size :]
 
     def freed(self) -> int:
-        """See `Payload`; always 0, since frames are copied and a reply implies that the channel is free."""
+        """Return 0, since frames are copied and a reply implies that the channel is free."""
         return 0
 
     def free(self) -> None:
-        """See `Payload`; other clients can lease the channel from now on."""
+        """Release the channel for other clients."""
         if self._channel is not None:
             self._pool.release(self._channel)
             self._channel = None

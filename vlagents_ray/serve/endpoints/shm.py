@@ -260,14 +260,14 @@ class ShmServer(UnixServer):
     name: ClassVar[str] = "shm"
 
     def __init__(self, engine: Engine, limits: Limits, admit: Admit | NoKey, ops: Sequence[Op] = OPS) -> None:
-        """See `UnixServer`."""
+        """Create the server and its address; see `UnixServer`."""
         super().__init__(engine, admit, limits, partial(MemoryFiles, limits), ops)
         self.address = LocalAddress(
             f"vlagents-ray-{secrets.token_hex(16)}", boot_id(), keyed=not isinstance(admit, NoKey)
         )
 
     def listen(self) -> None:
-        """See `UnixServer`."""
+        """Listen at the address of the metadata."""
         self._listener.bind(f"\0{self.address.socket}")
         self._listener.listen(BACKLOG)
 
@@ -282,7 +282,7 @@ class MemoryFiles:
         self._freed: set[int] = set()  # freed files that no reply has reported yet
 
     def read(self, message: memoryview, descriptors: list[int]) -> tuple[np.ndarray, bool, memoryview]:
-        """See `Payload`."""
+        """Return the frame in the message's memory file, whether it is compact, and the rest of the message."""
         if len(message) < LocalAddress.REQUEST.size:
             raise MalformedMessage(f"local: got {len(message)} bytes, want at least {LocalAddress.REQUEST.size}")
         number, flags, length = LocalAddress.REQUEST.unpack_from(message)
@@ -292,14 +292,14 @@ class MemoryFiles:
         return memory, bool(flags & LocalAddress.COMPACT), message[LocalAddress.REQUEST.size :]
 
     def freed(self) -> int:
-        """See `Payload`."""
+        """Return the bits of the freed files since the last call."""
         bits = 0
         while self._freed:
             bits |= 1 << self._freed.pop()
         return bits
 
     def free(self) -> None:
-        """See `Payload`; memory that the policy still views is freed with the last view."""
+        """Free all memory; memory that the policy still views is freed with the last view."""
         self._files.clear()
 
     def _memory(self, number: int, length: int) -> np.ndarray:

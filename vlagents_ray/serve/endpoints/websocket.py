@@ -1,9 +1,9 @@
 """The WebSocket port of a replica, without a proxy between the robot and the policy thread.
 
-The metadata gives a client the port and an unguessable path, so that a client that may not read the metadata cannot
-use the port; where there are API keys, the handshake must contain one, too. Messages are those of `WS /v1/stream` on
-the server's port, which remains for clients that cannot reach this one. As with local clients the policy thread reads
-the sockets (see `vlagents_ray.serve.endpoints.connection`) and decodes the messages.
+The metadata gives a client the port and an unguessable path, so that a client that may not read the metadata cannot use
+the port; with API keys, the handshake must also contain one. Messages are those of `WS /v1/stream` on the server's
+port, which remains for clients that cannot reach this one. As with local clients the policy thread reads the sockets
+(see `vlagents_ray.serve.endpoints.connection`) and decodes the messages.
 """
 
 from __future__ import annotations
@@ -153,7 +153,7 @@ class WebSocketServer(PolledServer["WebSocketConnection"]):
         return caller
 
     def remove(self, client: WebSocketConnection) -> None:
-        """See `PolledServer`."""
+        """Forget a connection, also during its handshake."""
         self._handshaking.pop(client, None)
         super().remove(client)
 
@@ -183,13 +183,13 @@ class WebSocketConnection(PolledConnection):
         self._received = ReceiveBuffer()
         self._out = SendBuffer(connection, self._sending, STREAM_BYTES)
         self._paused = False  # whether too much is unanswered; guarded by the lock
-        # Received but unprocessed frames, their arrival times, s, and the admissions of those that came in parts.
+        # Received but unprocessed frames, their arrival times, s, and the admissions of those received in parts.
         self._frames: deque[tuple[Frame, float, MessageAdmission | None]] = deque()
         self._partial: MessageAdmission | None = None  # admission of the message of which a part is here
         self._unanswered = self._unanswered_bytes = 0  # messages; bytes with the decoded images
         self._messages = 0  # number received so far
         self._ending = False  # `end` was called; bytes that arrive now are ignored
-        self._discarded = 0  # bytes that arrived after a wrong message, which nobody reads
+        self._discarded = 0  # unread bytes after a wrong message
         # Of `overdue` alone: messages at its last call, since when so many, since when a part of the next is here (s).
         self._seen, self._quiet_since, self._part_since = 0, time.monotonic(), float("inf")
 
@@ -251,7 +251,7 @@ class WebSocketConnection(PolledConnection):
             self._pause(_BACKLOGGED)
 
     def _hold_partial(self, sender: Sender) -> None:
-        """Count a message of which a part is here for its key, before the rest is read, and its bytes as they come."""
+        """Count a partly received message for its key, before the rest is read, and its bytes as they arrive."""
         try:
             if self._partial is None:
                 admission = sender.admission(self._limits)
@@ -266,7 +266,7 @@ class WebSocketConnection(PolledConnection):
             self.end(str(error), _TRY_AGAIN_LATER if isinstance(error, Overloaded) else POLICY_VIOLATION)
 
     def _is_backlogged(self) -> bool:
-        """Whether the client has too many unanswered messages or bytes; the caller holds the lock."""
+        """Return whether the client has too many unanswered messages or bytes; the caller holds the lock."""
         return self._unanswered >= _UNANSWERED or self._unanswered_bytes > self._limits.body_bytes
 
     def _discard(self) -> None:
@@ -275,7 +275,7 @@ class WebSocketConnection(PolledConnection):
         self._out.close()
 
     def overdue(self, now: float, refusal: Callable[[Caller], str | None]) -> tuple[str, int] | None:
-        """See `PolledConnection`.
+        """Return a reason and a close code if the connection is too slow or has to end; see `PolledConnection`.
 
         Time counts against the client only while the server has read all that arrived: a slow policy keeps its thread
         from reading.

@@ -35,7 +35,7 @@ from vlagents_ray.weights.safetensors import MESSAGE_BYTES, ValueSpec, ValuesRea
 logger = logging.getLogger(__name__)
 
 PATH = "/v1/weights"
-LEAST_RATE = 2**18  # bytes a second that a push has on average: no other push is taken meanwhile
+LEAST_RATE = 2**18  # average bytes a second of a push, since it blocks other pushes
 _SCOPE = "weights"
 _DIGITS = 20  # most of a version's number
 _TRUTH = {"true": True, "false": False}
@@ -45,7 +45,7 @@ class ReceivesWeights(Protocol):
     """The replicas of a policy, for which one of them receives new weights."""
 
     def read_header(self, header: bytes, options: PushOptions) -> dict[str, ValueSpec]:
-        """Return types and shapes of the values to come; raise an error if they do not fit the policy."""
+        """Return types and shapes of the announced values; raise an error if they do not fit the policy."""
         ...
 
     async def push_received(self, named: Mapping[str, Any], options: PushOptions) -> PushResult:
@@ -100,7 +100,7 @@ class _WeightsEndpoint:
         except Exception:
             logger.exception("a push of weights failed")
             answer = problem(VLAgentsError("internal error; the server's log has the details"))
-        with suppress(WebSocketDisconnect, RuntimeError):  # the learner has gone meanwhile
+        with suppress(WebSocketDisconnect, RuntimeError):  # the learner has disconnected
             await socket.send_text(json.dumps(answer))
             await socket.close()
 

@@ -493,7 +493,7 @@ class Engine:
 
     def _ready(self, pending: PendingRequest) -> tuple[Session[LoadedModel], LoadedModel, WeightsVersion]:
         session: Session[LoadedModel] | None = pending.session
-        if session is None or session.over:  # it has ended, or came here from another replica, since it was looked up
+        if session is None or session.over:  # it has ended, or moved here from another replica, since the lookup
             session = self.sessions.get(pending.session_id)
         model, weights = session.model, session.weights
         if session.agent is None:  # an earlier reset in the queue failed, or waits for its checkpoint

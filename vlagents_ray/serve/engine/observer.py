@@ -1,7 +1,7 @@
-"""The interface of observers, which are the only way to see the requests and the answers of an engine.
+"""The interface of observers, the only access to the requests and the answers of an engine.
 
 An observer is called on the threads that requests and answers take: it copies or passes on references, and leaves the
-rest to a thread of its own. It retains nothing unbounded: beyond a limit in bytes or entries it drops. Requests that
+rest to its own thread. What it retains is bounded: beyond a limit in bytes or entries it drops data. Requests that
 could not be decoded reach no observer. `vlagents_ray.serve.observers` has the observers.
 """
 
@@ -55,19 +55,19 @@ class Observers(Observer):
             self.any = bool(self._all)
 
     def on_request(self, pending: PendingRequest) -> None:
-        """See `Observer`; as below, an error of an observer costs no answer."""
+        """Call all observers with a request; their errors are logged, and affect no answer."""
         for observer in self._all:
             with _logged(observer):
                 observer.on_request(pending)
 
     def before_answer(self, pending: PendingRequest, reply: Reply) -> None:
-        """See `Observer`."""
+        """Call all observers before an answer is sent; their errors are logged."""
         for observer in self._all:
             with _logged(observer):
                 observer.before_answer(pending, reply)
 
     def on_answer(self, pending: PendingRequest, reply: Reply) -> None:
-        """See `Observer`."""
+        """Call all observers with an answer; their errors are logged."""
         for observer in self._all:
             with _logged(observer):
                 observer.on_answer(pending, reply)

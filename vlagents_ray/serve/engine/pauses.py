@@ -23,7 +23,7 @@ _CHECK_S = 0.1  # interval of the checks for a pause
 _PAUSE_S = 0.3  # time without a check above which the process was paused, rather than merely busy
 _BACKLOG_S = (0.5, 5.0)  # shortest and longest time to read the backlog of a pause; it is half as long as the pause
 
-# Ports of both ends of the TCP connection on which the current HTTP request came, the server's first.
+# Ports of both ends of the current HTTP request's TCP connection, the server's first.
 _PORTS: ContextVar[tuple[int, int] | None] = ContextVar("vlagents_ray_ports", default=None)
 
 
@@ -42,7 +42,7 @@ def _since_last_data_s() -> float | None:
         return None
     with contextlib.suppress(OSError):  # the system does not list descriptors
         for descriptor in map(int, os.listdir("/proc/self/fd")):
-            with contextlib.suppress(OSError):  # it is no connected socket, or was closed meanwhile
+            with contextlib.suppress(OSError):  # it is no connected socket, or has been closed
                 connection = socket.socket(socket.AF_INET, socket.SOCK_STREAM, fileno=descriptor)
                 try:
                     names = connection.getsockname(), connection.getpeername()

@@ -61,7 +61,7 @@ def build_reply(
             raise PolicyFailed(_too_large("action", act.action.nbytes, limit))
         if act.info:
             require_serializable(act.info, limit - act.action.nbytes)
-        act.info = {**policy, **(act.info or {})}  # the session's own; policies without info may say None
+        act.info = {**policy, **(act.info or {})}  # the session's own; policies without info may return None
     except Exception as error:  # noqa: BLE001 - becomes the reply
         return Reply(request_id, error=public_error(error, pending))
     session.steps += 1

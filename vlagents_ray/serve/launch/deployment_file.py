@@ -59,7 +59,7 @@ def read_deployment(
             raise ConfigError(f"{source}: not YAML ({error})") from error
         return _checked(document, source, step_follows)
     if ":" not in source and source not in names("policies"):
-        policy_class(source)  # raises with the list of what there is
+        policy_class(source)  # raises with the list of choices
     return _of_name(source, overrides or {}, step_follows)
 
 

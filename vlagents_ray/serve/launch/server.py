@@ -92,9 +92,9 @@ def wait_for_proxies(proxies: list[Any], look_again: Callable[[], list[Any]]) ->
 def shut_down(client: Any) -> None:
     """End Serve, so that replicas drain and HAProxy stops, like `serve.shutdown`, but without its error message.
 
-    The controller ends itself during this call, which Ray would report as a failed task that will be
-    retried. A signal to the whole process group or service, as systemd's SIGTERM, also ends Ray's head: then Serve can
-    neither answer nor go on, and the reaper ends its processes.
+    The controller ends itself during this call, which Ray would report as a failed task that will be retried. A signal
+    to the whole process group or service, as systemd's SIGTERM, also ends Ray's head: then Serve can neither answer nor
+    continue, and the reaper ends its processes.
     """
     import ray
 
@@ -262,7 +262,7 @@ def _missing_gpus(config: ServeDeploySchema, here: float | None = None) -> str |
         return None
     where = "this machine" if here is not None or started_here() else "this cluster"
     return (
-        f"resources.num_gpus: the replicas of {wanted} want {sum(wanted.values()):g} GPUs, {where} has {there:g}; "
+        f"resources.num_gpus: the replicas of {wanted} need {sum(wanted.values()):g} GPUs, {where} has {there:g}; "
         f"want less (0 runs on the CPU), or add a machine that has them"
     )
 
@@ -371,7 +371,7 @@ def own_ray(
         # Ray starts its workers with a low priority, so that a policy would wait for all other processes.
         # Proxies start while policies load: on a slow machine Serve would replace them after three times its 5 s.
         environment = {"RAY_worker_niceness": "0", "RAY_SERVE_PROXY_READY_CHECK_TIMEOUT_S": "60"}
-        # The address at which replicas listen for WebSockets: loopback if the network may see nothing but TLS.
+        # The address at which replicas listen for WebSockets: loopback if only TLS may cross the network.
         ours = {MARK: str(folder), ALONE: "0", HOST: host if tls is None else LOOPBACK}
         listener = None
         if not ingress:

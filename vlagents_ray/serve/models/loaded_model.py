@@ -121,7 +121,7 @@ class LoadedModel:
     sessions: int = 0  # number of sessions that hold it
     closed: bool = False
     key: str = field(init=False)  # `key_of(settings)`
-    # Held beside `busy` while the agent runs, so that no other model is captured as a CUDA graph meanwhile. Where none
+    # Held beside `busy` while the agent runs, so that no other model is captured as a CUDA graph. Where none
     # can be, it is a lock of no other use, which costs less.
     uncaptured: AbstractContextManager[Any] = field(init=False)
     _calls_by_kind: dict[tuple[str, Hashable], PolicyCall] = field(default_factory=dict)
@@ -135,7 +135,7 @@ class LoadedModel:
 
     @property
     def checkpoint(self) -> str | None:
-        """Name of the checkpoint, as its sessions see it."""
+        """The checkpoint's name for its sessions."""
         return resolved(self.settings) or self.choice.name
 
     @property
@@ -164,7 +164,7 @@ class LoadedModel:
         return call
 
     def require_open(self) -> None:
-        """Raise `UnknownSession` if the model and its sessions were closed meanwhile; `busy` is held."""
+        """Raise `UnknownSession` if the model and its sessions have been closed; `busy` is held."""
         if self.closed:
             raise UnknownSession(f"{self.choice} has just been unloaded for another; reset the session")
 

@@ -4,7 +4,7 @@ The first checkpoint is loaded on the policy's thread. A loading thread then loa
 while sessions of loaded checkpoints act. `ModelCache` decides which one is next.
 
 Ray's `serve.multiplexed` counts models alone: at its limit it unloads the one that was requested least recently, also
-while sessions act with it, and it never waits for them. Hence this cache, which knows the sessions.
+while sessions act with it, and it never waits for them. Hence this cache, which tracks the sessions.
 
 A deployment's own settings can change (`ModelManager.configure`): the new checkpoint is loaded beside the old one. New
 episodes then use the new checkpoint, and the old one is evicted when its last episode has ended.
@@ -209,7 +209,7 @@ class ModelManager:
 
     def __init__(self, source: Checkpoints, loader: Loader, sessions: SessionTable[LoadedModel]) -> None:
         """Manage models from `loader` for `sessions`; a model's sessions are closed when it is evicted at once."""
-        self.continues_plans = False  # whether that model's chunks go on from the plan that is executed
+        self.continues_plans = False  # whether that model's chunks continue the executed plan
         self.contract: Contract | None = None  # contract of the deployment's own model that was loaded last
         self.weights: dict[str, Any] | None = None  # weights of the deployment's own model that was loaded last
         self.devices: list[dict[str, Any]] = []  # on which that model computes
@@ -458,7 +458,7 @@ class ModelManager:
         with self._changed:
             if task.at_once and model.sessions:  # a session from another replica holds it, but is in no table yet
                 self._changed.wait(_CHECK_S)
-            if model.sessions:  # a session still holds it, or took it meanwhile
+            if model.sessions:  # a session still holds it, or has taken it
                 return
             del self._cache.loaded[task.key]
         logger.info("%s: unloading %s", model.choice, model.checkpoint)

@@ -1,7 +1,7 @@
 """Commands to the sessions of a replica, from keys that may operate them on the live page.
 
 From a network a robot can only be made to stop: it is paused, stopped, or its episode is marked. What makes it move
-(resuming, another instruction, a human's motion) is done at the robot. A command travels in the answer to the next
+(resuming, another instruction, an operator's motion) is done at the robot. A command travels in the answer to the next
 request of the robot, within `_WAITS_S` or never, since a late one would surprise the person beside it; a later request
 states the outcome. The server itself executes `SAVE`.
 """

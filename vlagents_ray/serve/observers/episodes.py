@@ -24,7 +24,7 @@ logger = logging.getLogger(__name__)
 
 CHUNK, ROWS, SESSION = "chunk", "chunk_rows", "session"  # columns of each frame
 TRACE = "trace"  # key in `info.json`
-_FRAMES = 2000  # most frames of an episode, whose numbers are in memory; the session goes on in the next one
+_FRAMES = 2000  # most frames of an episode, whose numbers are in memory; the session continues in the next one
 _BYTES = 16 * 2**20  # most bytes of these numbers
 _SESSIONS = 32  # most sessions that are recorded at once, each with an encoder for each camera
 _FREE_BYTES = 2**30  # room that the recording leaves on its disk
@@ -48,7 +48,7 @@ class RecordedAct:
 
     @property
     def shapes(self) -> tuple[Any, ...]:
-        """What the frames of one dataset have in common."""
+        """The common columns of the frames of one dataset."""
         obs = self.obs
         cameras = tuple((name, obs.cameras[name].shape) for name in sorted(obs.cameras))
         state = tuple((name, obs.state[name].shape) for name in sorted(obs.state))
@@ -57,7 +57,7 @@ class RecordedAct:
 
 @dataclass(frozen=True, slots=True)
 class _Shelf:
-    """A dataset, and what its frames have in common."""
+    """A dataset, and the common columns of its frames."""
 
     dataset: Dataset
     shapes: tuple[Any, ...]
@@ -73,7 +73,7 @@ class _Running:
     number: int  # of the session, the same in all its episodes
     instruction: str
     reset: str  # options of the reset, as `to_text` writes them; empty once they are recorded
-    weights: str  # what the reset said of the loaded weights, as text; empty once it is recorded
+    weights: str  # the loaded weights in the reset's info, as text; empty once recorded
     shelf: _Shelf | None = None  # of `episode`
     episode: RobotEpisode | None = None  # None before the first frame
     frames: int = 0  # of `episode`
@@ -83,7 +83,7 @@ class _Running:
 class EpisodeWriter:
     """Writes the episodes of one replica. Not thread-safe.
 
-    Frames of other cameras, states or actions go into a dataset of their own: `FOLDER/NAME-0`, `FOLDER/NAME-1`, …
+    Frames of other cameras, states or actions go into another dataset: `FOLDER/NAME-0`, `FOLDER/NAME-1`, …
     """
 
     def __init__(
@@ -133,7 +133,7 @@ class EpisodeWriter:
         """Append a frame to a session that has begun.
 
         Raises:
-            RecordingEnded: The folder, or its disk, is full; what was recorded is complete.
+            RecordingEnded: The folder, or its disk, is full; the recorded episodes are complete.
             OSError: It cannot be written.
         """
         running = self._running[session]
@@ -214,7 +214,7 @@ class EpisodeWriter:
                 return shelf
         root = self._folder / f"{self._name}-{len(self._shelves)}"
         self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        root.mkdir(mode=0o700)  # others do not see what a robot sees
+        root.mkdir(mode=0o700)  # pictures are only for this user
         dataset = Dataset(root, self._fps, lossless=self._lossless)
         meaning = ActionSpec()
         if self._describe is not None:

@@ -2,7 +2,7 @@
 
 Clients choose what is kept, so all of it is bounded in bytes: of an answer, numbers and short texts; of observations,
 the latest of each session, at most `RATE` times a second; and of both, the oldest are dropped beyond `ANSWER_BYTES` and
-`OBSERVATION_BYTES`. The live page, the last seconds of each session and the viewers read them on threads of their own.
+`OBSERVATION_BYTES`. The live page, the last seconds of each session and the viewers read them on their own threads.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _KEPT_S = 1.0  # time for which pixels are kept for a reader
 
 
 class Answer(NamedTuple):
-    """What is kept of the answer to one request."""
+    """The kept data of the answer to one request."""
 
     number: int  # increases with every answer of the replica
     session: str
@@ -56,7 +56,7 @@ class Answer(NamedTuple):
     rows: int = 0  # of the chunk
     action: np.ndarray | None = None  # (rows, D) float32, as far as `ROWS` and `VALUES` reach; None without an act
     done: bool = False
-    info: Mapping[str, Any] = MappingProxyType({})  # the numbers and short texts that the policy says
+    info: Mapping[str, Any] = MappingProxyType({})  # the numbers and short texts in the policy's info
 
     @property
     def size(self) -> int:
@@ -86,7 +86,7 @@ class KeptObservation:
         return _OBJECTS + arrays + sum(pixels.values()) + sum(len(file) for file in self.files.values())
 
     def pictures(self) -> dict[str, bytes]:
-        """Return the files of all cameras; those that came as pixels are encoded now, which may take milliseconds."""
+        """Return the files of all cameras; raw pixels are encoded now, which may take milliseconds."""
         with _ENCODING:  # several may read
             for camera, image in self.cameras.items():
                 self.files[camera] = JPEG.file(image)
@@ -131,7 +131,7 @@ class LiveObserver(Observer):
             for kept in self._observations.values():
                 if kept.time < self._clock() - _KEPT_S:
                     kept.cameras = {}
-                kept.counted = kept.size  # pictures were encoded meanwhile
+                kept.counted = kept.size  # pictures have been encoded
             self._observation_bytes = sum(kept.counted for kept in self._observations.values())
 
     def close(self) -> None:
@@ -140,7 +140,7 @@ class LiveObserver(Observer):
         self._observers.remove(self)
 
     def on_request(self, pending: PendingRequest) -> None:
-        """See `Observer`."""
+        """Keep the request's observation, and read the outcomes of commands."""
         pending.kept[self] = self._keep(pending)
         if self._commands is not None:
             self._commands.read_outcomes(pending.session_id, pending.request)
@@ -151,7 +151,7 @@ class LiveObserver(Observer):
             self._commands.send(pending.session_id, reply)
 
     def on_answer(self, pending: PendingRequest, reply: Reply) -> None:
-        """See `Observer`."""
+        """Add the answer to the session's observation."""
         observation = pending.kept.pop(self, None)
         if observation is not None and reply.act is not None and (row := reply.act.rows()[0]).size <= _ACTION:
             observation.action = np.array(row)
@@ -169,7 +169,7 @@ class LiveObserver(Observer):
         return list(itertools.takewhile(lambda one: one.number > since, reversed(held)))[::-1]
 
     def observation(self, session: str) -> KeptObservation | None:
-        """Return the session's latest observation that was kept; None if there is none."""
+        """Return the session's latest kept observation, or None."""
         return self._observations.get(session)
 
     def forget_others(self, sessions: Collection[str]) -> None:
@@ -234,7 +234,7 @@ def _info(info: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _is_number(value: object) -> bool:
-    """Whether it is a number of bounded size, and no NaN."""
+    """Return whether it is a number of bounded size, and no NaN."""
     return type(value) in (int, float) and -_MOST <= value <= _MOST  # type: ignore[operator]
 
 

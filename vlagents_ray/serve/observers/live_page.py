@@ -10,7 +10,7 @@ commands, but videos:
 
     GET /v1/live/videos/7   a video to which the document refers by its number
 
-The viewer asks for each message, with the sessions whose pictures it shows: {"shown": ["arm-1", …]}. So a slow viewer
+The viewer requests each message, with the sessions whose pictures it shows: {"shown": ["arm-1", …]}. So a slow viewer
 misses old messages, and delays no other. The answer is the length of a JSON document (32 bits, little-endian), the
 document, and the files to which it refers by their index in `files`, the list of their lengths.
 
@@ -150,7 +150,7 @@ class _LiveEndpoint:
         except WebSocketDisconnect:
             return
         except VLAgentsError as error:
-            with suppress(WebSocketDisconnect, RuntimeError):  # the viewer has gone meanwhile
+            with suppress(WebSocketDisconnect, RuntimeError):  # the viewer has disconnected
                 await socket.send_text(json.dumps(problem(error)))
                 await socket.close(_POLICY_VIOLATION)
         finally:

@@ -1,6 +1,6 @@
-"""What viewers see: the snapshots of a replica, numbers as a JSON document and pictures as files, and those of a fleet.
+"""The data for viewers: the snapshots of a replica, as a JSON document and picture files, and those of a fleet.
 
-The snapshots of all replicas, and what is shown beside them, are gathered once for all viewers of one page.
+The snapshots of all replicas, and the other content of a page, are gathered once for all its viewers.
 """
 
 from __future__ import annotations
@@ -98,9 +98,9 @@ class ReplicaView:
         self.live.close()
 
     def press(self, session: str, do: str, by: str) -> dict[str, Any] | None:
-        """Give a command to a session, see `CommandBoard.press`, and await its outcome for a while.
+        """Give a command to a session and await its outcome for a limited time; see `CommandBoard.press`.
 
-        Returns None if the session is not here.
+        Returns None if the session is not at this replica.
         """
         try:
             pressed = self.commands.press(session, do, by)
@@ -188,7 +188,7 @@ def _session(session: Session[LoadedModel], last: Answer | None) -> dict[str, An
 
 
 def _pictures(kept: KeptObservation, files: list[bytes]) -> dict[str, int]:
-    """Add the pictures of an observation to `files`, encoding those that came as pixels; return their indices."""
+    """Add the pictures of an observation to `files`, encoding raw pixels; return their indices."""
     found = kept.pictures()
     if sum(map(len, files)) + sum(map(len, found.values())) > PICTURES:
         return {}
@@ -243,7 +243,7 @@ class OtherReplicas(Protocol):
 
 
 class Viewer:
-    """What one viewer is still to be sent."""
+    """The unsent data of one viewer."""
 
     def __init__(self) -> None:
         self.shown: frozenset[str] = frozenset()  # the sessions whose pictures it shows

@@ -20,7 +20,7 @@ from vlagents_ray.serve.observers.spans import RequestSpans
 class ReplicaObservers:
     """The open observers of one replica, until `close`."""
 
-    view: ReplicaView  # what viewers see; the live observer is active only while something reads it
+    view: ReplicaView  # the data for viewers; the live observer is active only while it is read
     recorder: SessionRecorder | None
     _opened: ExitStack
 
@@ -38,7 +38,7 @@ def open_observers(
 ) -> ReplicaObservers:
     """Observe the requests of an engine from now on.
 
-    `replica` is Ray's name of the replica, which no other has or will have. Viewers see the name of its `node`.
+    `replica` is Ray's name of the replica, which is unique over time. Viewers see the name of its `node`.
 
     Raises:
         ConfigError: A folder cannot be written to.

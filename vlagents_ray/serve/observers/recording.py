@@ -1,7 +1,7 @@
 """Records requests and answers of sessions as LeRobotDatasets; other threads copy, encode and write them.
 
 The thread that handles a message only puts references into a queue. A second thread copies the observations, since they
-may lie in memory that their client wants back, and a third one encodes and writes. If these fall behind, or the disk is
+may be in memory that their client needs again, and a third one encodes and writes. If these fall behind, or the disk is
 full, frames are dropped and counted; no answer waits for them.
 """
 
@@ -126,7 +126,7 @@ class SessionRecorder(Observer):
 
         At most `held_bytes` of requests wait to be written.
         """
-        self.dropped = 0  # acts for which there was no memory, or which came in an episode that could not be written
+        self.dropped = 0  # acts without memory for them, or in an episode that could not be written
         self.ended: str | None = None  # why nothing more is recorded
         self._writer = writer
         self._sessions = sessions
@@ -151,7 +151,7 @@ class SessionRecorder(Observer):
         return self.dropped + self._writer.lost
 
     def on_request(self, pending: PendingRequest) -> None:
-        """See `Observer`."""
+        """Copy the request for the recording, on another thread."""
         request = pending.request
         if self.ended is not None or request.op not in ("act", "reset", "close"):
             return
@@ -168,7 +168,7 @@ class SessionRecorder(Observer):
         self._copier.put(partial(self._copy, recorded))
 
     def on_answer(self, pending: PendingRequest, reply: Reply) -> None:
-        """See `Observer`."""
+        """Record the frame of the answered request."""
         recorded = pending.kept.pop(self, None)
         if recorded is not None and reply.error is None:
             self._write_later(partial(self._handle, recorded, reply))
@@ -243,7 +243,7 @@ class SessionRecorder(Observer):
                     self.dropped += 1
         except (OSError, RecordingEnded):
             raise
-        except UnknownSession:  # it has ended meanwhile, as has its episode
+        except UnknownSession:  # it has ended, and so has its episode
             self.dropped += 1
         except Exception as error:  # noqa: BLE001 - one session's episode
             logger.warning("recording: the episode of session %s is lost: %s", session, error)
@@ -251,7 +251,7 @@ class SessionRecorder(Observer):
             self._writer.drop(session)
 
     def _records(self, session: str) -> bool:
-        """Return whether the session is recorded; one that came from another replica is drawn here."""
+        """Return whether the session is recorded; one from another replica is drawn here."""
         if session not in self._first:
             self._first[session] = None
             if random.random() < self._share:

@@ -1,9 +1,9 @@
 """The last seconds of each session, of which a press on the live page makes an episode of a LeRobotDataset.
 
 A thread reads the live observer ten times a second, as a viewer does, and keeps pictures as files: those that clients
-sent as they came, others encoded with at most 4 % of a core, for which frames are left out. All sessions together hold
-at most `memory_mb`; beyond that the oldest frames go first. One session is saved at a time, and one frame of it decoded
-at a time, until the folder holds `most_gb`.
+kept unchanged, others encoded with at most 4 % of a core, for which frames are left out. All sessions together hold at
+most `memory_mb`; beyond that the oldest frames go first. One session is saved at a time, and one frame of it decoded at
+a time, until the folder holds `most_gb`.
 """
 
 from __future__ import annotations

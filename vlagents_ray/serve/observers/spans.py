@@ -18,11 +18,11 @@ from vlagents_ray.serve.requests import PendingRequest
 _KEPT = 4096  # most answers between two half seconds; older ones have no spans
 _STAGES = {"queue": "queue", "inference": "batch"}  # in their order from the end of decoding on; names of the spans
 _OPS = ("act", "reset")
-_TEXT = 200  # most characters of an error, or of what a client states
+_TEXT = 200  # most characters of an error, or of a client's text
 
 
 class _ServedRequest(NamedTuple):
-    """What is kept of a request and its answer: nothing that its client may make large."""
+    """The kept data of a request and its answer, of bounded size."""
 
     session: str
     op: str
@@ -54,14 +54,14 @@ class RequestSpans(Observer):
         tracing.flush()
 
     def on_request(self, pending: PendingRequest) -> None:
-        """See `Observer`."""
+        """Remember the begin of the request."""
         request = pending.request
         if request.op in _OPS:
             session, parent = pending.session_id, _traceparent(request)
             pending.kept[self] = _ServedRequest(session, request.op, request.rank, parent, time.time_ns())
 
     def on_answer(self, pending: PendingRequest, reply: Reply) -> None:
-        """See `Observer`."""
+        """Export the span of the answered request."""
         served: _ServedRequest | None = pending.kept.pop(self, None)
         if served is not None:
             error = "" if reply.error is None else f"{reply.error.code}: {reply.error}"[:_TEXT]

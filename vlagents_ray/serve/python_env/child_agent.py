@@ -52,7 +52,7 @@ class Child:
     def __init__(self, python: str, settings: Settings, env_vars: Mapping[str, str]) -> None:
         self.contract: Contract | None = None  # contract of the policy, set by `start`
         self.weights: dict[str, Any] | None = None  # identity of the weights, set by `start`
-        self.continues_plans = False  # whether the policy's chunks go on from a plan, set by `start`
+        self.continues_plans = False  # whether the policy's chunks continue a plan, set by `start`
         self.sessions: set[str] = set()  # names of the sessions in the child
         self._python = python
         self._settings = settings

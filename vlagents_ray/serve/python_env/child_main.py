@@ -74,7 +74,7 @@ def unloaded_contract(agent: Agent) -> Contract | None:
 
 
 def run() -> None:
-    """Run the policy until the replica ends it, or has ended itself."""
+    """Run the policy until the replica closes it or ends."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     answers = os.fdopen(os.dup(1), "w")

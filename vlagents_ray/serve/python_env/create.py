@@ -71,7 +71,7 @@ def find_python(version: str) -> str:
     It is this process's own, one on PATH, or one that pyenv or uv has installed for this user.
 
     Raises:
-        ConfigError: There is none.
+        ConfigError: There is no such interpreter.
     """
     folders = [Path(folder) for folder in os.environ.get("PATH", "").split(os.pathsep) if folder]
     pyenv = Path(os.environ.get("PYENV_ROOT") or Path.home() / ".pyenv") / "versions"
@@ -230,7 +230,7 @@ def _minor(python: Path) -> str:
 
 
 def _is(python: Path, version: str) -> bool:
-    """Whether an interpreter runs and has that minor version; a shim of pyenv's may not run."""
+    """Return whether an interpreter runs and has that minor version; a shim of pyenv's may not run."""
     done = subprocess.run([str(python), "-c", _MINOR], capture_output=True, text=True, check=False)  # noqa: S603
     return done.returncode == 0 and done.stdout.strip() == version
 

@@ -28,7 +28,7 @@ _DENSE_S = 500e-6  # gap between two requests below which the next one is expect
 
 
 class Taken(NamedTuple):
-    """What the policy's thread takes at once; both are empty if no request has arrived for long."""
+    """The work that the policy's thread takes at once; both are empty after a long time without requests."""
 
     batch: list[PendingRequest]
     expired: list[PendingRequest]  # whose deadlines have passed: not in the batch, and still to be answered
@@ -81,7 +81,7 @@ class BatchQueue:
         self._begun = 0.0  # start of the running batch, s
 
     def bind(self, *, driven: bool = False) -> None:
-        """Make the calling thread the policy's; if it is `driven`, the poller's `wake` tells it when to call `take`."""
+        """Make the calling thread the policy's; if it is `driven`, the poller's `wake` signals when to call `take`."""
         self._thread = 0 if driven else threading.get_ident()
         self._driven = self._asleep = driven
         self._load_timer.mark_busy()
@@ -128,7 +128,7 @@ class BatchQueue:
         return Taken(batch, expired)
 
     def begin(self, batch: Sequence[PendingRequest]) -> None:
-        """Note that the policy begins to act on a batch; another thread polls meanwhile, if that pays."""
+        """Record that the policy begins to act on a batch; another thread polls during it, if worthwhile."""
         self._begun = self._clock()
         self._running = batch
         if self.window.overlaps:
@@ -208,8 +208,8 @@ class BatchQueue:
     def _wait_for_event(self) -> bool:
         """Wait for a watched file or a wake-up call; False if there was none within `idle_s`.
 
-        If the last request came soon, the thread polls for `_SPIN_S` before it sleeps, since waking up takes as long
-        as a fast policy. It yields the core to other processes meanwhile.
+        If the last request followed soon, the thread polls for `_SPIN_S` before it sleeps, since waking up takes as
+        long as a fast policy. While polling it yields the core to other processes.
         """
         begun = self._load_timer.mark_idle()
         while self._dense and time.perf_counter() - begun < _SPIN_S:

@@ -106,7 +106,7 @@ class PolicyCalls:
         self.broken: BaseException | None = None  # error of an accelerator, after which no call succeeds
 
     def record_error(self, error: BaseException) -> None:
-        """Note an error of the policy, if it says that its accelerator failed."""
+        """Record an error of the policy, if it reports a failed accelerator."""
         if self.broken is None and is_device_failure(error):
             self.broken = error
 

@@ -107,7 +107,7 @@ class FairQueue:
         """Take the next batch of at most `size` requests.
 
         Returns:
-            The batch, and the expired requests that were removed on the way. Requests that are over are dropped.
+            The batch, and the expired requests that were removed. Finished requests are dropped.
         """
         lone = self._lone
         if lone is not None and not lone.over and now <= lone.deadline:

@@ -83,7 +83,7 @@ class Poller:
         return (bool(self._timers) and self._run_timers()) or bool(events)
 
     def hand_to_reader(self) -> None:
-        """Let the reader thread poll until `reclaim`; the owner must not poll meanwhile."""
+        """Let the reader thread poll until `reclaim`; until then the owner must not poll."""
         if self._reader is None:
             self._reader = threading.Thread(target=self._read, name="policy-reader", daemon=True)
             self._reader.start()
@@ -154,7 +154,7 @@ class Poller:
 
     def _timer_s(self) -> float:
         """Return the time until the next timer, s."""
-        first = self._timers[:1]  # a copy, since the owner may take the poller back from the reader meanwhile
+        first = self._timers[:1]  # a copy, since the owner may take the poller back from the reader
         return max(0.0, first[0][0] - time.monotonic()) if first else math.inf
 
     def _run_timers(self) -> bool:

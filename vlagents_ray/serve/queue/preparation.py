@@ -1,7 +1,7 @@
 """Preparation of observations on other threads than the policy's, so that the next batch is ready when one ends.
 
 A batch does not wait for a preparation that has not begun: the policy's thread then does that itself, beginning with
-the last one. So a robot whose request comes last does not wait for the preparations of simulations before it.
+the last one. So a robot whose request arrives last does not wait for the preparations of earlier simulations.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Preparation:
         Raises:
             Exception: Any error of the agent's `prepare`.
         """
-        if agent is self._agent:  # otherwise the session was reset meanwhile
+        if agent is self._agent:  # otherwise the session has been reset
             self._obs.prepared = self._future.result() if begun else self._agent.prepare(self._obs)
 
 

@@ -46,7 +46,7 @@ def build(args: ServerArgs, *, drains: bool = True) -> Application:
     else:
         options["num_replicas"] = args.replicas or 1
     if os.environ.get("RAY_SERVE_ENABLE_HA_PROXY") != "1":
-        # HAProxy hashes the session header by itself (see haproxy.py) and refuses a custom router.
+        # HAProxy itself hashes the session header (see haproxy.py) and refuses a custom router.
         from ray.serve.config import RequestRouterConfig
 
         options["request_router_config"] = RequestRouterConfig(
@@ -65,7 +65,7 @@ def _options(args: ServerArgs) -> dict[str, Any]:
     """Return Serve's options that do not depend on the number of replicas."""
     return {
         "name": POLICY,
-        "health_check_period_s": 1 if args.environment.process == "child" else 5,  # Serve wants three failures
+        "health_check_period_s": 1 if args.environment.process == "child" else 5,  # Serve needs three failures
         # A replica that does not reply is frozen, or its policy holds the interpreter's lock: then only these checks
         # limit the time of a call. Together they take the limit of a call; Serve's default is 95 s for any policy.
         "health_check_timeout_s": max(_LEAST_ANSWER_S, args.limits.act_s / _FAILURES),

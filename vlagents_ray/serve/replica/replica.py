@@ -67,7 +67,7 @@ _CATCH_UP_S = 10.0  # interval of the questions whether this replica has missed 
 
 
 class PolicyReplica(ClientApi, SiblingApi):
-    """One replica of the policy, with all the ways in that clients use.
+    """One replica of the policy, with all endpoints for clients.
 
     Ray calls its methods by name: Serve those of a deployment, clients inside the cluster those of `ClientApi`, and
     other replicas those of `SiblingApi`. Until the first replica runs, Serve's proxies reply for
@@ -96,7 +96,7 @@ class PolicyReplica(ClientApi, SiblingApi):
             warn_of_plain_http(_plain_host())
         self._tasks: list[asyncio.Task[None]] = []
 
-        # The engine, and what it shares with the other replicas.
+        # The engine, and its parts that are shared with other replicas.
         self._peers = SiblingReplicas()
         self._migrator = SessionMigrator(self._peers.others, asyncio.get_running_loop())
         self._limits = settings.limits.limits()
@@ -107,7 +107,7 @@ class PolicyReplica(ClientApi, SiblingApi):
         self._weights = ThisReplica(self._peers.own_name, self._engine.weights)
         self._pusher = WeightPusher(self._weights, self._peers.others)
 
-        # What is seen of it.
+        # Its observers.
         node = ray.get_runtime_context().get_node_id()[:8]
         self._observers = open_observers(self._engine, settings, self._peers.own_name, node, self.metadata)
         self._fleet = Fleet(self._observers.view, self._peers)
@@ -115,7 +115,7 @@ class PolicyReplica(ClientApi, SiblingApi):
         self._metrics = Exporter(self._engine, tags_of(settings.policy), self._keys, self._observers.recorder)
         self._metrics.start()
 
-        # The ways in.
+        # The endpoints.
         has_files = hasattr(os, "memfd_create")
         self._local = ShmServer(self._engine, self._limits, self._admit()) if has_files else None
         self._plasma = PlasmaServer(self._engine, self._limits) if has_files else None
@@ -157,13 +157,13 @@ class PolicyReplica(ClientApi, SiblingApi):
             if not isinstance(error.__cause__, VLAgentsError):
                 raise
             logger.exception("the policy did not load")
-            # Errors of this package say what to do: `serve status` would show the tracebacks of both before it.
+            # Errors of this package have the cure; without this, `serve status` would show both tracebacks before it.
             raise PolicyFailed(str(error)) from None
 
     async def close(self) -> None:
-        """Close everything: first what gives or takes work, then the engine, then what observes it, the ways in last.
+        """Close everything: first the sources of work, then the engine, then its observers, and last the endpoints.
 
-        So the engine answers what waits, over ways that are still open, and observers see all of it.
+        So the engine answers waiting requests over open endpoints, and observers see all answers.
         """
         for task in self._tasks:
             task.cancel()
@@ -348,12 +348,12 @@ class PolicyReplica(ClientApi, SiblingApi):
         )
         return [newest.number for newest in found if isinstance(newest, NewestVersion)]
 
-    # What the replica does by itself.
+    # The replica's periodic tasks.
 
     async def _watch_shutdown(self) -> None:
         """Drain the engine as soon as Serve stops this replica, if other replicas can take its clients.
 
-        Until then, detect a policy that hangs. A policy that holds the interpreter's lock blocks this task, too: then a
+        Until then, detect a policy that hangs. A policy that holds the interpreter's lock also blocks this task: then a
         thread that needs no lock writes the stack traces into the log.
         """
         while not replica_is_ending():
@@ -445,7 +445,7 @@ def _plain_host() -> str:
 
 
 def _others_run() -> bool:
-    """Whether the application has a replica that accepts requests."""
+    """Return whether the application has a replica that accepts requests."""
     context = serve.get_replica_context()
     app = serve.status().applications.get(context.app_name)
     policy = None if app is None else app.deployments.get(context.deployment)

@@ -2,9 +2,9 @@
 
 A connection over shared memory, plasma, a WebSocket or a Serve handle stays at its replica for as long as it lasts, so
 that a new replica would not relieve the others. Therefore each replica compares its number of sessions with the others'
-every few seconds. If it holds clearly more than its share, it asks some connections to reconnect. Their sessions then
-move as they do when a replica stops (`vlagents_ray.serve.scaling.session_migration`). The load balancer's hash decides
-on the replica of HTTP sessions.
+every few seconds. If it holds clearly more than its share, it requests some connections to reconnect. Their sessions
+then move as they do when a replica stops (`vlagents_ray.serve.scaling.session_migration`). The load balancer's hash
+decides on the replica of HTTP sessions.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class ReplicaLoad:
 
 @dataclass(frozen=True, slots=True)
 class ClientLocation:
-    """The location of a client, as far as the client knows it; replicas near to it are preferred."""
+    """The location of a client, as far as the client states it; near replicas are preferred."""
 
     node: str = ""  # Ray's id of its node; empty outside the cluster
     boot_id: str = ""  # boot id of its machine; empty if unknown
@@ -123,12 +123,12 @@ class Rebalancer:
         self._expected: deque[float] = deque()  # times at which clients were sent here that have no session yet
         self._opened = 0
         self._others: list[ReplicaLoad] = []
-        self._asked_at = float("-inf")  # time at which the others were asked for their loads
+        self._asked_at = float("-inf")  # time of the last request for the others' loads
         self._uneven = False  # whether the last comparison found too many sessions here
         self._placing = asyncio.Lock()  # clients are placed in turn
 
     async def run(self) -> None:
-        """Compare periodically, until cancelled."""
+        """Compare the numbers of sessions periodically, until cancelled."""
         while True:
             await asyncio.sleep(random.uniform(0.8, 1.2) * PERIOD_S)
             try:
@@ -162,7 +162,7 @@ class Rebalancer:
         """
         arrived = time.monotonic()
         async with self._placing:
-            if arrived > self._asked_at:  # clients that arrived while the others were being asked use those answers
+            if arrived > self._asked_at:  # clients that arrived during the requests use those answers
                 try:
                     self._others = await self._siblings.loads()
                 except Exception:  # errors of the other replicas must not keep a client from connecting
@@ -183,7 +183,7 @@ class Rebalancer:
         if chosen is mine:
             self.expect_client()
             return None
-        chosen.sessions += 1  # valid until that replica is asked again
+        chosen.sessions += 1  # valid until the next request to that replica
         return chosen.replica
 
     async def compare(self) -> None:

@@ -49,8 +49,8 @@ Spawn = Callable[[Coroutine[Any, Any, Any]], "asyncio.Task[Any]"]
 _PENDING = 4096  # largest number of concurrent searches of a caller; further requests get `UnknownSession` at once
 _ANSWER_S = 3.0  # time limit for another replica's answer; a replica that still loads does not answer
 _OTHERS_S = 0.3  # time limit for the remaining answers, once a replica has answered that it holds the session
-_SILENT_S = 3.0  # time for which a replica that did not answer is not asked again
-_ATTEMPTS = 5  # number of repeated attempts after which a search is given up, if `ARRIVAL_S` has passed, too
+_SILENT_S = 3.0  # time without further requests to a silent replica
+_ATTEMPTS = 5  # number of attempts after which a search is given up, if `ARRIVAL_S` has also passed
 _LOAD_S = 60.0  # time limit for loading the checkpoint of a fetched session
 _BATCH_S = 0.002  # time for which searches are collected into one question
 _GATHER_S = 0.02  # time for which begun episodes are collected into one announcement
@@ -149,7 +149,7 @@ class HeldSessions:
     async def send_to_peer(self, session_id: str, peers: Sequence[Peer]) -> bool:
         """Give the session to the first of `peers` that takes it over; return whether one did.
 
-        The next replica is only asked if the one before refused or has ended.
+        The next replica only gets a request if the last one refused or has ended.
         """
         state = await self._ask(session_id, "export", None)  # without a limit, as the session ends here otherwise
         if state is None or not peers:
@@ -256,7 +256,7 @@ class SessionMigrator:
         self._next_query: dict[str, asyncio.Future[_Answers]] = {}  # sessions of the next question
         self._callers: Counter[str] = Counter()  # number of running searches by caller
         self._unannounced: dict[str, int] = {}  # steps of begun episodes that are not announced yet, by session
-        self._silent: dict[str, float] = {}  # time until which a silent replica is not asked, by its name
+        self._silent: dict[str, float] = {}  # time until which a silent replica gets no request, by its name
         self._tasks: set[asyncio.Task[Any]] = set()
 
     def start(self, engine: Engine) -> None:
@@ -372,7 +372,7 @@ class SessionMigrator:
             self._finish(session_id)
 
     async def _move(self, session_id: str, peer: Peer) -> bool:
-        """Move the session from that replica to this one; False if its state there has changed meanwhile."""
+        """Move the session from that replica to this one; return False if its state there has changed."""
         state = await self._answer(peer.ask(HeldSessions.copy, session_id), EXPORT_S)
         if state is None:
             return False

@@ -29,8 +29,8 @@ _NAMESPACE = "serve"
 _ANSWER_S = 3.0  # time limit for an answer; a replica that still loads does not answer
 _TRANSFER_S = 600.0  # time limit for an answer that weights are sent with
 _QUICK_S = 0.3  # time limit for an answer while a client waits to connect
-_SILENT_S = 3.0  # time for which a replica that did not answer is not asked for its load again
-_VIEW_ANSWER_S = 0.3  # time limit for an answer; a replica that is late is asked again
+_SILENT_S = 3.0  # time without further requests for a silent replica's load
+_VIEW_ANSWER_S = 0.3  # time limit for an answer; a late replica gets another request
 _VIEW_S = 2.0  # time for which the replicas that were found are not looked up again
 
 
@@ -156,7 +156,7 @@ class ReplicasInCluster(OtherReplicas):
             if entry["namespace"] == _NAMESPACE and name.startswith(prefixes) and name != self._but:
                 try:
                     yield name, ray.get_actor(name, namespace=_NAMESPACE)
-                except ValueError:  # the replica has ended meanwhile
+                except ValueError:  # the replica has ended
                     continue
 
 
@@ -167,7 +167,7 @@ class SiblingReplicas(ReplicasInCluster):
         context = serve.get_replica_context()
         self.own_name = context.replica_id.to_full_id_str()
         super().__init__([context.app_name], but=self.own_name)
-        self._silent: dict[str, float] = {}  # time until which a silent replica is not asked, by its name
+        self._silent: dict[str, float] = {}  # time until which a silent replica gets no request, by its name
 
     async def loads(self) -> list[ReplicaLoad]:
         """Return the loads of the replicas that answer within 0.3 s."""
@@ -182,10 +182,10 @@ class SiblingReplicas(ReplicasInCluster):
         return [answer for answer in answers if isinstance(answer, ReplicaLoad)]
 
     async def announce_client(self, replica: str) -> Any:
-        """Announce a client to another replica; return its answer to the client; None if there is none within 0.3 s."""
+        """Announce a client to another replica; return its answer to the client; None after 0.3 s without one."""
         try:
             actor = await asyncio.to_thread(ray.get_actor, replica, namespace=_NAMESPACE)
             return await asyncio.wait_for(call_replica(actor, SiblingApi.expect_client), _QUICK_S)
         except (ValueError, ray.exceptions.RayError, TimeoutError, asyncio.TimeoutError) as error:
-            logger.info("another replica does not answer: %s", error)  # it may have ended meanwhile
+            logger.info("another replica does not answer: %s", error)  # it may have ended
             return None

@@ -32,7 +32,7 @@ _ATTEMPTS = 3  # at the commit of a replica that cannot be reached
 
 
 class WeightsReplica(Protocol):
-    """A replica as a push sees it."""
+    """A replica's interface for a push."""
 
     @property
     def name(self) -> str:
@@ -77,7 +77,7 @@ class WeightPusher:
 
         Args:
             values: The values: numpy arrays, as `vlagents_ray.weights.trainable.portable` returns them, or on a GPU.
-            options: When sessions change, and what is allowed.
+            options: The time at which sessions change, and the permissions.
 
         Returns:
             The version, and the replicas that act with it.
@@ -145,7 +145,7 @@ class WeightPusher:
             for replica in await self._others():
                 try:
                     newest = await replica.weights(WeightUpdates.newest)
-                except (PeerEnded, PeerUnreachable, VLAgentsError):  # it knows no better than this one
+                except (PeerEnded, PeerUnreachable, VLAgentsError):  # it has no newer state than this one
                     continue
                 if newest.number > best.number and newest.model == own.model:
                     best, source = newest, replica
