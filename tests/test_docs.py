@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from page_commands import PAGES, commands, read_as_typed
 from ray.serve.schema import ServeApplicationSchema
+from readme_blocks import PAGES, commands, read_as_typed
 
 from vlagents_ray.cli.evaluate import read_run
 from vlagents_ray.envs import aloha, calvin, metaworld, robocasa

@@ -26,7 +26,7 @@ def outcome(folder: Path, *bodies: str, strict: bool = True) -> tuple[int, str]:
             "-rfE",
             "--continue-on-collection-errors",
             "-p",
-            "fail_on_skip",
+            "needs",
             "-p",
             "no:cacheprovider",
         ],

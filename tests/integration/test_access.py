@@ -22,9 +22,9 @@ import pytest
 import ray
 from certificates import Authority, authority
 from eval_fakes import PYTHONPATH, wait_for
-from flat_config import flat_config
+from in_process_evaluation import flat_config
 from listening_sockets import Listener, listeners
-from secret_leaks import leaked
+from ray_processes import leaked
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 

@@ -12,7 +12,7 @@ from urllib.parse import urlsplit
 
 import pytest
 from eval_fakes import wait_for
-from flat_config import flat_config
+from in_process_evaluation import flat_config
 from ray.serve.schema import ServeDeploySchema
 from shared_ray import shared_server
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import psutil
 import pytest
-from flat_config import flat_config
+from in_process_evaluation import flat_config
 from ray_processes import words
 
 from tests.integration.conftest import serving

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 from eval_fakes import LINE, wait_for
-from in_process_pool import without_ray
+from in_process_evaluation import without_ray
 from served_agents import Stochastic
 
 from tests.integration.conftest import serving

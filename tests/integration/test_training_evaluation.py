@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from eval_fakes import LINE
-from flat_config import flat_config
+from in_process_evaluation import flat_config
 from served_agents import Proportional
 
 from tests.integration.conftest import serving
