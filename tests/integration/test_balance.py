@@ -114,7 +114,7 @@ def test_sessions_move_to_a_replica_that_joins(server: Server) -> None:
         agent.close()
 
 
-@pytest.mark.parametrize("way", ["shm", "handle", "plasma", "websocket"])
+@pytest.mark.parametrize("way", ["shm", "handle", "websocket"])
 def test_new_sessions_spread_evenly(server: Server, way: TransportName) -> None:
     """Sixteen that come at once; two replicas run since the test before."""
     agents = [RemoteAgent(url(server, way), transport=way) for _ in range(16)]

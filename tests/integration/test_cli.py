@@ -51,21 +51,6 @@ def rows(out: Path) -> list[tuple[Any, ...]]:
         return db.execute(f"SELECT {columns} FROM episodes ORDER BY env, episode").fetchall()  # noqa: S608
 
 
-def test_two_workers_play_all_episodes_over_shared_memory(ray_home: Path, tmp_path: Path) -> None:
-    """That one worker would have played the same, test_invariance.py shows."""
-    done = evaluate(
-        ray_home, "tabletop", "--policy", "scripted", "--episodes", "24", "--workers", "2",
-        "--video", "none", "--out", str(tmp_path / "out"),
-    )  # fmt: skip
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "scripted" in done.stdout
-    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
-    assert summary["state"] == "complete"
-    assert summary["totals"][0]["success_once"]["rate"] >= 0.95
-    assert summary["transports"] == ["shm"]
-    assert len(rows(tmp_path / "out")) == 24
-
-
 @pytest.mark.slow
 @pytest.mark.vulkan
 def test_maniskill_is_solved_whatever_the_number_of_workers(ray_home: Path, tmp_path: Path) -> None:
@@ -148,19 +133,14 @@ def test_a_file_of_runs_is_one_evaluation_of_all(ray_home: Path, tmp_path: Path)
     assert done.returncode == 0, done.stdout + done.stderr
     summary = json.loads((tmp_path / "runs" / "nightly" / "summary.json").read_text())
     cells = {(one["contender"], one["suite"], one["env"]): one["success_once"] for one in summary["cells"]}
+    assert summary["state"] == "complete"
+    assert summary["transports"] == ["shm"]
     assert [one["episodes"] for one in cells.values()] == [4, 4, 6] * 2
     assert cells["expert", "easy", "tabletop/lift"]["successes"] == 4
     assert cells["still", "easy", "tabletop/slide"]["successes"] == 0
     refused = evaluate(ray_home, str(file), "--episodes", "9", cwd=tmp_path)
     assert refused.returncode == 2
     assert "says what is evaluated; got ['episodes'] beside it" in refused.stderr
-
-
-def test_a_policy_that_does_not_fit_is_told_in_a_line(ray_home: Path, tmp_path: Path) -> None:
-    done = evaluate(ray_home, "tabletop", "--policy", "noop", "--out", "x", cwd=tmp_path)
-    assert done.returncode == 1, done.stdout + done.stderr
-    assert "action.dim: the policy gives 7, the env takes 4" in done.stderr
-    assert "Traceback" not in done.stderr + done.stdout
 
 
 def command(ray_home: Path, *words: str) -> subprocess.CompletedProcess[str]:
