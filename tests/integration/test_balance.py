@@ -34,15 +34,6 @@ def server() -> Iterator[Server]:
         yield server
 
 
-def test_a_server_on_a_single_address_is_reached_there(server: Server) -> None:
-    """HAProxy looks for replicas at 127.0.0.1, Serve would have bound them to this one."""
-    assert server.url.startswith("http://127.0.0.2:")
-    for transport in ("http", "websocket", "shm"):
-        with RemoteAgent(server.url, transport=transport) as agent:
-            agent.reset(obs(1), "x")
-            assert agent.act(obs(0, 3)).action.tolist() == [1, 3, 1]
-
-
 def test_sessions_move_to_a_replica_that_joins(server: Server) -> None:
     """Pinned ones, on every such transport, exactly where they were; so do several of one connection.
 
