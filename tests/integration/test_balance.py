@@ -11,6 +11,7 @@ import pytest
 from eval_fakes import wait_for
 from ray.serve.schema import ServeDeploySchema
 
+from tests.integration.conftest import deploy
 from tests.integration.test_sessions import obs, url
 from vlagents_ray import RemoteAgent
 from vlagents_ray.client.transports.select import TransportName
@@ -71,11 +72,7 @@ def test_sessions_move_to_a_replica_that_joins(server: Server) -> None:
         return dict(pids) | {f"env {i}": pid for i, pid in enumerate(where)}
 
     assert len(set(act().values())) == 1
-    from ray.serve.context import _get_global_client
-
-    client = _get_global_client()
-    assert client is not None
-    client.deploy_apps(deployed(2))
+    deploy(deployed(2))
 
     def even() -> bool:
         held = Counter(act().values())

@@ -13,6 +13,7 @@ from in_process_evaluation import flat_config
 from ray.serve.schema import ServeDeploySchema
 from shared_ray import shared_server
 
+from tests.integration.conftest import deploy, states
 from tests.integration.test_sessions import TRANSPORTS, url
 from vlagents_ray import Obs, RemoteAgent
 from vlagents_ray.errors import CheckpointFailed, UnknownCheckpoint
@@ -53,18 +54,7 @@ def server(shared_ray: None, folder: Path) -> Iterator[Server]:
 
 def redeploy(folder: Path, replicas: int = 1, **user_config: Any) -> None:
     """What `serve deploy` does with the changed file."""
-    from ray.serve.context import _get_global_client
-
-    client = _get_global_client()
-    assert client is not None
-    client.deploy_apps(deployed(folder, num_replicas=replicas, user_config=user_config))
-
-
-def states() -> dict[str, int]:
-    """Replicas by what they do."""
-    from ray import serve
-
-    return dict(serve.status().applications["Stored"].deployments["Policy"].replica_states)
+    deploy(deployed(folder, num_replicas=replicas, user_config=user_config))
 
 
 def metadata(server: Server) -> dict[str, Any]:
@@ -83,7 +73,7 @@ def fresh(server: Server, folder: Path) -> Server:
     for marker in folder.glob("*.*"):
         marker.unlink()
     redeploy(folder)
-    wait_for(lambda: states() == {"RUNNING": 1} and own(server, folder) == "1")
+    wait_for(lambda: states("Stored") == {"RUNNING": 1} and own(server, folder) == "1")
     return server
 
 

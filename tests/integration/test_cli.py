@@ -8,14 +8,13 @@ import signal
 import sqlite3
 import subprocess
 import sys
-from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import pytest
 from eval_fakes import wait_for
-from ray_processes import end, processes, ray_folder, wait_for_end
+from ray_processes import end, wait_for_end
 from typer.testing import CliRunner
 
 from vlagents_ray.cli.main import app
@@ -24,13 +23,6 @@ from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.serve.launch.server import running_server
 
 COMMAND = str(Path(sys.executable).parent / "vlagents-ray")
-
-
-@pytest.fixture(name="ray_home")
-def own_ray_folder() -> Iterator[Path]:
-    with ray_folder() as folder:
-        yield folder
-        assert not processes(folder), "left running"
 
 
 def evaluate(ray_home: Path, *words: str, **options: Any) -> subprocess.CompletedProcess[str]:

@@ -12,23 +12,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-import pytest
 import yaml
 from eval_fakes import LINE, PYTHONPATH, wait_for
 from live_server import LivePage
-from ray_processes import processes, ray_folder
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import Results
 
 COMMAND = str(Path(sys.executable).parent / "vlagents-ray")
-
-
-@pytest.fixture(name="ray_home")
-def own_ray_folder() -> Iterator[Path]:
-    with ray_folder() as folder:
-        yield folder
-        assert not processes(folder), "left running"
 
 
 @contextmanager
