@@ -19,8 +19,6 @@ from typer.testing import CliRunner
 
 from vlagents_ray.cli.main import app
 from vlagents_ray.evaluate import Results
-from vlagents_ray.serve.launch.deployment_file import deployment
-from vlagents_ray.serve.launch.server import running_server
 
 COMMAND = str(Path(sys.executable).parent / "vlagents-ray")
 
@@ -83,27 +81,6 @@ def test_kill_dash_nine_and_resume_leave_each_episode_once(ray_home: Path, tmp_p
     after = rows(out)
     assert [row[1] for row in after] == list(range(200))
     assert set(before) <= set(after)
-
-
-def test_a_running_server_is_evaluated_by_its_url(ray_home: Path, tmp_path: Path) -> None:
-    with running_server(deployment("scripted"), num_cpus=4) as server:
-        done = evaluate(
-            ray_home,
-            "tabletop",
-            "--policy",
-            server.url,
-            "--episodes",
-            "6",
-            "--video",
-            "all",
-            "--out",
-            str(tmp_path / "o"),
-        )
-        assert done.returncode == 0, done.stderr
-    summary = json.loads((tmp_path / "o" / "summary.json").read_text())
-    assert summary["config"]["policies"][0]["name"] == "scripted"
-    assert summary["transports"] == ["shm"]
-    assert len(list((tmp_path / "o" / "videos").rglob("*.mp4"))) == 6
 
 
 RUNS = """
