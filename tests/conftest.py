@@ -13,11 +13,16 @@ from pathlib import Path
 import many  # noqa: F401 - registers profiles
 import pytest
 import shared_ray as shared
-from assets import assets
-from fail_on_skip import pytest_make_collect_report, pytest_runtest_makereport
-from needs import left_out, mark_tier, nothing_else, skip_what_is_missing
-from process_resources import pytest_pyfunc_call
-from xdist_workers import own_ray_folder, turn
+from needs import (
+    assets,
+    left_out,
+    mark_tier,
+    nothing_else,
+    pytest_make_collect_report,
+    pytest_runtest_makereport,
+    skip_what_is_missing,
+)
+from process_resources import own_ray_folder, pytest_pyfunc_call, turn
 
 from vlagents_ray.envs.graphics import prepare_rendering
 

@@ -10,15 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from page_commands import PAGES, commands, read_as_typed
 from ray.serve.schema import ServeApplicationSchema
+from readme_blocks import PAGES, commands, read_as_typed
 
 from vlagents_ray.cli.evaluate import read_run
 from vlagents_ray.envs import aloha, calvin, metaworld, robocasa
 from vlagents_ray.envs.gymnasium import known
 from vlagents_ray.envs.robosuite import TASKS
 from vlagents_ray.envs.simulator import BenchmarkProtocol
-from vlagents_ray.errors import BY_CODE, Overloaded, VLAgentsError
+from vlagents_ray.errors import BY_CODE, Overloaded
 from vlagents_ray.evaluate import EvalConfig
 from vlagents_ray.interface import Act
 from vlagents_ray.protocol import frame_layout, frames, json_messages, messages, values
@@ -80,14 +80,10 @@ def test_a_command_that_is_typed_wrong_is_found(line: str, says: str) -> None:
         read_as_typed(line, whole=True)
 
 
-def test_there_are_commands_on_the_pages() -> None:
+def test_there_are_commands_and_blocks_on_the_pages() -> None:
     found = [one for page in PAGES for one in commands(page.read_text())]
     assert len([line for line, whole in found if whole]) > 40
-    assert len(found) > 70
-
-
-def test_there_are_such_blocks() -> None:
-    assert len(BLOCKS) == 2
+    assert (len(found) > 70, len(BLOCKS)) == (True, 2)
 
 
 def test_the_file_of_runs_behind_the_reports_picture_is_accepted() -> None:
@@ -126,14 +122,11 @@ def test_a_benchmarks_page_states_the_protocol_that_is_recorded(page: str, proto
     assert ("ends the episode" in rows["success"]) is protocol.ends_on_success
 
 
-@pytest.mark.parametrize(("code", "error"), sorted(BY_CODE.items()))
-def test_troubleshooting_has_every_error_with_its_status_and_a_cure(code: str, error: type[VLAgentsError]) -> None:
-    rows = re.findall(r"^\| `(\w+)` \| (\d+) \| `(\w+)` \| (.+) \| (.+) \|$", _read("troubleshooting.md"), re.MULTILINE)
-    assert [row[1:3] for row in rows if row[0] == code] == [(str(error.status), error.__name__)]
-
-
-def test_troubleshooting_has_no_error_that_is_gone() -> None:
-    assert set(re.findall(r"^\| `(\w+)` \| \d+ \|", _read("troubleshooting.md"), re.MULTILINE)) == set(BY_CODE)
+def test_troubleshooting_has_every_error_with_its_status_and_a_cure_and_no_other() -> None:
+    page = _read("troubleshooting.md")
+    rows = re.findall(r"^\| `(\w+)` \| (\d+) \| `(\w+)` \| .+ \| .+ \|$", page, re.MULTILINE)
+    assert sorted(rows) == sorted((code, str(error.status), error.__name__) for code, error in BY_CODE.items())
+    assert len(rows) == len(re.findall(r"^\| `(\w+)` \| \d+ \|", page, re.MULTILINE))
 
 
 PROTOCOL = (DOCS / "protocol.md").read_text()

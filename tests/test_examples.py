@@ -14,8 +14,7 @@ from pathlib import Path
 
 import pytest
 from client_servers import client_servers
-from example_files import EXAMPLES, code_of
-from readme_blocks import ROOT
+from readme_blocks import EXAMPLES, ROOT, code_of
 
 INDEX = (EXAMPLES / "README.md").read_text()
 FILES = sorted(path for path in EXAMPLES.iterdir() if path.suffix in (".py", ".sh", ".ipynb"))

@@ -11,10 +11,20 @@ import shutil
 from pathlib import Path
 
 import pytest
-from flat_config import flat_config
-from in_process_evaluation import play
-from page_commands import PAGES, TUTORIALS, commands, read_as_typed
-from readme_blocks import PYTHON, SHELL, Block, blocks, check_commands, checkout, run
+from in_process_evaluation import flat_config, play
+from readme_blocks import (
+    PAGES,
+    PYTHON,
+    SHELL,
+    TUTORIALS,
+    Block,
+    blocks,
+    check_commands,
+    checkout,
+    commands,
+    read_as_typed,
+    run,
+)
 from recorded_results import record, runs
 
 from vlagents_ray.policies.scripted import Scripted

@@ -22,28 +22,23 @@ def test_only_python_and_shell_blocks_are_taken() -> None:
     assert [block.language for block in blocks(text)] == ["python", "bash", "console", "sh"]
 
 
-def test_a_block_without_a_comment_is_run() -> None:
-    block = one("```python\nprint(1)\n```\n")
-    assert (block.server, block.not_run) == (None, None)
-
-
-def test_a_comment_names_the_policy_that_must_be_served() -> None:
-    assert one("<!-- test: serve scripted -->\n```python\n```\n").server == "scripted"
-
-
-@pytest.mark.parametrize("server", ["", ": serve deployments/openpi.yaml"])
-def test_a_block_may_be_for_other_systems_clients(server: str) -> None:
-    block = one(f"<!-- test{server} with peers -->\n```python\n```\n")
-    assert (block.peers, block.server) == (True, server.removeprefix(": serve ") or None)
-    assert not one("<!-- test -->\n```python\n```\n").peers
-
-
-def test_a_comment_says_why_a_block_is_not_run() -> None:
-    assert one("<!-- not run: needs a robot -->\n```python\n```\n").not_run == "needs a robot"
-
-
-def test_a_comment_counts_only_straight_above_its_block() -> None:
-    assert one("<!-- not run: needs a robot -->\nSome text.\n```python\n```\n").not_run is None
+@pytest.mark.parametrize(
+    ("above", "server", "peers", "not_run"),
+    [
+        ("", None, False, None),
+        ("<!-- test -->\n", None, False, None),
+        ("<!-- test: serve scripted -->\n", "scripted", False, None),
+        ("<!-- test with peers -->\n", None, True, None),
+        ("<!-- test: serve deployments/openpi.yaml with peers -->\n", "deployments/openpi.yaml", True, None),
+        ("<!-- not run: needs a robot -->\n", None, False, "needs a robot"),
+        ("<!-- not run: needs a robot -->\nSome text.\n", None, False, None),  # it does not stand straight above
+    ],
+)
+def test_the_comment_above_a_block_says_how_it_is_tested(
+    above: str, server: str | None, peers: bool, not_run: str | None
+) -> None:
+    block = one(f"{above}```python\n```\n")
+    assert (block.server, block.peers, block.not_run) == (server, peers, not_run)
 
 
 @pytest.mark.parametrize("mark", ["not run", "not run:", "skip", "test: deploy scripted", "tset"])

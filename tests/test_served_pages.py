@@ -10,10 +10,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from example_files import EXAMPLES, code_of
-from page_commands import PAGES, TUTORIALS
-from readme_blocks import DOCUMENTED_HOST, Block, blocks, checkout, run
-from serve_command import serving
+from ray_processes import serving
+from readme_blocks import DOCUMENTED_HOST, EXAMPLES, PAGES, TUTORIALS, Block, blocks, checkout, code_of, run
 
 pytestmark = [pytest.mark.server, pytest.mark.slow]
 

@@ -9,9 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from eval_fakes import wait_for
+from eval_fakes import Clock, wait_for
 from in_process_replicas import Replicas
-from manual_clock import Clock
 
 from vlagents_ray import (
     Act,

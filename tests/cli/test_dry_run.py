@@ -8,8 +8,7 @@ from typing import Any
 
 import pytest
 from eval_fakes import LINE, OTHER_LINE
-from flat_config import flat_config
-from in_process_evaluation import play
+from in_process_evaluation import flat_config, play
 
 from vlagents_ray.cli.evaluation import forecasts, print_plan
 from vlagents_ray.evaluate import EvalConfig, Results

@@ -6,8 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
-from flat_config import flat_config
-from in_process_evaluation import play
+from in_process_evaluation import flat_config, play
 from typer.testing import CliRunner, Result
 from wrist_roll_env import ROLLER, Turner
 

@@ -10,8 +10,8 @@ import dialect_server
 import numpy as np
 import pytest
 import yaml
+from ray_processes import serving
 from readme_blocks import ENV, Block, run
-from serve_command import serving
 from typer.testing import CliRunner
 
 from vlagents_ray import Obs, RemoteAgent

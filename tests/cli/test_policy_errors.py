@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from eval_fakes import LINE, ToZero
-from flat_config import flat_config
+from in_process_evaluation import flat_config
 from typer.testing import CliRunner, Result
 
 import vlagents_ray.evaluate

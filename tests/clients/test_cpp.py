@@ -21,7 +21,7 @@ from asgi_server import served
 from cpp_client import CppClient, CppError, build
 from eval_fakes import wait_for
 from golden import GOLDEN, of_request
-from hostile_answers import ADDED_MB, ANSWERS
+from hostile_messages import ADDED_MB, ANSWERS
 from in_flight import read_requests
 from in_memory_keys import ChangingKeys
 from scripted_server import Visit, answer, document, scripted_server

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import typescript_client
 from client_servers import client_servers
-from hostile_answers import ADDED_MB, ANSWERS
+from hostile_messages import ADDED_MB, ANSWERS
 
 pytestmark = pytest.mark.node
 

@@ -1,4 +1,7 @@
-"""cluster/docker: what the Dockerfile names is there, and nothing it should not have. No container engine is needed."""
+"""cluster/docker: what the Dockerfile names is there, and nothing it should not have; each package by its digest.
+
+No container engine is needed. Locks get what pyproject.toml and requirements/ want.
+"""
 
 from __future__ import annotations
 
@@ -7,17 +10,45 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 import resolved
 import yaml
-from dockerfile import instructions
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 from typer.testing import CliRunner
 
 from vlagents_ray.cli.main import app
 
 pytestmark = pytest.mark.integration
+
+
+@dataclass(frozen=True)
+class Instruction:
+    stage: str  # its name
+    word: str  # in capitals: RUN
+    flags: dict[str, str]  # --from=build: {"from": "build"}
+    text: str  # the rest, on one line
+
+
+def instructions(file: Path) -> Iterator[Instruction]:
+    """In order, those before the first FROM in the stage ""; raises `ValueError` for a line that is none."""
+    stage = ""
+    kept = "\n".join(line for line in file.read_text().splitlines() if not line.lstrip().startswith("#"))
+    for line in re.sub(r"\\\n", "", kept).splitlines():
+        if not line.strip():
+            continue
+        match = re.fullmatch(r"([A-Z]+)((?:\s+--[\w-]+=\S+)*)\s+(.*)", line)
+        if match is None:
+            raise ValueError(f"{file}: {line!r} is no instruction")
+        word, flags, text = match.groups()
+        if word == "FROM":
+            stage = text.rpartition(" AS ")[2]
+        yield Instruction(stage, word, dict(re.findall(r"--([\w-]+)=(\S+)", flags)), text.strip())
+
 
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "cluster" / "docker"
@@ -202,3 +233,51 @@ def test_its_command_asks_for_keys(monkeypatch: pytest.MonkeyPatch) -> None:
     result = CliRunner().invoke(app, words)
     assert result.exit_code != 0
     assert "keys new" in result.output
+
+
+ENTRY = re.compile(r"([a-z0-9-]+)==(\S+)((?: \\\n    --hash=sha256:[0-9a-f]{64})+)\n")
+TORCH = {Requirement(line).name: Requirement(line) for line in resolved.lines(resolved.TORCH)}
+
+
+def locked(text: str) -> dict[str, str]:
+    """The versions by name, of a lock that consists of a comment and of packages with digests."""
+    comment, _, entries = text.partition("\n")
+    assert comment.startswith("# ")
+    assert ENTRY.sub("", entries) == "", "has a line that is neither a version nor a digest"
+    return {name: version for name, version, _ in ENTRY.findall(entries)}
+
+
+def unmet(versions: dict[str, str], requirements: list[str]) -> list[str]:
+    """The requirements that no locked version meets."""
+    wanted = [Requirement(text) for text in requirements]
+    wanted = [TORCH.get(one.name, one) for one in wanted if one.marker is None or one.marker.evaluate()]
+    return [
+        str(one)
+        for one in wanted
+        if (version := versions.get(canonicalize_name(one.name))) is None or not one.specifier.contains(version)
+    ]
+
+
+def test_there_is_a_lock_for_every_image_and_no_other() -> None:
+    assert {file.stem for file in resolved.LOCKS.iterdir()} == resolved.locks().keys()
+    assert {"server-sim", "server-maniskill", "family-hf", "family-octo"} <= resolved.locks().keys()
+
+
+@pytest.mark.parametrize("name", resolved.locks())
+def test_a_lock_meets_what_its_image_wants_and_has_a_digest_of_every_package(name: str) -> None:
+    python, requirements = resolved.locks()[name]
+    text = (resolved.LOCKS / f"{name}.txt").read_text()
+    assert f"for Python {python} on {resolved.PLATFORM}:" in text
+    versions = locked(text)
+    assert len(versions) > 60
+    torch = [str(one) for name, one in TORCH.items() if name in versions]  # the same in all images
+    assert unmet(versions, [*requirements, *torch]) == [], "run `make locks`"
+
+
+def test_a_lock_that_is_out_of_date_or_has_no_digest_is_told() -> None:
+    text = "# a comment\nnumpy==2.4.6 \\\n    --hash=sha256:" + 64 * "0" + "\n"
+    assert locked(text) == {"numpy": "2.4.6"}
+    assert unmet(locked(text), ["numpy>=1.24"]) == []
+    assert unmet(locked(text), ["numpy>=2.5", "pillow>=10"]) == ["numpy>=2.5", "pillow>=10"]
+    with pytest.raises(AssertionError, match="neither"):
+        locked(text + "pillow==12.0\n")

@@ -3,20 +3,155 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import re
+import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
-from long_evaluation import Evaluation, cluster_of, serving, until, workers_on
+import yaml
+from eval_fakes import HURRY, LINE, PYTHONPATH, Line, Unhurried, wait_for
+from in_process_episode import run_episode
 
-from benchmarks.hosts import Host, HostFailed, hosts, ray_cluster
+from benchmarks.hosts import Host, HostFailed, RayCluster, hosts, ray_cluster
 from vlagents_ray.client.credentials import KEY_VARIABLE
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.evaluate import Results
+from vlagents_ray.evaluate.episode.records import EpisodeResult
+from vlagents_ray.evaluate.results.reader import Attempt
+from vlagents_ray.serve.access.key_store import new_key
+from vlagents_ray.serve.ports import EVERYWHERE
 
 pytestmark = [pytest.mark.hosts, pytest.mark.slow]
+
+until = functools.partial(wait_for, every_s=0.25)  # what takes a process, or all results, to find out
+POLICY = "policy"  # a resource of nodes that replicas may run on
+# Joined to the cluster before the command asks its policy, which is inside.
+_SERVED = "import ray; ray.init(log_to_driver=False); from vlagents_ray.cli.main import app; app()"
+_OWN = """
+import sys, yaml
+from eval_fakes import Unhurried
+from vlagents_ray.cli.console import out
+from vlagents_ray.errors import VLAgentsError
+from vlagents_ray.evaluate import EvalConfig, evaluate, progress_for
+settings = yaml.safe_load(open(sys.argv[2])) | {"resume": "--resume" in sys.argv}
+try:
+    evaluate(EvalConfig.model_validate(settings), agent_factory=Unhurried, progress=progress_for(out))
+except VLAgentsError as error:
+    sys.exit(f"{type(error).__name__}: {error}")
+"""
+
+
+@contextlib.contextmanager
+def cluster_of(
+    head: Host, nodes: Sequence[tuple[Host, int, bool]], run: Evaluation, **environment: str
+) -> Iterator[RayCluster]:
+    """A head that plays nothing, and nodes with so many workers, and perhaps a replica; `run` is to be played there."""
+    shared = {"PYTHONPATH": PYTHONPATH, "TERM": "dumb", HURRY: str(run.hurry)} | environment
+    with ray_cluster([head], cpus=0, environment=shared) as cluster:
+        for host, workers, serves in nodes:
+            cluster.join(host, workers, resources=json.dumps({POLICY: 1} if serves else {}))
+        yield cluster
+
+
+@contextlib.contextmanager
+def serving(head: Host, folder: Path, replicas: int) -> Iterator[str]:
+    """`Unhurried` for everybody who has the key that this yields."""
+    args = {"policy": "eval_fakes:Unhurried", "replicas": replicas, "resources": {"num_cpus": 0, "custom": {POLICY: 1}}}
+    application = {"name": "line", "route_prefix": "/", "import_path": "vlagents_ray.serve.app:build", "args": args}
+    file, keys, log = folder / "serve.yaml", folder / "keys.json", folder / "serve.log"
+    file.write_text(yaml.safe_dump({"applications": [application]}))
+    keys.unlink(missing_ok=True)
+    token = new_key(keys, "all")
+    command = ["vlagents-ray", "serve", str(file), "--address", "auto", "--host", EVERYWHERE, "--keys", str(keys)]
+    with log.open("w") as output, head.start(command, stdout=output, stderr=output) as server:
+        try:
+            until(lambda: "serving line" in log.read_text() or server.poll() is not None)
+            assert server.poll() is None, log.read_text()
+            yield token
+        finally:
+            server.kill()
+
+
+class Evaluation:
+    """One that runs at a host; `folder` has its results and its log.
+
+    Its policy is `serving`'s if there is one, else each worker has its own. `episodes` are as many as would take far
+    longer than the test needs; the file `hurry` ends that.
+    """
+
+    def __init__(self, folder: Path, episodes: int, workers: int) -> None:
+        self.out, self.hurry = folder / "out", folder / "hurry"
+        self._log = folder / "eval.log"
+        self._file = folder / "eval.yaml"
+        policy = {"name": "line", "url": "serve://line", "execute": 1}
+        suite = {"envs": [LINE], "episodes": episodes}
+        run = {"workers": workers, "worker": {"cpus": 1}, "video": "none", "out": str(self.out), "place_timeout_s": 60}
+        self._file.write_text(yaml.safe_dump({"policies": [policy], "suites": [suite], **run}))
+        self._process: subprocess.Popen[str] | None = None
+
+    @contextlib.contextmanager
+    def running(self, host: Host, *options: str, token: str | None = None) -> Iterator[None]:
+        """From its first episode on; `token` is the server's."""
+        command = ["env", f"{KEY_VARIABLE}={token}", sys.executable, "-c", _OWN if token is None else _SERVED]
+        command += ["eval", str(self._file), *options]
+        before = len(self.played())
+        with self._log.open("a") as output, host.start(command, stdout=output, stderr=output) as self._process:
+            try:
+                self.plays(before + 1)
+                yield
+            finally:
+                self._process.kill()
+
+    def ends(self) -> int:
+        """The exit status."""
+        assert self._process is not None
+        return self._process.wait(300)
+
+    def plays(self, episodes: int) -> None:
+        """Wait for so many episodes in all."""
+        process = self._process
+        assert process is not None
+        until(lambda: len(self.played()) >= episodes or process.poll() is not None)
+        assert process.poll() is None, self.said()
+
+    def goes_on(self, by: int = 12) -> None:
+        """Wait for some more episodes."""
+        self.plays(len(self.played()) + by)
+
+    def played(self) -> list[EpisodeResult]:
+        """What is recorded so far."""
+        try:
+            cells = Results.load(self.out).cells
+        except ConfigError:  # nothing yet
+            return []
+        return [one.result for cell in cells for one in cell.episodes]
+
+    def attempts(self) -> list[Attempt]:
+        """Those that infrastructure failed."""
+        return [one for cell in Results.load(self.out).cells for one in cell.attempts]
+
+    def said(self) -> str:
+        """All that it printed."""
+        return self._log.read_text()
+
+    def is_whole(self, episodes: int) -> None:
+        """Each episode is there once, and as it comes out where nothing breaks."""
+        played = self.played()
+        assert sorted(one.key.episode for one in played) == list(range(episodes))
+        for one in played:
+            alone = run_episode(Line(), Unhurried(0.0), one.key, execute=1)
+            assert one.outcome == alone.outcome
+
+
+def workers_on(host: Host) -> int:
+    """Processes of rollout workers there."""
+    return host.run(["ps", "-eo", "args"]).count("ray::Rollout")
+
 
 MEMORY = Path("/proc/meminfo")
 

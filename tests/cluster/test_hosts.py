@@ -1,4 +1,4 @@
-"""Hosts on one machine: what they share, what not, and that nothing of them is left."""
+"""Hosts on one machine: what they share, what not, that nothing of them is left, and Ray on several of them."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.hosts import Host, HostFailed, hosts, ray_cluster
+from vlagents_ray.evaluate import Results
 from vlagents_ray.protocol.messages import boot_id
 
 pytestmark = pytest.mark.hosts
@@ -67,3 +68,17 @@ def test_a_command_that_fails_says_what_it_said() -> None:
 def test_ray_runs_over_several_hosts() -> None:
     with hosts(2) as both, ray_cluster(both, cpus=1) as cluster:
         assert cluster.python(WHERE).split() == ["host1", "host2"]
+
+
+EVALUATE = [sys.executable, "-c", "from vlagents_ray.cli import main; main()", "eval", "tabletop", "--policy=scripted"]
+
+
+@pytest.mark.ray
+def test_without_an_address_an_evaluation_has_a_ray_of_its_own(tmp_path: Path) -> None:
+    show = [sys.executable, "-c", "import ray; ray.init(logging_level='ERROR'); print(ray.nodes()[0]['NodeID'])"]
+    with hosts(1) as [host], ray_cluster([host]):
+        host.run([*EVALUATE, "--episodes=1", f"--out={tmp_path / 'out'}"])
+        node = host.run(show).split()[-1]
+    found = Results.load(tmp_path / "out")
+    assert [one.result.status for one in found.cells[0].episodes] == ["done"]
+    assert found.workers[0].node != node

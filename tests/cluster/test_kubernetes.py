@@ -15,8 +15,7 @@ from typing import Any
 import kubernetes_validate
 import pytest
 import yaml
-from cluster_pages import serve_runs
-from kuberay import FOLDER, PodMonitor, RayJob, RayService, check, documents, manifest
+from kuberay import FOLDER, PodMonitor, RayJob, RayService, check, documents, manifest, serve_runs
 from packaging.specifiers import SpecifierSet
 from pydantic import ValidationError
 from readme_blocks import check_command

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 from eval_fakes import LINE, PYTHONPATH
-from flat_config import flat_config
+from in_process_evaluation import flat_config
 
 from vlagents_ray.evaluate import EvalConfig
 

@@ -7,9 +7,8 @@ import time
 from collections.abc import Callable
 
 import pytest
-from eval_fakes import ToZero
-from flat_config import flat_config
-from manual_clock import Clock
+from eval_fakes import Clock, ToZero
+from in_process_evaluation import flat_config
 
 from vlagents_ray.evaluate import EvalConfig, OutOfTime, Progress, evaluate
 from vlagents_ray.evaluate.episode.records import EpisodeResult

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 from eval_fakes import DRIFTING_LINE, LINE, OTHER_LINE, ToZero
-from in_process_pool import without_ray
+from in_process_evaluation import without_ray
 
 from vlagents_ray.errors import ClusterLost, ConfigError, EnvFailed
 from vlagents_ray.evaluate import EvalConfig, EvaluationInterrupted, Summary, evaluate, run

@@ -14,8 +14,7 @@ from subprocess import Popen
 
 import pytest
 from eval_fakes import wait_for
-from ray_processes import processes, ray_folder, wait_for_end
-from secret_leaks import leaked
+from ray_processes import leaked, processes, ray_folder, wait_for_end
 
 from vlagents_ray.client.credentials import KEY_VARIABLE
 from vlagents_ray.evaluate import EvalConfig

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable
 
 from eval_fakes import ToZero
-from in_process_pool import without_ray
+from in_process_evaluation import without_ray
 
 from vlagents_ray.evaluate import EvalConfig, evaluate
 

@@ -7,13 +7,17 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
+from ray_processes import processes, ray_folder
 from shared_ray import shared_server
 
 from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.serve.launch.server import Server
+
+if TYPE_CHECKING:
+    from ray.serve.schema import ServeDeploySchema
 
 SUPPORT = Path(__file__).parent.parent / "support"
 
@@ -34,6 +38,30 @@ def importable_agents() -> Iterator[None]:
     os.environ.pop("PYTHONPATH")
     if before is not None:
         os.environ["PYTHONPATH"] = before
+
+
+@pytest.fixture
+def ray_home() -> Iterator[Path]:
+    """A folder for the Ray of a command, of which nothing may run at the end."""
+    with ray_folder() as folder:
+        yield folder
+        assert not processes(folder), "left running"
+
+
+def deploy(config: ServeDeploySchema) -> None:
+    """Have Serve deploy the file, as `serve deploy` does with one that was changed."""
+    from ray.serve.context import _get_global_client
+
+    client = _get_global_client()
+    assert client is not None
+    client.deploy_apps(config)
+
+
+def states(app: str) -> dict[str, int]:
+    """Replicas of an application's policy by what they do."""
+    from ray import serve
+
+    return dict(serve.status().applications[app].deployments["Policy"].replica_states)
 
 
 @contextmanager

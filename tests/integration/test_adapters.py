@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from adapted_network import DIM, LAYERS, Small, base
-from peft_adapters import merge, pairs, save
+from adapted_network import DIM, LAYERS, Small, base, merge, pairs, save
 
 from tests.integration.conftest import serving
 from vlagents_ray import Obs, RemoteAgent

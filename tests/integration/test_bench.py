@@ -6,22 +6,13 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from ray_processes import processes, ray_folder
 
 from benchmarks.own_clients import own_clients
 
 ROOT = Path(__file__).parents[2]
-
-
-@pytest.fixture(name="ray_home")
-def own_ray_folder() -> Iterator[Path]:
-    with ray_folder() as folder:
-        yield folder
-        assert not processes(folder), "left running"
 
 
 def bench(ray_home: Path, name: str, *words: str) -> subprocess.CompletedProcess[str]:

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import http.client
-import json
 import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
 
 import pytest
 from eval_fakes import wait_for
-from flat_config import flat_config
+from in_process_evaluation import flat_config
 from ray.serve.schema import ServeDeploySchema
 from shared_ray import shared_server
 
+from tests.integration.conftest import deploy, states
 from tests.integration.test_sessions import TRANSPORTS, url
 from vlagents_ray import Obs, RemoteAgent
 from vlagents_ray.errors import CheckpointFailed, UnknownCheckpoint
@@ -56,18 +54,7 @@ def server(shared_ray: None, folder: Path) -> Iterator[Server]:
 
 def redeploy(folder: Path, replicas: int = 1, **user_config: Any) -> None:
     """What `serve deploy` does with the changed file."""
-    from ray.serve.context import _get_global_client
-
-    client = _get_global_client()
-    assert client is not None
-    client.deploy_apps(deployed(folder, num_replicas=replicas, user_config=user_config))
-
-
-def states() -> dict[str, int]:
-    """Replicas by what they do."""
-    from ray import serve
-
-    return dict(serve.status().applications["Stored"].deployments["Policy"].replica_states)
+    deploy(deployed(folder, num_replicas=replicas, user_config=user_config))
 
 
 def metadata(server: Server) -> dict[str, Any]:
@@ -86,7 +73,7 @@ def fresh(server: Server, folder: Path) -> Server:
     for marker in folder.glob("*.*"):
         marker.unlink()
     redeploy(folder)
-    wait_for(lambda: states() == {"RUNNING": 1} and own(server, folder) == "1")
+    wait_for(lambda: states("Stored") == {"RUNNING": 1} and own(server, folder) == "1")
     return server
 
 
@@ -153,40 +140,6 @@ def test_metadata_says_what_may_be_chosen_and_what_is_loaded(fresh: Server, fold
     assert str(folder / "9") in said["loaded"]
 
 
-def test_what_is_not_offered_is_a_400_and_what_does_not_load_says_why(fresh: Server) -> None:
-    connection = http.client.HTTPConnection(urlsplit(fresh.url).netloc, timeout=30)
-    body = json.dumps({"instruction": "push", "kwargs": {"checkpoint": "/etc/passwd"}})
-    connection.request("POST", "/v1/reset", body, {"x-session-id": "bare", "content-type": "application/json"})
-    answer = connection.getresponse()
-    assert (answer.status, json.loads(answer.read())["code"]) == (400, "unknown_checkpoint")
-    connection.close()
-    with RemoteAgent(fresh.url) as agent:
-        with pytest.raises(UnknownCheckpoint, match="late"):
-            agent.reset(Obs(), "x", checkpoint="early")
-        with pytest.raises(CheckpointFailed, match="checkpoint step 77 did not load: FileNotFoundError; the server's"):
-            agent.reset(Obs(), "x", checkpoint_step=77)
-        agent.reset(Obs(), "x")
-        assert told(agent) == [1, 1]
-
-
-def test_a_slow_load_keeps_nobody_waiting_and_the_least_recently_used_goes(fresh: Server, folder: Path) -> None:
-    held = folder / "5.held"
-    held.touch()
-    robot = Robot(RemoteAgent(fresh.url, transport="websocket"))
-    slow = Robot(RemoteAgent(fresh.url, transport="http"), checkpoint_step=5)
-    wait_for((folder / "5.begun").exists)
-    before = len(robot.rows)
-    wait_for(lambda: len(robot.rows) > before + 500 or robot.failure is not None)
-    assert slow.rows == []
-    held.unlink()
-    wait_for(lambda: len(slow.rows) > 50)
-    assert {row[:2] for row in robot.end()} == {("1", 1.0)}
-    assert {row[:2] for row in slow.end()} == {("5", 5.0)}
-    with RemoteAgent(fresh.url) as agent:
-        agent.reset(Obs(), "x", checkpoint_step=6)
-        wait_for(lambda: (folder / "1.closed").exists() or (folder / "5.closed").exists())
-
-
 def test_a_redeploy_swaps_under_load_without_a_failed_step(fresh: Server, folder: Path) -> None:
     """Each step of each episode is answered by the checkpoint that its reset was told, and no replica restarts."""
     robots = [Robot(RemoteAgent(url(fresh, t).replace("Reacher", "Stored"), transport=t)) for t in TRANSPORTS]
@@ -227,16 +180,8 @@ def test_a_redeploy_of_what_does_not_load_leaves_the_old_one_and_says_why(fresh:
     assert {row[:2] for row in robot.end()} == {("1", 1.0)}
 
 
-def test_any_other_setting_is_swapped_too(fresh: Server, folder: Path) -> None:
-    redeploy(folder, scale=10.0)
-    wait_for(lambda: metadata(fresh)["config"].get("scale") == 10.0)
-    with RemoteAgent(fresh.url) as agent:
-        agent.reset(Obs(), "x")
-        assert told(agent) == [10, 1]
-
-
 def test_every_replica_swaps_and_new_ones_begin_with_what_was_swapped_to(fresh: Server, folder: Path) -> None:
-    redeploy(folder, replicas=2, checkpoint_step=4)
+    redeploy(folder, replicas=2, checkpoint_step=4, scale=10.0)  # any setting is swapped
 
     def numbers() -> dict[int, set[float]]:
         """What each replica's sessions act by."""
@@ -248,7 +193,7 @@ def test_every_replica_swaps_and_new_ones_begin_with_what_was_swapped_to(fresh: 
         return found
 
     wait_for(lambda: len(numbers()) == 2)
-    wait_for(lambda: list(numbers().values()) == [{4.0}] * 2)
+    wait_for(lambda: list(numbers().values()) == [{40.0}] * 2)
     redeploy(folder, replicas=2, checkpoint_step=5)
     wait_for(lambda: list(numbers().values()) == [{5.0}] * 2)
 

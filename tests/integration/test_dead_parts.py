@@ -14,7 +14,7 @@ from pathlib import Path
 import psutil
 import pytest
 from eval_fakes import wait_for
-from serve_command import free_address, healthy
+from ray_processes import free_address, healthy
 
 from vlagents_ray import ConfigError
 from vlagents_ray.evaluate import Results

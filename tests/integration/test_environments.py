@@ -15,7 +15,7 @@ import pytest
 import ray
 import yaml
 from eval_fakes import LINE, wait_for
-from flat_config import flat_config
+from in_process_evaluation import flat_config
 from shared_ray import shared_server
 from virtual_environments import ended, layered
 

@@ -21,7 +21,7 @@ import pytest
 import ray
 import yaml
 from family_env import DESK, DeskActor, play
-from flat_config import flat_config
+from in_process_evaluation import flat_config
 
 from vlagents_ray.evaluate import evaluate
 from vlagents_ray.serve.launch.deployment_file import read_deployment

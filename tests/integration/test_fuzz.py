@@ -24,7 +24,7 @@ import httpx
 import numpy as np
 import psutil
 import pytest
-from mutated_messages import changed, mutated
+from hostile_messages import changed, mutated
 from websockets.exceptions import ConnectionClosedError
 from websockets.sync.client import ClientConnection, connect
 

@@ -18,8 +18,7 @@ import pytest
 from eval_fakes import wait_for
 from gr00t_client import PolicyClient
 from lerobot_messages import AsyncClient, robot_saw
-from peer_environment import peers_python
-from peer_versions import package
+from peer_environment import package, peers_python
 from virtual_environments import ended
 
 from tests.integration.conftest import SUPPORT, serving

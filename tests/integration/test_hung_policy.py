@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import re
 import threading
 import time
-import urllib.request
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -15,6 +13,7 @@ import pytest
 import ray
 import served_agents
 from eval_fakes import wait_for
+from prometheus_series import scrape
 
 from tests.integration.conftest import serving
 from vlagents_ray import DeadlineExceeded, Obs, PolicyUnavailable, RemoteAgent
@@ -32,13 +31,9 @@ def server(shared_ray: None) -> Iterator[Server]:
         yield server
 
 
-def hung_calls() -> list[str]:
+def hung_calls() -> list[tuple[str, float]]:
     """What Prometheus would read of them: the op of each, and their number."""
-    (node,) = ray.nodes()
-    url = f"http://{node['NodeManagerAddress']}:{node['MetricsExportPort']}/metrics"
-    with urllib.request.urlopen(url, timeout=10) as answer:
-        text = answer.read().decode()
-    return re.findall(r'^ray_vlagents_hung_calls_total\{.*op="(\w+)".*\} ([\d.]+)$', text, re.MULTILINE)
+    return [(one.tags["op"], one.value) for one in scrape() if one.name == "vlagents_hung_calls_total"]
 
 
 def logged() -> str:
@@ -81,7 +76,7 @@ def test_its_sessions_go_on_elsewhere_the_cause_is_told_and_it_is_replaced(how: 
     wait_for(lambda: not any(thread.is_alive() for thread in threads))
     print(f"{how}: {len(hit)} sessions were there; the last acted elsewhere after {time.monotonic() - begun:.1f} s")
     if how == "sleep":
-        wait_for(lambda: hung_calls() == [("act", "1.0")])
+        wait_for(lambda: hung_calls() == [("act", 1.0)])
         wait_for(lambda: f"has not returned from 'act' for {ACT_S}" in logged())
         assert "threading.Event().wait()" in logged(), "the log does not say where it hangs"
     else:

@@ -10,7 +10,7 @@ from typing import Any
 
 import psutil
 import pytest
-from flat_config import flat_config
+from in_process_evaluation import flat_config
 from ray_processes import words
 
 from tests.integration.conftest import serving
@@ -97,7 +97,7 @@ def test_killed_workers_and_a_resumption_change_no_result(
     assert outcomes(tmp_path) == alone
 
 
-@pytest.mark.parametrize(("server", "workers", "num_envs"), [(1, 2, 1), (1, 2, 5), (2, 4, 1)], indirect=["server"])
+@pytest.mark.parametrize(("server", "workers", "num_envs"), [(1, 2, 5), (2, 4, 1)], indirect=["server"])
 def test_workers_batches_replicas_and_envs_side_by_side_change_no_result(
     alone: dict[Any, Any], tmp_path: Path, server: Server, workers: int, num_envs: int
 ) -> None:

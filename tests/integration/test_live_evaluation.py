@@ -1,4 +1,7 @@
-"""`vlagents-ray eval … --live`: the page is there while the evaluation runs, with cells and sessions, and then gone."""
+"""`vlagents-ray eval` beside a page and a trainer that go on: `--live-at` and `--watch`.
+
+The page is there while the evaluation runs, with cells and sessions, and then gone.
+"""
 
 from __future__ import annotations
 
@@ -6,23 +9,17 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
-import pytest
 import yaml
 from eval_fakes import LINE, PYTHONPATH, wait_for
 from live_server import LivePage
-from ray_processes import processes, ray_folder
+
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.evaluate import Results
 
 COMMAND = str(Path(sys.executable).parent / "vlagents-ray")
-
-
-@pytest.fixture(name="ray_home")
-def own_ray_folder() -> Iterator[Path]:
-    with ray_folder() as folder:
-        yield folder
-        assert not processes(folder), "left running"
 
 
 @contextmanager
@@ -66,27 +63,46 @@ def test_it_shows_cells_sessions_and_failures_while_it_runs(ray_home: Path, tmp_
         (tmp_path / "open").touch()
 
 
-def test_a_training_gets_a_point_for_each_checkpoint(ray_home: Path, tmp_path: Path) -> None:
-    runs, file = tmp_path / "runs", tmp_path / "watched.yaml"
+def finished(out: Path) -> dict[str, int]:
+    """Episodes of each contender."""
+    with suppress(ConfigError):
+        return {cell.contender: len(cell.counted) for cell in Results.load(out).cells}
+    return {}
+
+
+def written(folder: Path, step: int, number: str, *, done: bool) -> None:
+    """A checkpoint as `served_agents.Stored` loads it."""
+    (folder / f"{step}").mkdir(exist_ok=True)
+    (folder / f"{step}" / "number").write_text(number)
+    if done:
+        (folder / f"{step}" / "done").touch()
+
+
+def test_each_checkpoint_is_evaluated_once_it_is_whole_by_one_server_and_gets_a_point(
+    ray_home: Path, tmp_path: Path
+) -> None:
+    runs, out, file = tmp_path / "runs", tmp_path / "out", tmp_path / "watched.yaml"
+    runs.mkdir()
     policy = {
         "name": "mine", "source": "served_agents:Stored", "config": {"checkpoint": str(runs / "{step}" / "number")}
     }  # fmt: skip
-    gate = tmp_path / "gate-1"  # while it is there, the last episode does not wait for the test
-    gate.touch()
-    suites = [{"envs": [LINE], "episodes": 2, "env_options": {"folder": str(tmp_path), "trouble": {"gate": [1]}}}]
-    file.write_text(yaml.safe_dump({"policies": [policy], "suites": suites, "video": "none"}))
-
-    def write(step: int) -> None:
-        (runs / f"{step}").mkdir(parents=True)
-        (runs / f"{step}" / "number").write_text("1")
-        (runs / f"{step}" / "done").touch()
-
-    write(10)
-    words = ["--watch", str(runs), "--marker", "done", "--until", "20", "--out", str(tmp_path / "out")]
-    with evaluating(ray_home, tmp_path / "log", str(file), *words) as page:
+    suites = [{"envs": [LINE], "episodes": 2}]
+    file.write_text(yaml.safe_dump({"policies": [policy], "suites": suites, "out": str(out), "video": "none"}))
+    written(runs, 20, "half a numb", done=False)
+    words = [str(file), "--watch", str(runs), "--marker", "done", "--until", "30"]
+    with evaluating(ray_home, tmp_path / "log", *words) as page:
+        written(runs, 10, "0.5", done=True)
+        wait_for(lambda: finished(out) == {"mine@10": 2}, 180)
         wait_for(lambda: page.evaluation().get("state") == "waiting")
         assert page.steps() == [10]
-        gate.unlink()
-        write(20)
+        written(runs, 20, "-0.5", done=True)
         wait_for(lambda: page.steps() == [10, 20])
-        (tmp_path / "open").touch()
+        written(runs, 30, "1.0", done=True)
+    results = Results.load(out)
+    assert finished(out) == {"mine@10": 2, "mine@20": 2, "mine@30": 2}
+    assert [cell.counted[0].checkpoint for cell in results.cells] == [
+        str(runs / f"{n}" / "number") for n in (10, 20, 30)
+    ]
+    assert [cell.step for cell in results.cells] == [10, 20, 30]
+    assert "step 20: not yet: has no done" in (tmp_path / "log").read_text()
+    assert {one["checkpoint"] for one in results.policies.values()} == {str(runs / "10" / "number")}, "one server"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -16,6 +15,8 @@ from vlagents_ray import Obs, RemoteAgent
 from vlagents_ray.client.transports.select import TransportName
 
 CLIENTS, ACTS = 24, 8
+FROM_NONE = {"min_replicas": 0, "max_replicas": 2, "look_back_s": 2, "upscale_delay_s": 0.5, "downscale_delay_s": 1}
+WAYS: list[TransportName] = ["shm", "websocket"]
 
 
 def play(url: str, transport: TransportName, client: int) -> list[int]:
@@ -37,28 +38,6 @@ def test_what_waits_while_a_batch_runs_is_the_next_batch(shared_ray: None) -> No
             assert 5 < max(flat) <= 16, (transport, flat)
 
 
-@pytest.mark.slow
-def test_replicas_come_with_the_load_and_go_with_it(shared_ray: None) -> None:
-    """Neither shared memory nor a WebSocket is a request to Serve that says how much is going on."""
-    autoscaling = {"max_replicas": 2, "look_back_s": 2, "upscale_delay_s": 1, "downscale_delay_s": 1}
-    with serving("noop", config={"base_ms": 30}, autoscaling=autoscaling) as server:
-        with RemoteAgent(server.url, transport="websocket") as idle:
-            idle.reset(Obs())
-            time.sleep(4)
-            assert replicas() == 1
-        stop = threading.Event()
-        ways: list[TransportName] = ["shm", "websocket"]
-        with ThreadPoolExecutor(4) as pool:
-            jobs = [pool.submit(act_until, server.url, way, stop) for way in 2 * ways]
-            try:
-                wait_for(lambda: replicas() == 2 or any(job.done() for job in jobs))
-                assert replicas() == 2
-            finally:
-                stop.set()
-            assert min(job.result() for job in jobs) > 0
-        wait_for(lambda: replicas() == 1)
-
-
 def act_until(url: str, transport: TransportName, stop: threading.Event) -> int:
     """Act until `stop`; returns how often. An error fails the test."""
     acts = 0
@@ -74,3 +53,28 @@ def replicas() -> int:
     """Replicas that run."""
     (app,) = serve.status().applications.values()
     return sum(d.replica_states.get("RUNNING", 0) for d in app.deployments.values())
+
+
+def gone() -> bool:
+    """Are even those that stop no more?"""
+    (app,) = serve.status().applications.values()
+    return not any(number for deployment in app.deployments.values() for number in deployment.replica_states.values())
+
+
+@pytest.mark.slow
+def test_replicas_come_from_none_and_go_to_none_and_no_step_fails(shared_ray: None) -> None:
+    with serving("noop", config={"base_ms": 40}, batch={"max_size": 1}, autoscaling=FROM_NONE) as server:
+        wait_for(gone)
+        stop = threading.Event()
+        with ThreadPoolExecutor(4) as pool:
+            robots = [pool.submit(act_until, server.url, way, stop) for way in 2 * WAYS]
+            try:
+                wait_for(lambda: replicas() == 2 or any(robot.done() for robot in robots))
+            finally:
+                stop.set()
+            assert min(robot.result() for robot in robots) > 0
+        wait_for(gone)
+        for way in WAYS:
+            with RemoteAgent(server.url, transport=way, connect_timeout_s=120) as late:
+                late.reset(Obs(), "after the quiet")
+                assert late.act(Obs()).action.shape == (7,)

@@ -16,6 +16,7 @@ from eval_fakes import wait_for
 from ray.serve.schema import ServeDeploySchema
 from shared_ray import shared_server
 
+from tests.integration.conftest import deploy, states
 from tests.integration.test_sessions import TRANSPORTS, obs, url
 from vlagents_ray import RemoteAgent
 from vlagents_ray.images.jpeg_png import encode_jpeg
@@ -39,19 +40,8 @@ def server(shared_ray: None) -> Iterator[Server]:
 
 
 def scale(replicas: int) -> None:
-    from ray.serve.context import _get_global_client
-
-    client = _get_global_client()
-    assert client is not None
-    client.deploy_apps(deployed(replicas))
-    wait_for(lambda: states().get("RUNNING") == replicas)
-
-
-def states() -> dict[str, int]:
-    """Replicas of the first policy by what they do."""
-    from ray import serve
-
-    return dict(serve.status().applications["Reacher"].deployments["Policy"].replica_states)
+    deploy(deployed(replicas))
+    wait_for(lambda: states("Reacher").get("RUNNING") == replicas)
 
 
 def test_sessions_go_on_when_replicas_stop(server: Server) -> None:
@@ -85,7 +75,7 @@ def test_sessions_go_on_when_replicas_stop(server: Server) -> None:
             act(key)
     scaling = threading.Thread(target=scale, args=(1,))
     scaling.start()
-    while scaling.is_alive() or states() != {"RUNNING": 1}:
+    while scaling.is_alive() or states("Reacher") != {"RUNNING": 1}:
         for key in busy:
             act(key)
     scaling.join()

@@ -69,7 +69,7 @@ def test_a_caller_learns_on_which_nodes_the_replicas_are_and_of_no_application_n
     assert ReplicaNodes("Nobody").query() == {}
 
 
-@pytest.mark.parametrize("transport", ["handle", "shm", "plasma"])
+@pytest.mark.parametrize("transport", ["handle", "shm"])
 def test_a_dead_replica_ends_its_own_sessions_and_no_others(server: Server, transport: TransportName) -> None:
     agents = [RemoteAgent("serve://Reacher", transport=transport, resume=False) for _ in range(8)]
     pids = spread(agents, evenly=True)

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from eval_fakes import wait_for
 
-from tests.integration.conftest import serving
+from tests.integration.conftest import serving, states
 from vlagents_ray import DeadlineExceeded, Obs, PolicyUnavailable, RemoteAgent, VLAgentsError
 from vlagents_ray.client.transports.select import TransportName
 from vlagents_ray.serve.launch.server import Server
@@ -112,12 +112,6 @@ def server(shared_ray: None, ledger: Path) -> Iterator[Server]:
         yield server
 
 
-def running() -> int:
-    from ray import serve
-
-    return dict(serve.status().applications["Ledger"].deployments["Policy"].replica_states).get("RUNNING", 0)
-
-
 @pytest.mark.alone
 @pytest.mark.integration
 def test_killed_and_frozen_replicas_lose_double_cross_and_delay_no_act(server: Server, ledger: Path) -> None:
@@ -136,7 +130,7 @@ def test_killed_and_frozen_replicas_lose_double_cross_and_delay_no_act(server: S
     frozen: dict[int, float] = {}
     while left := [f for f in LEAST if len(took[f]) < LEAST[f] or len(reached[f]) < len(WAYS)]:
         fault = drawn.choice(left)
-        wait_for(lambda: running() == REPLICAS, 120)
+        wait_for(lambda: states("Ledger").get("RUNNING") == REPLICAS, 120)
         wait_for(lambda: all(player.pid for player in players), 60)
         time.sleep(drawn.uniform(0.5, 1.5))
         held: dict[int, set[str]] = {}

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from serve_command import free_address, serving
+from ray_processes import free_address, serving
 
 from vlagents_ray import Act, Agent, Obs, RemoteAgent
 from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings

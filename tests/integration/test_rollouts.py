@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import os
 import signal
 import threading
@@ -13,7 +12,7 @@ from typing import Any
 
 import pytest
 from eval_fakes import LINE, wait_for
-from in_process_pool import without_ray
+from in_process_evaluation import without_ray
 from served_agents import Stochastic
 
 from tests.integration.conftest import serving
@@ -88,18 +87,6 @@ def test_a_worker_killed_with_several_episodes_costs_no_transition_and_doubles_n
     assert got.equals(expected)
     assert 1 <= found.stats.retries <= 3
     assert found.stats.lost == 0
-
-
-def test_episodes_of_weights_that_a_learner_has_replaced_are_played_again(served: Server, version: Path) -> None:
-    write(version, 1)
-    with Rollouts(RolloutPlan(LINE, "serve://Stochastic", workers=2, num_envs=2)) as found:
-        first = next(found)
-        write(version, 2)
-        found.version = 2
-        rest = list(itertools.islice(found, 5))
-    assert [set(batch.column("version").to_pylist()) for batch in (first, *rest)] == [{1}] + [{2}] * 5
-    assert [batch.column("episode")[0].as_py() for batch in (first, *rest)] == list(range(6))
-    assert found.stats.stale > 0
 
 
 def test_what_the_policy_does_not_offer_ends_the_rollouts_at_once(served: Server, version: Path) -> None:

@@ -116,9 +116,9 @@ def test_health_is_503_while_the_policy_loads_and_clients_wait_for_it(tmp_path: 
 
 
 def test_two_servers_on_one_machine_do_not_meet() -> None:
-    ports = [free_port(), free_port()]
+    ports, robots = [free_port(), free_port()], free_port()
     with (
-        command("serve", "noop", "--port", str(ports[0]), "--set", "action_dim=3"),
+        command("serve", "noop", "--port", str(ports[0]), "--set", "action_dim=3", "--vlagents-port", str(robots)),
         command("serve", "noop", "--port", str(ports[1]), "--set", "action_dim=5", "--serve-set", "batch.max_size=2"),
     ):
         for port, dim in zip(ports, (3, 5), strict=True):
@@ -127,11 +127,6 @@ def test_two_servers_on_one_machine_do_not_meet() -> None:
                 agent.reset(Obs(), "x")
                 for _ in range(20):
                     assert agent.act(Obs()).action.shape == (dim,)
-
-
-def test_the_command_line_opens_an_endpoint_for_vlagents_and_closes_it() -> None:
-    port, robots = free_port(), free_port()
-    with command("serve", "noop", "--port", str(port), "--vlagents-port", str(robots)):
         wait_for(lambda: _name_at(robots) == "noop")
     with pytest.raises(ConnectionRefusedError):
         Client(robots)

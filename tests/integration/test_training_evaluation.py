@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 from eval_fakes import LINE
-from flat_config import flat_config
+from in_process_evaluation import flat_config
 from served_agents import Proportional
 
 from tests.integration.conftest import serving
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.evaluate import EvalConfig, Progress, Summary
+from vlagents_ray.evaluate import EvalConfig, Summary
 from vlagents_ray.learn import Publisher, TrainingEvaluation
 from vlagents_ray.serve.launch.server import Server
 
@@ -61,20 +61,3 @@ def test_each_version_is_evaluated_as_it_was_pushed(
     assert len(played(summary)) == 12
     with pytest.raises(ConfigError, match=rf"got 99, but the newest that {url} acts with is {versions[-1]}"):
         served.play(99)
-
-
-def test_a_push_during_an_evaluation_ends_it(server: Server, tmp_path: Path) -> None:
-    weights = Publisher("serve://Proportional")
-
-    class Another(Progress):
-        """A learner of its own."""
-
-        def episode(self, *_: Any) -> None:
-            weights.push(gain(0.6))
-
-    evaluation = TrainingEvaluation("serve://Proportional", plan(tmp_path, workers=1), progress=Another())
-    version = weights.push(gain(0.5))
-    with pytest.raises(
-        ConfigError, match=rf"versions {version + 1} to {version + 1} of the weights \(\w+\), want {version}"
-    ):
-        evaluation.play(version)

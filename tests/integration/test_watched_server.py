@@ -11,8 +11,8 @@ import pytest
 from eval_fakes import wait_for
 from opentelemetry.proto.collector.trace.v1.trace_service_pb2 import ExportTraceServiceRequest
 from opentelemetry.proto.trace.v1.trace_pb2 import Span
+from ray_processes import serving
 from readme_blocks import ENV
-from serve_command import serving
 
 from vlagents_ray import Obs, RemoteAgent, tracing
 

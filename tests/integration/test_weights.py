@@ -10,6 +10,7 @@ from eval_fakes import wait_for
 from ray.serve.schema import ServeDeploySchema
 from shared_ray import shared_server
 
+from tests.integration.conftest import deploy, states
 from vlagents_ray import Obs, RemoteAgent
 from vlagents_ray.errors import InvalidWeights, UnchangedWeights
 from vlagents_ray.learn import Publisher
@@ -71,18 +72,8 @@ def test_a_push_over_the_network_reaches_both_replicas(server: Server) -> None:
 
 
 def test_a_replica_that_starts_later_has_the_weights_of_the_others(server: Server) -> None:
-    from ray.serve.context import _get_global_client
-
-    client = _get_global_client()
-    assert client is not None
     weights = Publisher("serve://Trainable")
     version = weights.push(gain(7))
-    client.deploy_apps(deployed(3))
-    wait_for(lambda: running() == 3)
+    deploy(deployed(3))
+    wait_for(lambda: states("Trainable").get("RUNNING") == 3)
     assert weights.acknowledged(version) == 3
-
-
-def running() -> int:
-    from ray.serve import status
-
-    return int(status().applications["Trainable"].deployments["Policy"].replica_states.get("RUNNING", 0))

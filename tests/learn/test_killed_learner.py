@@ -13,7 +13,7 @@ from typing import Any
 import pyarrow as pa
 import pytest
 from eval_fakes import LINE, PYTHONPATH, ToZero, wait_for
-from in_process_pool import without_ray
+from in_process_evaluation import without_ray
 from ray_processes import processes, ray_folder, wait_for_end
 
 from vlagents_ray.learn import RolloutPlan, Rollouts, rollouts

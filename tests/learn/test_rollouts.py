@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from eval_fakes import EVERY, LINE, OTHER_LINE, Line, SevenLine, ToZero
-from flat_config import flat_config
-from in_process_pool import without_ray
+from in_process_evaluation import flat_config, without_ray
 from in_process_replicas import Replicas
 
 from vlagents_ray.envs.base import BatchEnv, SequentialBatch

@@ -10,10 +10,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
-from eval_fakes import LINE, ToZero
-from flat_config import flat_config
+from eval_fakes import LINE, Clock, ToZero
+from in_process_evaluation import flat_config
 from in_process_replicas import Replicas
-from manual_clock import Clock
 from served_agents import Proportional
 
 from vlagents_ray.errors import ConfigError, NotTrainable, UnknownEnv

@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 from eval_fakes import LINE, Line, ToZero
-from flat_config import flat_config
+from in_process_evaluation import flat_config
 
 from vlagents_ray.envs.base import SequentialBatch
 from vlagents_ray.errors import EnvFailed, MissingDependency

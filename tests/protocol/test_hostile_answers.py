@@ -6,7 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from hostile_answers import ADDED_MB, ANSWERS
+from hostile_messages import ADDED_MB, ANSWERS
 
 READ = """
 import resource, sys

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from flat_config import flat_config
+from in_process_evaluation import flat_config
 from pydantic import ValidationError
 
 from vlagents_ray.errors import ConfigError

@@ -10,10 +10,9 @@ import psutil
 import pytest
 import ray
 from eval_fakes import wait_for
-from flat_config import flat_config
-from ray_processes import processes, words
+from in_process_evaluation import flat_config
+from ray_processes import leaked, processes, words
 from ray_processes import ray_folder as ray_folder_of_test
-from secret_leaks import leaked
 
 from vlagents_ray import ConfigError
 from vlagents_ray.client.credentials import KEY_VARIABLE

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from manual_clock import Clock
+from eval_fakes import Clock
 
 from vlagents_ray import ActionSpec, ConfigError, Contract, Obs
 from vlagents_ray.envs import make_env

@@ -31,8 +31,8 @@ from api_key_replica import WAYS, KeyedReplica, keyed_replica
 from dialect_server import body, libero, seen
 from eval_fakes import wait_for
 from gr00t_client import encode as gr00t_encode
+from hostile_messages import mutated
 from many import many
-from mutated_messages import mutated
 from rpyc_client import LOCAL, ROOT, TUPLE, VALUE, call, document, request
 
 from vlagents_ray.interface import Obs

@@ -234,3 +234,12 @@ def wait_for(true: Any, timeout_s: float = 120.0, every_s: float = 0.02) -> None
         if time.monotonic() > deadline:
             raise TimeoutError(f"waited {timeout_s:g} s for {true}")
         time.sleep(every_s)
+
+
+class Clock:
+    """Shows what it is set to."""
+
+    now = 0.0
+
+    def __call__(self) -> float:
+        return self.now

@@ -1,17 +1,20 @@
-"""Evaluations that run in the test's process, without Ray."""
+"""Evaluations and rollouts that run in the test's process, without Ray."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import contextlib
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any
 
 from eval_fakes import ToZero
 
-from vlagents_ray.evaluate import EvalConfig, Results
+from vlagents_ray.evaluate import EvalConfig, Results, run
 from vlagents_ray.evaluate.artifacts.recorder import save
 from vlagents_ray.evaluate.artifacts.storage import versions
 from vlagents_ray.evaluate.plan.jobs import plan
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.evaluate.workers.rollout import Rollout
+from vlagents_ray.evaluate.workers.worker import InProcessWorkers
 from vlagents_ray.interface import Agent
 
 
@@ -36,3 +39,34 @@ def play(config: EvalConfig, make: Callable[[], Agent] = ToZero, *, left_out: It
         store.end_run("complete")
     worker.close()
     return Results.load(config.out)
+
+
+@contextlib.contextmanager
+def without_ray(module: Any = run, pool: type[InProcessWorkers] = InProcessWorkers) -> Iterator[None]:
+    """Within this the module's pool is one in this process, so that by default `evaluate` plays here."""
+    before: dict[str, Any] = {name: getattr(module, name) for name in ("WorkerPool", "ray_cluster")}
+    module.WorkerPool = pool
+    module.ray_cluster = lambda _config: contextlib.nullcontext()
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            setattr(module, name, value)
+
+
+_POLICY = {
+    "policy": "name", "policy_url": "url", "policy_config": "config", "policy_options": "options",
+    "checkpoint": "checkpoint", "steps": "steps", "execute": "execute", "codec": "codec", "transport": "transport",
+}  # fmt: skip
+_SUITE = {name: name for name in ("envs", "env_options", "reset_options", "episodes", "seeds", "num_envs")}
+_WORKER = {"cpus_per_worker": "cpus", "gpus_per_worker": "gpus", "threads": "threads", "runtime_env": "runtime_env"}
+
+
+def flat_config(**settings: Any) -> EvalConfig:
+    """An evaluation of one policy in one suite, from settings side by side; `seed` is the only seed."""
+    if "seed" in settings:
+        settings = settings | {"seeds": [settings["seed"]]}
+        del settings["seed"]
+    policy, suite, worker = ({one[k]: v for k, v in settings.items() if k in one} for one in (_POLICY, _SUITE, _WORKER))
+    rest = {k: v for k, v in settings.items() if k not in _POLICY | _SUITE | _WORKER}
+    return EvalConfig.model_validate({"policies": [policy], "suites": [suite], "worker": worker, **rest})

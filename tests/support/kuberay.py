@@ -8,13 +8,17 @@ of Prometheus' operator.
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import kubernetes_validate
 import yaml
+from eval_fakes import wait_for
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 from pydantic.alias_generators import to_camel
+
+from benchmarks.hosts import RayCluster
 
 FOLDER = Path(__file__).parents[2] / "cluster" / "kuberay"
 KUBERNETES = "1.37"
@@ -191,3 +195,23 @@ def check(document: dict[str, Any]) -> None:
         ours[document["kind"]].model_validate(document)
     else:
         kubernetes_validate.validate(document, KUBERNETES, strict=True)
+
+
+STATUS = """
+import json, ray
+from ray import serve
+ray.init(logging_level="ERROR")
+print(json.dumps({name: [app.status, app.message] for name, app in serve.status().applications.items()}))
+"""
+
+
+def serve_runs(cluster: RayCluster) -> None:
+    """Wait until all applications of a cluster run; `AssertionError` if one fails."""
+
+    def runs() -> bool:
+        states = json.loads(cluster.python(STATUS).splitlines()[-1])
+        failed = {name: state for name, state in states.items() if state[0] in ("DEPLOY_FAILED", "UNHEALTHY")}
+        assert not failed, failed
+        return bool(states) and all(state == "RUNNING" for state, _ in states.values())
+
+    wait_for(runs)

@@ -2,27 +2,33 @@
 
 So `make check`, which leaves out whatever is marked, is sure to start no Ray and to load no simulator. The marker
 `integration` is the tier that `make test` leaves out.
+
+On CI a skipped test has failed: `VLAGENTS_FAIL_ON_SKIP=1` makes it so. CI installs all that tests need but a GPU,
+sources and assets that are on no package index, a browser where apt has none, and libraries that others load wherever
+they are installed: only tests marked `gpu`, `source`, `assets`, `browser` and `library` may be skipped there.
 """
 
 from __future__ import annotations
 
+import functools
 import importlib.util
 import os
 import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
 from importlib.abc import Loader
 from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
 from types import ModuleType
+from typing import TypeVar
 
 import pytest
-from assets import assets
 from browser import CHROMIUM
-from cluster_hosts import no_hosts
 from cpp_client import no_compiler
 from typescript_client import node_version
+
+from vlagents_ray.errors import ConfigError
 
 # Ray makes a session's folder in this one: in no process of the test does one start that finds a file in its place.
 _NO_RAY = "/dev/null/not-marked-ray"  # short: a longer name would be replaced, as sockets in it could not be named
@@ -127,3 +133,48 @@ class _Refusal(Loader):
 
     def create_module(self, spec: ModuleSpec) -> ModuleType:
         raise ModuleNotFoundError(f"{spec.name}: the test is not marked `sim` or `torch`", name=spec.name)
+
+
+@functools.cache
+def no_hosts() -> str | None:
+    """Why tests cannot have several hosts here; None if they can."""
+    from benchmarks.hosts import require
+
+    try:
+        require()
+    except ConfigError as error:
+        return str(error)
+    return None
+
+
+_MAY_BE_MISSING = ("gpu", "source", "assets", "browser", "library")
+Report = TypeVar("Report", pytest.CollectReport, pytest.TestReport)
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    report = yield
+    return report if any(item.get_closest_marker(marker) for marker in _MAY_BE_MISSING) else _failed_if_skipped(report)
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_make_collect_report() -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
+    return _failed_if_skipped((yield))
+
+
+def _failed_if_skipped(report: Report) -> Report:
+    expected_failure = hasattr(report, "wasxfail")  # pytest counts it as skipped, too
+    if report.skipped and not expected_failure and os.environ.get("VLAGENTS_FAIL_ON_SKIP") == "1":
+        reason = report.longrepr[2] if isinstance(report.longrepr, tuple) else report.longrepr
+        report.outcome = "failed"
+        report.longrepr = f"unexpected skip (VLAGENTS_FAIL_ON_SKIP=1): {reason}"
+    return report
+
+
+BESIDE = Path(__file__).parents[3] / "shared" / "assets"  # the checkout
+
+
+def assets(simulator: str) -> Path | None:
+    """The folder of a simulator's data that no package brings, e.g. of "libero"; None where there is none."""
+    folder = Path(os.environ.get("VLAGENTS_RAY_ASSETS", BESIDE)) / simulator
+    return folder if folder.is_dir() else None

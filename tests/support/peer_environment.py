@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.peers import REQUIREMENTS, set_up
-from vlagents_ray.serve.python_env.create import python_in
+from vlagents_ray.serve.python_env.create import install, python_in
 
 FOLDER = Path(os.environ.get("VLAGENTS_PEERS", Path(__file__).parents[2] / ".venv-peers"))
 CLIENTS = Path(__file__).with_name("peer_clients.py")
@@ -34,3 +34,13 @@ def drive(python: Path, client: str, *words: object, timeout_s: float = 120) -> 
     done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=timeout_s)
     assert done.returncode == 0, f"{client} ended with {done.returncode}:\n{done.stdout[-2000:]}\n{done.stderr[-4000:]}"
     return json.loads(done.stdout.splitlines()[-1])
+
+
+def package(requirement: str) -> Path:
+    """A folder for PYTHONPATH with that version of a package, alone: what it needs is the environment's."""
+    folder = FOLDER / requirement.replace("==", "-")
+    done = folder / ".installed"
+    if not done.exists():
+        install(peers_python(), ["--no-deps", "--target", str(folder), requirement])
+        done.touch()
+    return folder

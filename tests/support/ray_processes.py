@@ -1,19 +1,31 @@
-"""Ray's processes: those of one that has a folder of its own (RAY_TMPDIR, --temp-dir) are known by it."""
+"""Processes of servers and of Ray.
+
+Those of a Ray that has a folder of its own (RAY_TMPDIR, --temp-dir) are known by it. `serving` runs
+`vlagents-ray serve` as users do; `leaked` searches the places where other processes can read a secret.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import os
+import shlex
 import shutil
 import signal
+import subprocess
 import tempfile
-from collections.abc import Iterator
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import psutil
 from eval_fakes import wait_for
+from readme_blocks import ENV
 
 from vlagents_ray.ray_tools.reaper import has_open_files, is_titled
+from vlagents_ray.serve.ports import free_port
 
 
 def words(process: psutil.Process) -> list[str]:
@@ -75,3 +87,73 @@ def end(folder: Path) -> None:
         with suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
     wait_for(lambda: not processes(folder))
+
+
+START_S, STOP_S = 180, 180
+
+
+def free_address() -> str:
+    """A "host:port" on which nobody listens."""
+    return f"127.0.0.1:{free_port()}"
+
+
+@contextlib.contextmanager
+def serving(
+    policy: str, log: Path, address: str | None = None, *options: str, cwd: Path | None = None
+) -> Iterator[str]:
+    """A server for the length of the context, on a free port unless one is given; yields "host:port" once healthy.
+
+    With a `cwd` it is as a reader types it there: what tests add to PYTHONPATH is not in it.
+    """
+    address = address or free_address()
+    command = ["vlagents-ray", "serve", policy, "--port", address.rpartition(":")[2], *options]
+    with log.open("w") as output:
+        server = subprocess.Popen(
+            [shutil.which(command[0], path=ENV["PATH"]) or command[0], *command[1:]],
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            cwd=cwd,
+            # As tests have set it meanwhile.
+            env=ENV if cwd is not None else ENV | {"PYTHONPATH": os.environ.get("PYTHONPATH", "")},
+        )
+    try:
+        deadline = time.monotonic() + START_S
+        while not healthy(address):
+            assert server.poll() is None, f"{shlex.join(command)} ended:\n{log.read_text()}"
+            assert time.monotonic() < deadline, f"{shlex.join(command)} is not healthy:\n{log.read_text()}"
+            time.sleep(0.2)
+        yield address
+    finally:
+        server.terminate()  # as Ctrl-C, which what a shell runs in the background never hears
+        try:
+            server.wait(STOP_S)
+        except subprocess.TimeoutExpired:
+            server.kill()
+            server.wait()
+            raise
+
+
+def healthy(address: str) -> bool:
+    """Does it answer, with its policy loaded?"""
+    try:
+        with urllib.request.urlopen(f"http://{address}/healthz", timeout=5) as answer:
+            return answer.status == 200
+    except (urllib.error.URLError, OSError):
+        return False
+
+
+def leaked(secret: str, folders: Iterable[Path]) -> list[str]:
+    """The files below `folders` that hold it, and processes but this one, by their command lines and environments."""
+    sought = secret.encode()
+    files = [file for folder in folders for file in folder.rglob("*") if file.is_file()]
+    for process in Path("/proc").glob("[0-9]*"):
+        files += [process / "cmdline", *([process / "environ"] if int(process.name) != os.getpid() else [])]
+    found = []
+    for file in files:
+        try:
+            if sought in file.read_bytes():
+                found.append(str(file))
+        except OSError:  # it has ended, or is another user's
+            continue
+    return found

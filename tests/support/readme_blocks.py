@@ -1,4 +1,4 @@
-"""Reading, running and checking the fenced blocks of a Markdown text.
+"""Reading, running and checking the fenced blocks of a Markdown text, its commands, and the files of examples/.
 
 An HTML comment straight above a block says how it is tested. `<!-- test: serve scripted -->` runs it
 with a server of that policy in place of http://gpu-box:8000, `<!-- test -->` or no comment without
@@ -18,6 +18,7 @@ after it on the page find the file.
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shlex
@@ -26,8 +27,12 @@ import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from peer_environment import peers_python
+from typer.main import get_command
+
+from vlagents_ray.cli.main import app
 
 ROOT = Path(__file__).parents[2]
 DOCUMENTED_HOST = "gpu-box:8000"
@@ -168,3 +173,51 @@ def check_command(words: list[str], where: str) -> None:
         known = set(re.findall(r"--[\w-]+", done.stdout))
         shown = {word.partition("=")[0] for word in arguments if word.startswith("--")}
         assert shown - known == set(), f"{where}: {sorted(shown - known)} are not among {sorted(known)}"
+
+
+DOCS = ROOT / "docs"
+TUTORIALS = sorted(page for page in (DOCS / "tutorials").glob("*.md") if page.name != "index.md")
+COMMAND: Any = get_command(app)  # of click, or of what typer has of it
+PAGES = sorted([ROOT / "README.md", ROOT / "SECURITY.md", *DOCS.rglob("*.md")])
+
+
+def commands(text: str) -> list[tuple[str, bool]]:
+    """The commands of `vlagents-ray` in a page, and whether one stands in a block, whole, and not in a sentence."""
+    blocks = re.findall(r"```(?:bash|sh|console)\n(.*?)```", text, re.DOTALL)
+    lines = [line.strip().removeprefix("$ ") for block in blocks for line in block.replace("\\\n", " ").splitlines()]
+    typed = [line for line in lines if re.match(r"(\w+=\S+ )*vlagents-ray ", line)]
+    prose = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
+    mentioned = [" ".join(one.split()) for one in re.findall(r"`(vlagents-ray [^`]*)`", prose)]
+    return [(line, True) for line in typed] + [(line, False) for line in mentioned]
+
+
+def read_as_typed(line: str, *, whole: bool) -> None:
+    """Raise what the command would say of its words before it does anything; of a mention some may be left out."""
+    if not whole:
+        line = re.sub(r"[\[\]…]", "", line)  # what is optional, and what is anything
+    words = re.split(r" (?:\d?>|\||&)", line)[0]  # what the shell reads
+    arguments = shlex.split(words, comments=True)
+    arguments = arguments[arguments.index("vlagents-ray") + 1 :]
+    command = COMMAND
+    try:
+        while hasattr(command, "resolve_command") and arguments:
+            _, command, arguments = command.resolve_command(command.context_class(command), arguments)
+        command.make_context(line, arguments)
+    except Exception as error:
+        left_out = type(error).__name__ in ("MissingParameter", "NoArgsIsHelpError") or "requires an argument" in str(
+            error
+        )
+        if whole or not left_out:
+            raise ValueError(f"{line}: {getattr(error, 'format_message', error.__str__)()}") from error
+
+
+EXAMPLES = ROOT / "examples"
+
+
+def code_of(notebook: Path, server: str | None = None) -> Block:
+    """The cells of a notebook in their order, as one block of Python; raises `ValueError` if it has outputs."""
+    cells = [cell for cell in json.loads(notebook.read_text())["cells"] if cell["cell_type"] == "code"]
+    if kept := [cell["id"] for cell in cells if cell["outputs"] or cell["execution_count"]]:
+        raise ValueError(f"{notebook.name}: got outputs in {kept}, want none; clear them")
+    code = "\n".join("".join(cell["source"]) for cell in cells).replace("localhost:8000", DOCUMENTED_HOST)
+    return Block("python", 1, code, server)

@@ -8,8 +8,8 @@ import sys
 from pathlib import Path
 from subprocess import PIPE
 
-from example_files import EXAMPLES
 from ray_processes import processes
+from readme_blocks import EXAMPLES
 
 from vlagents_ray.evaluate import Results
 from vlagents_ray.evaluate.results.summary import pushed_of

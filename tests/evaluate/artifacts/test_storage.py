@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from eval_fakes import ToZero
 from faulty_disks import FULL, READ_ONLY, python_on
-from in_process_pool import without_ray
+from in_process_evaluation import without_ray
 
 from vlagents_ray.errors import ConfigError, ConnectionLost, DeadlineExceeded, StorageFailed
 from vlagents_ray.evaluate import (
@@ -31,7 +31,7 @@ COMMANDS = """
 import sys
 from pathlib import Path
 from eval_fakes import ToZero
-from in_process_pool import without_ray
+from in_process_evaluation import without_ray
 from vlagents_ray.cli.console import errors
 from vlagents_ray.evaluate import EvalConfig, evaluate
 config = EvalConfig.model_validate_json(sys.argv[2])

@@ -15,8 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from eval_fakes import LINE
-from flat_config import flat_config
-from in_process_evaluation import play
+from in_process_evaluation import flat_config, play
 from typer.testing import CliRunner
 
 from vlagents_ray.cli.main import app

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 from eval_fakes import LINE, OTHER_LINE
-from flat_config import flat_config
+from in_process_evaluation import flat_config
 
 from vlagents_ray.envs.tabletop import Tabletop
 from vlagents_ray.errors import ConfigError, UnknownEnv

@@ -3,7 +3,7 @@ from __future__ import annotations
 from io import StringIO
 
 import pytest
-from flat_config import flat_config
+from in_process_evaluation import flat_config
 from rich.console import Console
 
 from vlagents_ray.evaluate import Rate, progress_for

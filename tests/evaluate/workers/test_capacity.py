@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import pytest
-from manual_clock import Clock
+from eval_fakes import Clock
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig, WorkerConfig

@@ -4,7 +4,7 @@ from collections import Counter
 from typing import Any
 
 import pytest
-from flat_config import flat_config
+from in_process_evaluation import flat_config
 
 from vlagents_ray.client.credentials import KEY_VARIABLE, Credentials
 from vlagents_ray.envs.graphics import GPUS

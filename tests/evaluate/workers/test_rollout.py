@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 import pytest
 from eval_fakes import DRIFTING_LINE, LINE, OTHER_LINE, SPARING_LINE, Line, SparingLine, ToZero
-from flat_config import flat_config
+from in_process_evaluation import flat_config
 
 from vlagents_ray.errors import (
     ConfigError,

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from adapted_network import merge, pairs, save
 from lerobot.policies.factory import make_pre_post_processors
-from peft_adapters import merge, pairs, save
 
 from tests.families.lerobot import tiny
 from tests.families.lerobot.conftest import FILTERS, TASKS, Load, Made, begun, view

@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from eval_fakes import LINE
-from flat_config import flat_config
-from in_process_evaluation import play
+from in_process_evaluation import flat_config, play
 from lerobot.datasets.dataset_tools import delete_episodes, merge_datasets
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from recorded_sessions import recorded, seen

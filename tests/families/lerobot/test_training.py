@@ -18,8 +18,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import torch
-from flat_config import flat_config
-from in_process_evaluation import play
+from in_process_evaluation import flat_config, play
 from recorded_sessions import recorded
 from safetensors.torch import load_file, save_file
 from typer.testing import CliRunner

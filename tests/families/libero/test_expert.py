@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from assets import assets
 from experts.osc_pose import LiberoExpert
+from needs import assets
 
 from vlagents_ray.envs.libero import Libero
 from vlagents_ray.errors import ContractMismatch, InvalidObservation, NotReset

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from peft_adapters import merge, pairs, save
+from adapted_network import merge, pairs, save
 
 from tests.families.pi0 import tiny
 from tests.families.pi0.test_pi0 import WORDS, seen

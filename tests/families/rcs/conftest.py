@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import pytest
-from assets import assets
+from needs import assets
 
 from tests.families.rcs.stand_ins import write_duobench, write_rcs
 

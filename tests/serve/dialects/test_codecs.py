@@ -12,11 +12,11 @@ from typing import Any
 import msgpack
 import numpy as np
 import pytest
+from hostile_messages import mutated
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from many import many
-from mutated_messages import mutated
 
 from vlagents_ray.errors import InvalidInput, MalformedMessage, MessageTooLarge, VLAgentsError
 from vlagents_ray.images.jpeg_png import encode_jpeg, encode_png

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from eval_fakes import Clock
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from manual_clock import Clock
 from many import many
 from observed import observe
 

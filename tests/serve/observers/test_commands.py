@@ -13,10 +13,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from eval_fakes import wait_for
+from eval_fakes import Clock, wait_for
 from in_memory_keys import ChangingKeys
 from live_server import LiveServer, ask, live_server
-from manual_clock import Clock
 
 from vlagents_ray import Obs, RemoteAgent
 from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings

@@ -7,7 +7,7 @@ import weakref
 
 import numpy as np
 import pytest
-from manual_clock import Clock
+from eval_fakes import Clock
 from observed import observe
 
 from vlagents_ray.images.codecs import DecodedFiles

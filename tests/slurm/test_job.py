@@ -1,0 +1,131 @@
+"""A job in Slurm: what it makes of Slurm's variables, when it ends, and how its server says that it can be reached."""
+
+from __future__ import annotations
+
+import datetime
+import json
+import os
+import socket
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from vlagents_ray.slurm.job import Allocation, Ports, as_text, connection_info, end_of_job, write
+
+ENVIRONMENT = {"SLURM_JOB_ID": "4711", "SLURM_JOB_NUM_NODES": "3", "SLURM_NODEID": "1", "SLURM_CPUS_ON_NODE": "1"}
+
+
+def options(**more: str) -> dict[str, str]:
+    """Of `ray start`, by name."""
+    words = Allocation.here(ENVIRONMENT | more).ray_start("10.0.0.5", "/tmp/x")
+    assert words[:2] == ["ray", "start"]
+    return dict(word.removeprefix("--").partition("=")[::2] for word in words[2:])
+
+
+def test_ray_gets_what_slurm_gave_and_not_what_the_machine_has() -> None:
+    found = options(SLURM_GPUS_ON_NODE="2", SLURM_MEM_PER_NODE="8192")
+    assert (found["num-cpus"], found["num-gpus"]) == ("1", "2")
+    assert int(found["memory"]) + int(found["object-store-memory"]) == 8192 * 2**20
+
+
+def test_memory_may_be_counted_by_cpu_or_not_at_all() -> None:
+    found = options(SLURM_MEM_PER_CPU="4096")
+    assert int(found["memory"]) + int(found["object-store-memory"]) == 4096 * 2**20
+    for more in ({}, {"SLURM_MEM_PER_NODE": "0"}):
+        assert "memory" not in options(**more)
+
+
+def test_a_task_that_is_bound_to_fewer_cpus_counts_those() -> None:
+    assert Allocation.here(ENVIRONMENT | {"SLURM_CPUS_ON_NODE": "9999"}).cpus == len(os.sched_getaffinity(0))
+
+
+def test_the_first_node_is_the_head_and_the_others_join_it() -> None:
+    head, other = options(SLURM_NODEID="0"), options()
+    assert {"head", "block"} <= head.keys()
+    assert head["node-ip-address"] == "10.0.0.5"
+    assert other["address"] == f"10.0.0.5:{head['port']}"
+    assert "head" not in other
+
+
+@pytest.mark.parametrize("job", [1, 4711, 2_499, 67_043_328])
+def test_jobs_that_follow_each_other_share_no_port(job: int) -> None:
+    def ports(number: int) -> Ports:
+        return Allocation.here(ENVIRONMENT | {"SLURM_JOB_ID": str(number)}).ports
+
+    def numbers(found: Ports) -> set[int]:
+        return {found.gcs, found.client, found.metrics, found.serve}
+
+    assert len(numbers(ports(job))) == 4
+    assert not numbers(ports(job)) & numbers(ports(job + 1))
+    assert all(10_000 <= port < 20_000 for port in numbers(ports(job)))
+
+
+def test_rays_own_folder_which_it_opens_to_everybody_is_within_that_of_the_job() -> None:
+    assert options()["temp-dir"] == "/tmp/x/ray"
+
+
+def squeue_says(text: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = folder / "squeue"
+    file.write_text(f"#!/bin/bash\necho '{text}'\n")
+    file.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{folder}{os.pathsep}{os.environ['PATH']}")
+
+
+def test_the_end_of_a_job_is_slurms_local_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    squeue_says("2027-01-31T18:30:00", tmp_path, monkeypatch)
+    assert end_of_job(1) == datetime.datetime(2027, 1, 31, 18, 30).timestamp()
+
+
+def test_a_job_without_a_limit_has_no_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    squeue_says("NONE", tmp_path, monkeypatch)
+    assert end_of_job(1) is None
+
+
+def test_a_newer_slurm_has_said_it_by_a_variable(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SLURM_JOB_END_TIME", "1801500000")
+    assert end_of_job(1) == 1801500000.0
+
+
+SERVER = {
+    "SLURM_JOB_ID": "12",
+    "SLURM_SUBMIT_HOST": "login1",
+    "SLURM_JOB_USER": "me",
+    "VLAGENTS_RAY_HEAD": "10.0.0.5",
+    "VLAGENTS_RAY_API_KEY": "vlr_x",
+}
+
+
+def test_the_connection_information_has_all_that_a_client_needs() -> None:
+    host = socket.gethostname()
+    found = connection_info({"pi0": "/pi0", "noop": "/"}, 9000, SERVER)
+    assert found["apps"] == {"pi0": f"http://{host}:9000/pi0", "noop": f"http://{host}:9000"}
+    assert (found["job"], found["key"], found["address"]) == (12, "vlr_x", "10.0.0.5")
+    assert found["ssh"] == f"ssh -N -L 9000:{host}:9000 me@login1"
+
+
+def test_people_are_told_the_same() -> None:
+    found = connection_info({"pi0": "/pi0"}, 9000, SERVER)
+    text = as_text(found, Path("server.json"))
+    assert all(part in text for part in (found["apps"]["pi0"], found["ssh"], "server.json"))
+    assert "the key that you were given" in as_text(found | {"key": None}, Path("server.json"))
+
+
+def test_the_log_has_no_key_but_the_command_that_reads_it(tmp_path: Path) -> None:
+    found = connection_info({"pi0": "/pi0"}, 9000, SERVER)
+    file = tmp_path / 'it\'s "here"' / "server.json"
+    file.parent.mkdir()
+    write(file, found)
+    text = as_text(found, file)
+    assert "vlr_x" not in text
+    (command,) = (line.strip() for line in text.splitlines() if "export" in line)
+    shown = subprocess.run(
+        ["bash", "-c", f"{command}; echo $VLAGENTS_RAY_API_KEY"], check=True, capture_output=True, text=True
+    )
+    assert shown.stdout.strip() == "vlr_x"
+
+
+def test_the_file_with_the_key_is_its_owners_alone(tmp_path: Path) -> None:
+    write(tmp_path / "server.json", {"key": "vlr_x"})
+    assert (tmp_path / "server.json").stat().st_mode & 0o777 == 0o600
+    assert json.loads((tmp_path / "server.json").read_text()) == {"key": "vlr_x"}

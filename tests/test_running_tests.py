@@ -1,0 +1,153 @@
+"""Which tests are imported, that CI skips none but those of missing hardware, and a second try of those that failed.
+
+Tried on small test files.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from needs import left_out
+
+
+@pytest.mark.parametrize(
+    ("line", "markexpr", "wanted"),
+    [
+        ("pytestmark = pytest.mark.sim", "not (torch or sim)", True),
+        ("pytestmark = [pytest.mark.vulkan, pytest.mark.slow]", "not (slow)", True),
+        ("pytestmark = pytest.mark.simple", "not (torch or sim)", False),
+        ("@pytest.mark.sim", "not (torch or sim)", False),
+        ("pytestmark = pytest.mark.sim", "not (torch or sim) or slow", False),
+        ("pytestmark = pytest.mark.sim", "slow", False),
+        ("pytestmark = pytest.mark.sim", "", False),
+        ("pytestmark = pytest.mark.hosts", "not (integration)", True),
+        ("pytestmark = pytest.mark.hosts", "integration", False),
+        ("@pytest.mark.integration", "integration", False),
+        ("@pytest.mark.sim", "integration", True),
+    ],
+)
+def test_a_file_is_not_imported_if_all_of_it_is_left_out(
+    line: str, markexpr: str, wanted: bool, tmp_path: Path
+) -> None:
+    file = tmp_path / "test_it.py"
+    file.write_text(f"import pytest\n\n{line}\n")
+    assert left_out(file, markexpr) is wanted
+    assert not left_out(tmp_path, markexpr)
+
+
+def test_the_page_of_the_tests_lists_every_module_of_support() -> None:
+    tests = Path(__file__).parent
+    packages = {path.parent.name for path in (tests / "support").glob("*/__init__.py")}
+    modules = {path.stem for path in (tests / "support").glob("*.py")} | packages
+    page = (tests / "README.md").read_text()
+    assert {name for name in modules if f"`{name}`" not in page and f"support/{name}.py" not in page} == set()
+
+
+SUPPORT = Path(__file__).parent / "support"
+
+
+def outcome(folder: Path, *bodies: str, strict: bool = True) -> tuple[int, str]:
+    """Exit status and output of pytest on files that hold one of `bodies` each: test_0.py, test_1.py, …"""
+    for number, body in enumerate(bodies):
+        (folder / f"test_{number}.py").write_text(f"import pytest\n{body}\n")
+    (folder / "pytest.ini").write_text("[pytest]\nmarkers = gpu: needs a GPU\n")
+    done = subprocess.run(
+        [
+            *(sys.executable, "-m", "pytest", "-rfE", "--continue-on-collection-errors"),
+            *("-p", "needs", "-p", "no:cacheprovider"),
+        ],
+        check=False,
+        cwd=folder,
+        env={
+            **os.environ,
+            "COLUMNS": "300",
+            "PYTHONPATH": str(SUPPORT),
+            "VLAGENTS_FAIL_ON_SKIP": str(int(strict)),
+            "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1",  # other plugins take longer to load than the test to run
+        },
+        capture_output=True,
+        text=True,
+    )
+    return done.returncode, done.stdout
+
+
+SKIPS = {
+    "mark": "@pytest.mark.skip(reason='no reason')\ndef test_a(): pass",
+    "call": "def test_a(): pytest.skip('no reason')",
+    "condition": "@pytest.mark.skipif(True, reason='no reason')\ndef test_a(): pass",
+    "fixture": "@pytest.fixture\ndef f(): pytest.skip('no reason')\ndef test_a(f): pass",
+    "missing module": "pytest.importorskip('no_reason')",
+    "module": "pytest.skip('no reason', allow_module_level=True)",
+}
+
+
+@pytest.fixture(scope="module")
+def skipping(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """What pytest says of a file for each kind of skip, of one for a GPU, and of an expected failure."""
+    gpu = "@pytest.mark.gpu\ndef test_a(): pytest.skip('no GPU')"
+    expected = "@pytest.mark.xfail\ndef test_a(): assert False"
+    status, said = outcome(tmp_path_factory.mktemp("skipping"), *SKIPS.values(), gpu, expected)
+    assert status != 0
+    return said
+
+
+@pytest.mark.parametrize("how", SKIPS)
+def test_a_skip_fails_and_is_told_with_its_reason(how: str, skipping: str) -> None:
+    [failure] = re.findall(rf"^(?:FAILED|ERROR) test_{list(SKIPS).index(how)}\.py.*", skipping, re.MULTILINE)
+    assert "unexpected skip" in failure
+    assert re.search("no.reason", failure)
+
+
+def test_a_skip_is_only_a_skip_without_the_variable(tmp_path: Path) -> None:
+    found = [f"{SKIPS[how]}\ndef test_b(): pass" for how in ("mark", "call", "missing module")]
+    status, said = outcome(tmp_path, *found, strict=False)
+    assert (status, "2 passed, 3 skipped" in said) == (0, True), said
+
+
+def test_a_gpu_test_may_be_skipped_and_an_expected_failure_is_no_skip(skipping: str) -> None:
+    assert re.search(r"\b1 skipped, 1 xfailed", skipping), skipping
+
+
+SCRIPT = Path(__file__).parent / "support" / "play_again.py"
+TESTS = """
+from pathlib import Path
+
+def test_by_chance():
+    seen = Path('seen')
+    if not seen.exists():
+        seen.touch()
+        raise AssertionError('the first time')
+
+def test_broken():
+    assert not Path('broken').exists()
+
+def test_right():
+    with Path('times').open('a') as times:
+        times.write('once ')
+"""
+
+
+def run(folder: Path, ci: str) -> tuple[int, str]:
+    """Exit status and output of the script in `folder`."""
+    (folder / "test_some.py").write_text(TESTS)
+    environment = {**os.environ, "CI": ci, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
+    done = subprocess.run(
+        [sys.executable, SCRIPT, "-q"], check=False, cwd=folder, env=environment, capture_output=True, text=True
+    )
+    return done.returncode, done.stdout
+
+
+@pytest.mark.parametrize(("ci", "broken", "status"), [("true", False, 0), ("true", True, 1), ("", False, 1)])
+def test_only_what_passes_the_second_time_on_ci_is_flaky(tmp_path: Path, ci: str, broken: bool, status: int) -> None:
+    if broken:
+        (tmp_path / "broken").touch()
+    got, output = run(tmp_path, ci)
+    assert got == status
+    assert ("flaky: test_some.py::test_by_chance" in output) == (ci == "true")
+    assert "flaky: test_some.py::test_broken" not in output
+    assert (tmp_path / "times").read_text() == "once "

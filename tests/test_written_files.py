@@ -1,0 +1,52 @@
+"""Files that scripts of tests/support write are up to date: tables of the pages, and tests/surface.txt.
+
+What README and docs/ say about the registered adapters follows from the registry. What users write down changes only
+where a review sees it.
+"""
+
+from __future__ import annotations
+
+import pytest
+import surface
+import tables
+
+from vlagents_ray.registry import DIALECTS, ENVS, POLICIES
+
+
+@pytest.mark.parametrize("file", [*tables.TABLES, "mkdocs.yml"])
+def test_the_tables_are_up_to_date(file: str) -> None:
+    text = (tables.ROOT / file).read_text()
+    assert tables.with_tables(file, text) == text, "run `python tests/support/tables.py`"
+
+
+def test_each_adapter_has_a_page_and_each_page_an_adapter() -> None:
+    for folder, adapters, more in (("policies", POLICIES, tables.PLUGINS), ("benchmarks", ENVS, ())):
+        named = {tables.page_of(name, one) for name, one in adapters.items() if one.about} | {*more}
+        assert {page.stem for page in (tables.ROOT / "docs" / folder).glob("*.md")} - {"index"} == named - {""}
+
+
+def test_each_dialect_is_shown_among_the_clients_of_other_systems() -> None:
+    page = (tables.ROOT / "docs" / "other_clients.md").read_text()
+    assert [name for name in DIALECTS if f"{name}: {{" not in page] == []
+
+
+def test_the_public_surface_is_the_one_that_was_reviewed() -> None:
+    changes = list(surface.lines_that_differ(surface.FILE.read_text(), surface.surface()))
+    if changes:
+        pytest.fail(
+            "the public surface is another one:\n"
+            + "\n".join(changes)
+            + "\nIf that is meant, run `python tests/support/surface.py`."
+        )
+
+
+def test_a_change_is_seen() -> None:
+    """Of each kind: a name, a default, a path."""
+    was = surface.FILE.read_text()
+    for before, after in (
+        ("batch.max_size = 16", "batch.max_size = 8"),
+        ("POST /v1/act", "POST /v1/acts"),
+        ("vlagents_ray.RemoteAgent.act(obs)", "vlagents_ray.RemoteAgent.act(obs, now)"),
+    ):
+        assert before in was.splitlines()
+        assert surface.lines_that_differ(was, was.replace(before, after)) == [f"- {before}", f"+ {after}"]
