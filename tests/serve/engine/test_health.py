@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import queue
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 import pytest
-from in_flight import submit
+from in_flight import answered
 
 from vlagents_ray.errors import InvalidObservation, PolicyFailed, PolicyUnavailable
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.protocol.messages import Reply, Request
+from vlagents_ray.protocol.messages import Request
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.queue.call_limits import FAILED_BATCHES
 
@@ -62,12 +61,7 @@ def engine(agent: Failing) -> Iterator[Engine]:
 
 @pytest.fixture
 def ask(engine: Engine) -> Callable[[Any], Exception | None]:
-    def ask(op: Any) -> Exception | None:
-        replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
-        submit(engine, "a", Request(op, Obs()), replies.put)
-        return replies.get(timeout=10).error
-
-    return ask
+    return lambda op: answered(engine, "a", Request(op, Obs())).error
 
 
 @pytest.mark.parametrize("op", ["reset", "observe", "act", "act_batch"])

@@ -16,7 +16,7 @@ from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.queue.batch_queue import BatchQueue
-from vlagents_ray.serve.requests import PendingRequest, Rank
+from vlagents_ray.serve.requests import PendingRequest
 
 
 @pytest.fixture
@@ -33,27 +33,10 @@ def queue() -> Iterator[Callable[[int], BatchQueue]]:
         one.release()
 
 
-def put(
-    queue: BatchQueue, name: str, session: str = "", rank: Rank = Rank.SIMULATION, **fields: float
-) -> PendingRequest:
-    one = pending(session or name, Request("act", request_id=name, **fields), lambda _: None)  # type: ignore[arg-type]
-    one.rank = rank
+def put(queue: BatchQueue, name: str, **fields: float) -> PendingRequest:
+    one = pending(name, Request("act", request_id=name, **fields), lambda _: None)  # type: ignore[arg-type]
     queue.put(one)
     return one
-
-
-def batch(queue: BatchQueue) -> list[str]:
-    """The names of what the policy gets next."""
-    taken = queue.take()
-    assert taken is not None
-    return [one.request.request_id for one in taken.batch]
-
-
-def test_what_waits_is_taken_together_up_to_the_limit(queue: Callable[[int], BatchQueue]) -> None:
-    waiting = queue(3)
-    for name in "abcd":
-        put(waiting, name)
-    assert [batch(waiting), batch(waiting)] == [["a", "b", "c"], ["d"]]
 
 
 def test_a_lone_request_does_not_wait_for_others(queue: Callable[[int], BatchQueue]) -> None:
@@ -64,37 +47,16 @@ def test_a_lone_request_does_not_wait_for_others(queue: Callable[[int], BatchQue
     assert len(taken.batch) == 1
 
 
-def test_robots_go_before_simulations(queue: Callable[[int], BatchQueue]) -> None:
-    waiting = queue(2)
-    for name in "abc":
-        put(waiting, name)
-    put(waiting, "robot", rank=Rank.ROBOT)
-    assert batch(waiting) == ["robot", "a"]
-
-
-def test_a_session_is_in_a_batch_once_and_in_order(queue: Callable[[int], BatchQueue]) -> None:
-    waiting = queue(4)
-    for name in ("a1", "a2", "a3", "b1"):
-        put(waiting, name, session=name[0])
-    assert [batch(waiting) for _ in range(3)] == [["a1", "b1"], ["a2"], ["a3"]]
-
-
-def test_an_expired_request_never_reaches_the_policy(queue: Callable[[int], BatchQueue]) -> None:
+def test_a_request_that_expired_or_was_given_up_never_reaches_the_policy(queue: Callable[[int], BatchQueue]) -> None:
     waiting = queue(4)
     late = put(waiting, "late", deadline_ms=1.0)
     late.deadline -= 1.0
+    waiting.withdraw(put(waiting, "gone"))
     put(waiting, "good")
     taken = waiting.take()
     assert taken is not None
     assert [one.request.request_id for one in taken.batch] == ["good"]
     assert taken.expired == [late]
-
-
-def test_a_request_that_is_over_never_reaches_the_policy(queue: Callable[[int], BatchQueue]) -> None:
-    waiting = queue(4)
-    waiting.withdraw(put(waiting, "gone"))
-    put(waiting, "good")
-    assert batch(waiting) == ["good"]
 
 
 def test_who_waits_when_it_closes_is_given_back(queue: Callable[[int], BatchQueue]) -> None:
@@ -106,74 +68,13 @@ def test_who_waits_when_it_closes_is_given_back(queue: Callable[[int], BatchQueu
         put(waiting, "after")
 
 
-def test_nothing_comes_for_long_and_the_thread_is_told(queue: Callable[[int], BatchQueue]) -> None:
-    quiet = BatchQueue(1, idle_s=0.01)
-    quiet.bind()
-    assert quiet.next() == ([], [])
-    quiet.release()
-
-
 def test_the_time_spent_waiting_for_requests_counts_as_idle() -> None:
     quiet = BatchQueue(1, idle_s=0.05)
     quiet.bind()
     before_s, began = quiet.idle_time_s(), time.perf_counter()
-    quiet.next()
+    assert quiet.next() == ([], []), "its thread is told that nothing came for long"
     assert 0.05 <= quiet.idle_time_s() - before_s <= time.perf_counter() - began
     quiet.release()
-
-
-def test_the_queue_costs_a_lone_request_little(queue: Callable[[int], BatchQueue]) -> None:
-    """Against a bare hand-over to a thread and back, in the same run."""
-
-    def median(run: Callable[[], None]) -> float:
-        times = []
-        for _ in range(300):
-            begun = time.perf_counter()
-            run()
-            times.append(time.perf_counter() - begun)
-        return sorted(times)[150]
-
-    waiting = BatchQueue(16)
-
-    def serve() -> None:
-        waiting.bind()
-        while (taken := waiting.next()) is not None:
-            waiting.begin(taken.batch)
-            for one in taken.batch:
-                one.finish(Reply())
-            waiting.end()
-        waiting.release()
-
-    policy = threading.Thread(target=serve)
-    policy.start()
-
-    def through_queue() -> None:
-        done = threading.Event()
-        waiting.put(PendingRequest("s", Request("act"), lambda _: done.set()))
-        done.wait(5)
-
-    there, back, stop = threading.Semaphore(0), threading.Semaphore(0), threading.Event()
-
-    def echo() -> None:
-        while not stop.is_set():
-            there.acquire()
-            back.release()
-
-    thread = threading.Thread(target=echo)
-    thread.start()
-
-    def bare() -> None:
-        there.release()
-        back.acquire()
-
-    rounds = [(median(bare), median(through_queue)) for _ in range(5)]
-    bare_s, queued_s = map(min, zip(*rounds, strict=True))
-    stop.set()
-    bare()
-    thread.join(5)
-    waiting.close()
-    policy.join(5)
-    assert queued_s < 10 * bare_s, (queued_s, bare_s)
 
 
 # The policy's thread.

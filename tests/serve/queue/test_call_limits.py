@@ -15,7 +15,8 @@ import numpy as np
 import psutil
 import pytest
 from eval_fakes import wait_for
-from in_flight import submit
+from in_flight import asked
+from manual_clock import Clock
 from shm_client import call, client, request
 from starlette.testclient import TestClient
 
@@ -23,29 +24,13 @@ from vlagents_ray.errors import OutcomeUnknown, PolicyFailed, PolicyUnavailable
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.messages import Limits, Reply, Request
 from vlagents_ray.serve.access.api_keys import NoKey
-from vlagents_ray.serve.config.deployment import LimitArgs
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.queue.call_limits import (
-    LOAD,
-    CallLimits,
-    PolicyCall,
-    PolicyCalls,
-)
+from vlagents_ray.serve.queue.call_limits import CallLimits, PolicyCall, PolicyCalls
 from vlagents_ray.serve.requests import DEFAULT, PendingRequest
 
 LIMITS = CallLimits(act_s=10.0, warm_up_s=100.0, load_s=1000.0)
-
-
-class Clock:
-    """Time that passes when it is told to."""
-
-    def __init__(self) -> None:
-        self.now = 0.0
-
-    def __call__(self) -> float:
-        return self.now
 
 
 class Hanging(Agent):
@@ -101,9 +86,7 @@ def engine(agent: Hanging, clock: Clock) -> Iterator[Engine]:
 
 
 def put(engine: Engine, session: str, op: Any, **kwargs: Any) -> queue.SimpleQueue[Reply]:
-    replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
-    submit(engine, session, Request(op, Obs(), kwargs=kwargs), replies.put)
-    return replies
+    return asked(engine, session, Request(op, Obs(), kwargs=kwargs))
 
 
 def ask(engine: Engine, session: str, op: Any, **kwargs: Any) -> Reply:
@@ -133,26 +116,20 @@ OPS = ["reset", "act", "observe", "export"]
 
 
 @pytest.mark.parametrize("op", OPS)
-def test_a_call_over_its_limit_makes_the_engine_unhealthy(engine: Engine, clock: Clock, op: str) -> None:
-    hang(engine, op)
-    clock.now += 9.9
-    assert engine.ready
-    clock.now += 0.2
-    assert not engine.ready
-    with pytest.raises(PolicyUnavailable, match=rf"not returned from '{op}' for 10.1 s; its limit is 10 s"):
-        engine.check_health()
-
-
-@pytest.mark.parametrize("op", OPS)
-def test_those_who_wait_for_it_are_answered_and_no_others_are_let_in(
+def test_a_call_over_its_limit_is_unhealthy_those_who_wait_for_it_are_answered_and_no_others_are_let_in(
     engine: Engine, agent: Hanging, clock: Clock, op: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     engine.stats.enable()
     begun, behind = hang(engine, op), put(engine, "good", "act")
+    clock.now += 9.9
     engine.notice_hung()
+    assert engine.ready
     assert begun.empty()
     assert behind.empty()
-    clock.now += 11.0
+    clock.now += 0.2
+    assert not engine.ready
+    with pytest.raises(PolicyUnavailable, match=rf"not returned from '{op}' for 10.1 s; its limit is 10 s"):
+        engine.check_health()
     engine.notice_hung()
     engine.notice_hung()
     # Not to be repeated elsewhere, where it would hang as well; unlike what had not begun.
@@ -174,16 +151,6 @@ def test_those_who_wait_for_it_are_answered_and_no_others_are_let_in(
     assert "has returned" in caplog.text
     ask(engine, "good", "act")
     assert begun.empty()
-
-
-def test_a_first_call_may_compile(engine: Engine, clock: Clock) -> None:
-    ask(engine, "bad", "reset", hangs_at="act")
-    put(engine, "bad", "act")
-    wait_for(lambda: engine.calls.under_way)
-    clock.now += 99.0
-    assert engine.ready
-    clock.now += 2.0
-    assert not engine.ready
 
 
 def test_every_batch_size_may_compile_where_batches_have_fixed_sizes(agent: Hanging, clock: Clock) -> None:
@@ -208,18 +175,6 @@ def test_a_slow_policy_has_ten_times_its_longest_call(clock: Clock) -> None:
         with call:
             clock.now += took_s
     assert limits == [100.0, 100.0, 400.0, 500.0]
-
-
-def test_loading_has_its_own_limit(clock: Clock) -> None:
-    calls = PolicyCalls(LIMITS, clock)
-    with PolicyCall(calls, LOAD):
-        clock.now = 999.0
-        assert calls.overdue() is None
-        clock.now = 1001.0
-        overdue = calls.overdue()
-        assert overdue is not None
-        assert overdue.op == LOAD
-    assert calls.overdue() is None
 
 
 def test_a_policy_that_never_loads_has_failed() -> None:
@@ -278,13 +233,6 @@ def test_a_local_client_is_refused_though_the_thread_that_reads_its_requests_han
     assert engine.calls.under_way
     waiting.close()
     endpoint.close()
-
-
-def test_a_deployment_sets_the_limits() -> None:
-    args = LimitArgs(act_s=1, warm_up_s=2, load_s=3)
-    assert args.call_limits() == CallLimits(1, 2, 3)
-    assert args.limits() == Limits()
-    assert LimitArgs().call_limits() == CallLimits()
 
 
 class Forking(Agent):

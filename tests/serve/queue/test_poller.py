@@ -242,7 +242,7 @@ def test_a_robot_is_answered_before_the_next_batch(slow: Callable[..., Slow]) ->
 ENDLESS = 1e6  # times the batch before: what waits, waits until something ends it
 
 
-def test_a_batch_waits_for_the_rest_of_its_group(slow: Callable[..., Slow]) -> None:
+def test_a_batch_waits_for_the_rest_of_its_group_or_the_end(slow: Callable[..., Slow]) -> None:
     one = slow(size=8, patience=ENDLESS)
     one.start()
     one.learn("a", "b")
@@ -252,23 +252,7 @@ def test_a_batch_waits_for_the_rest_of_its_group(slow: Callable[..., Slow]) -> N
     one.put("b")
     wait_for(lambda: one.called("answer a", "answer b"))
     assert one.events[0] == "batch a b"
-
-
-def test_a_robot_ends_the_wait(slow: Callable[..., Slow]) -> None:
-    one = slow(size=8, patience=ENDLESS)
-    one.start()
-    one.learn("a", "b")
-    one.put("a")
-    wait_for(lambda: one.queue._gathering)
-    one.put("r", rank=Rank.ROBOT)
-    wait_for(lambda: one.called("answer a", "answer r"))
-    assert one.events[0] == "batch a r"
-
-
-def test_closing_ends_the_wait(slow: Callable[..., Slow]) -> None:
-    one = slow(size=8, patience=ENDLESS)
-    one.start()
-    one.learn("a", "b")
+    one.events.clear()
     one.put("a")
     wait_for(lambda: one.queue._gathering)
     one.engine.close()
