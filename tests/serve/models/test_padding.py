@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
-from in_flight import submit
+from in_flight import answered, submit
 from pydantic import ValidationError
 
 from vlagents_ray.errors import PolicyFailed
@@ -65,11 +65,9 @@ class Picky(Compiled):
 
 
 def ask(engine: Engine, session: str, op: Any, value: int = 0, **fields: Any) -> Reply:
-    replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
     if op == "reset":
         fields |= {"instruction": session, "kwargs": {"env": "lab"}}
-    submit(engine, session, Request(op, Obs(info={"value": value}), **fields), replies.put)
-    return replies.get(timeout=10)
+    return answered(engine, session, Request(op, Obs(info={"value": value}), **fields))
 
 
 @pytest.fixture
@@ -146,9 +144,8 @@ def test_without_padding_the_batch_runs_as_it_is(serving: Callable[[Compiled], E
 
 def test_a_refused_first_reset_is_not_what_padding_begins_with(serving: Callable[[Compiled], Engine]) -> None:
     engine = serving(Compiled())
-    replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
-    submit(engine, "bad", Request("reset", Obs(), "bad"), replies.put)  # lacks the `env` that it wants
-    assert isinstance(replies.get(timeout=10).error, PolicyFailed)
+    refused = answered(engine, "bad", Request("reset", Obs(), "bad"))  # lacks the `env` that the policy needs
+    assert isinstance(refused.error, PolicyFailed)
     ask(engine, "good", "reset")
     assert ask(engine, "good", "act").error is None
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import queue
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, ClassVar
 
 import numpy as np
 import pytest
-from in_flight import submit
+from in_flight import answered
 
 from vlagents_ray.errors import (
     InvalidInput,
@@ -80,9 +79,7 @@ class Served:
         return act.info["policy"]["version"], float(act.action[0])
 
     def ask(self, session: str, request: Request) -> Reply:
-        replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
-        submit(self.engine, session, request, replies.put)
-        reply = replies.get(timeout=30)
+        reply = answered(self.engine, session, request)
         if reply.error is not None:
             raise reply.error
         return reply
@@ -116,7 +113,9 @@ AGENTS = pytest.mark.parametrize("agent", [Gain, Doubled], ids=["by reference", 
 
 
 @AGENTS
-def test_an_episode_ends_with_the_weights_that_it_began_with(serving: Callable[..., Served], agent: type[Gain]) -> None:
+def test_an_episode_ends_with_the_weights_that_it_began_with_unless_they_are_pushed_to_it(
+    serving: Callable[..., Served], agent: type[Gain]
+) -> None:
     served = serving(agent())
     alone = serving(agent())
     for one in (served, alone):
@@ -134,26 +133,12 @@ def test_an_episode_ends_with_the_weights_that_it_began_with(serving: Callable[.
     assert served.reset("old").info == {"gain": 4.0}
     assert served.act("old") == (4, 4.0)
     assert served.act("new") == (1, 1.0)
-
-
-@AGENTS
-def test_with_keep_running_episodes_change_at_once(serving: Callable[..., Served], agent: type[Gain]) -> None:
-    served = serving(agent())
-    served.reset("a")
-    assert served.act("a") == (0, 0.0)
-    served.push(1, "keep")
-    assert served.act("a") == (1, 1.0)
-
-
-@AGENTS
-def test_the_fingerprint_is_that_of_what_the_agent_holds(serving: Callable[..., Served], agent: type[Gain]) -> None:
-    served = serving(agent())
-    digest = served.push(1)
-    served.reset("a")
-    act = served.ask("a", Request("act", Obs())).act
+    digest = served.push(5, "keep")
+    assert served.act("new") == (5, 5.0), "running episodes change at once"
+    act = served.ask("new", Request("act", Obs())).act
     assert act is not None
-    assert act.info["policy"] == {"version": 1, "fingerprint": digest}
-    assert digest == fingerprint(gains(1))
+    assert act.info["policy"] == {"version": 5, "fingerprint": digest}
+    assert digest == fingerprint(gains(5)), "of what the agent holds"
 
 
 def test_robots_keep_the_pinned_weights_unless_they_follow(serving: Callable[..., Served]) -> None:
