@@ -52,13 +52,6 @@ def test_it_is_the_engines_only_while_somebody_looks(watched: Watched) -> None:
     assert watched.observers.any is False
 
 
-def test_a_lease_that_ends_without_any_message_ends_too(watched: Watched) -> None:
-    watched.live.renew()
-    watched.clock.now += LEASE_S
-    watched.live.expire()
-    assert watched.observers.any is False
-
-
 def test_answers_are_kept_in_order(watched: Watched) -> None:
     watched.live.renew()
     watched.ask("a", Obs())

@@ -113,14 +113,9 @@ def test_nothing_is_kept_once_nobody_looks(server: LiveServer) -> None:
     with server.viewer() as viewer:
         ask(viewer)
         assert server.engine.observers.any
+        status, text, _ = get(f"{server.url}/v1/live", {"sec-fetch-site": "same-origin"})  # without a WebSocket
+        assert (status, json.loads(text)["replicas"][0]["waiting"]) == (200, {"robot": 0, "simulation": 0})
     wait_for(lambda: server.engine.observers.any is False)
-
-
-def test_the_document_is_there_without_a_websocket(server: LiveServer) -> None:
-    status, text, _ = get(f"{server.url}/v1/live")
-    assert status == 200
-    [replica] = json.loads(text)["replicas"]
-    assert replica["waiting"] == {"robot": 0, "simulation": 0}
 
 
 def test_the_page_holds_no_data_and_no_addresses(server: LiveServer) -> None:
@@ -176,10 +171,6 @@ def test_another_sites_page_sees_nothing_and_does_not_start_the_observer(
     assert get(f"{server.url}/v1/live", headers)[0] == 403
     assert server.engine.observers.any is False
     assert not server.fleet.watched
-
-
-def test_its_own_page_may_ask(server: LiveServer) -> None:
-    assert get(f"{server.url}/v1/live", {"sec-fetch-site": "same-origin"})[0] == 200
 
 
 def test_a_server_open_to_the_network_shows_nothing() -> None:
