@@ -103,13 +103,15 @@ def test_sessions_at_once_have_episodes_of_their_own(tmp_path: Path) -> None:
 
 
 def test_other_cameras_go_into_a_dataset_of_their_own(tmp_path: Path) -> None:
-    with recorded(tmp_path) as server:
+    with recorded(tmp_path, pictures="small") as server:
         robot = server.robot()
         robot.play(1)
         robot.act(seen(1, side=64))
     names = sorted(tmp_path.iterdir())
     assert [name.name[-2:] for name in names] == ["-0", "-1"]
     assert [rows(name)["tick"] for name in names] == [[0], [1]]
+    with av.open(str(next(tmp_path.rglob("*.mp4")))) as video:
+        assert video.streams.video[0].codec_context.pix_fmt == "yuv420p", "small ones are ordinary videos"
 
 
 def test_a_long_session_goes_on_in_the_next_episode(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
