@@ -91,6 +91,9 @@ def test_what_was_answered_is_recorded_with_its_code(client: TestClient, engine:
     with client.websocket_connect("/v1/stream") as socket:
         socket.send_bytes(b"garbage")
         socket.receive_bytes()
+        socket.send_bytes(encode_request(Request("reset", OBS)))
+        socket.receive_bytes()
+        assert engine.sessions.by_transport() == {"http": 1, "websocket": 1}
     batches: list[int] = []
     requests: Counter[Any] = Counter()
 
@@ -98,7 +101,7 @@ def test_what_was_answered_is_recorded_with_its_code(client: TestClient, engine:
         collected = engine.stats.collect()
         batches.extend(collected.batches.values)
         requests.update({kind: sample.seen for kind, sample in collected.requests.items()})
-        return len(batches) >= 2 and requests.total() >= 6
+        return len(batches) >= 2 and requests.total() >= 7
 
     wait_for(are_all_recorded)
     assert batches == [1, 1]
@@ -109,16 +112,8 @@ def test_what_was_answered_is_recorded_with_its_code(client: TestClient, engine:
         ("act", "http", "robot", "policy_failed"): 1,
         ("act", "http", "robot", "malformed"): 1,
         ("unknown", "websocket", "robot", "malformed"): 1,
+        ("reset", "websocket", "robot", "ok"): 1,
     }
-
-
-def test_sessions_are_counted_by_their_endpoint(client: TestClient, engine: Engine) -> None:
-    headers = {"x-session-id": "robot", "content-type": CONTENT_TYPE}
-    client.post("/v1/reset", content=encode_request(Request("reset", OBS)), headers=headers)
-    with client.websocket_connect("/v1/stream") as socket:
-        socket.send_bytes(encode_request(Request("reset", OBS)))
-        socket.receive_bytes()
-        assert engine.sessions.by_transport() == {"http": 1, "websocket": 1}
 
 
 KIND = ("act", "shm", "robot", "ok")

@@ -5,14 +5,14 @@ from __future__ import annotations
 import asyncio
 import queue
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import pytest
 from eval_fakes import wait_for
 from in_flight import ask, send
 
-from vlagents_ray.errors import DeadlineExceeded, MessageTooLarge
+from vlagents_ray.errors import DeadlineExceeded, MessageTooLarge, PolicyFailed, PolicyUnavailable
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol import frames
 from vlagents_ray.protocol.frames import decode_replies
@@ -26,7 +26,7 @@ from vlagents_ray.serve.requests import Message, PendingRequest
 
 
 class Gated(Agent):
-    """Acts when the gate is open."""
+    """Acts when the gate is open, and breaks with the error that it is told."""
 
     gate = threading.Event()
     busy = threading.Semaphore(0)
@@ -35,6 +35,11 @@ class Gated(Agent):
         Gated.busy.release()
         assert Gated.gate.wait(10)
         return Act(np.zeros(1))
+
+    def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
+        if "error" in obs[0].info:
+            raise obs[0].info["error"]
+        return super().act_batch(obs, sessions)
 
 
 class Served:
@@ -49,9 +54,11 @@ class Served:
     def sender(self, name: str, *, connected: bool = True) -> Sender:
         return Sender(self.engine, "test", name, caller=NoKey.OPEN, connected=connected)
 
-    def put(self, sender: Sender, op: str, **fields: float) -> queue.SimpleQueue[list[Reply]]:
+    def put(
+        self, sender: Sender, op: str, info: dict[str, object] | None = None, **fields: float
+    ) -> queue.SimpleQueue[list[Reply]]:
         replies: queue.SimpleQueue[list[Reply]] = queue.SimpleQueue()
-        send(sender, [Request(op, Obs(), **fields)], replies.put)  # type: ignore[arg-type]
+        send(sender, [Request(op, Obs(info=info or {}), **fields)], replies.put)  # type: ignore[arg-type]
         return replies
 
     def ask(self, sender: Sender, op: str) -> Reply:
@@ -99,6 +106,45 @@ def test_a_close_that_comes_too_late_leaves_the_session_to_the_end_of_its_connec
     assert "other" in served.engine.sessions
     other.release()
     assert "other" not in served.engine.sessions
+
+
+@pytest.mark.parametrize("error", [RuntimeError("broken"), SystemExit(1)], ids=repr)
+def test_a_policy_that_breaks_fails_its_batch_and_goes_on(served: Served, error: BaseException) -> None:
+    assert isinstance(served.put(served.first, "act", {"error": error}).get(timeout=10)[0].error, PolicyFailed)
+    served.ask(served.first, "act")
+
+
+def test_a_caller_that_cannot_take_its_reply_does_not_stop_the_queue(served: Served) -> None:
+    def explode(_: list[Reply]) -> None:
+        raise ValueError("gone")
+
+    send(served.first, [Request("act", Obs())], explode)
+    served.ask(served.first, "act")
+
+
+def test_closing_answers_everyone_and_so_does_a_deadline_that_passes_in_the_queue(served: Served) -> None:
+    other = served.sender("other")
+    served.ask(other, "reset")
+    Gated.gate.clear()
+    running = served.put(served.first, "act")
+    assert Gated.busy.acquire(timeout=10)
+    late = served.put(other, "act", deadline_ms=1.0)
+    threading.Event().wait(0.01)
+    Gated.gate.set()
+    assert isinstance(late.get(timeout=10)[0].error, DeadlineExceeded)
+    assert running.get(timeout=10)[0].error is None
+    Gated.gate.clear()
+    running = served.put(served.first, "act")
+    assert Gated.busy.acquire(timeout=10)
+    waiting = served.put(other, "act")
+    closer = threading.Thread(target=served.engine.close)
+    closer.start()
+    assert isinstance(waiting.get(timeout=10)[0].error, PolicyUnavailable)
+    Gated.gate.set()
+    closer.join(10)
+    assert running.get(timeout=10)[0].error is None
+    assert not served.engine.alive
+    assert isinstance(served.put(other, "act").get(timeout=10)[0].error, PolicyUnavailable | PolicyFailed)
 
 
 @pytest.mark.parametrize("for_good", [True, False])

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vlagents_ray.errors import MessageTooLarge, PolicyFailed
+from vlagents_ray.errors import PolicyFailed
 from vlagents_ray.interface import Act, Obs
-from vlagents_ray.protocol.frames import decode_replies, encode_replies
 from vlagents_ray.protocol.messages import Limits, Reply, Request
 from vlagents_ray.serve.config.deployment import LimitArgs
 from vlagents_ray.serve.engine import responses
@@ -90,14 +89,6 @@ def test_nothing_of_what_is_too_large_is_copied_or_looked_at(monkeypatch: pytest
 def test_what_no_client_would_read_is_refused_where_it_was_made(info: dict[str, Any], said: str) -> None:
     with pytest.raises(PolicyFailed, match=said):
         require_serializable(info)
-
-
-def test_replies_of_one_frame_that_are_too_much_together_are_not_joined() -> None:
-    each = Limits().body_bytes // 4
-    replies = [Reply(str(i), Act(large(each))) for i in range(5)]
-    read = decode_replies(encode_replies(replies))
-    assert [reply.request_id for reply in read] == list("01234")
-    assert all(isinstance(reply.error, MessageTooLarge) for reply in read)
 
 
 def test_a_deployment_sets_the_limit_as_far_as_clients_read() -> None:

@@ -191,18 +191,6 @@ def test_a_callback_may_end_its_watch_beside_a_batch(slow: Callable[..., Slow]) 
     wait_for(lambda: one.called("answer a", "answer b"))
 
 
-def test_where_a_full_batch_waits_simulations_are_answered_from_another_thread(slow: Callable[..., Slow]) -> None:
-    one = slow()
-    one.start()
-    one.learn("a", "b")
-    assert set(one.answered_by.values()) == {"policy"}
-    one.hold("a", "b")
-    one.put("c", "d")
-    one.open.set()
-    wait_for(lambda: one.called(*(f"answer {s}" for s in "abcd")))
-    assert [one.answered_by[s] for s in "abcd"] == ["policy-answers"] * 2 + ["policy"] * 2
-
-
 def test_answers_come_while_the_next_batch_runs_and_when_the_queue_closes(slow: Callable[..., Slow]) -> None:
     one = slow()
     one.start()
