@@ -27,7 +27,7 @@ from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.queue.call_limits import CallLimits, PolicyCall, PolicyCalls
+from vlagents_ray.serve.queue.call_limits import LOAD, CallLimits, PolicyCall, PolicyCalls
 from vlagents_ray.serve.requests import DEFAULT, PendingRequest
 
 LIMITS = CallLimits(act_s=10.0, warm_up_s=100.0, load_s=1000.0)
@@ -175,6 +175,7 @@ def test_a_slow_policy_has_ten_times_its_longest_call(clock: Clock) -> None:
         with call:
             clock.now += took_s
     assert limits == [100.0, 100.0, 400.0, 500.0]
+    assert PolicyCall(PolicyCalls(LIMITS, clock), LOAD).limit_s == 1000.0
 
 
 def test_a_policy_that_never_loads_has_failed() -> None:
