@@ -18,7 +18,7 @@ import pytest
 from asgi_server import served
 from eval_fakes import wait_for
 from in_memory_keys import ChangingKeys
-from probes import bytes_probe
+from probes import bytes_probe, is_probe_answer
 from starlette.testclient import TestClient
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
@@ -427,6 +427,24 @@ def test_a_full_replica_closes_a_proxied_websocket_with_its_reason(keyed: Replic
     assert closed.value.rcvd is not None
     assert closed.value.rcvd.code == 1013
     assert "its limit; close one, or raise sessions.limit" in closed.value.rcvd.reason
+
+
+@pytest.mark.parametrize("size", [8, 5_000, 100_000])
+def test_a_probe_is_answered_without_a_session_and_a_broken_one_leaves_the_stream_as_it_was(
+    keyed: Replica, size: int
+) -> None:
+    probe, app = bytes_probe(size), build_http_app(keyed.engine, dict, Limits(body_bytes=100_000))
+    with TestClient(AccessMiddleware(app, None, "app")).websocket_connect("/v1/stream") as stream:
+        stream.send_bytes(probe)
+        assert is_probe_answer(stream.receive_bytes(), probe)
+        assert len(keyed.engine.sessions) == 0
+        stream.send_bytes(b"VLA?\0\0")
+        error = decode_reply(stream.receive_bytes()).error
+        assert error is not None
+        assert error.code == "malformed"
+        stream.send_bytes(encode_request(Request("reset", Obs())))
+        assert decode_reply(stream.receive_bytes()).error is None
+    assert not keyed.policy.acting.is_set()
 
 
 def test_a_look_that_fails_is_followed_by_the_next(caplog: pytest.LogCaptureFixture) -> None:
