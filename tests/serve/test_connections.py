@@ -129,13 +129,6 @@ def keyed() -> Iterator[Replica]:
         yield one
 
 
-@pytest.fixture
-def impatient() -> Iterator[Replica]:
-    """Cuts off who is silent."""
-    with replica(slow_s=SLOW_S, idle_s=IDLE_S) as one:
-        yield one
-
-
 def handshake(path: str, *headers: str) -> bytes:
     lines = [f"GET {path} HTTP/1.1", "Host: 127.0.0.1", "Upgrade: websocket", "Connection: Upgrade"]
     lines += [f"Sec-WebSocket-Key: {base64.b64encode(os.urandom(16)).decode()}", "Sec-WebSocket-Version: 13", *headers]
@@ -254,35 +247,31 @@ def test_what_comes_without_a_handshake_is_cut_off_and_not_read(keyed: Replica, 
         each.close()
 
 
-def test_a_silent_connection_ends_and_one_that_is_used_does_not(impatient: Replica) -> None:
-    token = impatient.known.add("arm")
-    silent, used = impatient.stream(token), impatient.stream(token)
-    begun = time.monotonic()
-    while len(impatient.own._clients) > 1 or time.monotonic() - begun < 1.5 * IDLE_S:
-        used.send(bytes_probe(100), 5)
-        assert used.recv(5)
-        time.sleep(0.02)
-        assert time.monotonic() - begun < 60
-    with pytest.raises((ConnectionClosed, OSError), match="silent"):
-        listen_to_the_end(silent)
-
-
-def test_nobody_is_cut_off_because_the_policy_takes_long(impatient: Replica) -> None:
-    """It is the server then that does not read."""
-    token = impatient.known.add("arm")
-    other, waiting = impatient.stream(token), impatient.stream(token)
-    for client in (other, waiting):
-        client.send(encode_request(Request("reset", Obs())), 5)
-        client.recv(5)
-    impatient.policy.hold.clear()
-    other.send(encode_request(Request("act", Obs())), 5)
-    assert impatient.policy.acting.wait(5)
-    message = frame(encode_request(Request("act", Obs(info={"much": bytes(20_000)}))))
-    waiting._socket.sendall(message)
-    time.sleep(1.5 * IDLE_S)
-    impatient.policy.hold.set()
-    for client in (other, waiting):
-        assert decode_reply(client.recv(5)).error is None
+def test_a_silent_connection_ends_and_none_that_is_used_or_that_the_policy_keeps_waiting() -> None:
+    """It is the server that does not read while the policy is busy."""
+    with replica(slow_s=SLOW_S, idle_s=IDLE_S) as quiet, replica(slow_s=SLOW_S, idle_s=IDLE_S) as busy:
+        token = busy.known.add("arm")
+        other, waiting = busy.stream(token), busy.stream(token)
+        for client in (other, waiting):
+            client.send(encode_request(Request("reset", Obs())), 5)
+            client.recv(5)
+        busy.policy.hold.clear()
+        other.send(encode_request(Request("act", Obs())), 5)
+        assert busy.policy.acting.wait(5)
+        waiting._socket.sendall(frame(encode_request(Request("act", Obs(info={"much": bytes(20_000)})))))
+        token = quiet.known.add("arm")
+        silent, used = quiet.stream(token), quiet.stream(token)
+        begun = time.monotonic()
+        while len(quiet.own._clients) > 1 or time.monotonic() - begun < 1.5 * IDLE_S:
+            used.send(bytes_probe(100), 5)
+            assert used.recv(5)
+            time.sleep(0.02)
+            assert time.monotonic() - begun < 60
+        with pytest.raises((ConnectionClosed, OSError), match="silent"):
+            listen_to_the_end(silent)
+        busy.policy.hold.set()
+        for client in (other, waiting):
+            assert decode_reply(client.recv(5)).error is None
 
 
 @pytest.mark.parametrize(

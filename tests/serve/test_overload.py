@@ -650,12 +650,12 @@ def test_parts_of_messages_of_a_key_are_bounded_by_its_rate(replica: KeyedReplic
     visitor = replica.visitor("right")
     replica.known.change(visitor.name, rate=1)
     before = _rss()
-    clients = [_keyed_stream(replica, visitor.token) for _ in range(8)]
+    clients = [_keyed_stream(replica, visitor.token) for _ in range(5)]
     for client in clients:
         _part(client, STREAM_BYTES)
     mine = [one for one in list(replica.own._clients) if getattr(one.caller, "name", "") == visitor.name]
     begun = [one for one in mine if one._received.size > 2**20 + 100]
-    assert len(begun) <= 6  # one a second, of those that took half a second each
+    assert len(begun) <= 4  # one a second, of those that took half a second each
     assert replica.engine.admission.held <= len(begun) * STREAM_BYTES + 8 * 2**20
     assert _rss() - before < len(begun) * STREAM_BYTES + 8 * 2**20 + SLACK
     for client in clients:
@@ -712,10 +712,7 @@ def test_an_act_in_compact_form_is_read_again_after_a_refusal(replica: KeyedRepl
     transport.close()
 
 
-@pytest.mark.parametrize("connections", [2, 12])
-def test_parts_of_messages_before_a_key_are_bounded_at_groots_gateway(
-    connections: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_parts_of_messages_before_a_key_are_bounded_at_groots_gateway(monkeypatch: pytest.MonkeyPatch) -> None:
     """12 connections with 24 MiB of a message each take no more than the 64 MiB of one message, and a part more."""
     monkeypatch.setattr(gr00t, "_STRANGER_S", 3.0)
     context = GatewayContext("app", _no_replica, DEFAULT_LIMITS, 8, 30.0, None, lambda _: NoKey.OPEN)
@@ -726,7 +723,7 @@ def test_parts_of_messages_before_a_key_are_bounded_at_groots_gateway(
     greeting = b"\xff" + bytes(8) + b"\x7f" + b"\x03\x01" + b"NULL".ljust(20, b"\0") + b"\0" + bytes(31)
     greeted = b"\x05READY" + b"\x0bSocket-Type" + struct.pack(">I", 6) + b"DEALER"
     before, held, part = _rss(), [], bytes(24 * 2**20)
-    for _ in range(connections):
+    for _ in range(12):
         connection = socket.create_connection(("127.0.0.1", port), timeout=5)
         held.append(connection)
         connection.sendall(greeting)
