@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import queue
 import random
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -53,21 +53,6 @@ class Echo(Agent):
 
 def ask(engine: Engine, session: str, op: Any, info: dict[str, Any] | None = None, **fields: Any) -> Reply:
     return answered(engine, session, Request(op, Obs(info=info or {}), **fields))
-
-
-@pytest.fixture
-def serving() -> Iterator[Callable[..., Engine]]:
-    engines: list[Engine] = []
-
-    def serve(agent: Agent, **options: Any) -> Engine:
-        engine = Engine(agent, **options)
-        engines.append(engine)
-        engine.start()
-        return engine
-
-    yield serve
-    for engine in engines:
-        engine.close()
 
 
 def test_sessions_interleaved_at_random_never_mix(serving: Callable[..., Engine]) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -52,11 +52,8 @@ def agent() -> Failing:
 
 
 @pytest.fixture
-def engine(agent: Failing) -> Iterator[Engine]:
-    engine = Engine(agent)
-    engine.start()
-    yield engine
-    engine.close()
+def engine(agent: Failing, serving: Callable[..., Engine]) -> Engine:
+    return serving(agent)
 
 
 @pytest.fixture

@@ -12,10 +12,10 @@ import pytest
 from eval_fakes import wait_for
 from in_flight import ask, send
 
-from vlagents_ray.errors import DeadlineExceeded, MessageTooLarge, PolicyFailed, PolicyUnavailable
+from vlagents_ray.errors import DeadlineExceeded, InvalidInput, MessageTooLarge, PolicyFailed, PolicyUnavailable
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol import frames
-from vlagents_ray.protocol.frames import decode_replies
+from vlagents_ray.protocol.frames import Decoded, decode_replies
 from vlagents_ray.protocol.messages import Limits, Reply, Request
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.engine.engine import Engine
@@ -204,3 +204,48 @@ def test_an_observer_that_fails_costs_no_answer(served: Served, caplog: pytest.L
     served.engine.observers.add(Broken())
     assert served.ask(served.first, "act").act is not None
     assert "Broken: a request is left out" in caplog.text
+
+
+class Noting(Observer):
+    """Notes what it sees, and keeps the number of the request for the answer."""
+
+    def __init__(self, seen: list[str]) -> None:
+        self.seen, self.requests = seen, 0
+
+    def on_request(self, pending: PendingRequest) -> None:
+        assert pending.request.obs is not None
+        self.requests += 1
+        pending.kept[self] = self.requests
+        self.seen.append(f"request of {pending.session_id}")
+
+    def before_answer(self, pending: PendingRequest, reply: Reply) -> None:
+        self.seen.append(f"before {pending.session_id}")
+
+    def on_answer(self, pending: PendingRequest, reply: Reply) -> None:
+        self.seen.append(f"answer {pending.kept[self]} to {pending.session_id}")
+
+
+def test_the_requests_of_a_message_are_seen_around_its_answer_without_those_that_could_not_be_read(
+    served: Served,
+) -> None:
+    seen = list[str]()
+    served.engine.observers.add(Noting(seen))
+    sender = served.sender("a")
+
+    def sent(_: Message) -> None:
+        seen.append("sent")
+
+    message = sender.message()
+    requests = [Request("reset", Obs(), session=name) for name in "ab"]
+    sender.send(message, Decoded(requests, {1: Reply(error=InvalidInput("no"))}), sent)
+    wait_for(lambda: seen[-1:] == ["answer 2 to b"])
+    assert message.replies[1].error is not None
+    assert seen == [
+        "request of a",
+        "request of b",
+        "before a",
+        "before b",
+        "sent",
+        "answer 1 to a",
+        "answer 2 to b",
+    ]

@@ -50,11 +50,6 @@ def test_an_act_over_the_limit_fails_and_is_not_counted(act: Act) -> None:
     assert (reply.act, session.steps) == (None, 0)
 
 
-def test_one_that_fits_is_sent() -> None:
-    reply, session = replied(Act(np.zeros(2), info={"array": large(LIMIT // 2), "text": "x" * 100}))
-    assert (reply.error, session.steps) == (None, 1)
-
-
 def test_no_info_may_be_said_with_none() -> None:
     session = Session("s")
     ticket = PendingRequest("s", Request("act", Obs()), lambda _: None)

@@ -109,26 +109,15 @@ def test_loading_one_checkpoint_keeps_no_session_of_another_waiting(
     engine = serving(choices=["b/2"])
     gate = library.hold("b/2")
     reset(engine, "own")
-    waiting = begin(engine, "chosen", checkpoint="b")
+    waiting = [begin(engine, f"chosen {i}", checkpoint="b") for i in range(8)]
     library.wait_for("b/2")
     assert [act(engine, "own")[1] for _ in range(200)] == list(range(1, 201))
     assert reset(engine, "another") == "a/1"
-    assert waiting.empty()
-    gate.set()
-    assert waiting.get(timeout=10).error is None
-    assert act(engine, "chosen") == [2, 1]
-
-
-def test_who_asks_for_the_same_checkpoint_at_once_has_it_loaded_once(
-    serving: Callable[..., Engine], library: Library
-) -> None:
-    engine = serving(choices=["b/2"])
-    gate = library.hold("b/2")
-    waiting = [begin(engine, f"s{i}", checkpoint="b") for i in range(8)]
-    library.wait_for("b/2")
+    assert waiting[0].empty()
     gate.set()
     assert [replies.get(timeout=10).error for replies in waiting] == [None] * 8
-    assert library.loads["b/2"] == 1
+    assert act(engine, "chosen 0") == [2, 1]
+    assert library.loads["b/2"] == 1, "once for all who need it"
 
 
 def test_what_does_not_load_says_why_and_is_tried_again(serving: Callable[..., Engine], library: Library) -> None:
@@ -336,26 +325,20 @@ def test_a_stopping_replica_turns_away_who_waits(library: Library) -> None:
 
 def test_a_session_that_moves_takes_its_checkpoint_along(serving: Callable[..., Engine], library: Library) -> None:
     here, there = serving(choices=["b/2"]), serving(choices=["b/2"])
+    elsewhere = serving(choices=["b/4"])
     reset(here, "s", checkpoint="b")
     act(here, "s")
     state = export(here, "s")
     assert state is not None
+    with pytest.raises(UnknownSession):
+        elsewhere.transfer.adopt("s", state, timeout_s=10)
+    assert elsewhere.models.describe()["loaded"] == ["a/1"], "it is not offered there"
     with pytest.raises(UnknownSession, match="'b' is not loaded here"):
         there.transfer.adopt("s", state)
     there.transfer.adopt("s", state, timeout_s=10)
     assert act(there, "s") == [2, 2]
     assert library.loads["b/2"] == 2
     wait_for(lambda: not any(model.sessions for model in here.models._cache.loaded.values()))
-
-
-def test_a_session_of_what_is_not_offered_here_does_not_move_here(serving: Callable[..., Engine]) -> None:
-    here, there = serving(choices=["b/2"]), serving(choices=["b/4"])
-    reset(here, "s", checkpoint="b")
-    state = export(here, "s")
-    assert state is not None
-    with pytest.raises(UnknownSession):
-        there.transfer.adopt("s", state, timeout_s=10)
-    assert there.models.describe()["loaded"] == ["a/1"]
 
 
 class Stored(Agent):

@@ -158,14 +158,6 @@ def test_a_batch_stays_a_batch_and_sessions_stay_apart(engine: Engine) -> None:
             assert told["seen"] == [i, *(10 * s + i for s in range(1, step + 1))]
 
 
-def test_acts_without_info_travel_as_they_are(engine: Engine) -> None:
-    bare = Obs({"front": np.zeros((8, 8, 3), np.uint8)}, 1.0, {"position": np.full(1, 0.25, np.float32)})
-    ask(engine, "bare", "reset", instruction="a task")
-    [reply] = ask_all(engine, [("bare", Request("act", bare))])
-    assert reply.act is not None
-    assert reply.act.action.tolist() == [-0.25]
-
-
 def test_a_session_that_begins_again_is_shown_its_history(engine: Engine) -> None:
     history = [observation(1), observation(2)]
     ask(engine, "again", "reset", instruction="a task", history=history)

@@ -115,13 +115,6 @@ def test_every_ticket_is_taken_once_and_in_its_sessions_order(seed: int, size: i
     assert waiting.depth == [0, 0]
 
 
-def test_nothing_is_left_after_clear() -> None:
-    waiting = filled(ticket("a"), ticket("a"), ticket("b", rank=Rank.ROBOT))
-    assert len(waiting.clear()) == 3
-    assert waiting.size == 0
-    assert waiting.take(4, 0.0) == ([], [])
-
-
 def test_a_simulation_that_is_over_does_not_take_the_turn_of_one_that_waits() -> None:
     waiting = filled(gone := ticket("gone"), ticket("waits"))
     for i in range(8):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
 import numpy as np
@@ -95,29 +95,15 @@ def gains(gain: float) -> dict[str, Any]:
     return {"layer/gain": np.full(2, gain, np.float32)}
 
 
-@pytest.fixture
-def serving() -> Iterator[Callable[..., Served]]:
-    engines: list[Engine] = []
-
-    def serve(agent: Agent, **options: Any) -> Served:
-        engines.append(Engine(agent, **options))
-        engines[-1].start()
-        return Served(engines[-1])
-
-    yield serve
-    for engine in engines:
-        engine.close()
-
-
 AGENTS = pytest.mark.parametrize("agent", [Gain, Doubled], ids=["by reference", "in place"])
 
 
 @AGENTS
 def test_an_episode_ends_with_the_weights_that_it_began_with_unless_they_are_pushed_to_it(
-    serving: Callable[..., Served], agent: type[Gain]
+    serving: Callable[..., Engine], agent: type[Gain]
 ) -> None:
-    served = serving(agent())
-    alone = serving(agent())
+    served = Served(serving(agent()))
+    alone = Served(serving(agent()))
     for one in (served, alone):
         one.reset("old", seed=3)
     served.push(1)
@@ -141,8 +127,8 @@ def test_an_episode_ends_with_the_weights_that_it_began_with_unless_they_are_pus
     assert digest == fingerprint(gains(5)), "of what the agent holds"
 
 
-def test_robots_keep_the_pinned_weights_unless_they_follow(serving: Callable[..., Served]) -> None:
-    served = serving(Gain())
+def test_robots_keep_the_pinned_weights_unless_they_follow(serving: Callable[..., Engine]) -> None:
+    served = Served(serving(Gain()))
     for session, options in {"pinned": {}, "follows": {"weights": "follow"}}.items():
         served.reset(session, "robot", **options)
     served.reset("baseline", weights="pinned")
@@ -167,9 +153,9 @@ def test_robots_keep_the_pinned_weights_unless_they_follow(serving: Callable[...
     [({}, InvalidWeights), ({"layer/gain": np.full(2, np.nan)}, InvalidWeights), (gains(1), UnchangedWeights)],
 )
 def test_what_is_refused_changes_nothing(
-    serving: Callable[..., Served], pushed: dict[str, Any], error: type[Exception]
+    serving: Callable[..., Engine], pushed: dict[str, Any], error: type[Exception]
 ) -> None:
-    served = serving(Gain())
+    served = Served(serving(Gain()))
     served.push(1)
     before = served.learn.describe()
     with pytest.raises(error):
@@ -182,8 +168,8 @@ def test_what_is_refused_changes_nothing(
     served.push(2)
 
 
-def test_a_staged_version_does_not_act_and_a_second_one_has_to_wait(serving: Callable[..., Served]) -> None:
-    served = serving(Gain())
+def test_a_staged_version_does_not_act_and_a_second_one_has_to_wait(serving: Callable[..., Engine]) -> None:
+    served = Served(serving(Gain()))
     served.learn.stage(1, gains(1), PushOptions())
     served.reset("a")
     assert served.act("a") == (0, 0.0)
@@ -199,9 +185,9 @@ def test_a_staged_version_does_not_act_and_a_second_one_has_to_wait(serving: Cal
 
 
 def test_a_learner_that_dies_between_the_phases_leaves_the_last_version(
-    serving: Callable[..., Served], monkeypatch: pytest.MonkeyPatch
+    serving: Callable[..., Engine], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    served = serving(Gain())
+    served = Served(serving(Gain()))
     monkeypatch.setattr(versions, "STAGED_S", 0.0)
     dropped = threading.Event()
     own = served.engine.models.own_weights
@@ -215,8 +201,8 @@ def test_a_learner_that_dies_between_the_phases_leaves_the_last_version(
     assert served.act("a") == (0, 0.0)
 
 
-def test_versions_never_go_back_and_no_act_fails_while_weights_are_pushed(serving: Callable[..., Served]) -> None:
-    served = serving(Gain())
+def test_versions_never_go_back_and_no_act_fails_while_weights_are_pushed(serving: Callable[..., Engine]) -> None:
+    served = Served(serving(Gain()))
     over = threading.Event()
     seen: dict[str, list[tuple[int, float]]] = {name: [] for name in "abc"}
     failed: list[BaseException] = []
@@ -244,8 +230,8 @@ def test_versions_never_go_back_and_no_act_fails_while_weights_are_pushed(servin
         assert all(gain == number for number, gain in acts)
 
 
-def test_a_moved_session_goes_on_with_its_version_and_not_where_that_is_missing(serving: Callable[..., Served]) -> None:
-    here, there, without = serving(Gain()), serving(Gain()), serving(Gain())
+def test_a_moved_session_goes_on_with_its_version_and_not_where_that_is_missing(serving: Callable[..., Engine]) -> None:
+    here, there, without = Served(serving(Gain())), Served(serving(Gain())), Served(serving(Gain()))
     here.push(1)
     here.reset("a")
     there.push(1)
@@ -266,22 +252,22 @@ def test_a_moved_session_goes_on_with_its_version_and_not_where_that_is_missing(
         without.engine.transfer.adopt("a", state)
 
 
-def test_versions_that_nobody_acts_with_are_freed(serving: Callable[..., Served]) -> None:
-    served = serving(Gain())
+def test_versions_that_nobody_acts_with_are_freed(serving: Callable[..., Engine]) -> None:
+    served = Served(serving(Gain()))
     served.reset("a")
     for number in range(1, 4):
         served.push(number)
     assert sorted(served.engine.models.own_weights._alive) == [0, 3]
 
 
-def test_weights_that_cannot_be_loaded_fail_the_act_and_others_act_again(serving: Callable[..., Served]) -> None:
+def test_weights_that_cannot_be_loaded_fail_the_act_and_others_act_again(serving: Callable[..., Engine]) -> None:
     class Fragile(Gain):
         def load_parameters(self, named: Mapping[str, Any]) -> None:
             if named["layer/gain"][0] == 1:
                 raise MemoryError
             super().load_parameters(named)
 
-    served = serving(Fragile())
+    served = Served(serving(Fragile()))
     served.reset("a")
     served.push(1)
     with pytest.raises(PolicyFailed):
@@ -292,12 +278,12 @@ def test_weights_that_cannot_be_loaded_fail_the_act_and_others_act_again(serving
     assert served.act("b") == (2, 2.0)
 
 
-def test_a_policy_that_names_no_parameters_is_not_trainable(serving: Callable[..., Served]) -> None:
+def test_a_policy_that_names_no_parameters_is_not_trainable(serving: Callable[..., Engine]) -> None:
     class Fixed(Agent):
         def act(self, obs: Obs) -> Act:
             return Act(np.zeros(1))
 
-    served = serving(Fixed())
+    served = Served(serving(Fixed()))
     with pytest.raises(NotTrainable, match="Fixed: names no parameters"):
         served.learn.stage(1, {}, PushOptions())
     assert served.learn.describe() == {key: {"version": 0, "fingerprint": ""} for key in ("newest", "pinned")}
