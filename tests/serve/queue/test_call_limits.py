@@ -1,4 +1,4 @@
-"""A policy that does not return from a call makes its replica unhealthy, and whoever waits for it is answered."""
+"""When a policy makes its replica unhealthy: by a call that does not return, an accelerator, or all of its batches."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import queue
 import sys
 import threading
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -15,19 +15,19 @@ import numpy as np
 import psutil
 import pytest
 from eval_fakes import wait_for
-from in_flight import asked
+from in_flight import answered, asked
 from manual_clock import Clock
 from shm_client import call, client, request
 from starlette.testclient import TestClient
 
-from vlagents_ray.errors import OutcomeUnknown, PolicyFailed, PolicyUnavailable
+from vlagents_ray.errors import InvalidObservation, OutcomeUnknown, PolicyFailed, PolicyUnavailable
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.messages import Limits, Reply, Request
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.queue.call_limits import LOAD, CallLimits, PolicyCall, PolicyCalls
+from vlagents_ray.serve.queue.call_limits import FAILED_BATCHES, LOAD, CallLimits, PolicyCall, PolicyCalls
 from vlagents_ray.serve.requests import DEFAULT, PendingRequest
 
 LIMITS = CallLimits(act_s=10.0, warm_up_s=100.0, load_s=1000.0)
@@ -287,3 +287,95 @@ def test_a_child_that_the_policy_forks_ends_with_the_call_and_answers_nobody(op:
     engine.close()
     assert not alive
     assert {child.returncode for child in ended} == {1}
+
+
+# A policy whose accelerator has failed, or that fails batch after batch.
+
+
+ASSERT = "CUDA error: device-side assert triggered"
+
+
+class Failing(Agent):
+    """Raises the error that a call is to raise."""
+
+    shared = ("errors",)
+
+    def __init__(self) -> None:
+        self.errors: dict[str, Exception] = {"none": ValueError()}  # by op; an empty one would not be shared
+
+    def _raise(self, op: str) -> None:
+        if op in self.errors:
+            raise self.errors[op]
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        self._raise("reset")
+        return {}
+
+    def observe(self, obs: Obs) -> None:
+        self._raise("observe")
+
+    def act(self, obs: Obs) -> Act:
+        self._raise("act")
+        return Act(np.zeros(1, np.float32))
+
+    def act_batch(self, obs: Any, sessions: Any) -> list[Act | Exception]:
+        self._raise("act_batch")
+        return super().act_batch(obs, sessions)
+
+
+@pytest.fixture
+def failing(serving: Callable[..., Engine]) -> tuple[Engine, Failing, Callable[[Any], Exception | None]]:
+    """An engine, its policy, and how it is asked."""
+    policy = Failing()
+    engine = serving(policy)
+    return engine, policy, lambda op: answered(engine, "a", Request(op, Obs())).error
+
+
+@pytest.mark.parametrize("op", ["reset", "observe", "act", "act_batch"])
+def test_a_replica_whose_accelerator_failed_is_not_healthy_and_sends_its_clients_away(
+    failing: tuple[Engine, Failing, Callable[[Any], Exception | None]], op: str
+) -> None:
+    engine, policy, ask = failing
+    assert ask("reset") is None
+    engine.check_health()
+    policy.errors[op] = RuntimeError(f"{ASSERT}\nmore")
+    assert isinstance(ask(op.removesuffix("_batch")), PolicyFailed)
+    policy.errors.clear()
+    with pytest.raises(PolicyUnavailable, match=ASSERT):
+        engine.check_health()
+    assert not engine.ready
+    for later in ("reset", "act"):
+        with pytest.raises(PolicyUnavailable, match="begins again at another one"):
+            ask(later)
+
+
+@pytest.mark.parametrize("op", ["act", "act_batch"])
+def test_a_replica_all_of_whose_batches_fail_is_not_healthy_until_one_does_not(
+    failing: tuple[Engine, Failing, Callable[[Any], Exception | None]], op: str
+) -> None:
+    engine, policy, ask = failing
+    assert ask("reset") is None
+    policy.errors[op] = ZeroDivisionError("of the policy")
+    for _ in range(FAILED_BATCHES):
+        engine.check_health()
+        assert isinstance(ask("act"), PolicyFailed)
+    with pytest.raises(PolicyFailed, match=f"the last {FAILED_BATCHES} batches failed as a whole"):
+        engine.check_health()
+    policy.errors.clear()
+    assert ask("act") is None
+    engine.check_health()
+
+
+@pytest.mark.parametrize(
+    "error",
+    [InvalidObservation("of a client"), PolicyUnavailable("of a policy elsewhere"), RuntimeError("CUDA out of memory")],
+)
+def test_what_another_replica_could_not_do_better_leaves_a_replica_healthy(
+    failing: tuple[Engine, Failing, Callable[[Any], Exception | None]], error: Exception
+) -> None:
+    engine, policy, ask = failing
+    assert ask("reset") is None
+    policy.errors["act"] = error
+    rounds = 1 if isinstance(error, RuntimeError) else FAILED_BATCHES + 1
+    assert all(ask("act") is not None for _ in range(rounds))
+    engine.check_health()
