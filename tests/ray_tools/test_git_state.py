@@ -36,7 +36,6 @@ def git(folder: Path, *words: str) -> str:
 
 def test_a_clean_checkout_is_its_commit(repository: Path) -> None:
     found = code_of("grasping:Grasping")
-    assert found is not None
     assert found.to_json() == {"commit": git(repository, "rev-parse", "HEAD"), "dirty": False, "diff_sha256": None}
 
 
@@ -44,7 +43,6 @@ def test_what_differs_from_the_commit_is_kept_with_its_digest(repository: Path) 
     (repository / "grasping.py").write_text("SPEED = 2\n")
     (repository / "secrets.env").write_text("KEY=1\n")
     found = code_of("grasping")
-    assert found is not None
     assert b"KEY" not in found.diff, "git does not track it"
     assert b"-SPEED = 1\n+SPEED = 2\n" in found.diff
     assert found.diff_sha256 == hashlib.sha256(found.diff).hexdigest()
@@ -61,7 +59,6 @@ def test_of_a_long_difference_the_first_part_is_kept_and_the_digest_is_of_all(
     monkeypatch.setattr(git_state, "MOST_BYTES", 100)
     (repository / "grasping.py").write_text("SPEED = 3\n" * 1000)
     found = code_in(repository)
-    assert found is not None
     assert len(found.diff) == 100
     assert found.diff_sha256 != hashlib.sha256(found.diff).hexdigest()
 

@@ -413,7 +413,6 @@ def test_a_full_replica_closes_a_proxied_websocket_with_its_reason(keyed: Replic
         assert isinstance(decode_reply(late.recv(5)).error, PolicyUnavailable)
         with pytest.raises(ConnectionClosed) as closed:
             late.recv(5)
-    assert closed.value.rcvd is not None
     assert closed.value.rcvd.code == 1013
     assert "its limit; close one, or raise sessions.limit" in closed.value.rcvd.reason
 
@@ -429,7 +428,6 @@ def test_a_probe_is_answered_without_a_session_and_a_broken_one_leaves_the_strea
         assert len(keyed.engine.sessions) == 0
         stream.send_bytes(b"VLA?\0\0")
         error = decode_reply(stream.receive_bytes()).error
-        assert error is not None
         assert error.code == "malformed"
         stream.send_bytes(encode_request(Request("reset", Obs())))
         assert decode_reply(stream.receive_bytes()).error is None

@@ -113,7 +113,6 @@ def test_a_file_is_kept_in_place_of_its_pixels_unless_the_policy_gets_others(wat
     files: DecodedFiles = {id(IMAGE): (IMAGE, memoryview(b"jpeg"))}
     watched.ask("a", Obs(cameras={"front": IMAGE, "wrist": turned}), files=files)
     seen = watched.live.observation("a")
-    assert seen is not None
     assert seen.files == {"front": b"jpeg"}
     assert list(seen.cameras) == ["wrist"]
 

@@ -89,11 +89,9 @@ def ask_all(engine: Engine, requests: list[tuple[str, Request]]) -> list[Reply]:
 
 def test_what_was_loaded_there_is_known_here(engine: Engine) -> None:
     told = engine.models.weights
-    assert told is not None
     assert told["digest"]
     assert (ask(engine, "weights", "reset").info or {})["weights"] == told["digest"]
     assert (ask(engine, "adapted", "reset", kwargs={"adapter": "stack"}).info or {})["weights"] == "with stack"
-    assert engine.contract is not None
     assert engine.contract.action.dim == 1
 
 
@@ -282,7 +280,6 @@ def test_the_child_ends_with_its_replica_that_is_killed() -> None:
     )
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, env=environment) as replica:
-        assert replica.stdout is not None
         pid = int(replica.stdout.readline())
         assert not ended(pid)
         replica.send_signal(signal.SIGKILL)

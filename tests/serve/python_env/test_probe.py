@@ -158,7 +158,6 @@ def test_the_policy_is_built_where_it_will_run(tmp_path: Path, monkeypatch: pyte
     )
     environment = args(python=str(python), env_vars={"SOURCE": "/src"})
     contract = check_policy(environment, "only_there:Policy", {"gain": 2.0})
-    assert contract is not None
     assert contract.action.dim == 15
     with pytest.raises(ConfigError, match=rf"in {python}: policy Policy: .*'gane'"):
         check_policy(environment, "only_there:Policy", {"gane": 2.0})

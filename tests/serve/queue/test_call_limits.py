@@ -160,7 +160,6 @@ def test_every_batch_size_may_compile_where_batches_have_fixed_sizes(agent: Hang
     hang(engine, "act")
     [call] = engine.calls.under_way
     model = engine.models.loaded(DEFAULT)
-    assert model is not None
     assert call is model.call("act", 1)
     assert (call.limit_s, model.call("act", 2).limit_s) == (10.0, 100.0)
     agent.over.set()

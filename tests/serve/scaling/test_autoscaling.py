@@ -137,5 +137,4 @@ def test_the_deployment_of_the_page_about_it_is_accepted() -> None:
     [block] = re.findall(r"```yaml\n(.*?)```", page.read_text(), re.DOTALL)
     [application] = yaml.safe_load(block)["applications"]
     args = ServerArgs(**application["args"])
-    assert args.autoscaling is not None
     assert args.autoscaling.min_replicas == 0

@@ -85,7 +85,6 @@ def obeys(engine: Engine, name: str = "robot-1") -> tuple[str, int]:
     reply = ask(engine, "act", name)
     if reply.error is not None:
         raise reply.error
-    assert reply.act is not None
     return reply.act.info["obeys"], int(reply.act.action[0])
 
 

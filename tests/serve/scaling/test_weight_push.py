@@ -55,7 +55,6 @@ class Replica(ThisReplica):
         if reset:
             assert answered(self.engine, session, Request("reset", Obs(), rank="simulation")).error is None
         act = answered(self.engine, session, Request("act", Obs())).act
-        assert act is not None
         return act.info["policy"]["version"], float(act.action[0])
 
 

@@ -75,7 +75,6 @@ class Served:
     def act(self, session: str) -> tuple[int, float]:
         """The version that acted, and the gain in its action."""
         act = self.ask(session, Request("act", Obs())).act
-        assert act is not None
         return act.info["policy"]["version"], float(act.action[0])
 
     def ask(self, session: str, request: Request) -> Reply:
@@ -112,8 +111,6 @@ def test_an_episode_ends_with_the_weights_that_it_began_with_unless_they_are_pus
         served.push(number)
         assert served.act("new") == (1, 1.0)
         mine, apart = (one.ask("old", Request("act", Obs())).act for one in (served, alone))
-        assert mine is not None
-        assert apart is not None
         assert mine.info == apart.info
         np.testing.assert_array_equal(mine.action, apart.action, strict=True)
     assert served.reset("old").info == {"gain": 4.0}
@@ -122,7 +119,6 @@ def test_an_episode_ends_with_the_weights_that_it_began_with_unless_they_are_pus
     digest = served.push(5, "keep")
     assert served.act("new") == (5, 5.0), "running episodes change at once"
     act = served.ask("new", Request("act", Obs())).act
-    assert act is not None
     assert act.info["policy"] == {"version": 5, "fingerprint": digest}
     assert digest == fingerprint(gains(5)), "of what the agent holds"
 
