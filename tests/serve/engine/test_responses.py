@@ -16,6 +16,7 @@ from vlagents_ray.protocol.messages import Limits, Reply, Request
 from vlagents_ray.serve.config.deployment import LimitArgs
 from vlagents_ray.serve.engine import responses
 from vlagents_ray.serve.engine.responses import build_reply, raised_at, require_serializable
+from vlagents_ray.serve.queue.call_limits import CallLimits
 from vlagents_ray.serve.requests import PendingRequest
 from vlagents_ray.serve.sessions import Session
 
@@ -83,8 +84,9 @@ def test_what_no_client_would_read_is_refused_where_it_was_made(info: dict[str, 
         require_serializable(info)
 
 
-def test_a_deployment_sets_the_limit_as_far_as_clients_read() -> None:
+def test_a_deployment_sets_the_limits_as_far_as_clients_read() -> None:
     assert LimitArgs(reply_bytes=2000).limits().reply_bytes == 2000
+    assert LimitArgs(act_s=1, warm_up_s=2, load_s=3).call_limits() == CallLimits(1, 2, 3)
     with pytest.raises(ValueError, match="reply_bytes"):
         LimitArgs(reply_bytes=Limits().body_bytes + 1)
 
