@@ -36,24 +36,16 @@ def git(folder: Path, *words: str) -> str:
 
 def test_a_clean_checkout_is_its_commit(repository: Path) -> None:
     found = code_of("grasping:Grasping")
-    assert found is not None
     assert found.to_json() == {"commit": git(repository, "rev-parse", "HEAD"), "dirty": False, "diff_sha256": None}
 
 
 def test_what_differs_from_the_commit_is_kept_with_its_digest(repository: Path) -> None:
     (repository / "grasping.py").write_text("SPEED = 2\n")
+    (repository / "secrets.env").write_text("KEY=1\n")
     found = code_of("grasping")
-    assert found is not None
+    assert b"KEY" not in found.diff, "git does not track it"
     assert b"-SPEED = 1\n+SPEED = 2\n" in found.diff
     assert found.diff_sha256 == hashlib.sha256(found.diff).hexdigest()
-
-
-def test_files_that_git_does_not_track_are_nowhere_in_it(repository: Path) -> None:
-    (repository / "secrets.env").write_text("KEY=1\n")
-    (repository / "grasping.py").write_text("SPEED = 2\n")
-    found = code_in(repository)
-    assert found is not None
-    assert b"KEY" not in found.diff
 
 
 def test_an_installed_module_inside_a_repository_is_not_taken_for_its_code(repository: Path) -> None:
@@ -67,20 +59,15 @@ def test_of_a_long_difference_the_first_part_is_kept_and_the_digest_is_of_all(
     monkeypatch.setattr(git_state, "MOST_BYTES", 100)
     (repository / "grasping.py").write_text("SPEED = 3\n" * 1000)
     found = code_in(repository)
-    assert found is not None
     assert len(found.diff) == 100
     assert found.diff_sha256 != hashlib.sha256(found.diff).hexdigest()
 
 
 @pytest.mark.parametrize("target", ["no_such_module", "no_such.module:Class", "sys", "numpy"])
-def test_of_what_git_does_not_know_nothing_is_said(target: str) -> None:
+def test_of_what_git_does_not_know_nothing_is_said(
+    target: str, repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert code_of(target) is None
-
-
-def test_a_folder_outside_any_repository_has_no_code(tmp_path: Path) -> None:
-    assert code_in(tmp_path) is None
-
-
-def test_without_git_nothing_is_said(repository: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert code_in(tmp_path) is None, "outside of any repository"
     monkeypatch.setenv("PATH", "")
-    assert code_in(repository) is None
+    assert code_in(repository) is None, "without git"

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import os
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from fake_raylet import raylet
+from eval_fakes import wait_for
 
 from vlagents_ray import ConfigError, join
 from vlagents_ray.ray_tools import session as found_here
@@ -35,6 +36,21 @@ def environ(process: Path) -> bytes:
     with contextlib.suppress(OSError):
         return (process / "environ").read_bytes()
     return b""
+
+
+@contextlib.contextmanager
+def raylet(folder: Path, ray_address: str, **environment: str) -> Iterator[None]:
+    """Run a process that looks like the daemon of the Ray cluster whose private folder is `folder`."""
+    folder.mkdir(exist_ok=True)
+    words = ["/ray/raylet", "-c", "read forever", "raylet", f"--gcs-address={ray_address}", "--node_id=1"]
+    with subprocess.Popen(
+        words, executable="/bin/sh", env={MARK: str(folder)} | environment, stdin=subprocess.PIPE
+    ) as process:
+        try:
+            wait_for(Path(f"/proc/{process.pid}/cmdline").read_bytes)  # which the kernel sets after Popen has returned
+            yield
+        finally:
+            process.kill()
 
 
 def ready(monkeypatch: pytest.MonkeyPatch, folder: Path, url: str, app: str, ray_address: str) -> None:

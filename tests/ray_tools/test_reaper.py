@@ -55,7 +55,6 @@ def test_a_driver_that_was_killed_or_has_lost_ray_takes_its_cluster_along(tmp_pa
         [sys.executable, "-c", DRIVER, str(folder), end], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as driver:
         assert driver.stdin is not None
-        assert driver.stdout is not None
         child, proxy, agent = map(int, driver.stdout.readline().split())
         wait_for(lambda: set(about(str(folder))) == {proxy, agent})
         wait_for(lambda: set(marked(str(folder))) == {child, proxy, agent})

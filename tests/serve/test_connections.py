@@ -18,7 +18,7 @@ import pytest
 from asgi_server import served
 from eval_fakes import wait_for
 from in_memory_keys import ChangingKeys
-from probes import bytes_probe
+from probes import bytes_probe, is_probe_answer
 from starlette.testclient import TestClient
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
@@ -129,13 +129,6 @@ def keyed() -> Iterator[Replica]:
         yield one
 
 
-@pytest.fixture
-def impatient() -> Iterator[Replica]:
-    """Cuts off who is silent."""
-    with replica(slow_s=SLOW_S, idle_s=IDLE_S) as one:
-        yield one
-
-
 def handshake(path: str, *headers: str) -> bytes:
     lines = [f"GET {path} HTTP/1.1", "Host: 127.0.0.1", "Upgrade: websocket", "Connection: Upgrade"]
     lines += [f"Sec-WebSocket-Key: {base64.b64encode(os.urandom(16)).decode()}", "Sec-WebSocket-Version: 13", *headers]
@@ -195,14 +188,6 @@ def test_a_page_of_another_site_has_nothing_read_either() -> None:
         assert opened.policy.seen == []
 
 
-@pytest.mark.parametrize("first", [RESET, b"GET / HTTP/1.1\r\n" + RESET, b"\r\n\r\n" + RESET, b"\0" * 40_000])
-def test_what_comes_without_a_handshake_is_not_read(keyed: Replica, first: bytes, monkeypatch) -> None:
-    monkeypatch.setattr(websocket, "_HANDSHAKE_S", 0.2)
-    assert not answer(keyed.own.address.port, first).startswith(b"HTTP/1.1 101")
-    wait_for(lambda: not keyed.own._clients)
-    assert keyed.policy.seen == []
-
-
 @pytest.mark.parametrize("cut", [0, 1, 20, -1])
 def test_what_comes_with_a_right_handshake_is_read(keyed: Replica, cut: int) -> None:
     token = keyed.known.add("arm")
@@ -245,46 +230,48 @@ def test_half_a_message_is_not_waited_for() -> None:
         assert good.recv(5)
 
 
-@pytest.mark.parametrize("first", [b"", b"GET / HTTP/1.1\r\nHost: x\r\n"])
-def test_who_does_not_say_what_he_wants_is_cut_off(keyed: Replica, first: bytes, monkeypatch) -> None:
+NO_HANDSHAKE = [RESET, b"GET / HTTP/1.1\r\n" + RESET, b"\r\n\r\n" + RESET, b"\0" * 40_000]
+
+
+@pytest.mark.parametrize("first", [b"", b"GET / HTTP/1.1\r\nHost: x\r\n", *NO_HANDSHAKE], ids=range(6))
+def test_what_comes_without_a_handshake_is_cut_off_and_not_read(keyed: Replica, first: bytes, monkeypatch) -> None:
     monkeypatch.setattr(websocket, "_HANDSHAKE_S", 0.2)
     silent = [socket.create_connection(("127.0.0.1", keyed.own.address.port)) for _ in range(20)]
     for each in silent:
-        each.sendall(first)
+        with contextlib.suppress(OSError):  # it is cut off meanwhile
+            each.sendall(first)
+    assert not answer(keyed.own.address.port, first).startswith(b"HTTP/1.1 101")
     wait_for(lambda: not keyed.own._clients)
+    assert keyed.policy.seen == []
     for each in silent:
         each.close()
 
 
-def test_a_silent_connection_ends_and_one_that_is_used_does_not(impatient: Replica) -> None:
-    token = impatient.known.add("arm")
-    silent, used = impatient.stream(token), impatient.stream(token)
-    begun = time.monotonic()
-    while len(impatient.own._clients) > 1 or time.monotonic() - begun < 1.5 * IDLE_S:
-        used.send(bytes_probe(100), 5)
-        assert used.recv(5)
-        time.sleep(0.02)
-        assert time.monotonic() - begun < 60
-    with pytest.raises((ConnectionClosed, OSError), match="silent"):
-        listen_to_the_end(silent)
-
-
-def test_nobody_is_cut_off_because_the_policy_takes_long(impatient: Replica) -> None:
-    """It is the server then that does not read."""
-    token = impatient.known.add("arm")
-    other, waiting = impatient.stream(token), impatient.stream(token)
-    for client in (other, waiting):
-        client.send(encode_request(Request("reset", Obs())), 5)
-        client.recv(5)
-    impatient.policy.hold.clear()
-    other.send(encode_request(Request("act", Obs())), 5)
-    assert impatient.policy.acting.wait(5)
-    message = frame(encode_request(Request("act", Obs(info={"much": bytes(20_000)}))))
-    waiting._socket.sendall(message)
-    time.sleep(1.5 * IDLE_S)
-    impatient.policy.hold.set()
-    for client in (other, waiting):
-        assert decode_reply(client.recv(5)).error is None
+def test_a_silent_connection_ends_and_none_that_is_used_or_that_the_policy_keeps_waiting() -> None:
+    """It is the server that does not read while the policy is busy."""
+    with replica(slow_s=SLOW_S, idle_s=IDLE_S) as quiet, replica(slow_s=SLOW_S, idle_s=IDLE_S) as busy:
+        token = busy.known.add("arm")
+        other, waiting = busy.stream(token), busy.stream(token)
+        for client in (other, waiting):
+            client.send(encode_request(Request("reset", Obs())), 5)
+            client.recv(5)
+        busy.policy.hold.clear()
+        other.send(encode_request(Request("act", Obs())), 5)
+        assert busy.policy.acting.wait(5)
+        waiting._socket.sendall(frame(encode_request(Request("act", Obs(info={"much": bytes(20_000)})))))
+        token = quiet.known.add("arm")
+        silent, used = quiet.stream(token), quiet.stream(token)
+        begun = time.monotonic()
+        while len(quiet.own._clients) > 1 or time.monotonic() - begun < 1.5 * IDLE_S:
+            used.send(bytes_probe(100), 5)
+            assert used.recv(5)
+            time.sleep(0.02)
+            assert time.monotonic() - begun < 60
+        with pytest.raises((ConnectionClosed, OSError), match="silent"):
+            listen_to_the_end(silent)
+        busy.policy.hold.set()
+        for client in (other, waiting):
+            assert decode_reply(client.recv(5)).error is None
 
 
 @pytest.mark.parametrize(
@@ -426,9 +413,25 @@ def test_a_full_replica_closes_a_proxied_websocket_with_its_reason(keyed: Replic
         assert isinstance(decode_reply(late.recv(5)).error, PolicyUnavailable)
         with pytest.raises(ConnectionClosed) as closed:
             late.recv(5)
-    assert closed.value.rcvd is not None
     assert closed.value.rcvd.code == 1013
     assert "its limit; close one, or raise sessions.limit" in closed.value.rcvd.reason
+
+
+@pytest.mark.parametrize("size", [8, 5_000, 100_000])
+def test_a_probe_is_answered_without_a_session_and_a_broken_one_leaves_the_stream_as_it_was(
+    keyed: Replica, size: int
+) -> None:
+    probe, app = bytes_probe(size), build_http_app(keyed.engine, dict, Limits(body_bytes=100_000))
+    with TestClient(AccessMiddleware(app, None, "app")).websocket_connect("/v1/stream") as stream:
+        stream.send_bytes(probe)
+        assert is_probe_answer(stream.receive_bytes(), probe)
+        assert len(keyed.engine.sessions) == 0
+        stream.send_bytes(b"VLA?\0\0")
+        error = decode_reply(stream.receive_bytes()).error
+        assert error.code == "malformed"
+        stream.send_bytes(encode_request(Request("reset", Obs())))
+        assert decode_reply(stream.receive_bytes()).error is None
+    assert not keyed.policy.acting.is_set()
 
 
 def test_a_look_that_fails_is_followed_by_the_next(caplog: pytest.LogCaptureFixture) -> None:

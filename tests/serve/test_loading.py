@@ -71,17 +71,6 @@ def test_a_replica_runs_when_its_policy_has_loaded() -> None:
     assert asyncio.run(start()) == [False, True]
 
 
-def test_a_policy_that_does_not_load_is_a_failed_start() -> None:
-    def fail() -> None:
-        raise PolicyFailed("the policy did not load: no checkpoint here")
-
-    async def start() -> None:
-        await replica(fail).reconfigure({}, None)
-
-    with pytest.raises(PolicyFailed, match="no checkpoint here"):
-        asyncio.run(start())
-
-
 @pytest.mark.parametrize(("cause", "shown"), [(MissingDependency("no jax"), False), (KeyError("jax"), True)])
 def test_only_the_traceback_of_a_policys_own_bug_is_shown(
     cause: Exception, shown: bool, caplog: pytest.LogCaptureFixture
@@ -118,15 +107,11 @@ def test_serve_status_shows_one_sentence_if_an_application_cannot_be_built(args:
     assert built._bound_deployment.num_replicas == 2
 
 
-def test_serve_gives_up_after_the_first_failed_start() -> None:
-    policy = build(ServerArgs(policy="noop", replicas=8))._bound_deployment
-    assert policy._deployment_config.max_constructor_retry_count == 1
-
-
 @pytest.mark.parametrize("act_s", [3.0, 60.0, 600.0])
 def test_serve_leaves_a_replica_that_does_not_answer_as_much_time_as_a_call_may_take(act_s: float) -> None:
     """Its policy may hold the interpreter's lock: Serve's checks are all that limits that."""
     policy = build(ServerArgs(policy="noop", limits={"act_s": act_s}))._bound_deployment
+    assert policy._deployment_config.max_constructor_retry_count == 1, "it gives up after the first failed start"
     silent_s = 3 * policy._deployment_config.health_check_timeout_s
     assert act_s <= silent_s <= max(15.0, act_s)
 

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import fcntl
+import gc
 import http.client
 import os
+import queue
 import socket
 import struct
 import threading
@@ -14,17 +17,16 @@ import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 from urllib.parse import urlsplit
 
 import api_key_replica
 import numpy as np
+import psutil
 import pytest
 from api_key_replica import (
     WAYS,
     KeyedReplica,
-    PlasmaChannel,
     Visitor,
     _read_reply,
     _read_vla_eval,
@@ -34,12 +36,21 @@ from api_key_replica import (
 from eval_fakes import wait_for
 from in_flight import read_requests
 from probes import bytes_probe, is_probe_answer
+from websockets.exceptions import InvalidStatus
 
 import vlagents_ray
+from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.credentials import Credentials
 from vlagents_ray.client.transports.shm import ShmTransport
 from vlagents_ray.client.transports.websocket import Stream
-from vlagents_ray.errors import DeadlineExceeded, MessageTooLarge, Overloaded, TooManyRequests, VLAgentsError
+from vlagents_ray.errors import (
+    DeadlineExceeded,
+    MessageTooLarge,
+    Overloaded,
+    PolicyUnavailable,
+    TooManyRequests,
+    VLAgentsError,
+)
 from vlagents_ray.images import codecs, jpeg_png
 from vlagents_ray.images.codecs import decode_files
 from vlagents_ray.interface import Act, Agent, Obs
@@ -51,22 +62,26 @@ from vlagents_ray.protocol.frames import (
     decode_reply,
     decode_requests,
     encode_replies,
+    encode_request,
 )
 from vlagents_ray.protocol.messages import (
     DEFAULT_LIMITS,
+    STREAM_BYTES,
     Budget,
     Limits,
     LocalAddress,
-    PlasmaAddress,
     Reply,
     Request,
 )
+from vlagents_ray.serve.access import api_keys
 from vlagents_ray.serve.access.api_keys import NoKey
+from vlagents_ray.serve.dialects import gr00t
+from vlagents_ray.serve.dialects.base import GatewayContext
 from vlagents_ray.serve.endpoints.shm import ShmServer, UnixConnection
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.admission import Admission, MessageAdmission, NeedsDecodingThread
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.engine.sender import Sender
+from vlagents_ray.serve.engine.sender import REFUSALS
 from vlagents_ray.wire import gr00t as gr00t_codec
 from vlagents_ray.wire import json_numpy, msgpack
 from vlagents_ray.wire import openpi as openpi_codec
@@ -77,6 +92,8 @@ JPEG = jpeg_png.encode_jpeg(np.full((32, 32, 3), 9, np.uint8))
 PNG = jpeg_png.encode_png(np.full((32, 32, 3), 9, np.uint8))
 LARGE = jpeg_png.encode_jpeg(np.zeros((1100, 1000, 3), np.uint8), 1, "420")  # over a megapixel
 DECODED = 32 * 32 * 3
+SLACK = 48 * 2**20  # bytes of buffers in the kernel's and the interpreter's own care
+OBS = Obs({"front": np.zeros((8, 8, 3), np.uint8)})
 SEEN = {"cameras": {"front": {"$": ["img", 0]}}}
 
 
@@ -118,11 +135,12 @@ def decoded(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         (openpi_codec, "decode"),
         (openvla_codec, "decode"),
         (gr00t_codec, "read_request"),
+        (vla_eval_codec, "decode"),
     ):
         original = getattr(module, name)
 
-        def noted(*args: Any, original: Any = original, name: str = name, **options: Any) -> Any:
-            if name == "decode" or threading.current_thread() is not threading.main_thread():
+        def noted(*args: Any, original: Any = original, module: Any = module, name: str = name, **options: Any) -> Any:
+            if module is jpeg_png or threading.current_thread() is not threading.main_thread():
                 by.append(name)
             return original(*args, **options)
 
@@ -146,44 +164,6 @@ def _post(path: str, kind: str, content: bytes) -> Callable[[Visitor, str], str]
     return attempt
 
 
-def _form() -> tuple[str, bytes]:
-    head = '--X\r\nContent-Disposition: form-data; name="obs"\r\n\r\n{}\r\n--X\r\nContent-Disposition: form-data; '
-    return "multipart/form-data; boundary=X", head.encode() + (
-        b'name="cameras.front"; filename="a"\r\n\r\n' + JPEG + b"\r\n--X--\r\n"
-    )
-
-
-def _over_shm(visitor: Visitor, _when: str) -> str:
-    transport = ShmTransport(asdict(visitor.replica.local.address), Credentials(visitor.token))
-    transport.connect(10)
-    visitor.become()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("vlagents_ray.client.transports.shm.request_parts", lambda *_: frame_layout.pack(reset(), [JPEG]))
-        [reply] = transport.call([Request("reset", Obs())], 10)
-    transport.close()
-    return "done" if reply.error is None else str(reply.error.status)
-
-
-def _over_plasma(visitor: Visitor, _when: str) -> str:
-    key = visitor.name.encode().ljust(28, b"\0")
-    PlasmaChannel.frames[key] = frame(reset())
-    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:
-        connection.settimeout(10)
-        connection.connect(visitor.replica.plasma.plasma.socket)
-        connection.send(PlasmaAddress.REQUEST.pack(key, 0))
-        return _read_reply(connection.recv(65536)[12:])
-
-
-def _image_of_vla_eval(mark: str) -> bytes:
-    image = {"__image__": True, "format": "jpeg", "data": JPEG, "shape": [32, 32, 3]}
-    seen = {"images": {"front": image}, "task_description": mark, "state": np.ones(3)}
-    return vla_eval_codec.encode(vla_eval_codec.Message("observation", seen, 3))
-
-
-def _stream(path: str) -> list[Callable[[Visitor, str], str]]:
-    return [over_websocket(path, lambda _: frame(reset()), _read_reply)]
-
-
 NOTHING_TO_DECODE = {
     *(way for way in WAYS if way.startswith("`GET")),
     "`POST /v1/close`",  # nothing that it brings is decoded
@@ -200,15 +180,22 @@ NO_KEY = {
     "Serve handle (`serve://`)",
     "plasma (`serve://`)",
 }
-# The attempts by each other way, which carry something to decode; those of WAYS, unless another message carries more.
-CARRY: dict[str, list[Callable[[Visitor, str], str]]] = {
-    **{way: [attempt] for way, attempt in WAYS.items() if way not in NOTHING_TO_DECODE | NO_KEY},
-    "`POST /v1/reset`": [_post("/v1/reset", *_form()), _post("/v1/reset", CONTENT_TYPE, frame(reset()))],
-    "`POST /v1/act`": [_post("/v1/act", *_form()), _post("/v1/act", CONTENT_TYPE, frame({"op": "act", "obs": SEEN}))],
-    "`WS /v1/stream`": _stream("/v1/stream"),
-    "own port": _stream("own"),
-    "`WS /vla-eval`": [over_websocket("/vla-eval", _image_of_vla_eval, _read_vla_eval)],
-    "shared memory": [_over_shm],
+
+
+FORM = (
+    b'--X\r\nContent-Disposition: form-data; name="obs"\r\n\r\n{}\r\n--X\r\nContent-Disposition: form-data; '
+    b'name="cameras.front"; filename="a"\r\n\r\n' + JPEG + b"\r\n--X--\r\n"
+)
+ACT = "`POST /v1/act`"  # for which the others reset a session first
+# Each way in by which something to decode comes, for a key; docs/access.md has them all.
+CARRY = {way: attempt for way, attempt in WAYS.items() if way not in NOTHING_TO_DECODE | NO_KEY | {ACT}} | {
+    f"{op}, {kind.partition(';')[0]}": _post(f"/v1/{op}", kind, content)
+    for op in ("reset", "act")
+    for kind, content in (
+        ("multipart/form-data; boundary=X", FORM),
+        (CONTENT_TYPE, frame({"op": op, "obs": SEEN})),
+        ("application/json", b"{}"),
+    )
 }
 
 
@@ -226,31 +213,27 @@ def test_a_refused_body_that_is_long_is_not_read(replica: KeyedReplica) -> None:
     assert b"connection: close" in answer.lower()
 
 
-def test_every_way_in_is_tried() -> None:
-    assert CARRY.keys() | NOTHING_TO_DECODE | NO_KEY == WAYS.keys()
+def test_no_other_way_in_is_left_out() -> None:
+    assert WAYS.keys() >= NOTHING_TO_DECODE | NO_KEY | {ACT}
+
+
+@pytest.mark.parametrize("way", CARRY)
+def test_nothing_of_a_key_over_its_rate_is_decoded(replica: KeyedReplica, decoded: list[str], way: str) -> None:
+    attempt, when = CARRY[way], "with" if "gateway" in way else "after"
+    assert attempt(replica.visitor("over its rate"), when) == "429"
+    assert decoded == []
+    assert attempt(replica.visitor("right"), when) in ("done", "200", "409", "404")  # an act before a reset
+    assert decoded != []
 
 
 @pytest.mark.parametrize("path", ["/v1/stream", "own"])
 def test_a_probe_through_a_websocket_counts_for_the_rate(replica: KeyedReplica, path: str) -> None:
     probe = bytes_probe(100)
-
-    def read(data: Any) -> str:
-        return "answered" if is_probe_answer(data, probe) else _read_reply(data)
-
-    attempt = over_websocket(path, lambda _: probe, read)
-    assert attempt(replica.visitor("right"), "after") == "answered"
-    assert attempt(replica.visitor("over its rate"), "after") == "429"
-
-
-@pytest.mark.parametrize(("way", "number"), [(way, n) for way, tries in CARRY.items() for n in range(len(tries))])
-def test_nothing_of_a_key_over_its_rate_is_decoded(
-    replica: KeyedReplica, decoded: list[str], way: str, number: int
-) -> None:
-    attempt, when = CARRY[way][number], "with" if "gateway" in way else "after"
-    assert attempt(replica.visitor("over its rate"), when) == "429"
-    assert decoded == []
-    assert attempt(replica.visitor("right"), when) in ("done", "200", "409", "404")  # an act before a reset
-    assert decoded != [], "NOTHING_TO_DECODE lists a way that carries nothing to decode"
+    send = over_websocket(
+        path, lambda _: probe, lambda got: "done" if is_probe_answer(got, probe) else _read_reply(got)
+    )
+    assert send(replica.visitor("right"), "after") == "done"
+    assert send(replica.visitor("over its rate"), "after") == "429"
 
 
 @pytest.mark.parametrize("way", sorted(NO_KEY))
@@ -266,7 +249,7 @@ def test_ways_without_a_key_count_what_they_hold(
 
     monkeypatch.setattr(MessageAdmission, "begin", noted)
     visitor = replica.visitor("right")
-    assert (_over_plasma if way.startswith("plasma") else WAYS[way])(visitor, "with") == "done"
+    assert WAYS[way](visitor, "with") == "done"
     assert asked
 
 
@@ -319,16 +302,14 @@ def test_what_a_request_names_is_counted_each_time_and_taken_once() -> None:
     message.release()
     assert held.held == 0
 
-
-def test_an_array_is_counted_each_time_it_is_named() -> None:
     def named(times: int) -> dict[str, Any]:
         return {"op": "reset", "obs": {"info": {str(n): {"$": ["nd", 0, "|u1", [1000]]} for n in range(times)}}}
 
-    limits = Limits(decoded_bytes=4000)
-    good, bad = read_requests(frame(named(4), named(5), files=[bytes(1000)]), Budget(limits))
-    assert isinstance(good, Request)
-    assert isinstance(bad, Reply)
-    assert isinstance(bad.error, MessageTooLarge)
+    arrays = frame(named(4), named(5), files=[bytes(1000)])
+    good_one, bad_one = read_requests(arrays, Budget(Limits(decoded_bytes=4000)))
+    assert isinstance(good_one, Request)
+    assert isinstance(bad_one, Reply)
+    assert isinstance(bad_one.error, MessageTooLarge)
 
 
 def test_what_images_declare_is_refused_before_the_first_is_decoded(decoded: list[str]) -> None:
@@ -379,13 +360,10 @@ def test_robots_have_a_share_of_the_memory_for_themselves() -> None:
     del simulations[0]  # answered, or dropped
     assert message("robot")[1] is None
     assert isinstance(message("simulation")[1], Overloaded)  # what robots have taken is theirs
-
-
-def test_a_message_that_will_never_fit_is_not_told_to_wait() -> None:
-    small = Admission(DECODED)
-    [answer] = read_requests(frame(reset(rank="simulation")), MessageAdmission(small, DEFAULT_LIMITS, lambda _: True))
+    small = MessageAdmission(Admission(DECODED), DEFAULT_LIMITS, lambda _: True)  # into which it will never fit
+    [answer] = read_requests(frame(reset(rank="simulation")), small)
     assert isinstance(answer, Reply)
-    assert isinstance(answer.error, MessageTooLarge)
+    assert isinstance(answer.error, MessageTooLarge), "it is not told to wait"
     assert "limits.in_flight_bytes" in str(answer.error)
 
 
@@ -587,50 +565,6 @@ def test_simulations_images_are_decoded_one_by_one(monkeypatch: pytest.MonkeyPat
 # Over the rate.
 
 
-def test_a_connection_over_its_rate_is_not_read_meanwhile(replica: KeyedReplica) -> None:
-    """Its messages wait in its own socket, so that those that are refused cost the others nothing."""
-    visitor = replica.visitor("right")
-    own = replica.own
-    client = Stream(
-        urlsplit("http://127.0.0.1"),
-        own.address.port,
-        own.address.path,
-        10,
-        {"authorization": f"Bearer {visitor.token}"},
-    )
-    client.send(frame(reset()), 10)
-    assert decode_replies(client.recv(10))[0].error is None
-    replica.known.change(visitor.name, rate=1e-6)
-    replica.known.keys.check(visitor.token, "app").admit()
-    [held] = [one for one in list(own._clients) if getattr(one.caller, "name", "") == visitor.name]
-
-    client.send(frame(reset()), 10)
-    assert isinstance(decode_replies(client.recv(10))[0].error, TooManyRequests)
-    wait_for(lambda: not held._polled, every_s=0.001)  # for a second, and again after each message
-    client.send(frame(reset()), 10)
-    assert isinstance(decode_replies(client.recv(10))[0].error, TooManyRequests)  # after a second, at most
-    client.close()
-
-
-def test_a_local_client_over_its_rate_is_not_read_meanwhile(replica: KeyedReplica) -> None:
-    visitor = replica.visitor("right")
-    transport = ShmTransport(asdict(replica.local.address), Credentials(visitor.token))
-    transport.connect(10)
-    seen = Obs({"front": np.zeros((8, 8, 3), np.uint8)})
-    assert transport.call([Request("reset", seen)], 10)[0].error is None
-    [held] = [one for one in list(replica.local._clients) if getattr(one.caller, "name", "") == visitor.name]
-    replica.known.change(visitor.name, rate=1e-6)
-    replica.known.keys.check(visitor.token, "app").admit()
-
-    def is_left_alone(op: Any) -> bool:  # for a second, in which this process may have stood still
-        assert isinstance(transport.call([Request(op, seen)], 10)[0].error, TooManyRequests)
-        return not held._polled
-
-    for op in ("act", "reset"):  # in compact form, and in a frame
-        wait_for(lambda op=op: is_left_alone(op))  # type: ignore[misc]
-    transport.close()
-
-
 def test_local_clients_over_their_rate_wait_without_threads_and_leave_nothing_behind(
     replica: KeyedReplica, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -687,6 +621,153 @@ def test_what_cannot_be_read_counts_too(replica: KeyedReplica, path: str) -> Non
         replica.known.keys.check(visitor.token, "app").admit()
 
 
-def test_a_sender_that_is_not_over_its_rate_is_read_at_once() -> None:
-    engine: Any = SimpleNamespace()
-    assert Sender(engine, "shm", caller=NoKey.OPEN).throttled_s() == 0.0
+# What is kept of messages is bounded in bytes, however many the largest ones are.
+
+
+def _rss() -> int:
+    gc.collect()
+    return int(psutil.Process().memory_info().rss)
+
+
+def _keyed_stream(replica: KeyedReplica, token: str) -> Stream:
+    own = replica.own
+    headers = {"authorization": f"Bearer {token}"}
+    return Stream(urlsplit("http://127.0.0.1"), own.address.port, own.address.path, 10, headers)
+
+
+def _part(client: Stream, size: int) -> None:
+    """Send all but the last byte of a message of that size, as far as the server reads it."""
+    connection = client._socket
+    connection.setblocking(False)
+    data = memoryview(bytes([0x82, 0x80 | 127]) + struct.pack(">Q", size) + bytes(4) + bytes(size - 1))
+    connection.settimeout(0.5)
+    with contextlib.suppress(OSError):  # the server reads no more
+        while data:
+            data = data[connection.send(data) :]
+
+
+def test_parts_of_messages_of_a_key_are_bounded_by_its_rate(replica: KeyedReplica) -> None:
+    visitor = replica.visitor("right")
+    replica.known.change(visitor.name, rate=1)
+    before = _rss()
+    clients = [_keyed_stream(replica, visitor.token) for _ in range(5)]
+    for client in clients:
+        _part(client, STREAM_BYTES)
+    mine = [one for one in list(replica.own._clients) if getattr(one.caller, "name", "") == visitor.name]
+    begun = [one for one in mine if one._received.size > 2**20 + 100]
+    assert len(begun) <= 4  # one a second, of those that took half a second each
+    assert replica.engine.admission.held <= len(begun) * STREAM_BYTES + 8 * 2**20
+    assert _rss() - before < len(begun) * STREAM_BYTES + 8 * 2**20 + SLACK
+    for client in clients:
+        client.close()
+    wait_for(lambda: replica.engine.admission.held == 0)
+
+
+def test_a_connection_ends_after_some_refusals_in_a_row(replica: KeyedReplica, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(api_keys, "_THROTTLED_S", (0.02, 0.02))
+    visitor = replica.visitor("right")
+    client = _keyed_stream(replica, visitor.token)
+    replica.known.change(visitor.name, rate=1e-6)
+    replica.known.keys.check(visitor.token, "app").admit()
+    for _ in range(REFUSALS):
+        client.send(encode_request(Request("reset", OBS)), 10)
+        assert isinstance(decode_replies(client.recv(10))[0].error, TooManyRequests)
+    with pytest.raises((ConnectionError, VLAgentsError)):
+        client.recv(5)
+    client.close()
+
+
+def test_a_key_over_its_rate_is_read_on_none_of_its_connections(replica: KeyedReplica) -> None:
+    visitor = replica.visitor("right")
+    first, second = _keyed_stream(replica, visitor.token), _keyed_stream(replica, visitor.token)
+    frame = encode_request(Request("reset", OBS))
+    for client in (first, second):
+        client.send(frame, 10)
+        assert decode_replies(client.recv(10))[0].error is None
+    replica.known.change(visitor.name, rate=1e-6)
+    replica.known.keys.check(visitor.token, "app").admit()
+
+    first.send(frame, 10)
+    assert isinstance(decode_replies(first.recv(10))[0].error, TooManyRequests)
+    second.send(frame, 10)
+    with pytest.raises(TimeoutError):  # it is not read for a second
+        second.recv(0.1)
+    with pytest.raises(InvalidStatus, match="429"):
+        _keyed_stream(replica, visitor.token)
+    first.close(), second.close()
+
+
+def test_an_act_in_compact_form_is_read_again_after_a_refusal(replica: KeyedReplica) -> None:
+    """The layout of its arrays came with the first message, which was refused before it was parsed."""
+    visitor = replica.visitor("right")
+    transport = ShmTransport(asdict(replica.local.address), Credentials(visitor.token))
+    transport.connect(10)
+    assert transport.call([Request("reset", OBS)], 10)[0].error is None
+    replica.known.change(visitor.name, rate=1e-6)
+    replica.known.keys.check(visitor.token, "app").admit()
+    assert isinstance(transport.call([Request("act", OBS, request_id="a")], 10)[0].error, TooManyRequests)
+    replica.known.change(visitor.name, rate=None)
+    [reply] = transport.call([Request("act", OBS, request_id="b")], 10)
+    assert reply.error is None, reply.error
+    transport.close()
+
+
+def test_parts_of_messages_before_a_key_are_bounded_at_groots_gateway(monkeypatch: pytest.MonkeyPatch) -> None:
+    """12 connections with 24 MiB of a message each take no more than the 64 MiB of one message, and a part more."""
+    monkeypatch.setattr(gr00t, "_STRANGER_S", 3.0)
+    context = GatewayContext("app", _no_replica, DEFAULT_LIMITS, 8, 30.0, None, lambda _: NoKey.OPEN)
+    dialect = gr00t.GR00TDialect("gr00t", gr00t.GR00TDialectConfig(), context)
+    listener = socket.create_server(("127.0.0.1", 0))
+    port = listener.getsockname()[1]
+    dialect.serve(listener)
+    greeting = b"\xff" + bytes(8) + b"\x7f" + b"\x03\x01" + b"NULL".ljust(20, b"\0") + b"\0" + bytes(31)
+    greeted = b"\x05READY" + b"\x0bSocket-Type" + struct.pack(">I", 6) + b"DEALER"
+    before, held, part = _rss(), [], bytes(24 * 2**20)
+    for _ in range(12):
+        connection = socket.create_connection(("127.0.0.1", port), timeout=5)
+        held.append(connection)
+        connection.sendall(greeting)
+        got = 0
+        while got < 64:
+            got += len(connection.recv(64 - got))
+        connection.sendall(b"\x04" + bytes([len(greeted)]) + greeted + b"\x02" + struct.pack(">Q", 2 * len(part)))
+        with contextlib.suppress(OSError):  # it is cut off meanwhile
+            connection.sendall(part)
+    assert _rss() - before < DEFAULT_LIMITS.body_bytes + len(part) + SLACK
+    wait_for(lambda: all(_ended(one) for one in held))
+    wait_for(lambda: _rss() - before < SLACK)
+    for connection in held:
+        connection.close()
+    dialect.close()
+
+
+def test_requests_that_wait_at_groots_gateway_count_as_in_flight() -> None:
+    admission = Admission(3 * 10**6)
+    context = GatewayContext("app", _no_replica, DEFAULT_LIMITS, 8, 30.0, None, NoKey.OPEN, admission)
+    answers: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+    dialect = gr00t.GR00TDialect("gr00t", gr00t.GR00TDialectConfig(), context)
+    client = gr00t.GR00TConnection(context, dialect.mapping, answers.put)
+    with pytest.raises((Overloaded, MessageTooLarge)):
+        client.put(bytes(4 * 10**6))
+    assert client.put(bytes(10**6))
+    answers.get(timeout=10)
+    assert admission.held == 0
+    client.end()
+    client.join(10)
+    dialect.close()
+
+
+def _no_replica(*_: object) -> RemoteAgent:
+    raise PolicyUnavailable("there is no replica")
+
+
+def _ended(connection: socket.socket) -> bool:
+    connection.setblocking(False)
+    try:
+        while connection.recv(65536):
+            pass
+    except BlockingIOError:
+        return False
+    except OSError:
+        return True
+    return True

@@ -47,7 +47,7 @@ class Stateful(Agent):
         return Act(np.array([len(self.history), self.buffer[0], self.scale(value)]), info={"random": self.rng.random()})
 
 
-def copies(agent: Agent) -> AgentCopies:
+def copies(agent: Agent) -> Any:
     agent.initialize()
     return AgentCopies(agent)
 
@@ -57,8 +57,6 @@ def test_copies_do_not_mix() -> None:
     a, b = make.make(), make.make()
     for value in range(5):
         a.act(Obs(info={"value": value}))
-    assert isinstance(a, Stateful)
-    assert isinstance(b, Stateful)
     assert a.history == [0, 1, 2, 3, 4]
     assert b.history == []
     assert list(b.queue) == []
@@ -81,6 +79,7 @@ class Heavy(Agent):
 
     def initialize(self) -> None:
         self.model = torch.nn.Sequential(torch.nn.Linear(3, 3), torch.nn.BatchNorm1d(3))
+        self.model.actions = []  # as LeRobot's policies keep their queue
         self.table = {"big": np.zeros(10)}
         self.own = {"small": np.zeros(10)}
 
@@ -88,43 +87,13 @@ class Heavy(Agent):
 def test_weights_are_shared_and_module_state_is_not() -> None:
     make = copies(Heavy())
     a, b = make.make(), make.make()
-    assert isinstance(a, Heavy)
-    assert isinstance(b, Heavy)
     assert a.model[0].weight is b.model[0].weight
     assert a.model is not b.model
     assert a.model[1].running_mean is not b.model[1].running_mean
-
-
-def test_named_attributes_are_shared() -> None:
-    make = copies(Heavy())
-    a, b = make.make(), make.make()
-    assert isinstance(a, Heavy)
-    assert isinstance(b, Heavy)
-    assert a.table is b.table
+    a.model.actions.append(1.0)
+    assert b.model.actions == []
+    assert a.table is b.table, "it is named"
     assert a.own is not b.own
-
-
-class Modular(Agent):
-    """State inside a torch module, as LeRobot's policies keep their action queue."""
-
-    class Net(torch.nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            self.layer = torch.nn.Linear(1, 1)
-            self.actions: list[float] = []
-
-    def initialize(self) -> None:
-        self.net = self.Net()
-
-
-def test_a_queue_inside_a_module_is_each_sessions_own() -> None:
-    make = copies(Modular())
-    a, b = make.make(), make.make()
-    assert isinstance(a, Modular)
-    assert isinstance(b, Modular)
-    a.net.actions.append(1.0)
-    assert b.net.actions == []
-    assert a.net.layer.weight is b.net.layer.weight
 
 
 class Locked(Agent):
@@ -137,8 +106,6 @@ def test_what_cannot_be_copied_is_shared_and_said(caplog: pytest.LogCaptureFixtu
     with caplog.at_level(logging.WARNING):
         make = copies(Locked())
     a, b = make.make(), make.make()
-    assert isinstance(a, Locked)
-    assert isinstance(b, Locked)
     assert a.lock is b.lock
     assert a.state is not b.state
     assert "lock" in caplog.text
@@ -156,28 +123,17 @@ def test_a_huge_array_is_shared_but_cannot_be_written(monkeypatch: pytest.Monkey
         agent.weights[0] = 2
 
 
-def test_unknown_sessions_are_named() -> None:
-    with pytest.raises(UnknownSession, match="'nobody'"):
-        SessionTable(1, 1).get("nobody")
-
-
-def test_a_full_table_refuses_and_makes_room_for_the_idle() -> None:
+def test_a_full_table_refuses_and_makes_room_for_the_idle_which_are_forgotten() -> None:
     table = SessionTable(limit=1, idle_s=60)
     table.open("a")
     with pytest.raises(PolicyUnavailable, match="limit"):
         table.open("b")
     table.open("a").used -= 61
-    table.open("b")
-    with pytest.raises(UnknownSession):
+    table.open("b").used -= 61
+    with pytest.raises(UnknownSession, match="'a'"):
         table.get("a")
-
-
-def test_idle_sessions_are_forgotten() -> None:
-    table = SessionTable(limit=10, idle_s=60)
-    table.open("old").used -= 61
-    table.open("new")
     table.drop_idle()
-    assert len(table) == 1
+    assert len(table) == 0
 
 
 class Networked(Agent):
@@ -198,13 +154,11 @@ def test_a_session_goes_on_in_another_replica_with_its_state_and_the_other_ones_
     ours, theirs = copies(here), copies(there)
     assert ours.fingerprint == theirs.fingerprint
     session = ours.make()
-    assert isinstance(session, Networked)
     session.state += 5
     session.seen.append(np.arange(3))
     data = ours.dump(session)
     assert len(data) < 2000  # no weights in it
     moved = theirs.load(data)
-    assert isinstance(moved, Networked)
     assert moved.state.tolist() == [5, 5, 5]
     assert moved.seen[0].tolist() == [0, 1, 2]
     assert moved.model.weight is there.model.weight
@@ -215,7 +169,7 @@ def test_a_session_goes_on_in_another_replica_with_its_state_and_the_other_ones_
 def test_what_a_session_may_not_carry_stays_where_it_is() -> None:
     ours = copies(Networked())
     session = ours.make()
-    session.window = threading.Lock()  # type: ignore[attr-defined]
+    session.window = threading.Lock()
     with pytest.raises(TypeError):
         ours.dump(session)
 

@@ -77,7 +77,6 @@ class Robot:
                 return
 
     def _check(self, reply: Reply, instruction: str, expected: list[str]) -> None:
-        assert reply.act is not None
         obeyed, ids = reply.act.info["obeys"], reply.act.info["ids"]
         if not obeyed.startswith(self.name + "/"):
             raise Violation(f"{expected[-1]}: crossed with another session, it obeys {obeyed}")

@@ -1,7 +1,6 @@
 """A keyed replica in a process of its own, and one that floods it.
 
-`flood.py serve`, `flood.py attack WAY PART WHERE CONNECTIONS S`, and `flood.py table [WAY...]`, which prints how long a
-robot's acts take beside each flood, and beside the same flood of `flood.py sink`, a process that reads nothing.
+`flood.py serve`, and `flood.py attack WAY PART WHERE CONNECTIONS S`.
 """
 
 from __future__ import annotations
@@ -27,9 +26,7 @@ import numpy as np
 from asgi_server import served
 from dialect_server import ALL, METADATA
 from websockets.client import ClientProtocol
-from websockets.http11 import Request as Handshake
 from websockets.protocol import State
-from websockets.server import ServerProtocol
 from websockets.uri import parse_uri
 
 from vlagents_ray.client.credentials import Credentials
@@ -89,30 +86,6 @@ def serve() -> None:
         sys.stdin.read()
     engine.close()
     own.close(), near.close()
-
-
-def sink() -> None:
-    """Print an address as `serve` does, accept what comes there, and read nothing after a WebSocket's handshake."""
-    own, near, name = socket.create_server(("127.0.0.1", 0)), socket.socket(*UNIX), f"flood-sink-{os.getpid()}"
-    near.bind(f"\0{name}")
-    near.listen(128)
-    port = own.getsockname()[1]
-    print(json.dumps({"port": port, "own": [port, "/own"], "local": {"socket": name}}), flush=True)
-    threading.Thread(target=_hold, args=(own,), daemon=True).start()
-    sys.stdin.read()
-
-
-def _hold(listener: socket.socket) -> None:
-    held = []
-    while True:
-        connection, _ = listener.accept()
-        held.append(connection)
-        protocol = ServerProtocol()
-        protocol.receive_data(connection.recv(65536))
-        for event in protocol.events_received():
-            if isinstance(event, Handshake):
-                protocol.send_response(protocol.accept(event))
-                connection.sendall(b"".join(protocol.data_to_send()))
 
 
 def _jpeg() -> bytes:
@@ -365,68 +338,8 @@ def percentile(taken: list[float], percent: float) -> float:
     return taken[int(percent / 100 * len(taken))]
 
 
-def table(seconds: float = 2.0, rounds: int = 3) -> None:
-    """Print the median p50 and p99 of a robot's acts alone, beside the control, and beside the flood.
-
-    The ratio is p99 beside the flood by the larger one of the others; the last columns are the server's processor time
-    in the three cases, and the attacker's.
-    """
-    print(" " * 41 + f"{'p50 alone, control, beside':>27s}{'p99 alone, control, beside':>27s}  ratio  % of a core")
-    with child("serve") as server, child("sink") as idle:
-        assert server.stdout is not None
-        assert idle.stdout is not None
-        where, nowhere = json.loads(server.stdout.readline()), json.loads(idle.stdout.readline())
-        with robot(where) as transport:
-            acts_ms(transport, 1.0)
-
-            def measure(attacker: subprocess.Popen[str] | None = None) -> tuple[float, ...]:
-                processes = [server] if attacker is None else [server, attacker]
-                before = [_cpu_s(one.pid) for one in processes]
-                taken = acts_ms(transport, seconds)
-                used = [100 * (_cpu_s(p.pid) - b) / seconds for p, b in zip(processes, before, strict=True)]
-                return percentile(taken, 50), percentile(taken, 99), *used
-
-            def beside(target: Where, *flood: str) -> tuple[float, ...]:
-                with child("attack", *flood[:2], json.dumps(target), flood[2], "30") as attacker:
-                    assert attacker.stdout is not None
-                    attacker.stdout.readline()
-                    time.sleep(1.0)
-                    return measure(attacker)
-
-            for way in sys.argv[2:] or FRAMES:
-                for part, connections in CASES if way in FRAMES else [("images", 1), ("images", 8), ("images", 32)]:
-                    flood, found = (way, part, str(connections)), []
-                    for _ in range(rounds):
-                        time.sleep(0.5)
-                        found.append((measure(), beside(nowhere, *flood), beside(where, *flood)))
-                    alone, control, flooded = (np.median(one, axis=0) for one in zip(*found, strict=True))
-                    numbers = " ".join(f"{one[n]:8.2f}" for n in (0, 1) for one in (alone, control, flooded))
-                    used = " ".join(f"{n:4.0f}" for n in (alone[2], control[2], *flooded[2:]))
-                    ratio = flooded[1] / max(alone[1], control[1])
-                    print(f"{way:23s}{part:15s}{connections:3d} {numbers}  {ratio:5.2f}  {used}", flush=True)
-
-
-CASES = (
-    *(("images", n) for n in (1, 8, 32)),
-    *(("header", n) for n in (1, 8, 32)),
-    ("allowed header", 32),
-    ("names", 8),
-    ("blobs", 8),
-    ("history", 8),
-)
-
-
-def _cpu_s(pid: int) -> float:
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-
-
 if __name__ == "__main__":
     if sys.argv[1] == "serve":
         serve()
-    elif sys.argv[1] == "sink":
-        sink()
-    elif sys.argv[1] == "table":
-        table()
     else:
         attack(sys.argv[2], sys.argv[3], json.loads(sys.argv[4]), int(sys.argv[5]), float(sys.argv[6]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import queue
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -34,6 +35,18 @@ def submit(engine: Engine, session_id: str, request: Request, done: Done) -> Pen
     one = checked(engine, session_id, request, done)
     engine.queue.put(one)
     return one
+
+
+def asked(engine: Engine, session_id: str, request: Request) -> queue.SimpleQueue[Reply]:
+    """Queue a request; where the answer will come."""
+    replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
+    submit(engine, session_id, request, replies.put)
+    return replies
+
+
+def answered(engine: Engine, session_id: str, request: Request) -> Reply:
+    """Queue a request, and wait for the answer."""
+    return asked(engine, session_id, request).get(timeout=30)
 
 
 def send(sender: Sender, requests: Sequence[Request], done: Callable[[list[Reply]], Any]) -> list[PendingRequest]:

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
-from in_flight import submit
+from in_flight import answered
 
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.connection import Connection
@@ -158,10 +158,10 @@ class _Peer(Peer):
 
 def export(engine: Engine, session_id: str) -> dict[str, Any] | None:
     """Take a session out of a replica, as another one does that adopts it; None if it stays."""
-    copied = _ask(engine, session_id, Request("export"))
+    copied = answered(engine, session_id, Request("export"))
     if copied.info is None:
         return None
-    released = _ask(engine, session_id, Request("release", kwargs={"version": version_of(copied.info)}))
+    released = answered(engine, session_id, Request("release", kwargs={"version": version_of(copied.info)}))
     assert released.info == {"released": True}
     return copied.info
 
@@ -169,9 +169,3 @@ def export(engine: Engine, session_id: str) -> dict[str, Any] | None:
 def version_of(state: dict[str, Any]) -> tuple[int, int]:
     """The version of what was exported."""
     return state["steps"], state["moves"]
-
-
-def _ask(engine: Engine, session_id: str, request: Request) -> Reply:
-    replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
-    submit(engine, session_id, request, replies.put)
-    return replies.get(timeout=30)

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from in_flight import submit
+from in_flight import asked
 
 from vlagents_ray import Act, Agent, Obs
 from vlagents_ray.contract import Contract, StateSpec
@@ -100,9 +100,7 @@ class Library:
 
 def ask(engine: Engine, session: str, op: str, **fields: Any) -> queue.SimpleQueue[Reply]:
     """Where the answer will come."""
-    replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
-    submit(engine, session, Request(op, Obs(**fields.pop("obs", {})), **fields), replies.put)  # type: ignore[arg-type]
-    return replies
+    return asked(engine, session, Request(op, Obs(**fields.pop("obs", {})), **fields))  # type: ignore[arg-type]
 
 
 def begin(engine: Engine, session: str, **kwargs: Any) -> queue.SimpleQueue[Reply]:

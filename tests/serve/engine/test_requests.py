@@ -5,17 +5,17 @@ from __future__ import annotations
 import asyncio
 import queue
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import pytest
 from eval_fakes import wait_for
 from in_flight import ask, send
 
-from vlagents_ray.errors import DeadlineExceeded, MessageTooLarge
+from vlagents_ray.errors import DeadlineExceeded, InvalidInput, MessageTooLarge, PolicyFailed, PolicyUnavailable
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol import frames
-from vlagents_ray.protocol.frames import decode_replies
+from vlagents_ray.protocol.frames import Decoded, decode_replies
 from vlagents_ray.protocol.messages import Limits, Reply, Request
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.engine.engine import Engine
@@ -26,7 +26,7 @@ from vlagents_ray.serve.requests import Message, PendingRequest
 
 
 class Gated(Agent):
-    """Acts when the gate is open."""
+    """Acts when the gate is open, and breaks with the error that it is told."""
 
     gate = threading.Event()
     busy = threading.Semaphore(0)
@@ -35,6 +35,11 @@ class Gated(Agent):
         Gated.busy.release()
         assert Gated.gate.wait(10)
         return Act(np.zeros(1))
+
+    def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
+        if "error" in obs[0].info:
+            raise obs[0].info["error"]
+        return super().act_batch(obs, sessions)
 
 
 class Served:
@@ -49,9 +54,11 @@ class Served:
     def sender(self, name: str, *, connected: bool = True) -> Sender:
         return Sender(self.engine, "test", name, caller=NoKey.OPEN, connected=connected)
 
-    def put(self, sender: Sender, op: str, **fields: float) -> queue.SimpleQueue[list[Reply]]:
+    def put(
+        self, sender: Sender, op: str, info: dict[str, object] | None = None, **fields: float
+    ) -> queue.SimpleQueue[list[Reply]]:
         replies: queue.SimpleQueue[list[Reply]] = queue.SimpleQueue()
-        send(sender, [Request(op, Obs(), **fields)], replies.put)  # type: ignore[arg-type]
+        send(sender, [Request(op, Obs(info=info or {}), **fields)], replies.put)  # type: ignore[arg-type]
         return replies
 
     def ask(self, sender: Sender, op: str) -> Reply:
@@ -99,6 +106,45 @@ def test_a_close_that_comes_too_late_leaves_the_session_to_the_end_of_its_connec
     assert "other" in served.engine.sessions
     other.release()
     assert "other" not in served.engine.sessions
+
+
+@pytest.mark.parametrize("error", [RuntimeError("broken"), SystemExit(1)], ids=repr)
+def test_a_policy_that_breaks_fails_its_batch_and_goes_on(served: Served, error: BaseException) -> None:
+    assert isinstance(served.put(served.first, "act", {"error": error}).get(timeout=10)[0].error, PolicyFailed)
+    served.ask(served.first, "act")
+
+
+def test_a_caller_that_cannot_take_its_reply_does_not_stop_the_queue(served: Served) -> None:
+    def explode(_: list[Reply]) -> None:
+        raise ValueError("gone")
+
+    send(served.first, [Request("act", Obs())], explode)
+    served.ask(served.first, "act")
+
+
+def test_closing_answers_everyone_and_so_does_a_deadline_that_passes_in_the_queue(served: Served) -> None:
+    other = served.sender("other")
+    served.ask(other, "reset")
+    Gated.gate.clear()
+    running = served.put(served.first, "act")
+    assert Gated.busy.acquire(timeout=10)
+    late = served.put(other, "act", deadline_ms=1.0)
+    threading.Event().wait(0.01)
+    Gated.gate.set()
+    assert isinstance(late.get(timeout=10)[0].error, DeadlineExceeded)
+    assert running.get(timeout=10)[0].error is None
+    Gated.gate.clear()
+    running = served.put(served.first, "act")
+    assert Gated.busy.acquire(timeout=10)
+    waiting = served.put(other, "act")
+    closer = threading.Thread(target=served.engine.close)
+    closer.start()
+    assert isinstance(waiting.get(timeout=10)[0].error, PolicyUnavailable)
+    Gated.gate.set()
+    closer.join(10)
+    assert running.get(timeout=10)[0].error is None
+    assert not served.engine.alive
+    assert isinstance(served.put(other, "act").get(timeout=10)[0].error, PolicyUnavailable | PolicyFailed)
 
 
 @pytest.mark.parametrize("for_good", [True, False])
@@ -158,3 +204,48 @@ def test_an_observer_that_fails_costs_no_answer(served: Served, caplog: pytest.L
     served.engine.observers.add(Broken())
     assert served.ask(served.first, "act").act is not None
     assert "Broken: a request is left out" in caplog.text
+
+
+class Noting(Observer):
+    """Notes what it sees, and keeps the number of the request for the answer."""
+
+    def __init__(self, seen: list[str]) -> None:
+        self.seen, self.requests = seen, 0
+
+    def on_request(self, pending: PendingRequest) -> None:
+        assert pending.request.obs is not None
+        self.requests += 1
+        pending.kept[self] = self.requests
+        self.seen.append(f"request of {pending.session_id}")
+
+    def before_answer(self, pending: PendingRequest, reply: Reply) -> None:
+        self.seen.append(f"before {pending.session_id}")
+
+    def on_answer(self, pending: PendingRequest, reply: Reply) -> None:
+        self.seen.append(f"answer {pending.kept[self]} to {pending.session_id}")
+
+
+def test_the_requests_of_a_message_are_seen_around_its_answer_without_those_that_could_not_be_read(
+    served: Served,
+) -> None:
+    seen = list[str]()
+    served.engine.observers.add(Noting(seen))
+    sender = served.sender("a")
+
+    def sent(_: Message) -> None:
+        seen.append("sent")
+
+    message = sender.message()
+    requests = [Request("reset", Obs(), session=name) for name in "ab"]
+    sender.send(message, Decoded(requests, {1: Reply(error=InvalidInput("no"))}), sent)
+    wait_for(lambda: seen[-1:] == ["answer 2 to b"])
+    assert message.replies[1].error is not None
+    assert seen == [
+        "request of a",
+        "request of b",
+        "before a",
+        "before b",
+        "sent",
+        "answer 1 to a",
+        "answer 2 to b",
+    ]

@@ -82,27 +82,17 @@ def test_checkpoints_that_cannot_be_chosen_are_refused(read: Callable[[dict[str,
         read({"checkpoint": "x"})
 
 
-def test_off_loopback_nothing_starts_until_somebody_decides_who_is_let_in(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="--insecure"), running_server(deployment("noop"), host=EVERYWHERE):
-        pytest.fail("started")
-    with (
-        pytest.raises(ConfigError, match="keys new"),
-        running_server(deployment("noop"), host=EVERYWHERE, keys_file=tmp_path / "none.json"),
-    ):
-        pytest.fail("started")
-
-
-def test_ipv6_is_not_supported_and_says_so() -> None:
-    with (
-        pytest.raises(ConfigError, match="IPv6 is not supported"),
-        running_server(deployment("noop"), host="::1", insecure=True),
-    ):
-        pytest.fail("started")
-
-
-def test_files_that_are_no_certificate_are_refused(tmp_path: Path) -> None:
+def test_nothing_starts_without_keys_off_loopback_or_certificates_or_on_ipv6(tmp_path: Path) -> None:
     certificate, key = authority(tmp_path, "a").sign("server")
     other = authority(tmp_path, "b").sign("server")[1]
-    for tls in (Tls(certificate, other), Tls(tmp_path / "none", key), Tls(certificate, key, client_ca=key)):
-        with pytest.raises(ConfigError, match="TLS"), running_server(deployment("noop"), tls=tls):
+    wrong: list[tuple[str, dict[str, Any]]] = [
+        ("--insecure", {"host": EVERYWHERE}),
+        ("keys new", {"host": EVERYWHERE, "keys_file": tmp_path / "none.json"}),
+        ("IPv6 is not supported", {"host": "::1", "insecure": True}),
+        ("TLS", {"tls": Tls(certificate, other)}),
+        ("TLS", {"tls": Tls(tmp_path / "none", key)}),
+        ("TLS", {"tls": Tls(certificate, key, client_ca=key)}),
+    ]
+    for said, options in wrong:
+        with pytest.raises(ConfigError, match=said), running_server(deployment("noop"), **options):
             pytest.fail("started")

@@ -1,19 +1,28 @@
-"""Which process builds the applications of a server, and what it waits for."""
+"""Which process builds the applications of a server, what it waits for, how many GPUs it gets, and how it ends."""
 
 from __future__ import annotations
 
+import os
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import ray
 from ray import serve
+from ray._private import accelerators
+from ray.serve._private.router import SharedRouterLongPollClient
 from ray.serve.schema import ServeDeploySchema
 
-from vlagents_ray.errors import PolicyUnavailable
+from vlagents_ray.errors import ConfigError, PolicyUnavailable
+from vlagents_ray.ray_tools import head_monitor
+from vlagents_ray.ray_tools.private import gpus_here, long_polls
 from vlagents_ray.serve.access.key_store import new_key
 from vlagents_ray.serve.launch import server
-from vlagents_ray.serve.launch.deployment_file import deployment, together, with_settings
+from vlagents_ray.serve.launch.deployment_file import deployment, together, with_replicas_on, with_settings
 from vlagents_ray.serve.launch.server import deploy, wait_for_proxies
+from vlagents_ray.serve.replica import replica
 
 
 class FakeClient:
@@ -59,27 +68,19 @@ def test_a_server_on_its_own_ray_builds_its_applications_itself(
         changed({"runtime_env": {"env_vars": {"A": "b"}}}),
         changed({"import_path": "somebody:elses"}),
         changed({}, logging_config={"log_level": "DEBUG"}),
+        changed({}),
     ],
 )
 def test_what_serve_must_apply_is_deployed_by_serve(config: ServeDeploySchema, monkeypatch: pytest.MonkeyPatch) -> None:
-    """So that another deployment of the file changes it without new replicas."""
+    """So that another deployment of the file changes it without new replicas; in a cluster of others, all of it is."""
     client = FakeClient(monkeypatch)
-    deploy(client, config, own=True, ingress=True)
-    assert (client.by_serve, client.built_here) == ([config], [])
-
-
-def test_a_cluster_of_others_keeps_the_file(monkeypatch: pytest.MonkeyPatch) -> None:
-    """There others may deploy it again."""
-    client, config = FakeClient(monkeypatch), deployment("noop")
-    deploy(client, config, own=False, ingress=True)
+    deploy(client, config, own=config != changed({}), ingress=True)
     assert (client.by_serve, client.built_here) == ([config], [])
 
 
 @pytest.mark.parametrize("deaths", [0, 2])
 def test_a_proxy_that_serve_replaces_is_waited_for(monkeypatch: pytest.MonkeyPatch, deaths: int) -> None:
     """Serve kills one that does not start within some seconds."""
-    import ray
-
     asked: list[str] = []
 
     def get(refs: list[str], timeout: float) -> None:
@@ -94,8 +95,6 @@ def test_a_proxy_that_serve_replaces_is_waited_for(monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.parametrize("late", ["ActorDiedError", "GetTimeoutError"])
 def test_proxies_that_never_listen_are_an_error(monkeypatch: pytest.MonkeyPatch, late: str) -> None:
-    import ray
-
     def get(_: list[str], timeout: float) -> None:
         raise getattr(ray.exceptions, late)
 
@@ -131,3 +130,145 @@ def test_a_server_whose_keys_cross_a_network_unencrypted_warns(
     ):
         pass
     assert ("--plain-http" in caplog.text) == warned
+
+
+# GPUs.
+
+
+PART = {"num_gpus": 0.5, "num_cpus": 2}
+
+
+@pytest.mark.parametrize(
+    ("gpus", "said", "becomes"),
+    [
+        (8.0, {}, {"replicas": 8, "resources": {"num_gpus": 1.0}}),
+        (3.0, {"resources": PART}, {"replicas": 6, "resources": PART}),
+        (5.0, {"resources": {"num_gpus": 2}}, {"replicas": 2, "resources": {"num_gpus": 2}}),
+        *((8.0, said, said) for said in ({"replicas": 3}, {"autoscaling": {"max_replicas": 2}})),
+        (8.0, {"resources": {"num_gpus": 0}}, {"resources": {"num_gpus": 0}}),
+        (0.0, {}, {}),
+    ],
+)
+def test_a_replica_stands_on_each_gpu_unless_the_file_says_otherwise(
+    gpus: float, said: dict[str, Any], becomes: dict[str, Any]
+) -> None:
+    [app] = with_replicas_on(deployment("noop", **said), gpus).applications
+    assert {name: value for name, value in app.args.items() if name != "policy"} == becomes
+
+
+@pytest.mark.parametrize(
+    ("said", "wanted"),
+    [
+        ({}, 0.0),
+        ({"resources": {"num_gpus": 1}}, 1.0),
+        ({"resources": {"num_gpus": 0.5}, "replicas": 3}, 1.5),
+        ({"resources": {"num_gpus": 1}, "autoscaling": {"min_replicas": 0, "max_replicas": 4}}, 0.0),
+        ({"resources": {"num_gpus": 1}, "autoscaling": {"initial_replicas": 2, "max_replicas": 4}}, 2.0),
+    ],
+)
+@pytest.mark.parametrize("own", [True, False])
+def test_more_gpus_than_this_machine_has_are_refused_at_once(
+    said: dict[str, Any], wanted: float, own: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A cluster that others started may get more: there it is said, and waited for."""
+    monkeypatch.setattr(server, "started_here", lambda: own)
+    monkeypatch.setattr(ray, "cluster_resources", lambda: {"GPU": wanted})
+    server._require_gpus(deployment("noop", **said))
+    if not wanted:
+        return
+    monkeypatch.setattr(ray, "cluster_resources", dict)
+    with pytest.raises(ConfigError, match=f"need {wanted:g} GPUs, this machine has 0") if own else nullcontext():
+        server._require_gpus(deployment("noop", **said))
+    where = "machine" if own else "cluster"
+    assert f"need {wanted:g} GPUs, this {where} has 0; want less" in str(
+        server._missing_gpus(deployment("noop", **said))
+    )
+
+
+class NoRay(Exception):
+    """A Ray would have been started."""
+
+
+@pytest.mark.parametrize("gpus", [0, 2])
+def test_more_gpus_than_this_machine_has_are_refused_before_a_ray_starts(
+    gpus: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def start(*_: object) -> None:
+        raise NoRay
+
+    monkeypatch.setattr(server, "_ray", start)
+    monkeypatch.setattr(ray, "is_initialized", lambda: False)
+    monkeypatch.setattr(server, "gpus_here", lambda: float(gpus))
+    wanted = deployment("noop", resources={"num_gpus": 1}, replicas=2)
+    said = None if gpus else "need 2 GPUs, this machine has 0; want less"
+    with pytest.raises(NoRay if gpus else ConfigError, match=said), server.running_server(wanted):
+        pass
+
+
+def test_gpus_are_counted_as_ray_counts_them_less_those_that_are_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
+    nvidia = accelerators.get_accelerator_manager_for_resource("GPU")
+    monkeypatch.setattr(nvidia, "get_current_node_num_accelerators", staticmethod(lambda: 4))
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    assert gpus_here() == 4
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0,3")
+    assert gpus_here() == 2
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    assert gpus_here() == 0
+
+
+def test_what_a_cluster_is_missing_is_repeated_until_it_is_there(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(server, "_REMIND_S", 0.0)
+    missing = iter(["a GPU", "a GPU", None])
+    states = iter(["DEPLOYING", "DEPLOYING", "DEPLOYING", "RUNNING"])
+    client = SimpleNamespace(status=lambda: SimpleNamespace(applications={"a": SimpleNamespace(status=next(states))}))
+    monkeypatch.setattr(server, "_http_reason", lambda _: None)
+    server.wait_until_ready(client, {"a": "url"}, ["a"], float("inf"), lambda: next(missing))
+    assert [record.getMessage() for record in caplog.records] == ["waiting: a GPU"] * 2
+
+
+@pytest.mark.parametrize(("given", "visible"), [([], ""), (["2"], "2")])
+def test_gpus_are_hidden_from_a_replica_to_which_ray_gave_none(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch, given: list[str], visible: str
+) -> None:
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "2")
+    monkeypatch.setattr(replica, "gpus_here", lambda: 4.0)
+    replica.hide_gpus(given)
+    assert os.environ["CUDA_VISIBLE_DEVICES"] == visible
+    assert ("resources: {num_gpus: 1}" in caplog.text) == (not given)
+
+
+# The end.
+
+
+@pytest.mark.parametrize(("ends", "head", "said"), [(True, True, False), (False, True, True), (False, False, False)])
+def test_a_controller_that_ends_or_that_does_not_answer_is_no_error(
+    ends: bool, head: bool, said: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    ending = SimpleNamespace(remote=lambda: None)
+    controller = SimpleNamespace(graceful_shutdown=SimpleNamespace(options=lambda **_: ending))
+    client = SimpleNamespace(
+        _controller=controller, handle_cache={}, shutdown_cached_handles=lambda: None, _shutdown=False
+    )
+    monkeypatch.setattr(ray, "wait", lambda refs, **_: (refs, []) if ends else ([], refs))
+    monkeypatch.setattr(head_monitor, "head_is_gone", lambda: not head)
+    monkeypatch.setattr(server, "_SHUTDOWN_S", 0.0)
+    server.shut_down(client)
+    assert client._shutdown
+    assert ("has not ended within" in caplog.text) is said
+
+
+def test_each_long_poll_of_a_controller_can_be_stopped_before_it_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ray would tell the user of a failed task, in one end of four."""
+    stopped: list[str] = []
+    own = SimpleNamespace(stop=lambda: stopped.append("own"))
+    shared = SimpleNamespace(long_poll_client=SimpleNamespace(stop=lambda: stopped.append("shared")))
+    monkeypatch.setattr(SharedRouterLongPollClient, "get_or_create", lambda *_: shared)
+    used = SimpleNamespace(
+        _router=SimpleNamespace(_asyncio_router=SimpleNamespace(long_poll_client=own, _event_loop=1))
+    )
+    unused = SimpleNamespace(_router=None)
+    for poll in long_polls(SimpleNamespace(_controller=None, handle_cache={"used": used, "unused": unused})):
+        poll.stop()
+    assert stopped == ["own", "shared"]

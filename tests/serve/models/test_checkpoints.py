@@ -1,8 +1,9 @@
-"""Sessions choose among the checkpoints of a deployment: loading, sharing, making room."""
+"""Sessions choose among the checkpoints of a deployment, which swaps its own: loading, sharing, making room."""
 
 from __future__ import annotations
 
 import queue
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -11,10 +12,10 @@ import numpy as np
 import pytest
 from eval_fakes import wait_for
 from in_flight import checked, submit
-from in_process_replicas import Replicas, export
+from in_process_replicas import export
 from numbered_checkpoints import Library, act, ask, begin, reset
 
-from vlagents_ray import Act, Agent, Obs
+from vlagents_ray import Agent, Obs
 from vlagents_ray.errors import (
     CheckpointFailed,
     DeadlineExceeded,
@@ -29,8 +30,7 @@ from vlagents_ray.policies.base.checkpoint_files import digest
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.models import model_manager
-from vlagents_ray.serve.models.checkpoints import Checkpoints
-from vlagents_ray.serve.requests import CheckpointChoice, PendingRequest
+from vlagents_ray.serve.requests import PendingRequest
 from vlagents_ray.serve.sessions import Session
 
 
@@ -62,16 +62,11 @@ def holders(engine: Engine) -> dict[str | None, int]:
 def test_sessions_act_by_the_checkpoint_that_they_chose(serving: Callable[..., Engine]) -> None:
     engine = serving(choices=["b/2"], steps=True, loaded=3)
     assert reset(engine, "own") == "a/1"
-    assert reset(engine, "chosen", checkpoint="b") == "b/2"
+    chosen = begin(engine, "chosen", checkpoint="b", seed=4).get(timeout=10)
+    assert chosen.info == {"checkpoint": "b/2", "options": {"seed": 4}}, "the choice is not the policy's business"
     assert reset(engine, "step", checkpoint_step=30) == "a/30"
     for step in range(1, 20):
         assert [act(engine, name) for name in ("own", "chosen", "step")] == [[1, step], [2, step], [30, step]]
-
-
-def test_what_a_session_chose_is_not_the_policys_business(serving: Callable[..., Engine]) -> None:
-    engine = serving(choices=["b/2"])
-    reply = begin(engine, "s", checkpoint="b", seed=4).get(timeout=10)
-    assert reply.info == {"checkpoint": "b/2", "options": {"seed": 4}}
 
 
 def test_a_batch_is_run_checkpoint_by_checkpoint(serving: Callable[..., Engine], library: Library) -> None:
@@ -114,26 +109,15 @@ def test_loading_one_checkpoint_keeps_no_session_of_another_waiting(
     engine = serving(choices=["b/2"])
     gate = library.hold("b/2")
     reset(engine, "own")
-    waiting = begin(engine, "chosen", checkpoint="b")
+    waiting = [begin(engine, f"chosen {i}", checkpoint="b") for i in range(8)]
     library.wait_for("b/2")
     assert [act(engine, "own")[1] for _ in range(200)] == list(range(1, 201))
     assert reset(engine, "another") == "a/1"
-    assert waiting.empty()
-    gate.set()
-    assert waiting.get(timeout=10).error is None
-    assert act(engine, "chosen") == [2, 1]
-
-
-def test_who_asks_for_the_same_checkpoint_at_once_has_it_loaded_once(
-    serving: Callable[..., Engine], library: Library
-) -> None:
-    engine = serving(choices=["b/2"])
-    gate = library.hold("b/2")
-    waiting = [begin(engine, f"s{i}", checkpoint="b") for i in range(8)]
-    library.wait_for("b/2")
+    assert waiting[0].empty()
     gate.set()
     assert [replies.get(timeout=10).error for replies in waiting] == [None] * 8
-    assert library.loads["b/2"] == 1
+    assert act(engine, "chosen 0") == [2, 1]
+    assert library.loads["b/2"] == 1, "once for all who need it"
 
 
 def test_what_does_not_load_says_why_and_is_tried_again(serving: Callable[..., Engine], library: Library) -> None:
@@ -341,51 +325,20 @@ def test_a_stopping_replica_turns_away_who_waits(library: Library) -> None:
 
 def test_a_session_that_moves_takes_its_checkpoint_along(serving: Callable[..., Engine], library: Library) -> None:
     here, there = serving(choices=["b/2"]), serving(choices=["b/2"])
+    elsewhere = serving(choices=["b/4"])
     reset(here, "s", checkpoint="b")
     act(here, "s")
     state = export(here, "s")
     assert state is not None
+    with pytest.raises(UnknownSession):
+        elsewhere.transfer.adopt("s", state, timeout_s=10)
+    assert elsewhere.models.describe()["loaded"] == ["a/1"], "it is not offered there"
     with pytest.raises(UnknownSession, match="'b' is not loaded here"):
         there.transfer.adopt("s", state)
     there.transfer.adopt("s", state, timeout_s=10)
     assert act(there, "s") == [2, 2]
     assert library.loads["b/2"] == 2
     wait_for(lambda: not any(model.sessions for model in here.models._cache.loaded.values()))
-
-
-def test_a_session_goes_on_by_its_checkpoint_where_its_replica_sends_it(library: Library) -> None:
-    offered = [Checkpoints(library.make, {"checkpoint": "a/1"}, {"b": {"checkpoint": "b/2"}}) for _ in range(2)]
-    replicas = Replicas(offered)
-    with replicas.agent() as agent:
-        agent.reset(Obs(), "x", checkpoint="b")
-        replicas.engines[0].drain()
-        acts: list[Act] = []
-
-        def has_moved() -> bool:  # the other replica is asked beside the acts
-            acts.append(agent.act(Obs()))
-            return [len(engine.sessions) for engine in replicas.engines] == [0, 1]
-
-        wait_for(has_moved)
-        acts.append(agent.act(Obs()))
-        assert [act.action.tolist() for act in acts] == [[2, step] for step in range(1, len(acts) + 1)]
-        assert not any("resumed" in act.info for act in acts)
-    replicas.close()
-
-
-def test_a_session_of_what_is_not_offered_here_does_not_move_here(serving: Callable[..., Engine]) -> None:
-    here, there = serving(choices=["b/2"]), serving(choices=["b/4"])
-    reset(here, "s", checkpoint="b")
-    state = export(here, "s")
-    assert state is not None
-    with pytest.raises(UnknownSession):
-        there.transfer.adopt("s", state, timeout_s=10)
-    assert there.models.describe()["loaded"] == ["a/1"]
-
-
-def test_names_say_what_was_asked_for() -> None:
-    assert str(CheckpointChoice("late")) == "checkpoint 'late'"
-    assert str(CheckpointChoice(step=20000)) == "checkpoint step 20000"
-    assert str(CheckpointChoice("late", 3)) == "checkpoint 'late' at step 3"
 
 
 class Stored(Agent):
@@ -427,3 +380,163 @@ def test_sessions_move_between_replicas_with_the_same_weights_only(tmp_path: Pat
         versions.append(engine.version)
         engine.close()
     assert versions[0] == versions[1] != versions[2]
+
+
+# A deployment's own settings change while it runs: new episodes get the new ones, running ones end on the old.
+
+
+def swap(engine: Engine, checkpoint: str) -> None:
+    engine.models.configure({"checkpoint": checkpoint})
+
+
+def state(engine: Engine) -> Any:
+    return engine.models.describe()["swap"]
+
+
+def swapped(engine: Engine, checkpoint: str) -> None:
+    swap(engine, checkpoint)
+    wait_for(lambda: state(engine) is None and engine.models.config["checkpoint"] == checkpoint)
+
+
+def test_running_episodes_end_on_the_old_checkpoint_and_new_ones_begin_on_the_new(
+    serving: Callable[..., Engine], library: Library
+) -> None:
+    engine = serving()
+    gate = library.hold("b/2")
+    reset(engine, "old")
+    swap(engine, "b/2")
+    library.wait_for("b/2")
+    assert state(engine) == {"state": "loading", "checkpoint": "b/2"}
+    assert reset(engine, "early") == "a/1"
+    gate.set()
+    wait_for(lambda: state(engine) is None)
+    assert reset(engine, "new") == "b/2"
+    assert act(engine, "new") == [2, 1]
+    assert [act(engine, "old") for _ in range(3)] == [[1, 1], [1, 2], [1, 3]]
+    assert reset(engine, "early") == "b/2"
+    assert library.closed == []
+    assert reset(engine, "old") == "b/2"
+    wait_for(lambda: library.closed == ["a/1"] and set(library.alive) == {"b/2"})
+
+
+def test_a_checkpoint_that_does_not_load_leaves_the_old_one_in_place(serving: Callable[..., Engine]) -> None:
+    engine = serving()
+    reset(engine, "old")
+    swap(engine, "broken")
+    wait_for(lambda: state(engine) is not None and state(engine)["state"] == "failed")
+    assert state(engine)["error"].endswith("did not load: FileNotFoundError; the server's log says why")
+    assert act(engine, "old") == [1, 1]
+    assert reset(engine, "new") == "a/1"
+    engine.models.configure({"checkpoint": "a/{step}", "checkpoint_step": 1})
+    assert state(engine) is None, "it is forgotten with the old settings"
+    swapped(engine, "b/2")
+    assert reset(engine, "new") == "b/2"
+
+
+def test_the_last_word_counts(serving: Callable[..., Engine], library: Library) -> None:
+    engine = serving()
+    gate = library.hold("b/2")
+    swap(engine, "b/2")
+    library.wait_for("b/2")
+    swap(engine, "c/3")
+    gate.set()
+    wait_for(lambda: reset(engine, "s") == "c/3")
+    wait_for(lambda: set(library.alive) == {"c/3"})
+
+
+def test_choices_are_laid_over_the_new_settings(serving: Callable[..., Engine]) -> None:
+    engine = serving(steps=True)
+    assert reset(engine, "s", checkpoint_step=5) == "a/5"
+    engine.models.configure({"checkpoint": "b/{step}", "checkpoint_step": 2})
+    wait_for(lambda: reset(engine, "s", checkpoint_step=5) == "b/5")
+    assert reset(engine, "t") == "b/2"
+
+
+def test_with_room_for_one_sessions_end_so_that_the_new_one_can_load(
+    serving: Callable[..., Engine], library: Library
+) -> None:
+    engine = serving(loaded=1)
+    gate = library.hold("b/2")
+    reset(engine, "old")
+    swap(engine, "b/2")
+    library.wait_for("b/2")
+    assert library.closed == ["a/1"]
+    assert "a/1" not in library.alive, "two would not have been in memory together"
+    with pytest.raises(UnknownSession):
+        act(engine, "old")
+    waiting = begin(engine, "old")
+    gate.set()
+    reply = waiting.get(timeout=10)
+    assert reply.info["checkpoint"] == "b/2"
+    swap(engine, "broken")
+    wait_for(lambda: state(engine) is not None and state(engine)["state"] == "failed")
+    assert reset(engine, "s") == "b/2", "the old one is loaded again if the new one cannot be"
+    assert library.loads["b/2"] == 2
+
+
+@pytest.mark.parametrize("op", ["act", "reset"])
+def test_what_a_swap_overtakes_is_told_that_its_session_has_ended(
+    serving: Callable[..., Engine], library: Library, op: str
+) -> None:
+    """Clients begin such an episode again by themselves; a closed policy must not be asked."""
+    engine = serving()
+    reset(engine, "s")
+    [model] = engine.models._cache.loaded.values()
+
+    class Overtaken:
+        """The lock, which the swap gets first."""
+
+        def __enter__(self) -> None:
+            model.busy = threading.Lock()
+            engine.sessions.close_those_of(model)
+            model.close()
+
+        def __exit__(self, *_: object) -> None: ...
+
+    model.busy = Overtaken()  # type: ignore[assignment]
+    before = len(library.batches)
+    assert isinstance(ask(engine, "s", op).get(timeout=10).error, UnknownSession)
+    assert len(library.batches) == before
+
+
+def test_a_third_waits_for_the_episodes_on_the_first(serving: Callable[..., Engine]) -> None:
+    engine = serving()
+    reset(engine, "first")
+    swapped(engine, "b/2")
+    reset(engine, "second")
+    swap(engine, "c/3")
+    assert act(engine, "first") == [1, 1]
+    assert act(engine, "second") == [2, 1]
+    assert state(engine)["state"] == "loading"
+    ask(engine, "first", "close")
+    wait_for(lambda: state(engine) is None)
+    assert act(engine, "second") == [2, 2]
+    assert reset(engine, "third") == "c/3"
+
+
+def test_replicas_with_different_settings_have_different_versions(serving: Callable[..., Engine]) -> None:
+    here, there = serving(), serving()
+    assert here.version == there.version
+    swapped(here, "b/2")
+    assert here.version != there.version
+    swapped(there, "b/2")
+    assert here.version == there.version
+
+
+def test_a_swap_without_room_takes_that_of_a_choice(serving: Callable[..., Engine], library: Library) -> None:
+    engine = serving(choices=["c/3"])
+    reset(engine, "own")
+    reset(engine, "chosen", checkpoint="c")
+    gate = library.hold("b/2")
+    swap(engine, "b/2")
+    wait_for(lambda: engine.models._cache.draining != "")
+    again = begin(engine, "chosen", checkpoint="c")  # its last episode is over: the room goes to the swap
+    library.wait_for("b/2")
+    assert reset(engine, "another") == "a/1"
+    gate.set()
+    wait_for(lambda: state(engine) is None)
+    for session in ("own", "another"):  # the last that kept the old one in memory
+        ask(engine, session, "close").get(timeout=10)
+    assert reset(engine, "own") == "b/2"
+    assert again.get(timeout=10).error is None
+    assert act(engine, "chosen") == [3, 1]

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
-from in_flight import submit
+from in_flight import answered, submit
 from pydantic import ValidationError
 
 from vlagents_ray.errors import PolicyFailed
@@ -19,6 +19,7 @@ from vlagents_ray.serve.config.deployment import BatchArgs
 from vlagents_ray.serve.engine.engine import Engine
 
 SIZES = [2, 4, 8]
+SIZED: dict[str, Any] = {"max_batch_size": 8, "batch_sizes": SIZES}
 
 
 class Compiled(Agent):
@@ -65,31 +66,20 @@ class Picky(Compiled):
 
 
 def ask(engine: Engine, session: str, op: Any, value: int = 0, **fields: Any) -> Reply:
-    replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
     if op == "reset":
         fields |= {"instruction": session, "kwargs": {"env": "lab"}}
-    submit(engine, session, Request(op, Obs(info={"value": value}), **fields), replies.put)
-    return replies.get(timeout=10)
+    return answered(engine, session, Request(op, Obs(info={"value": value}), **fields))
 
 
-@pytest.fixture
-def serving() -> Iterator[Callable[[Compiled], Engine]]:
-    engines: list[Engine] = []
-
-    def serve(agent: Compiled) -> Engine:
-        engines.append(Engine(agent, max_batch_size=8, batch_sizes=SIZES))
-        engines[-1].start()
-        return engines[-1]
-
-    yield serve
+@pytest.fixture(autouse=True)
+def _whole() -> Iterator[None]:
+    yield
     Compiled.broken = False
-    for engine in engines:
-        engine.close()
 
 
-def test_a_batch_is_padded_up_to_the_next_size(serving: Callable[[Compiled], Engine]) -> None:
+def test_a_batch_is_padded_up_to_the_next_size(serving: Callable[..., Engine]) -> None:
     agent = Compiled()
-    engine = serving(agent)
+    engine = serving(agent, **SIZED)
     names = [f"s{i}" for i in range(11)]  # ten of them act: 8, and 2
     for name in names:
         ask(engine, name, "reset")
@@ -107,48 +97,44 @@ def test_a_batch_is_padded_up_to_the_next_size(serving: Callable[[Compiled], Eng
     assert [reply.timing["batch_size"] for reply in answers] == [8] * 8 + [2] * 2
 
 
-def test_padding_acts_as_a_session_of_its_own_on_what_a_neighbour_sees(serving: Callable[[Compiled], Engine]) -> None:
+def test_padding_acts_as_a_session_of_its_own_on_what_a_neighbour_sees(serving: Callable[..., Engine]) -> None:
     agent = Compiled()
-    engine = serving(agent)
+    engine = serving(agent, **SIZED)
     ask(engine, "first", "reset")
     ask(engine, "second", "reset")
     for step in range(1, 4):
         reply = ask(engine, "second", "act", value=7)
-        assert reply.act is not None
         assert (reply.act.action.tolist(), reply.act.info["name"]) == ([7, step], "second")
         assert reply.timing["batch_size"] == 1
         assert agent.batches[-1] == ["second", "first"]  # the row beside it began as the first session did
         assert agent.seen == [7, 7]
     assert len(engine.sessions) == 2
     reply = ask(engine, "first", "act")
-    assert reply.act is not None
     assert reply.act.action[1] == 1  # whose own session has not acted with it
 
 
-def test_nobody_hears_of_paddings_failure(serving: Callable[[Compiled], Engine]) -> None:
-    engine = serving(Compiled())
+def test_nobody_hears_of_paddings_failure(serving: Callable[..., Engine]) -> None:
+    engine = serving(Compiled(), **SIZED)
     ask(engine, "a", "reset")
     Compiled.broken = True
     for step in range(1, 4):
         reply = ask(engine, "a", "act")
-        assert reply.act is not None
         assert reply.act.action[1] == step
 
 
-def test_without_padding_the_batch_runs_as_it_is(serving: Callable[[Compiled], Engine]) -> None:
+def test_without_padding_the_batch_runs_as_it_is(serving: Callable[..., Engine]) -> None:
     Picky.made.clear()
-    engine = serving(Picky())
+    engine = serving(Picky(), **SIZED)
     ask(engine, "a", "reset")
     for _ in range(3):
         assert ask(engine, "a", "act").error is None
     assert len(Picky.made) == 2  # it is tried once
 
 
-def test_a_refused_first_reset_is_not_what_padding_begins_with(serving: Callable[[Compiled], Engine]) -> None:
-    engine = serving(Compiled())
-    replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
-    submit(engine, "bad", Request("reset", Obs(), "bad"), replies.put)  # lacks the `env` that it wants
-    assert isinstance(replies.get(timeout=10).error, PolicyFailed)
+def test_a_refused_first_reset_is_not_what_padding_begins_with(serving: Callable[..., Engine]) -> None:
+    engine = serving(Compiled(), **SIZED)
+    refused = answered(engine, "bad", Request("reset", Obs(), "bad"))  # lacks the `env` that the policy needs
+    assert isinstance(refused.error, PolicyFailed)
     ask(engine, "good", "reset")
     assert ask(engine, "good", "act").error is None
 

@@ -73,14 +73,6 @@ def test_a_command_goes_into_one_answer_and_the_next_request_says_what_became_of
     assert board.board.of("arm")[1]["why"] == "no hands"
 
 
-def test_a_stop_overtakes_what_waits(board: Board) -> None:
-    board.press("pause")
-    stop = board.press("stop")
-    said = board.answered()
-    assert said is not None
-    assert said["id"] == stop
-
-
 def test_a_robot_that_does_not_answer_ignores_it(board: Board) -> None:
     pressed = board.press("pause")
     for _ in range(4):
@@ -114,7 +106,6 @@ def test_a_stop_is_accepted_however_many_commands_wait(board: Board) -> None:
         board.press("pause")
     stop = board.press("stop")
     said = board.answered()
-    assert said is not None
     assert said["id"] == stop
 
 
@@ -197,16 +188,7 @@ def test_a_robot_pauses_and_is_marked(server: LiveServer) -> None:
         assert reports[0].outcome == "success"
 
 
-def test_nothing_moves_while_it_is_paused(server: LiveServer) -> None:
-    with robot(server) as (arm, session, _):
-        post(server, {"session": session, "do": "pause"})
-        wait_for(lambda: states(server, session) == ["pause done"], 30)
-        applied, steps = arm.applied, server.engine.sessions.get(session).steps
-        wait_for(lambda: server.engine.sessions.get(session).steps > steps + 10, 30)  # the policy goes on
-        assert arm.applied == applied
-
-
-def test_nothing_that_comes_over_the_network_lets_a_paused_robot_go_on(server: LiveServer) -> None:
+def test_nothing_moves_while_it_is_paused_whatever_comes_over_the_network(server: LiveServer) -> None:
     with robot(server) as (arm, session, reports):
         post(server, {"session": session, "do": "pause"})
         wait_for(lambda: states(server, session) == ["pause done"], 30)
@@ -215,7 +197,7 @@ def test_nothing_that_comes_over_the_network_lets_a_paused_robot_go_on(server: L
             status, said = post(server, {"session": session, "do": do, "text": "go on"})
             assert (status, "at the robot" in said["detail"]) == (400, True)
         steps = server.engine.sessions.get(session).steps
-        wait_for(lambda: server.engine.sessions.get(session).steps > steps + 10, 30)
+        wait_for(lambda: server.engine.sessions.get(session).steps > steps + 10, 30)  # the policy goes on
         assert (arm.applied, reports) == (applied, [])
 
 

@@ -15,7 +15,7 @@ from in_memory_keys import ChangingKeys
 from live_server import Address
 from recorded_results import record, runs
 
-from vlagents_ray.evaluate.plan.cases import EvalCase, cells
+from vlagents_ray.evaluate.plan.cases import cells
 from vlagents_ray.evaluate.report.results_document import ProgressDocument
 from vlagents_ray.serve.access.api_keys import Keys
 from vlagents_ray.serve.observers.live_page import page_server
@@ -114,28 +114,6 @@ def test_it_says_how_it_ends_and_keeps_what_was_seen(page: Page, results: Path) 
         until(page, STATE, "Stopped by an error: StorageFailed: the disk is full")
     until(page, "document.getElementById('connection').textContent", "Ended")
     assert page.value("document.querySelectorAll('#cells .cell').length") == 9
-
-
-def test_a_training_grows_its_curve_by_the_version(page: Page, tmp_path: Path) -> None:
-    def learner(versions: int) -> None:
-        policies = [{"name": "learner", "url": "http://localhost:1", "steps": [1000 * versions]}]
-        record(runs(tmp_path, policies=policies, resume=versions > 1), better)
-
-    def better(cell: EvalCase, seed: int) -> int | None:
-        return 5 if seed % 20 < (cell.step or 0) / 1000 else None
-
-    document = ProgressDocument(tmp_path, goes_on=True)
-    with served(document.read, document.video) as url:
-        show(page, url)
-        until(page, STATE, "Starting: the workers make their environments")
-        for versions in range(1, 4):
-            document.begin([], {}, 36)
-            learner(versions)
-            document.end()
-            until(page, POINTS, versions)
-        until(page, STATE, "Waiting for the next version of the weights")
-        assert "Training: " in page.value("document.getElementById('policy').textContent")
-        assert page.value("document.getElementById('last-step').textContent") == "3,000"
 
 
 def test_the_time_left_is_told(page: Page) -> None:

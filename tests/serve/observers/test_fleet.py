@@ -93,22 +93,6 @@ def test_a_replica_that_does_not_answer_is_left_out_and_asked_again_from_where_i
     assert since[-1] > since[0] == 0
 
 
-def test_a_slow_viewer_misses_the_oldest(own: ReplicaView, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(live_view, "_BEHIND", 2)
-
-    async def watch() -> tuple[dict[str, Any], list[bytes]]:
-        viewer = Viewer()
-        viewer.shown = frozenset({"s"})
-        for number in range(4):
-            session = {"id": "s", "pictures": {"front": 0}}
-            viewer.put([Snapshot(number, {"name": str(number), "sessions": [session]}, [bytes([number])])])
-        return await viewer.next()
-
-    document, files = asyncio.run(watch())
-    assert [one["name"] for one in document["replicas"]] == ["2", "3"]
-    assert files == [b"\x02", b"\x03"]
-
-
 def test_nothing_is_gathered_without_viewers(own: ReplicaView) -> None:
     others = Others("b")
 
@@ -164,15 +148,25 @@ def test_what_is_beside_the_replicas_is_sent_when_it_has_changed() -> None:
     assert first["replicas"] == []
 
 
-def test_the_pictures_that_wait_for_a_slow_viewer_are_bounded(own: ReplicaView) -> None:
+@pytest.mark.parametrize(("behind", "size", "sent"), [(2, 1, 4), (None, PICTURES, 100)], ids=["messages", "bytes"])
+def test_a_slow_viewer_misses_the_oldest(
+    monkeypatch: pytest.MonkeyPatch, behind: int | None, size: int, sent: int
+) -> None:
+    if behind is not None:
+        monkeypatch.setattr(live_view, "_BEHIND", behind)
+
     async def watch() -> tuple[dict[str, Any], list[bytes]]:
         viewer = Viewer()
         viewer.shown = frozenset({"s"})
-        for number in range(100):
+        for number in range(sent):
             session = {"id": "s", "pictures": {"front": 0}}
-            viewer.put([Snapshot(number, {"name": str(number), "sessions": [session]}, [bytes(PICTURES)])])
+            viewer.put(
+                [Snapshot(number, {"name": str(number), "sessions": [session]}, [bytes([number]) + bytes(size - 1)])]
+            )
         return await viewer.next()
 
     document, files = asyncio.run(watch())
-    assert document["replicas"][-1]["name"] == "99"
-    assert sum(map(len, files)) <= 2**26
+    names = [one["name"] for one in document["replicas"]]
+    assert names == [str(sent - len(names) + i) for i in range(len(names))]
+    assert files[-1][0] == sent - 1
+    assert sum(map(len, files)) <= 2**26 if behind is None else len(names) == behind

@@ -1,22 +1,51 @@
-"""What is kept for viewers, and that nothing is while nobody looks."""
+"""What is kept for viewers while somebody looks, and the memory and the disk that clients can take by it."""
 
 from __future__ import annotations
 
 import gc
+import itertools
+import threading
+import time
+import tracemalloc
 import weakref
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from eval_fakes import Clock
-from observed import observe
 
+from vlagents_ray.errors import InvalidInput, MessageTooLarge, Overloaded, StorageFailed
+from vlagents_ray.images import jpeg_png
 from vlagents_ray.images.codecs import DecodedFiles
 from vlagents_ray.interface import Act, Obs
+from vlagents_ray.policies.noop import Noop
 from vlagents_ray.protocol.messages import Reply, Request
-from vlagents_ray.serve.engine.observer import Observers
+from vlagents_ray.robot.dataset import Dataset
+from vlagents_ray.serve.config.deployment import LiveArgs
+from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.observer import Observer, Observers
+from vlagents_ray.serve.observers import live, live_view, ring, spans
 from vlagents_ray.serve.observers.live import LEASE_S, RATE, LiveObserver
+from vlagents_ray.serve.observers.live_view import ReplicaView
+from vlagents_ray.serve.observers.ring import Ring
+from vlagents_ray.serve.observers.spans import RequestSpans
+from vlagents_ray.serve.requests import RANKS, PendingRequest
 
 IMAGE = np.zeros((4, 4, 3), np.uint8)
+
+
+def observe(
+    observer: Observer, session: str, request: Request, reply: Reply, files: DecodedFiles | None = None
+) -> None:
+    pending = PendingRequest(session, request, lambda _: None, RANKS[request.rank], kept={})
+    pending.files = files or {}
+    observer.on_request(pending)
+    request.obs = None  # as the engine does once the policy has acted
+    observer.before_answer(pending, reply)
+    observer.on_answer(pending, reply)
 
 
 class Watched:
@@ -47,13 +76,6 @@ def test_it_is_the_engines_only_while_somebody_looks(watched: Watched) -> None:
     watched.clock.now += LEASE_S * 0.9
     watched.live.expire()
     assert watched.observers.any
-    watched.clock.now += LEASE_S
-    watched.live.expire()
-    assert watched.observers.any is False
-
-
-def test_a_lease_that_ends_without_any_message_ends_too(watched: Watched) -> None:
-    watched.live.renew()
     watched.clock.now += LEASE_S
     watched.live.expire()
     assert watched.observers.any is False
@@ -91,7 +113,6 @@ def test_a_file_is_kept_in_place_of_its_pixels_unless_the_policy_gets_others(wat
     files: DecodedFiles = {id(IMAGE): (IMAGE, memoryview(b"jpeg"))}
     watched.ask("a", Obs(cameras={"front": IMAGE, "wrist": turned}), files=files)
     seen = watched.live.observation("a")
-    assert seen is not None
     assert seen.files == {"front": b"jpeg"}
     assert list(seen.cameras) == ["wrist"]
 
@@ -120,3 +141,231 @@ def test_sessions_that_ended_are_forgotten(watched: Watched) -> None:
     watched.live.forget_others(["b", "c"])
     assert watched.live.observation("a") is None
     assert watched.live.observation("b") is not None
+
+
+# Bounds.
+
+LARGE = 2**20  # bytes of one part of a message; a server accepts up to 64 MiB
+BUDGET = 2**21  # of each kind of what is kept
+SLACK = 2**20  # bytes of everything besides
+
+Message = tuple[Obs, Reply]
+
+
+def acted(**info: Any) -> Reply:
+    return Reply(act=Act(np.zeros((2, 7), np.float32), info=info))
+
+
+def small_image_of_a_large_message() -> Message:
+    pixels = np.frombuffer(bytes(LARGE), np.uint8)
+    return Obs({"front": pixels[:192].reshape(8, 8, 3)}), acted()
+
+
+MESSAGES: dict[str, Callable[[], Message]] = {
+    "a text in info": lambda: (Obs(info={"note": "x" * LARGE}), acted()),
+    "a large state": lambda: (Obs(state={"joints": np.zeros(LARGE // 4, np.float32)}), acted()),
+    "many parts of a state": lambda: (Obs(state={str(i): np.zeros(1, np.float32) for i in range(500)}), acted()),
+    "a long name": lambda: (Obs(state={"x" * LARGE: np.zeros(1, np.float32)}), acted()),
+    "a large image": lambda: (Obs({"front": np.zeros((512, 700, 3), np.uint8)}), acted()),
+    "a small image of a large message": small_image_of_a_large_message,
+    "a text of the policy": lambda: (Obs(), acted(note="x" * LARGE)),
+    "a long name of the policy": lambda: (Obs(), acted(**{"x" * LARGE: 1})),
+    "a number of the policy": lambda: (Obs(), acted(number=1 << (8 * LARGE))),
+    "many entries of the policy": lambda: (Obs(), acted(**{str(i): "x" * 200 for i in range(500)})),
+    "a long chunk": lambda: (Obs(), Reply(act=Act(np.zeros((2**12, 64), np.float32)))),
+    "a wide action": lambda: (Obs(), Reply(act=Act(np.zeros((1, 2**18), np.float32)))),
+    "a long error": lambda: (Obs(), Reply(error=InvalidInput("x" * LARGE))),
+}
+
+
+class Kept:
+    """The bytes of Python's and numpy's memory that are held now beyond those at its beginning."""
+
+    def __enter__(self) -> Kept:
+        gc.collect()
+        tracemalloc.start()
+        self._before = tracemalloc.get_traced_memory()[0]
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        tracemalloc.stop()
+
+    def bytes(self) -> int:
+        gc.collect()
+        return tracemalloc.get_traced_memory()[0] - self._before
+
+
+@pytest.fixture
+def budgets(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live, "ANSWER_BYTES", BUDGET // 2)
+    monkeypatch.setattr(live, "OBSERVATION_BYTES", BUDGET)
+
+
+def send(watched: LiveObserver, session: str, message: Message, files: DecodedFiles | None = None) -> None:
+    obs, reply = message
+    observe(watched, session, Request("act", obs), reply, files)
+
+
+@pytest.mark.parametrize("kind", [*MESSAGES, "all in turn"])
+def test_many_messages_of_the_largest_size_leave_bounded_memory_in_the_live_observer(budgets: None, kind: str) -> None:
+    clock, kinds = Clock(), itertools.cycle(MESSAGES if kind == "all in turn" else [kind])
+    watched = LiveObserver(Observers(), clock=clock)
+    watched.renew()
+    with Kept() as kept:
+        for number in range(200):
+            send(watched, f"key/{number}", MESSAGES[next(kinds)]())
+            if number % 20 == 0 and (seen := watched.observation(f"key/{number}")) is not None:
+                seen.pictures()
+        assert kept.bytes() < 1.5 * BUDGET + SLACK
+        assert watched.answers(0)[-1].size < 2**17  # of each answer something is kept
+        clock.now += 10.0
+        watched.expire()
+        del seen
+        assert kept.bytes() < SLACK
+        assert watched.answers(0) == []
+
+
+def test_the_files_of_observations_are_bounded_and_the_oldest_go_first(budgets: None) -> None:
+    watched = LiveObserver(Observers(), clock=Clock())
+    watched.renew()
+    with Kept() as kept:
+        for number in range(30):
+            image = np.zeros((8, 8, 3), np.uint8)
+            send(watched, str(number), (Obs({"front": image}), acted()), {id(image): (image, memoryview(bytes(LARGE)))})
+        assert kept.bytes() < 1.5 * BUDGET + SLACK
+    assert watched.observation("0") is None
+    assert watched.observation("29") is not None
+
+
+def test_a_snapshot_and_what_is_sent_of_it_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live_view, "PICTURES", BUDGET)
+    engine = Engine(Noop.from_config({}))
+    view = ReplicaView(
+        engine,
+        engine.observers,
+        "this",
+        "here",
+        lambda: {"policy": "", "checkpoint": "", "weights": None, "policy_version": None},
+    )
+    names = [str(number) for number in range(10)]
+    view.live.renew()
+    for name in names:
+        engine.sessions.open(name)
+        image = np.zeros((8, 8, 3), np.uint8)
+        send(view.live, name, (Obs({"front": image}), acted()), {id(image): (image, memoryview(bytes(LARGE)))})
+    pictured: set[str] = set()
+    for _ in range(6):
+        found = view.read(0, names)
+        assert 0 < sum(map(len, found.files)) <= BUDGET
+        pictured |= {one["id"] for one in found.document["sessions"] if one["pictures"]}
+    assert pictured == set(names)  # in turns
+    view.close()
+
+
+class Tracer:
+    """OpenTelemetry that is never asked for a span."""
+
+
+@pytest.mark.library("opentelemetry")
+def test_requests_that_wait_for_their_spans_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(spans, "each_half_second", SimpleNamespace(add=lambda _: None))
+    traced = RequestSpans(Tracer(), "this")
+    with Kept() as kept:
+        for kind in sorted(MESSAGES) * 3:
+            obs, reply = MESSAGES[kind]()
+            obs.info["traceparent"] = "x" * LARGE
+            observe(traced, "s", Request("act", obs), reply)
+            del obs, reply
+        assert kept.bytes() < SLACK
+
+
+FILE = jpeg_png.encode_jpeg(np.zeros((1024, 1024, 3), np.uint8), 60, "420")
+
+
+class Saves:
+    """A ring that holds frames of one session, "s"."""
+
+    def __init__(self, folder: Path, frames: int, **options: Any) -> None:
+        self.settings = LiveArgs(folder=str(folder), **options)
+        self.clock = clock = Clock()
+        clock.now = time.monotonic()
+        self.watched = LiveObserver(Observers(), clock=clock)
+        sessions: Any = SimpleNamespace(ids=lambda: ["s"], all=list)
+        self.ring = Ring(self.watched, sessions, self.settings, "r")
+        image = np.zeros((8, 8, 3), np.uint8)
+        for _ in range(frames):
+            files: DecodedFiles = {id(image): (image, memoryview(FILE))}
+            send(self.watched, "s", (Obs({"front": image}), acted()), files)
+            self.ring.read()
+            clock.now += 1.05 / live.RATE
+
+
+@pytest.fixture(scope="module")
+def saves(tmp_path_factory: pytest.TempPathFactory) -> Saves:
+    return Saves(tmp_path_factory.mktemp("kept") / "kept", 12)
+
+
+@pytest.mark.parametrize(
+    "kind", ["a large state", "a large image", "a small image of a large message", "a wide action"]
+)
+def test_the_ring_holds_no_more_than_its_memory(tmp_path: Path, kind: str) -> None:
+    held = Saves(tmp_path, 0, memory_mb=2)
+    with Kept() as kept:
+        for _ in range(20):
+            send(held.watched, "s", MESSAGES[kind]())
+            held.ring.read()
+            held.clock.now += 1.05 / live.RATE
+        assert kept.bytes() < 2e6 + 2 * LARGE + SLACK  # the ring, and the last observation that the live observer keeps
+        assert held.ring.bytes <= 2e6
+
+
+def test_a_save_decodes_one_frame_at_a_time(saves: Saves) -> None:
+    tracemalloc.start()
+    try:
+        saves.ring.save("s")
+        assert tracemalloc.get_traced_memory()[1] < 4 * 3 * 2**20  # a few pictures of the twelve
+    finally:
+        tracemalloc.stop()
+
+
+def test_one_session_is_saved_at_a_time(saves: Saves, monkeypatch: pytest.MonkeyPatch) -> None:
+    entered, go_on = threading.Event(), threading.Event()
+    begin = Dataset.begin
+
+    def waits(*args: Any) -> Any:
+        entered.set()
+        go_on.wait(30)
+        return begin(*args)
+
+    monkeypatch.setattr(Dataset, "begin", waits)
+    first = threading.Thread(target=saves.ring.save, args=("s",))
+    first.start()
+    assert entered.wait(30)
+    with pytest.raises(Overloaded, match="press again"):
+        saves.ring.save("s")
+    go_on.set()
+    first.join()
+    saves.ring.save("s")
+
+
+def test_nothing_is_saved_into_a_full_folder(tmp_path: Path) -> None:
+    small = Saves(tmp_path, 2, most_gb=1e-9)
+    small.ring.save("s")
+    with pytest.raises(StorageFailed, match="want 1e-09 at most; make room there"):
+        small.ring.save("s")
+
+
+def test_a_save_that_fails_leaves_no_files_and_the_next_one_works(
+    saves: Saves, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    decode, files = ring.decode, iter(range(100))
+
+    def fails(file: bytes, most: int) -> np.ndarray:
+        return decode(file, most if next(files) < 4 else 0)  # of the fourth frame
+
+    monkeypatch.setattr(ring, "decode", fails)
+    with pytest.raises(MessageTooLarge):
+        saves.ring.save("s")
+    monkeypatch.undo()
+    assert [list(folder.iterdir()) for folder in Path(saves.settings.folder).rglob("unfinished")] == [[]]
+    saves.ring.save("s")

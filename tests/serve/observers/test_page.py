@@ -6,7 +6,6 @@ import json
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,7 +24,6 @@ from vlagents_ray.protocol.messages import RankName
 from vlagents_ray.robot.loop import LoopReport, run_loop
 from vlagents_ray.robot.simulated import SimulatedRobot
 from vlagents_ray.serve.access import api_keys
-from vlagents_ray.serve.config.deployment import LiveArgs
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
@@ -112,23 +110,6 @@ def test_a_card_says_what_its_session_does(page: Page, server: LiveServer) -> No
     until(page, CARDS, 0)  # it ended
 
 
-def test_sixteen_simulations_are_found_by_name(page: Page, server: LiveServer) -> None:
-    with acting(server, 16, "simulation"):
-        show(page, server)
-        until(page, CARDS, 16)
-        name = page.value("document.querySelector('article .name').textContent")
-        page.value(
-            f"(() => {{ const filter = document.getElementById('filter'); filter.value = '{name}';"
-            "filter.dispatchEvent(new Event('input')); })()"
-        )
-        assert (
-            page.value("[...document.querySelectorAll('article')].filter((one) => one.checkVisibility()).length") == 1
-        )
-        assert "simulation" in page.value("document.querySelector('article').innerText")
-        buttons = "[...document.querySelectorAll('article button')].filter((one) => one.checkVisibility()).length"
-        assert page.value(buttons) == 0  # a simulation accepts no commands
-
-
 PRESS = "(text) => [...document.querySelectorAll('article button')].find((one) => one.textContent === text).click()"
 
 
@@ -190,18 +171,6 @@ def test_it_asks_for_a_key_and_watches_with_one(page: Page) -> None:
             until(page, STATUS, told)
         until(page, PICTURES, 1)
         assert "plain/" in page.value("document.querySelector('article .name').textContent")
-
-
-def test_a_session_is_saved(page: Page, tmp_path: Path) -> None:
-    outcome = "document.querySelector('article .operate > [role=status]')?.textContent"
-    policy = Noop.from_config({"action_dim": 7, "chunk": 8})
-    with live_server(policy, settings=LiveArgs(folder=str(tmp_path))) as server, operated(server):
-        show(page, server)
-        until(page, "[...document.querySelectorAll('article img')].length", 2)
-        page.value(f"({PRESS})('Save last 30 s')")
-        until(page, f"({outcome} || '').startsWith('save: done, in {tmp_path}')", want=True)
-    [info] = tmp_path.rglob("info.json")
-    assert json.loads(info.read_text())["total_episodes"] == 1
 
 
 def test_a_key_without_the_scope_sees_no_buttons(page: Page, monkeypatch: pytest.MonkeyPatch) -> None:

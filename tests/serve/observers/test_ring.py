@@ -115,21 +115,15 @@ def test_old_frames_are_dropped(tmp_path: Path) -> None:
         assert "nothing to save" in pressed(server, session)["why"]
 
 
-def test_a_server_without_the_setting_holds_and_saves_nothing() -> None:
-    with live_server(Counts()) as server, RemoteAgent(server.url) as agent:
-        agent.reset(Obs())
-        [session] = server.engine.sessions.ids()
-        said = pressed(server, session)
-        assert said["state"] == "refused"
-        assert "live: {folder" in said["why"]
-
-
-def test_a_folder_that_cannot_be_written_is_said(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("settings", "why"), [(None, "live: {folder"), ("file", "")])
+def test_where_nothing_can_be_saved_a_press_says_why(tmp_path: Path, settings: str | None, why: str) -> None:
+    """Without the setting nothing is held either; a file cannot be a folder."""
     (tmp_path / "file").write_text("")
-    settings = LiveArgs(folder=str(tmp_path / "file"))
-    with live_server(Counts(), settings=settings) as server, RemoteAgent(server.url) as agent:
+    args = None if settings is None else LiveArgs(folder=str(tmp_path / settings))
+    with live_server(Counts(), settings=args) as server, RemoteAgent(server.url) as agent:
         drive(agent, 3)
         [session] = server.engine.sessions.ids()
         said = pressed(server, session)
         assert said["state"] == "refused"
         assert said["why"]
+        assert why in said["why"]

@@ -64,7 +64,6 @@ def test_a_request_is_one_trace_from_the_program_to_the_batch(exporter: InMemory
     assert act.attributes == {"server.url": server.url, "transport": transport, "requests": 1}
     [served] = children(found, act)
     assert (served.name, served.kind) == ("vlagents act", SpanKind.SERVER)
-    assert served.attributes is not None
     assert (served.attributes["replica"], served.attributes["batch_size"]) == ("this", 1)
     stages = children(found, served)
     assert [one.name for one in stages] == ["decode", "queue", "batch", "encode"]

@@ -89,13 +89,10 @@ def ask_all(engine: Engine, requests: list[tuple[str, Request]]) -> list[Reply]:
 
 def test_what_was_loaded_there_is_known_here(engine: Engine) -> None:
     told = engine.models.weights
-    assert told is not None
     assert told["digest"]
     assert (ask(engine, "weights", "reset").info or {})["weights"] == told["digest"]
-
-
-def test_a_session_with_an_adapter_states_its_own_weights(engine: Engine) -> None:
     assert (ask(engine, "adapted", "reset", kwargs={"adapter": "stack"}).info or {})["weights"] == "with stack"
+    assert engine.contract.action.dim == 1
 
 
 def info(reply: Reply) -> dict[str, Any]:
@@ -111,6 +108,8 @@ def test_the_steps_of_a_long_start_there_are_reported_here() -> None:
     try:
         with loading_report(steps.append) as report:
             one.initialize()
+        one.reset(observation(), "a task")
+        assert isinstance(one.act(observation()), Act), "as an `Agent` by itself"
     finally:
         one.close()
     assert steps == ["compiling 1 rows (1 of 2)", "compiling 2 rows (2 of 2)"]
@@ -128,11 +127,6 @@ def test_the_policy_runs_in_another_process_with_its_variables_and_this_ones_dev
     assert (told["parent"], told["variable"], told["gpus"]) == (os.getpid(), "set", "3")
     one.close()
     assert ended(told["pid"])
-
-
-def test_the_contract_is_the_policys(engine: Engine) -> None:
-    assert engine.contract is not None
-    assert engine.contract.action.dim == 1
 
 
 def test_one_that_hangs_is_noticed_and_keeps_nobody_waiting() -> None:
@@ -160,14 +154,6 @@ def test_a_batch_stays_a_batch_and_sessions_stay_apart(engine: Engine) -> None:
         for i, told in enumerate(map(info, replies)):
             assert (told["batch"], told["acts"], told["instruction"]) == (7, step, f"task {i}")
             assert told["seen"] == [i, *(10 * s + i for s in range(1, step + 1))]
-
-
-def test_acts_without_info_travel_as_they_are(engine: Engine) -> None:
-    bare = Obs({"front": np.zeros((8, 8, 3), np.uint8)}, 1.0, {"position": np.full(1, 0.25, np.float32)})
-    ask(engine, "bare", "reset", instruction="a task")
-    [reply] = ask_all(engine, [("bare", Request("act", bare))])
-    assert reply.act is not None
-    assert reply.act.action.tolist() == [-0.25]
 
 
 def test_a_session_that_begins_again_is_shown_its_history(engine: Engine) -> None:
@@ -227,28 +213,20 @@ def test_a_session_that_cannot_move_stays(other: Engine) -> None:
     one.close()
 
 
-def test_a_child_that_dies_loses_the_connection_and_makes_the_replica_unhealthy() -> None:
+@pytest.mark.parametrize(("ends", "status"), [("is killed", "-9"), ("exits in an act", "7")])
+def test_a_child_that_dies_loses_the_connection_and_makes_the_replica_unhealthy(ends: str, status: str) -> None:
     one = Engine(agent())
     one.start()
     told = info(ask(one, "a", "reset", instruction="a task"))
     one.check_health()
-    os.kill(told["pid"], signal.SIGKILL)
-    error = ask(one, "a", "act").error
-    assert isinstance(error, ConnectionLost)
-    assert str(error) == "the policy's process ended with exit status -9; the replica is being replaced"
-    with pytest.raises(PolicyUnavailable, match="exit status -9"):
+    if ends == "is killed":
+        os.kill(told["pid"], signal.SIGKILL)
+    [reply] = ask_all(one, [("a", Request("act", observation(exit=ends != "is killed")))])
+    assert isinstance(reply.error, ConnectionLost)
+    assert str(reply.error) == f"the policy's process ended with exit status {status}; the replica is being replaced"
+    with pytest.raises(PolicyUnavailable, match=f"exit status {status}"):
         one.check_health()
     assert not one.ready
-    one.close()
-
-
-def test_a_policy_that_exits_in_an_act_loses_the_connection() -> None:
-    one = Engine(agent())
-    one.start()
-    ask(one, "a", "reset", instruction="a task")
-    [reply] = ask_all(one, [("a", Request("act", observation(exit=True)))])
-    assert isinstance(reply.error, ConnectionLost)
-    assert "exit status 7" in str(reply.error)
     one.close()
 
 
@@ -271,11 +249,13 @@ def test_a_child_whose_accelerator_failed_ends_so_that_the_replica_is_replaced()
         ("Telling", {"nope": 1}, "ConfigError: policy Telling"),
         ("Telling", {"needs": "no_such_package"}, "No module named 'no_such_package'"),
         ("Nobody", {}, "no class 'Nobody'"),
+        ("", {}, "'/no/such/python' cannot be started here"),
         ("Dying", {}, "exit status 3; it said:\nthe driver is too old"),
     ],
 )
 def test_why_a_policy_does_not_load_is_said(policy: str, config: dict[str, Any], said: str) -> None:
-    one = Engine(agent(policy, **config))
+    gone = ChildAgent(Child("/no/such/python", Settings("noop", {}, 1, ""), {}))
+    one = Engine(agent(policy, **config) if policy else gone)
     with pytest.raises(VLAgentsError) as error:
         one.start()
     assert said in str(error.value)
@@ -300,27 +280,10 @@ def test_the_child_ends_with_its_replica_that_is_killed() -> None:
     )
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, env=environment) as replica:
-        assert replica.stdout is not None
         pid = int(replica.stdout.readline())
         assert not ended(pid)
         replica.send_signal(signal.SIGKILL)
         wait_for(lambda: ended(pid))
-
-
-def test_an_interpreter_that_is_gone_is_said() -> None:
-    one = Engine(ChildAgent(Child("/no/such/python", Settings("noop", {}, 1, ""), {})))
-    with pytest.raises(PolicyFailed, match="'/no/such/python' cannot be started here"):
-        one.start()
-    one.close()
-
-
-def test_an_act_is_an_act(engine: Engine) -> None:
-    """The agent by itself, as an `Agent` is used."""
-    one = agent()
-    one.initialize()
-    one.reset(observation(), "a task")
-    assert isinstance(one.act(observation()), Act)
-    one.close()
 
 
 def test_the_weights_of_a_policy_in_a_child_process_are_out_of_reach() -> None:

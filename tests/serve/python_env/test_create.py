@@ -52,16 +52,13 @@ def test_it_holds_this_package_with_the_same_ray_and_the_requirements(
         assert word in asked[-1]
 
 
-def test_a_light_one_is_without_ray(asked: list[str], requirements: Path, tmp_path: Path) -> None:
-    make_environment(requirements, tmp_path / "env", light=True)
+def test_a_light_one_and_one_of_another_python_are_without_ray(
+    asked: list[str], requirements: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make_environment(requirements, tmp_path / "light", light=True)
     assert "ray==" not in asked[-1]
     assert "[serve]" not in asked[-1]
     assert "pydantic>=" in asked[-1]
-
-
-def test_one_of_another_python_is_a_light_one(
-    asked: list[str], requirements: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
     monkeypatch.setattr(making, "_minor", lambda python: "3.11" if python == Path(sys.executable) else "3.12")
     said: list[str] = []
     make_environment(requirements, tmp_path / "env", progress=said.append)

@@ -131,11 +131,6 @@ def test_nobody_waits_where_batches_save_nothing() -> None:
     assert waited < 0.05 * sum(0.01 * size for size in world.sizes)
 
 
-def test_robots_neither_wait_nor_are_waited_for() -> None:
-    world = World([soon(0), soon(1)], patience=1.0, ranks=dict.fromkeys(range(2), Rank.ROBOT)).run(60)
-    assert world.waits == []
-
-
 def answered_together(*names: str, patience: float = 0.1) -> tuple[BatchWindow, FairQueue]:
     """Three batches of 100 ms, the last over at 2.0; in between all were back after 2 ms."""
     returning = BatchWindow(patience, SIZE, lambda name: name != "closed")

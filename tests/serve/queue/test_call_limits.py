@@ -1,4 +1,4 @@
-"""A policy that does not return from a call makes its replica unhealthy, and whoever waits for it is answered."""
+"""When a policy makes its replica unhealthy: by a call that does not return, an accelerator, or all of its batches."""
 
 from __future__ import annotations
 
@@ -7,45 +7,29 @@ import queue
 import sys
 import threading
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
 import psutil
 import pytest
-from eval_fakes import wait_for
-from in_flight import submit
+from eval_fakes import Clock, wait_for
+from in_flight import answered, asked
 from shm_client import call, client, request
 from starlette.testclient import TestClient
 
-from vlagents_ray.errors import OutcomeUnknown, PolicyFailed, PolicyUnavailable
+from vlagents_ray.errors import InvalidObservation, OutcomeUnknown, PolicyFailed, PolicyUnavailable
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.messages import Limits, Reply, Request
 from vlagents_ray.serve.access.api_keys import NoKey
-from vlagents_ray.serve.config.deployment import LimitArgs
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.queue.call_limits import (
-    LOAD,
-    CallLimits,
-    PolicyCall,
-    PolicyCalls,
-)
+from vlagents_ray.serve.queue.call_limits import FAILED_BATCHES, LOAD, CallLimits, PolicyCall, PolicyCalls
 from vlagents_ray.serve.requests import DEFAULT, PendingRequest
 
 LIMITS = CallLimits(act_s=10.0, warm_up_s=100.0, load_s=1000.0)
-
-
-class Clock:
-    """Time that passes when it is told to."""
-
-    def __init__(self) -> None:
-        self.now = 0.0
-
-    def __call__(self) -> float:
-        return self.now
 
 
 class Hanging(Agent):
@@ -101,9 +85,7 @@ def engine(agent: Hanging, clock: Clock) -> Iterator[Engine]:
 
 
 def put(engine: Engine, session: str, op: Any, **kwargs: Any) -> queue.SimpleQueue[Reply]:
-    replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
-    submit(engine, session, Request(op, Obs(), kwargs=kwargs), replies.put)
-    return replies
+    return asked(engine, session, Request(op, Obs(), kwargs=kwargs))
 
 
 def ask(engine: Engine, session: str, op: Any, **kwargs: Any) -> Reply:
@@ -133,26 +115,20 @@ OPS = ["reset", "act", "observe", "export"]
 
 
 @pytest.mark.parametrize("op", OPS)
-def test_a_call_over_its_limit_makes_the_engine_unhealthy(engine: Engine, clock: Clock, op: str) -> None:
-    hang(engine, op)
-    clock.now += 9.9
-    assert engine.ready
-    clock.now += 0.2
-    assert not engine.ready
-    with pytest.raises(PolicyUnavailable, match=rf"not returned from '{op}' for 10.1 s; its limit is 10 s"):
-        engine.check_health()
-
-
-@pytest.mark.parametrize("op", OPS)
-def test_those_who_wait_for_it_are_answered_and_no_others_are_let_in(
+def test_a_call_over_its_limit_is_unhealthy_those_who_wait_for_it_are_answered_and_no_others_are_let_in(
     engine: Engine, agent: Hanging, clock: Clock, op: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     engine.stats.enable()
     begun, behind = hang(engine, op), put(engine, "good", "act")
+    clock.now += 9.9
     engine.notice_hung()
+    assert engine.ready
     assert begun.empty()
     assert behind.empty()
-    clock.now += 11.0
+    clock.now += 0.2
+    assert not engine.ready
+    with pytest.raises(PolicyUnavailable, match=rf"not returned from '{op}' for 10.1 s; its limit is 10 s"):
+        engine.check_health()
     engine.notice_hung()
     engine.notice_hung()
     # Not to be repeated elsewhere, where it would hang as well; unlike what had not begun.
@@ -176,16 +152,6 @@ def test_those_who_wait_for_it_are_answered_and_no_others_are_let_in(
     assert begun.empty()
 
 
-def test_a_first_call_may_compile(engine: Engine, clock: Clock) -> None:
-    ask(engine, "bad", "reset", hangs_at="act")
-    put(engine, "bad", "act")
-    wait_for(lambda: engine.calls.under_way)
-    clock.now += 99.0
-    assert engine.ready
-    clock.now += 2.0
-    assert not engine.ready
-
-
 def test_every_batch_size_may_compile_where_batches_have_fixed_sizes(agent: Hanging, clock: Clock) -> None:
     engine = Engine(agent, limits=LIMITS, batch_sizes=[1, 2], max_batch_size=2)
     engine.calls.clock = clock
@@ -193,7 +159,6 @@ def test_every_batch_size_may_compile_where_batches_have_fixed_sizes(agent: Hang
     hang(engine, "act")
     [call] = engine.calls.under_way
     model = engine.models.loaded(DEFAULT)
-    assert model is not None
     assert call is model.call("act", 1)
     assert (call.limit_s, model.call("act", 2).limit_s) == (10.0, 100.0)
     agent.over.set()
@@ -208,18 +173,7 @@ def test_a_slow_policy_has_ten_times_its_longest_call(clock: Clock) -> None:
         with call:
             clock.now += took_s
     assert limits == [100.0, 100.0, 400.0, 500.0]
-
-
-def test_loading_has_its_own_limit(clock: Clock) -> None:
-    calls = PolicyCalls(LIMITS, clock)
-    with PolicyCall(calls, LOAD):
-        clock.now = 999.0
-        assert calls.overdue() is None
-        clock.now = 1001.0
-        overdue = calls.overdue()
-        assert overdue is not None
-        assert overdue.op == LOAD
-    assert calls.overdue() is None
+    assert PolicyCall(PolicyCalls(LIMITS, clock), LOAD).limit_s == 1000.0
 
 
 def test_a_policy_that_never_loads_has_failed() -> None:
@@ -280,13 +234,6 @@ def test_a_local_client_is_refused_though_the_thread_that_reads_its_requests_han
     endpoint.close()
 
 
-def test_a_deployment_sets_the_limits() -> None:
-    args = LimitArgs(act_s=1, warm_up_s=2, load_s=3)
-    assert args.call_limits() == CallLimits(1, 2, 3)
-    assert args.limits() == Limits()
-    assert LimitArgs().call_limits() == CallLimits()
-
-
 class Forking(Agent):
     """Forks in each call; the child `ends` in the same way as a call that succeeds, or raises SystemExit."""
 
@@ -338,3 +285,95 @@ def test_a_child_that_the_policy_forks_ends_with_the_call_and_answers_nobody(op:
     engine.close()
     assert not alive
     assert {child.returncode for child in ended} == {1}
+
+
+# A policy whose accelerator has failed, or that fails batch after batch.
+
+
+ASSERT = "CUDA error: device-side assert triggered"
+
+
+class Failing(Agent):
+    """Raises the error that a call is to raise."""
+
+    shared = ("errors",)
+
+    def __init__(self) -> None:
+        self.errors: dict[str, Exception] = {"none": ValueError()}  # by op; an empty one would not be shared
+
+    def _raise(self, op: str) -> None:
+        if op in self.errors:
+            raise self.errors[op]
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        self._raise("reset")
+        return {}
+
+    def observe(self, obs: Obs) -> None:
+        self._raise("observe")
+
+    def act(self, obs: Obs) -> Act:
+        self._raise("act")
+        return Act(np.zeros(1, np.float32))
+
+    def act_batch(self, obs: Any, sessions: Any) -> list[Act | Exception]:
+        self._raise("act_batch")
+        return super().act_batch(obs, sessions)
+
+
+@pytest.fixture
+def failing(serving: Callable[..., Engine]) -> tuple[Engine, Failing, Callable[[Any], Exception | None]]:
+    """An engine, its policy, and how it is asked."""
+    policy = Failing()
+    engine = serving(policy)
+    return engine, policy, lambda op: answered(engine, "a", Request(op, Obs())).error
+
+
+@pytest.mark.parametrize("op", ["reset", "observe", "act", "act_batch"])
+def test_a_replica_whose_accelerator_failed_is_not_healthy_and_sends_its_clients_away(
+    failing: tuple[Engine, Failing, Callable[[Any], Exception | None]], op: str
+) -> None:
+    engine, policy, ask = failing
+    assert ask("reset") is None
+    engine.check_health()
+    policy.errors[op] = RuntimeError(f"{ASSERT}\nmore")
+    assert isinstance(ask(op.removesuffix("_batch")), PolicyFailed)
+    policy.errors.clear()
+    with pytest.raises(PolicyUnavailable, match=ASSERT):
+        engine.check_health()
+    assert not engine.ready
+    for later in ("reset", "act"):
+        with pytest.raises(PolicyUnavailable, match="begins again at another one"):
+            ask(later)
+
+
+@pytest.mark.parametrize("op", ["act", "act_batch"])
+def test_a_replica_all_of_whose_batches_fail_is_not_healthy_until_one_does_not(
+    failing: tuple[Engine, Failing, Callable[[Any], Exception | None]], op: str
+) -> None:
+    engine, policy, ask = failing
+    assert ask("reset") is None
+    policy.errors[op] = ZeroDivisionError("of the policy")
+    for _ in range(FAILED_BATCHES):
+        engine.check_health()
+        assert isinstance(ask("act"), PolicyFailed)
+    with pytest.raises(PolicyFailed, match=f"the last {FAILED_BATCHES} batches failed as a whole"):
+        engine.check_health()
+    policy.errors.clear()
+    assert ask("act") is None
+    engine.check_health()
+
+
+@pytest.mark.parametrize(
+    "error",
+    [InvalidObservation("of a client"), PolicyUnavailable("of a policy elsewhere"), RuntimeError("CUDA out of memory")],
+)
+def test_what_another_replica_could_not_do_better_leaves_a_replica_healthy(
+    failing: tuple[Engine, Failing, Callable[[Any], Exception | None]], error: Exception
+) -> None:
+    engine, policy, ask = failing
+    assert ask("reset") is None
+    policy.errors["act"] = error
+    rounds = 1 if isinstance(error, RuntimeError) else FAILED_BATCHES + 1
+    assert all(ask("act") is not None for _ in range(rounds))
+    engine.check_health()

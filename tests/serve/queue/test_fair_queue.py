@@ -1,14 +1,20 @@
-"""Whose turn it is."""
+"""Whose turn it is, and what of the waiting requests the policy gets."""
 
 from __future__ import annotations
 
 import random
+import time
 from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from in_flight import pending
 
+from vlagents_ray.errors import PolicyUnavailable
 from vlagents_ray.protocol.messages import Request
+from vlagents_ray.serve.queue.batch_queue import BatchQueue
 from vlagents_ray.serve.queue.fair_queue import PATIENCE_S, FairQueue
 from vlagents_ray.serve.requests import Origin, PendingRequest, Rank
 
@@ -109,13 +115,6 @@ def test_every_ticket_is_taken_once_and_in_its_sessions_order(seed: int, size: i
     assert waiting.depth == [0, 0]
 
 
-def test_nothing_is_left_after_clear() -> None:
-    waiting = filled(ticket("a"), ticket("a"), ticket("b", rank=Rank.ROBOT))
-    assert len(waiting.clear()) == 3
-    assert waiting.size == 0
-    assert waiting.take(4, 0.0) == ([], [])
-
-
 def test_a_simulation_that_is_over_does_not_take_the_turn_of_one_that_waits() -> None:
     waiting = filled(gone := ticket("gone"), ticket("waits"))
     for i in range(8):
@@ -123,3 +122,62 @@ def test_a_simulation_that_is_over_does_not_take_the_turn_of_one_that_waits() ->
     gone.over = True
     assert taken(waiting, 2, 2 * PATIENCE_S) == ["robot0", "robot1"]
     assert taken(waiting, 2, 2 * PATIENCE_S)[0] == "waits"
+
+
+# The queue of an engine.
+
+
+@pytest.fixture
+def queue() -> Iterator[Callable[[int], BatchQueue]]:
+    made: list[BatchQueue] = []
+
+    def make(max_batch_size: int) -> BatchQueue:
+        made.append(BatchQueue(max_batch_size))
+        made[-1].bind()
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.release()
+
+
+def put(queue: BatchQueue, name: str, **fields: float) -> PendingRequest:
+    one = pending(name, Request("act", request_id=name, **fields), lambda _: None)  # type: ignore[arg-type]
+    queue.put(one)
+    return one
+
+
+def test_a_lone_request_does_not_wait_for_others(queue: Callable[[int], BatchQueue]) -> None:
+    waiting = queue(4)
+    put(waiting, "a")
+    taken = waiting.next()
+    assert len(taken.batch) == 1
+
+
+def test_a_request_that_expired_or_was_given_up_never_reaches_the_policy(queue: Callable[[int], BatchQueue]) -> None:
+    waiting = queue(4)
+    late = put(waiting, "late", deadline_ms=1.0)
+    late.deadline -= 1.0
+    waiting.withdraw(put(waiting, "gone"))
+    put(waiting, "good")
+    taken = waiting.take()
+    assert [one.request.request_id for one in taken.batch] == ["good"]
+    assert taken.expired == [late]
+
+
+def test_who_waits_when_it_closes_is_given_back(queue: Callable[[int], BatchQueue]) -> None:
+    waiting = queue(4)
+    one = put(waiting, "waiting")
+    assert waiting.close() == [one]
+    assert waiting.next() is None
+    with pytest.raises(PolicyUnavailable):
+        put(waiting, "after")
+
+
+def test_the_time_spent_waiting_for_requests_counts_as_idle() -> None:
+    quiet = BatchQueue(1, idle_s=0.05)
+    quiet.bind()
+    before_s, began = quiet.idle_time_s(), time.perf_counter()
+    assert quiet.next() == ([], []), "its thread is told that nothing came for long"
+    assert 0.05 <= quiet.idle_time_s() - before_s <= time.perf_counter() - began
+    quiet.release()

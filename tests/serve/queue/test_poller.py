@@ -191,18 +191,6 @@ def test_a_callback_may_end_its_watch_beside_a_batch(slow: Callable[..., Slow]) 
     wait_for(lambda: one.called("answer a", "answer b"))
 
 
-def test_where_a_full_batch_waits_simulations_are_answered_from_another_thread(slow: Callable[..., Slow]) -> None:
-    one = slow()
-    one.start()
-    one.learn("a", "b")
-    assert set(one.answered_by.values()) == {"policy"}
-    one.hold("a", "b")
-    one.put("c", "d")
-    one.open.set()
-    wait_for(lambda: one.called(*(f"answer {s}" for s in "abcd")))
-    assert [one.answered_by[s] for s in "abcd"] == ["policy-answers"] * 2 + ["policy"] * 2
-
-
 def test_answers_come_while_the_next_batch_runs_and_when_the_queue_closes(slow: Callable[..., Slow]) -> None:
     one = slow()
     one.start()
@@ -242,7 +230,7 @@ def test_a_robot_is_answered_before_the_next_batch(slow: Callable[..., Slow]) ->
 ENDLESS = 1e6  # times the batch before: what waits, waits until something ends it
 
 
-def test_a_batch_waits_for_the_rest_of_its_group(slow: Callable[..., Slow]) -> None:
+def test_a_batch_waits_for_the_rest_of_its_group_or_the_end(slow: Callable[..., Slow]) -> None:
     one = slow(size=8, patience=ENDLESS)
     one.start()
     one.learn("a", "b")
@@ -252,23 +240,7 @@ def test_a_batch_waits_for_the_rest_of_its_group(slow: Callable[..., Slow]) -> N
     one.put("b")
     wait_for(lambda: one.called("answer a", "answer b"))
     assert one.events[0] == "batch a b"
-
-
-def test_a_robot_ends_the_wait(slow: Callable[..., Slow]) -> None:
-    one = slow(size=8, patience=ENDLESS)
-    one.start()
-    one.learn("a", "b")
-    one.put("a")
-    wait_for(lambda: one.queue._gathering)
-    one.put("r", rank=Rank.ROBOT)
-    wait_for(lambda: one.called("answer a", "answer r"))
-    assert one.events[0] == "batch a r"
-
-
-def test_closing_ends_the_wait(slow: Callable[..., Slow]) -> None:
-    one = slow(size=8, patience=ENDLESS)
-    one.start()
-    one.learn("a", "b")
+    one.events.clear()
     one.put("a")
     wait_for(lambda: one.queue._gathering)
     one.engine.close()

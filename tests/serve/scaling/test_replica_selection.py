@@ -51,10 +51,8 @@ def test_a_client_that_reaches_one_machine_only_is_sent_nowhere_else() -> None:
     place = ClientLocation("near", must_be_near=True)
     assert chosen([load("far", 0, "far"), load("near", 90, "near")], place) == "near"
     assert chosen([load("far", 0, "far")], place) is None
-
-
-def test_a_client_that_does_not_know_where_it_is_is_near_to_nobody() -> None:
-    assert chosen([replace(load("a", 0), node="", boot_id="")], ClientLocation(must_be_near=True)) is None
+    nowhere = replace(load("a", 0), node="", boot_id="")
+    assert chosen([nowhere], ClientLocation(must_be_near=True)) is None, "it does not know where it is"
 
 
 @pytest.mark.parametrize(

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import asyncio
-import queue
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import pytest
-from in_flight import submit
+from in_flight import answered
 
 from vlagents_ray.errors import InvalidInput, InvalidWeights, Overloaded, PolicyUnavailable, UnchangedWeights
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.protocol.messages import Reply, Request
+from vlagents_ray.protocol.messages import Request
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.scaling.session_migration import PeerEnded, PeerUnreachable
 from vlagents_ray.serve.scaling.weight_push import ThisReplica, WeightPusher, WeightsReplica
@@ -53,13 +52,9 @@ class Replica(ThisReplica):
 
     def gain(self, session: str = "s", *, reset: bool = True) -> tuple[int, float]:
         """The version and the gain with which a simulation acts."""
-        replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
         if reset:
-            submit(self.engine, session, Request("reset", Obs(), rank="simulation"), replies.put)
-            assert replies.get(timeout=30).error is None
-        submit(self.engine, session, Request("act", Obs()), replies.put)
-        act = replies.get(timeout=30).act
-        assert act is not None
+            assert answered(self.engine, session, Request("reset", Obs(), rank="simulation")).error is None
+        act = answered(self.engine, session, Request("act", Obs())).act
         return act.info["policy"]["version"], float(act.action[0])
 
 
@@ -120,13 +115,16 @@ def app() -> Iterator[Application]:
         replica.engine.close()
 
 
-def test_the_replica_that_coordinates_a_push_notes_its_duration(app: Application) -> None:
+def test_what_changes_nothing_is_refused_and_the_duration_of_a_push_is_noted_where_it_is_coordinated(
+    app: Application,
+) -> None:
     first, other = app.start(Gain(), Gain())
     app.push(5)
     with pytest.raises(UnchangedWeights):
         app.push(5)
     assert [took_ms > 0 for took_ms in first.engine.weights.collect_pushes_ms()] == [True]
     assert first.engine.weights.collect_pushes_ms() == other.engine.weights.collect_pushes_ms() == []
+    assert app.push(5, PushOptions(allow_same=True)).version == 2
 
 
 def test_all_replicas_act_with_a_push_by_way_of_any(app: Application) -> None:
@@ -145,14 +143,6 @@ def test_if_one_replica_refuses_none_acts_with_it(app: Application) -> None:
     assert app.gains() == [(0, 0.0)] * 3
     app.replicas.pop(1).engine.close()
     assert app.push(5).replicas == ("r0", "r2")  # nothing is left of the refused push
-
-
-def test_what_changes_nothing_is_refused_everywhere(app: Application) -> None:
-    app.start(Gain(), Gain())
-    app.push(5)
-    with pytest.raises(UnchangedWeights):
-        app.push(5)
-    assert app.push(5, PushOptions(allow_same=True)).version == 2
 
 
 def test_a_learner_numbers_versions_as_it_likes_if_they_rise(app: Application) -> None:
@@ -263,13 +253,3 @@ def test_values_may_be_a_reference_that_each_replica_resolves(app: Application) 
 
     asyncio.run(app.pusher(app.replicas[0]).push([Reference()], PushOptions()))
     assert app.gains() == [(1, 5.0)] * 2
-
-
-def test_running_episodes_end_with_their_weights_at_every_replica(app: Application) -> None:
-    app.start(Gain(), Gain())
-    for replica in app.replicas:
-        replica.gain("old")
-    app.push(5)
-    assert [replica.gain("old", reset=False) for replica in app.replicas] == [(0, 0.0)] * 2
-    app.push(6, PushOptions("keep"))
-    assert [replica.gain("old", reset=False) for replica in app.replicas] == [(2, 6.0)] * 2

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import queue
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
 import numpy as np
 import pytest
-from in_flight import submit
+from in_flight import answered
 
 from vlagents_ray.errors import (
     InvalidInput,
@@ -76,13 +75,10 @@ class Served:
     def act(self, session: str) -> tuple[int, float]:
         """The version that acted, and the gain in its action."""
         act = self.ask(session, Request("act", Obs())).act
-        assert act is not None
         return act.info["policy"]["version"], float(act.action[0])
 
     def ask(self, session: str, request: Request) -> Reply:
-        replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
-        submit(self.engine, session, request, replies.put)
-        reply = replies.get(timeout=30)
+        reply = answered(self.engine, session, request)
         if reply.error is not None:
             raise reply.error
         return reply
@@ -98,27 +94,15 @@ def gains(gain: float) -> dict[str, Any]:
     return {"layer/gain": np.full(2, gain, np.float32)}
 
 
-@pytest.fixture
-def serving() -> Iterator[Callable[..., Served]]:
-    engines: list[Engine] = []
-
-    def serve(agent: Agent, **options: Any) -> Served:
-        engines.append(Engine(agent, **options))
-        engines[-1].start()
-        return Served(engines[-1])
-
-    yield serve
-    for engine in engines:
-        engine.close()
-
-
 AGENTS = pytest.mark.parametrize("agent", [Gain, Doubled], ids=["by reference", "in place"])
 
 
 @AGENTS
-def test_an_episode_ends_with_the_weights_that_it_began_with(serving: Callable[..., Served], agent: type[Gain]) -> None:
-    served = serving(agent())
-    alone = serving(agent())
+def test_an_episode_ends_with_the_weights_that_it_began_with_unless_they_are_pushed_to_it(
+    serving: Callable[..., Engine], agent: type[Gain]
+) -> None:
+    served = Served(serving(agent()))
+    alone = Served(serving(agent()))
     for one in (served, alone):
         one.reset("old", seed=3)
     served.push(1)
@@ -127,37 +111,20 @@ def test_an_episode_ends_with_the_weights_that_it_began_with(serving: Callable[.
         served.push(number)
         assert served.act("new") == (1, 1.0)
         mine, apart = (one.ask("old", Request("act", Obs())).act for one in (served, alone))
-        assert mine is not None
-        assert apart is not None
         assert mine.info == apart.info
         np.testing.assert_array_equal(mine.action, apart.action, strict=True)
     assert served.reset("old").info == {"gain": 4.0}
     assert served.act("old") == (4, 4.0)
     assert served.act("new") == (1, 1.0)
+    digest = served.push(5, "keep")
+    assert served.act("new") == (5, 5.0), "running episodes change at once"
+    act = served.ask("new", Request("act", Obs())).act
+    assert act.info["policy"] == {"version": 5, "fingerprint": digest}
+    assert digest == fingerprint(gains(5)), "of what the agent holds"
 
 
-@AGENTS
-def test_with_keep_running_episodes_change_at_once(serving: Callable[..., Served], agent: type[Gain]) -> None:
-    served = serving(agent())
-    served.reset("a")
-    assert served.act("a") == (0, 0.0)
-    served.push(1, "keep")
-    assert served.act("a") == (1, 1.0)
-
-
-@AGENTS
-def test_the_fingerprint_is_that_of_what_the_agent_holds(serving: Callable[..., Served], agent: type[Gain]) -> None:
-    served = serving(agent())
-    digest = served.push(1)
-    served.reset("a")
-    act = served.ask("a", Request("act", Obs())).act
-    assert act is not None
-    assert act.info["policy"] == {"version": 1, "fingerprint": digest}
-    assert digest == fingerprint(gains(1))
-
-
-def test_robots_keep_the_pinned_weights_unless_they_follow(serving: Callable[..., Served]) -> None:
-    served = serving(Gain())
+def test_robots_keep_the_pinned_weights_unless_they_follow(serving: Callable[..., Engine]) -> None:
+    served = Served(serving(Gain()))
     for session, options in {"pinned": {}, "follows": {"weights": "follow"}}.items():
         served.reset(session, "robot", **options)
     served.reset("baseline", weights="pinned")
@@ -182,9 +149,9 @@ def test_robots_keep_the_pinned_weights_unless_they_follow(serving: Callable[...
     [({}, InvalidWeights), ({"layer/gain": np.full(2, np.nan)}, InvalidWeights), (gains(1), UnchangedWeights)],
 )
 def test_what_is_refused_changes_nothing(
-    serving: Callable[..., Served], pushed: dict[str, Any], error: type[Exception]
+    serving: Callable[..., Engine], pushed: dict[str, Any], error: type[Exception]
 ) -> None:
-    served = serving(Gain())
+    served = Served(serving(Gain()))
     served.push(1)
     before = served.learn.describe()
     with pytest.raises(error):
@@ -197,8 +164,8 @@ def test_what_is_refused_changes_nothing(
     served.push(2)
 
 
-def test_a_staged_version_does_not_act_and_a_second_one_has_to_wait(serving: Callable[..., Served]) -> None:
-    served = serving(Gain())
+def test_a_staged_version_does_not_act_and_a_second_one_has_to_wait(serving: Callable[..., Engine]) -> None:
+    served = Served(serving(Gain()))
     served.learn.stage(1, gains(1), PushOptions())
     served.reset("a")
     assert served.act("a") == (0, 0.0)
@@ -214,9 +181,9 @@ def test_a_staged_version_does_not_act_and_a_second_one_has_to_wait(serving: Cal
 
 
 def test_a_learner_that_dies_between_the_phases_leaves_the_last_version(
-    serving: Callable[..., Served], monkeypatch: pytest.MonkeyPatch
+    serving: Callable[..., Engine], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    served = serving(Gain())
+    served = Served(serving(Gain()))
     monkeypatch.setattr(versions, "STAGED_S", 0.0)
     dropped = threading.Event()
     own = served.engine.models.own_weights
@@ -230,8 +197,8 @@ def test_a_learner_that_dies_between_the_phases_leaves_the_last_version(
     assert served.act("a") == (0, 0.0)
 
 
-def test_versions_never_go_back_and_no_act_fails_while_weights_are_pushed(serving: Callable[..., Served]) -> None:
-    served = serving(Gain())
+def test_versions_never_go_back_and_no_act_fails_while_weights_are_pushed(serving: Callable[..., Engine]) -> None:
+    served = Served(serving(Gain()))
     over = threading.Event()
     seen: dict[str, list[tuple[int, float]]] = {name: [] for name in "abc"}
     failed: list[BaseException] = []
@@ -259,8 +226,8 @@ def test_versions_never_go_back_and_no_act_fails_while_weights_are_pushed(servin
         assert all(gain == number for number, gain in acts)
 
 
-def test_a_moved_session_goes_on_with_its_version_and_not_where_that_is_missing(serving: Callable[..., Served]) -> None:
-    here, there, without = serving(Gain()), serving(Gain()), serving(Gain())
+def test_a_moved_session_goes_on_with_its_version_and_not_where_that_is_missing(serving: Callable[..., Engine]) -> None:
+    here, there, without = Served(serving(Gain())), Served(serving(Gain())), Served(serving(Gain()))
     here.push(1)
     here.reset("a")
     there.push(1)
@@ -281,22 +248,22 @@ def test_a_moved_session_goes_on_with_its_version_and_not_where_that_is_missing(
         without.engine.transfer.adopt("a", state)
 
 
-def test_versions_that_nobody_acts_with_are_freed(serving: Callable[..., Served]) -> None:
-    served = serving(Gain())
+def test_versions_that_nobody_acts_with_are_freed(serving: Callable[..., Engine]) -> None:
+    served = Served(serving(Gain()))
     served.reset("a")
     for number in range(1, 4):
         served.push(number)
     assert sorted(served.engine.models.own_weights._alive) == [0, 3]
 
 
-def test_weights_that_cannot_be_loaded_fail_the_act_and_others_act_again(serving: Callable[..., Served]) -> None:
+def test_weights_that_cannot_be_loaded_fail_the_act_and_others_act_again(serving: Callable[..., Engine]) -> None:
     class Fragile(Gain):
         def load_parameters(self, named: Mapping[str, Any]) -> None:
             if named["layer/gain"][0] == 1:
                 raise MemoryError
             super().load_parameters(named)
 
-    served = serving(Fragile())
+    served = Served(serving(Fragile()))
     served.reset("a")
     served.push(1)
     with pytest.raises(PolicyFailed):
@@ -307,12 +274,12 @@ def test_weights_that_cannot_be_loaded_fail_the_act_and_others_act_again(serving
     assert served.act("b") == (2, 2.0)
 
 
-def test_a_policy_that_names_no_parameters_is_not_trainable(serving: Callable[..., Served]) -> None:
+def test_a_policy_that_names_no_parameters_is_not_trainable(serving: Callable[..., Engine]) -> None:
     class Fixed(Agent):
         def act(self, obs: Obs) -> Act:
             return Act(np.zeros(1))
 
-    served = serving(Fixed())
+    served = Served(serving(Fixed()))
     with pytest.raises(NotTrainable, match="Fixed: names no parameters"):
         served.learn.stage(1, {}, PushOptions())
     assert served.learn.describe() == {key: {"version": 0, "fingerprint": ""} for key in ("newest", "pinned")}

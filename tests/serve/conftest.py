@@ -1,0 +1,26 @@
+"""Engines in the test's process."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from vlagents_ray.interface import Agent
+from vlagents_ray.serve.engine.engine import Engine
+
+
+@pytest.fixture
+def serving() -> Iterator[Callable[..., Engine]]:
+    """Starts engines, which end with the test."""
+    engines: list[Engine] = []
+
+    def serve(agent: Agent, **options: Any) -> Engine:
+        engines.append(Engine(agent, **options))
+        engines[-1].start()
+        return engines[-1]
+
+    yield serve
+    for engine in engines:
+        engine.close()
