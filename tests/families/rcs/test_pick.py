@@ -10,7 +10,7 @@ import pytest
 from in_process_episode import Always, play
 
 from vlagents_ray.envs.rcs import Rcs
-from vlagents_ray.errors import ConfigError, EnvFailed, InvalidAction, MissingDependency, NotReset, UnknownEnv
+from vlagents_ray.errors import ConfigError, MissingDependency, UnknownEnv
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.testing import check_env
 
@@ -132,17 +132,3 @@ def test_what_cannot_be_evaluated_is_refused() -> None:
         env.reset(seed=0)
         with pytest.raises(ConfigError, match="what success is"):
             env.step(Act(np.array([*HOME, 1.0], np.float32)))
-
-
-def test_an_env_that_is_not_ready_says_so(pick: Rcs) -> None:
-    fresh = Rcs("pick", cameras=[])
-    with pytest.raises(NotReset, match="reset"):
-        fresh.step(Act(np.array([*HOME, 1.0], np.float32)))
-    with pytest.raises(ConfigError, match="options"):
-        fresh.reset(seed=0, options={"place": 1})
-    fresh.close()
-    with pytest.raises(EnvFailed, match="closed"):
-        fresh.reset(seed=0)
-    pick.reset(seed=0)
-    with pytest.raises(InvalidAction, match=r"\(8,\)"):
-        pick.step(Act(np.zeros((2, 8), np.float32)))

@@ -12,7 +12,7 @@ from in_process_episode import Always, play
 
 from vlagents_ray import Agent
 from vlagents_ray.envs.robocasa import ATOMIC_SEEN, COMPOSITE_SEEN, COMPOSITE_UNSEEN, CONTROL_HZ, TYPES, RoboCasa
-from vlagents_ray.errors import ConfigError, EnvFailed, NotReset
+from vlagents_ray.errors import EnvFailed
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.testing import check_env
 
@@ -161,13 +161,9 @@ def test_a_description_states_versions_protocol_and_what_deviates_from_it(drive:
         ]
 
 
-def test_errors_say_what_is_wanted(drive: RoboCasa) -> None:
-    with pytest.raises(ConfigError, match="level"):
-        drive.reset(seed=0, options={"level": 1})
-    with RoboCasa("NavigateKitchen", cameras=("eagle",), width=8, height=8) as env:
-        with pytest.raises(NotReset):
-            env.step(Act(MOVE))
-        with pytest.raises(EnvFailed, match=r"NavigateKitchen failed to reset.*eagle"):
-            env.reset(seed=0)
-    with pytest.raises(EnvFailed, match="closed"):
+def test_a_camera_that_is_not_there_is_named() -> None:
+    with (
+        RoboCasa("NavigateKitchen", cameras=("eagle",), width=8, height=8) as env,
+        pytest.raises(EnvFailed, match=r"NavigateKitchen failed to reset.*eagle"),
+    ):
         env.reset(seed=0)
