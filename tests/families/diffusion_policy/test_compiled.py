@@ -10,7 +10,6 @@ from counting_compiler import CountingCompiler, counting_compiler
 
 from tests.families.diffusion_policy.conftest import LIBRARIES, Checkpoint, begun, loaded, seen
 from vlagents_ray import Obs
-from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import DISTRIBUTION, SAMPLES, Act
 from vlagents_ray.policies.diffusion_policy import DiffusionPolicy
 
@@ -67,14 +66,3 @@ def test_samples_are_those_without_compilation(
     samples = [acts(policy, views)[1].info[DISTRIBUTION]["samples"] for policy in both]
     np.testing.assert_allclose(*samples, atol=ATOL)
     assert len(compiler.rows) == made
-
-
-def test_a_program_that_computes_something_else_is_not_used(checkpoint: Checkpoint, compiler: CountingCompiler) -> None:
-    compiler.change[SIZE + 1] = lambda result: result * 1.01
-    settings = {"actions": "chunk", "batch_sizes": [SIZE + 1]}
-    with pytest.raises(ConfigError, match="compile: require: 'denoise': its results are off by"):
-        loaded(checkpoint("unet"), compile="require", **settings)
-    policy, before = loaded(checkpoint("unet"), compile=True, **settings), compiler.calls
-    [act], [wanted] = (acts(one, [seen(0)]) for one in (policy, loaded(checkpoint("unet"), actions="chunk")))
-    np.testing.assert_allclose(act.action, wanted.action, atol=ATOL)
-    assert compiler.calls == before

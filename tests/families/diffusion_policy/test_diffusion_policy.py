@@ -8,12 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.families.diffusion_policy import tiny
 from tests.families.diffusion_policy.conftest import LIBRARIES, Checkpoint, begun, loaded, made, seen
 from vlagents_ray import Obs
 from vlagents_ray.contract import StateSpec
 from vlagents_ray.errors import MissingCamera, PolicyFailed
-from vlagents_ray.interface import DISTRIBUTION, SAMPLES
 from vlagents_ray.policies.base import Row
 from vlagents_ray.policies.diffusion_policy import DiffusionPolicy, noise_of
 from vlagents_ray.testing import check_agent
@@ -87,28 +85,6 @@ def test_a_session_gets_the_same_in_any_company(kind: str, policies: Callable[[s
         for i, act in enumerate(policy.act_batch(views[:size], company)):
             np.testing.assert_allclose(act.action, alone[i], atol=ATOL)
     assert np.ptp(np.stack(alone), axis=0).min() > 100 * ATOL  # eight answers, not one
-
-
-def test_a_queue_shows_the_model_the_frames_between_chunks(
-    checkpoint: Checkpoint, policies: Callable[[str], DiffusionPolicy]
-) -> None:
-    queue = made(checkpoint("unet"))
-    queue.model = policies("unet").model
-    session, views = begun(queue), [seen(i) for i in range(tiny.ACTION_STEPS + 1)]
-    rows = [session.act(view).action for view in views]
-    assert rows[0].shape == (tiny.ACTION,)
-    assert session.episode is not None
-    last = [frame["obs"] for frame in session.episode.frames]
-    np.testing.assert_array_equal(last, [view.state["state"] for view in views[-2:]])
-
-
-def test_samples_are_draws_of_their_own(policies: Callable[[str], DiffusionPolicy]) -> None:
-    plain, asked = begun(policies("unet")), begun(policies("unet"))
-    act = asked.act(seen(1, **{SAMPLES: 20}))
-    np.testing.assert_allclose(act.action, plain.act(seen(1)).action, atol=ATOL)
-    found = act.info[DISTRIBUTION]
-    assert found["samples"].shape == (20, 4, 2)
-    assert found["std"].min() > 100 * ATOL
 
 
 def test_an_image_of_another_size_is_made_as_the_authors_make_it(policies: Callable[[str], DiffusionPolicy]) -> None:

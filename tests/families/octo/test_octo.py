@@ -114,17 +114,6 @@ def test_samples_are_draws_of_their_own(policy: Octo) -> None:
     np.testing.assert_allclose(found["mean"], found["samples"].mean(0), atol=ATOL)
 
 
-def test_a_queue_sees_the_frames_between_chunks(pretrained: Path, policy: Octo) -> None:
-    queue = made(pretrained, actions="queue")
-    queue.model = policy.model
-    session, frames = begun(queue, seen(0)), [seen(i) for i in range(5)]
-    rows = [session.act(frame).action for frame in frames]
-    assert rows[0].shape == (7,)
-    assert session.episode is not None
-    last = [frame["image_primary"] for frame in session.episode.frames]
-    assert all(np.array_equal(a, policy.perceive(b)["image_primary"]) for a, b in zip(last, frames[3:], strict=True))
-
-
 def test_a_camera_that_is_left_out_has_no_tokens_as_in_octo(pretrained: Path) -> None:
     policy = made(pretrained, cameras={"image_primary": "front"})
     policy.initialize()

@@ -162,12 +162,6 @@ def test_the_samples_of_an_observation_are_of_one_reading_of_it(port: Path, monk
 
 
 @patched
-def test_acts_of_which_nothing_is_wanted_are_those_without_random_steps(port: Path) -> None:
-    acts = [begun(policy, "pi0", 0).act(seen("pi0", 0)) for policy in (made(port), made(port, noise_level=LEVEL))]
-    np.testing.assert_array_equal(acts[0].action, acts[1].action)
-
-
-@patched
 @pytest.mark.verifies("loading")
 def test_a_lost_tensor_is_an_error(port: Path, tmp_path: Path, tiny: ModuleType) -> None:
     from safetensors.torch import load_file, save_file

@@ -11,16 +11,11 @@ from counting_compiler import counting_compiler
 from pushed_weights import check_pushed_weights
 
 from tests.families.pi0 import tiny
-from tests.families.pi0.test_pi0 import BATCHED, begun, seen
+from tests.families.pi0.conftest import BATCHED, begun, made, seen
 from vlagents_ray.interface import BEHAVIOUR, DELAY, DISTRIBUTION, LEFTOVER, SAMPLES, WANT, Act, Obs
 from vlagents_ray.policies.pi0 import Pi0
 
 SIZE = 3
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tiny.save(tmp_path_factory.mktemp("pi0"))
 
 
 @pytest.fixture(scope="module")
@@ -32,17 +27,12 @@ def programs() -> Iterator[list[int]]:
 
 @pytest.fixture(scope="module")
 def plain(folder: Path) -> Pi0:
-    policy = Pi0.from_config({"checkpoint": str(folder), "noise_level": 0.5})
-    policy.initialize()
-    return policy
+    return made(folder, noise_level=0.5)
 
 
 @pytest.fixture(scope="module")
 def compiled(folder: Path, programs: list[int]) -> Pi0:
-    policy = Pi0.from_config(
-        {"checkpoint": str(folder), "noise_level": 0.5, "compile": "require", "batch_sizes": [SIZE]}
-    )
-    policy.initialize()
+    policy = made(folder, noise_level=0.5, compile="require", batch_sizes=[SIZE])
     assert programs == [SIZE, SIZE]  # what is seen, and one step of the flow
     return policy
 

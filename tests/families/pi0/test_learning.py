@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ from normal_steps import logprob_of_steps
 from shared_readings import check_shared_readings
 
 from tests.families.pi0 import tiny
-from tests.families.pi0.test_pi0 import BATCHED, begun, seen
+from tests.families.pi0.conftest import BATCHED, begun, made, seen
 from vlagents_ray.interface import BEHAVIOUR, DISTRIBUTION, SAMPLES, WANT, Act
 from vlagents_ray.policies import pi0
 from vlagents_ray.policies.flow import logprob_of_chain
@@ -25,11 +24,6 @@ SUMMED = 2e-3  # how far a sum of 25 log-probabilities may be off, in float32: e
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tiny.save(tmp_path_factory.mktemp("pi0"))
-
-
-@pytest.fixture(scope="module")
 def plain(folder: Path) -> Pi0:
     return made(folder)
 
@@ -37,12 +31,6 @@ def plain(folder: Path) -> Pi0:
 @pytest.fixture(scope="module")
 def learnt(folder: Path) -> Pi0:
     return made(folder, noise_level=LEVEL)
-
-
-def made(folder: Path, **settings: Any) -> Pi0:
-    policy = Pi0.from_config({"checkpoint": str(folder), **settings})
-    policy.initialize()
-    return policy
 
 
 def encoded(policy: Pi0, *seeds: int) -> dict[str, Any]:
@@ -58,13 +46,6 @@ def encoded(policy: Pi0, *seeds: int) -> dict[str, Any]:
 def test_it_offers_what_random_steps_have(plain: Pi0, learnt: Pi0) -> None:
     assert plain.contract.behaviour is None
     assert learnt.contract.behaviour == tuple(ALL)
-
-
-def test_acts_of_which_nothing_is_wanted_are_those_without_random_steps(plain: Pi0, learnt: Pi0) -> None:
-    acts = [begun(policy, 0).act(seen(0, **{SAMPLES: 2})) for policy in (plain, learnt)]
-    np.testing.assert_array_equal(acts[0].action, acts[1].action)
-    np.testing.assert_array_equal(acts[0].info[DISTRIBUTION]["samples"], acts[1].info[DISTRIBUTION]["samples"])
-    assert BEHAVIOUR not in acts[1].info
 
 
 def test_the_log_probability_is_that_of_the_network_itself(learnt: Pi0) -> None:
@@ -100,16 +81,6 @@ def test_a_learner_recomputes_what_was_stated_of_several_acts(learnt: Pi0) -> No
     np.testing.assert_allclose(again, np.stack([one["logprob"] for one in said]), atol=SUMMED)
     for act, one in zip(acts, said, strict=True):
         np.testing.assert_array_equal(act.action, learnt.model.actions(one["replay"]["chain"][-1]))
-
-
-def test_a_chain_is_less_likely_to_other_weights(folder: Path, learnt: Pi0) -> None:
-    said = begun(learnt, 0).act(seen(0, **{WANT: ALL})).info[BEHAVIOUR]
-    network = copy.deepcopy(learnt.model.network)
-    with torch.no_grad():
-        network.action_out_proj.bias.add_(0.5)
-        velocity = pi0.flow_velocity(network, encoded(learnt, 0), torch.float32)
-        other = logprob_of_chain(velocity, torch.from_numpy(said["replay"]["chain"])[None], LEVEL)
-    assert other[:, :, : tiny.ACTION_DIM].sum() < said["logprob"].sum() - 1
 
 
 def test_a_log_probability_for_each_sample_and_for_the_rows_that_are_used(folder: Path, learnt: Pi0) -> None:

@@ -205,13 +205,6 @@ def test_samples_are_other_plans_to_the_same_goal(policy: VJepa2Ac) -> None:
     assert (found["std"][:, :3] > 0).all()
 
 
-def test_every_allowed_batch_size_is_run_when_the_model_is_loaded(checkpoint: Path) -> None:
-    warm = VJepa2Ac.from_config({"checkpoint": str(checkpoint), **SETTINGS, "batch_sizes": [1, 4]})
-    warm.initialize()
-    acts = warm.act_batch([obs(i) for i in range(3)], [begun(warm, i) for i in range(3)])
-    assert all(isinstance(act, Act) for act in acts)
-
-
 def altered(checkpoint: Path, folder: Path, part: str, lose: str | None) -> Path:
     """The checkpoint without a part, or without one of its tensors."""
     import torch
