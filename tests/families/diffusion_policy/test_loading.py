@@ -22,8 +22,6 @@ def test_a_file_of_something_else_is_named(tmp_path: Path) -> None:
         loaded(path)
 
 
-
-
 @pytest.mark.verifies("loading")
 @pytest.mark.parametrize(
     ("config", "message"),
