@@ -93,20 +93,6 @@ def test_the_rows_of_a_lost_lane_are_asked_over_the_others(opened: Open, start: 
     require_right(agent, acting)
 
 
-def test_a_batch_waits_for_the_only_upstream_to_return(opened: Open, start: Any) -> None:
-    port = free_port()
-    server = start(port)
-    agent = opened(port, retry_s=60)
-    acting = sessions(agent, 4)
-    require_right(agent, acting)
-    server.kill()
-    server.wait()
-    returning = threading.Timer(0.3, start, [port])
-    returning.start()
-    require_right(agent, acting)
-    returning.join()
-
-
 PIXELS = {
     "openpi": {"cameras": CAMERA, **PLAIN},
     "openvla": "openvla",
