@@ -9,7 +9,6 @@ from benchmarks.environments import SLEEPING_ENV, SleepingEnv
 from benchmarks.scaling import CHUNKS, OWN, SHARED, ScalingPlan, fit, row, saturation
 from benchmarks.scaling_driver import DAEMONS, PlayedEpisodes, ScalingRound, daemons_s
 from vlagents_ray.envs import make_env
-from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Act
 from vlagents_ray.testing import check_env
 
@@ -77,8 +76,3 @@ def test_a_driver_is_saturated_when_its_second_is_full() -> None:
 
 def test_daemons_of_this_machine_are_found_by_their_names() -> None:
     assert set(daemons_s()) == set(DAEMONS)
-
-
-def test_a_plan_begins_with_one_worker() -> None:
-    with pytest.raises(ConfigError, match="from 1 on"):
-        ScalingPlan(workers=(2, 4))

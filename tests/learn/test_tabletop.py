@@ -13,7 +13,7 @@ from typing import Any, get_args
 
 import numpy as np
 import pytest
-from colours import named_colour, puck_position
+from colours import named_colour
 from eval_fakes import wait_for
 from learner import RPDLearner, advantages, advice, inputs_of
 from ray_processes import end, processes, ray_folder
@@ -71,19 +71,6 @@ def columns(episodes: list[tuple[bool, list[Obs], list[np.ndarray], str]]) -> di
         "t": np.array([t for one in episodes for t in range(len(one[1]))], np.int32),
         "action": np.stack([action for one in episodes for action in one[2]]),
     }
-
-
-def test_a_puck_is_seen_where_it_stands() -> None:
-    for seed in range(30):
-        env = Tabletop("lift", **ENV_OPTIONS)
-        obs, _ = env.reset(seed=seed)
-        colour = named_colour(env.instruction)
-        assert env._world is not None
-        puck = env._world.puck(colour)
-        seen = puck_position(obs.cameras["front"], colour)
-        assert seen is not None
-        assert np.hypot(seen[0] - puck.x, seen[1] - puck.y) < 0.01  # m
-    assert puck_position(np.zeros((96, 96, 3), np.uint8), "red") is None
 
 
 def test_an_instruction_without_a_puck_is_refused() -> None:

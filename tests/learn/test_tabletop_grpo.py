@@ -161,15 +161,6 @@ def test_the_tokens_of_the_better_episodes_of_a_group_become_likelier() -> None:
     assert min(gained[0], gained[3]) > 0 > max(gained[1], gained[2])
 
 
-def test_without_a_group_of_both_outcomes_the_weights_stay() -> None:
-    student, _ = ready()
-    columns = transitions([student] * 2, [10, 10], [False, False])
-    learner = GRPOLearner()
-    before = {name: value.clone() for name, value in learner.state().items()}
-    learner.improve(columns, 5)
-    assert all(value.equal(before[name]) for name, value in learner.state().items())
-
-
 @pytest.mark.server
 @pytest.mark.slow
 @pytest.mark.integration

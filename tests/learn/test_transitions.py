@@ -4,7 +4,6 @@ import copy
 import functools
 import pickle
 import re
-import warnings
 from typing import Any
 
 import numpy as np
@@ -99,17 +98,6 @@ def test_episodes_side_by_side_have_the_transitions_of_each_by_itself() -> None:
         assert isinstance(result, EpisodeResult)
         alone, _ = transitions(Stating(stated={"value": 1.0}), key=key, want=["value"])
         assert recorder.finish(result, lambda *_: None).transitions.equals(alone)
-
-
-@pytest.mark.torch
-def test_torch_shares_the_memory() -> None:
-    import torch
-
-    _, got = transitions(ToZero())
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # it says that the array is not to be written to
-        for name in ("action", "reward", "truncated", "state.position", "final.state.position", "version"):
-            assert torch.from_numpy(got[name]).data_ptr() == got[name].ctypes.data
 
 
 def test_images_have_a_column_of_their_own_which_may_be_left_out() -> None:

@@ -287,32 +287,3 @@ def test_without_gymnasium_the_error_names_the_extra(monkeypatch: pytest.MonkeyP
     monkeypatch.setitem(sys.modules, "gymnasium", None)
     with pytest.raises(MissingDependency, match=r"vlagents-ray\[learn\]"):
         __import__("importlib").import_module("vlagents_ray.learn.vector_env")
-
-
-def test_a_linear_policy_learns_to_reach_a_point_over_the_tabletop() -> None:
-    """The cross-entropy method, each environment with weights of its own; what it sees is the state alone."""
-    goal = np.array([0.1, -0.1, 0.15])
-    options = {"width": 32, "height": 32, "max_steps": 12}
-    venv, rng = as_vector_env("tabletop", 16, observation="state", env_options=options), np.random.default_rng(0)
-
-    def returns(weights: np.ndarray) -> np.ndarray:
-        """Minus the mean distance to the goal, m, of one episode with each (16, 3, 4)."""
-        obs, _ = venv.reset(seed=0)
-        total = np.zeros(16)
-        for _ in range(11):
-            inputs = np.concatenate([obs[:, :3], np.ones((16, 1))], axis=1)
-            actions = np.concatenate([np.einsum("nij,nj->ni", weights, inputs), np.zeros((16, 1))], axis=1)
-            obs, *_ = venv.step(np.clip(actions, -1, 1))
-            total -= np.linalg.norm(obs[:, :3] - goal, axis=1) / 11
-        return total
-
-    mean, std = np.zeros((3, 4)), np.full((3, 4), 3.0)
-    curve = []
-    for _ in range(12):
-        weights = rng.normal(mean, std, (16, 3, 4))
-        scores = returns(weights)
-        curve.append(scores.mean())
-        best = weights[np.argsort(scores)[-5:]]
-        mean, std = best.mean(axis=0), best.std(axis=0) + 0.2
-    venv.close()
-    assert curve[-1] > 0.6 * curve[0], curve  # distances: the smaller the better
