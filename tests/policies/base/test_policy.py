@@ -70,7 +70,7 @@ def loaded(**config: Any) -> Wobble:
     return policy
 
 
-@pytest.mark.parametrize("config", [{}, {"actions": "queue"}, {"actions": "ensemble"}, {"batch_sizes": [1, 2, 4]}])
+@pytest.mark.parametrize("config", [{"actions": "queue"}, {"actions": "ensemble"}, {"batch_sizes": [1, 2, 4]}])
 def test_keeps_the_contract(config: dict[str, Any]) -> None:
     check_agent(made(**config), steps=2 * HORIZON)
 
