@@ -1,8 +1,13 @@
+"""Our environments as Gymnasium's vector envs, of which Stable-Baselines3's PPO learns as it is."""
+
 from __future__ import annotations
 
 import itertools
+import os
+import subprocess
 import sys
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -287,3 +292,19 @@ def test_without_gymnasium_the_error_names_the_extra(monkeypatch: pytest.MonkeyP
     monkeypatch.setitem(sys.modules, "gymnasium", None)
     with pytest.raises(MissingDependency, match=r"vlagents-ray\[learn\]"):
         __import__("importlib").import_module("vlagents_ray.learn.vector_env")
+
+
+ROOT = Path(__file__).parents[2]
+SOURCE = "STABLE_BASELINES3_SRC"  # a checkout, or a folder of `pip install --target`
+
+
+@pytest.mark.source(SOURCE)
+@pytest.mark.torch
+@pytest.mark.slow
+def test_ppo_learns_to_swing_a_pendulum_up() -> None:
+    environment = {**os.environ, "PYTHONPATH": f"{ROOT}:{os.environ[SOURCE]}", "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, "docs/evaluation/stable_baselines.py"]
+    printed = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True).stdout
+    curve = [float(line.split()[1]) for line in printed.splitlines()]
+    assert curve[0] < -900, "or the test shows nothing: untrained"
+    assert curve[-1] > -400, curve

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import contextlib
 import math
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -24,6 +25,11 @@ pytestmark = pytest.mark.source("CALVIN_SRC")
 MOVE = Act(np.array([1, 0.3, -1, 0, 0.1, 1, -1], np.float32))
 STILL = np.tile(np.array([0, 0, 0, 0, 0, 0, 1], np.float32), (60, 1))  # a chunk, between whose rows nothing is drawn
 LED = 1  # the chain that begins with "turn_off_led"
+
+
+@pytest.fixture(scope="module")
+def checkout() -> Path:
+    return Path(os.environ["CALVIN_SRC"]).resolve()
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from tests.families.openpi.marks import MARKS
+from tests.families.openpi.conftest import MARKS
 from vlagents_ray.errors import ConfigError
 
 pytestmark = MARKS

@@ -13,7 +13,7 @@ import pytest
 from counting_compiler import counting_compiler
 from normal_steps import logprob_of_steps
 
-from tests.families.openpi.marks import MARKS
+from tests.families.openpi.conftest import MARKS
 from tests.families.openpi.test_openpi import BATCHED, WORDS, begun, seen, theirs
 from vlagents_ray.errors import ConfigError, InvalidObservation
 from vlagents_ray.interface import BEHAVIOUR, DELAY, DISTRIBUTION, LEFTOVER, SAMPLES, WANT
