@@ -106,13 +106,6 @@ def test_an_ensemble_and_its_coefficient_are_the_checkpoints_defaults(loaded: Lo
     assert loaded("act", actions="ensemble").config.execute is None
 
 
-def test_more_rows_than_usual_can_be_executed_and_are_the_same_at_first(loaded: Load) -> None:
-    longer = begun(loaded("diffusion", actions="chunk", execute=7)).act(view()).action
-    usual = begun(loaded("diffusion", actions="chunk")).act(view()).action
-    assert longer.shape == (7, tiny.ACTION)
-    np.testing.assert_allclose(longer[: tiny.EXECUTED], usual, atol=ATOL)
-
-
 @pytest.mark.parametrize("kind", ["diffusion", "tdmpc", "smolvla"])
 def test_samples_change_no_action_of_the_session(kind: str, loaded: Load) -> None:
     plain, asked = begun(loaded(kind, actions="chunk")), begun(loaded(kind, actions="chunk"))

@@ -98,17 +98,6 @@ def test_a_log_probability_for_each_sample_and_for_the_rows_that_are_used(folder
     np.testing.assert_allclose(again[:, :4, : tiny.ACTION_DIM], found["logprob"], atol=SUMMED)
 
 
-def test_neighbours_change_neither_what_is_drawn_nor_what_is_not(learnt: Pi0) -> None:
-    wanted = [seen(0), seen(1, **{WANT: ALL, SAMPLES: 2}), seen(2, **{WANT: ALL})]
-    together = learnt.act_batch(wanted, [begun(learnt, seed) for seed in range(3)])
-    for seed, act in enumerate(together):
-        assert isinstance(act, Act)
-        alone = begun(learnt, seed).act(wanted[seed])
-        np.testing.assert_allclose(act.action, alone.action, atol=BATCHED)
-        if BEHAVIOUR in alone.info:
-            np.testing.assert_allclose(act.info[BEHAVIOUR]["logprob"], alone.info[BEHAVIOUR]["logprob"], atol=SUMMED)
-
-
 def test_the_samples_of_an_observation_are_of_one_reading_of_it(learnt: Pi0, monkeypatch: pytest.MonkeyPatch) -> None:
     read: list[int] = []
     embed = learnt.model.network.model.embed_prefix
