@@ -9,17 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.families.octo.conftest import MARKS
 from vlagents_ray import Obs
 from vlagents_ray.errors import InvalidObservation, MissingCamera
 from vlagents_ray.interface import DISTRIBUTION, GOAL_IMAGE, SAMPLES
 from vlagents_ray.policies.octo import Octo
 from vlagents_ray.testing import check_agent
 
-pytestmark = [
-    pytest.mark.source("OCTO_SRC"),
-    # JAX 0.4.20, flax 0.7.5, tensorflow-probability 0.23 and Octo itself use what was deprecated since.
-    pytest.mark.filterwarnings("ignore::DeprecationWarning"),
-]
+pytestmark = MARKS
 
 ATOL = 1e-4  # float32 on a CPU, actions of up to 5; measured: 3e-5, as untrained weights amplify what differs
 INSTRUCTIONS = ["pick up the cube", "push the cube", "open the drawer"]
