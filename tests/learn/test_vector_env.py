@@ -20,7 +20,6 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from vlagents_ray.contract import CameraSpec, Contract
 from vlagents_ray.envs.base import SequentialBatch
 from vlagents_ray.errors import ConfigError, EnvFailed, InvalidAction, InvalidInput, MissingDependency, NotReset
-from vlagents_ray.evaluate.plan.jobs import EpisodeKey
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.learn import as_vector_env
 from vlagents_ray.learn.vector_env import BatchVectorEnv, observation_space
@@ -158,20 +157,6 @@ class as_vector_env_of_tabletop:  # noqa: N801 - a context manager
 
     def __exit__(self, *_: object) -> None:
         self._venv.close()
-
-
-def test_episodes_have_the_seeds_of_an_evaluation() -> None:
-    key = EpisodeKey("tabletop", episode=4, seed=104, settings="")
-    with as_vector_env_of_tabletop(3, "all") as venv:
-        venv.reset(seed=100)
-        seen: dict[int, np.ndarray] = {}
-        for _ in range(6):
-            obs, _, _, _, infos = venv.step(np.zeros((3, 4), np.float32))
-        seen = {seed: obs["cameras/front"][i] for i, seed in enumerate(infos["episode_seed"].tolist())}
-        assert sorted(seen) == [103, 104, 105]
-        again, _ = venv.reset(seed=key.seed)
-        np.testing.assert_array_equal(seen[key.seed], again["cameras/front"][0])
-        assert (seen[103] != seen[104]).any()
 
 
 def test_a_list_of_seeds_is_one_for_each_environment_and_later_episodes_go_on_after_them() -> None:
