@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from tests.bench.test_recorded import record
+from tests.bench.test_tuning import record
 from vlagents_ray.bench.tuner import TunePlan, Tuner, VariantFailed
 from vlagents_ray.bench.tuning_choice import TuningGoal, choose
 from vlagents_ray.errors import ConfigError

@@ -15,7 +15,6 @@ from benchmarks.evaluation import (
     EvaluationPlan,
     Played,
     alone,
-    measure_evaluation,
     play,
     ratios,
     their_runs,
@@ -25,7 +24,6 @@ from benchmarks.report import evaluation_outcomes
 from vlagents_ray.bench.line_process import ProcessFailed
 from vlagents_ray.envs import make_env
 from vlagents_ray.envs.base import known_contract
-from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Act
 
 FEW = EvaluationPlan(episodes=4, workers=2, size=32, max_steps=3)
@@ -102,13 +100,6 @@ def test_ratios_are_above_one_where_we_are_faster() -> None:
 def test_against_one_process_all_cores_must_count() -> None:
     found = {"cores": 8, "plan": {"workers": 2}, "ratios": {"vlagents": {"median": 1.9}, "vla-eval": {"median": 1.9}}}
     assert [one.met for one in evaluation_outcomes(found)] == [False, True]
-
-
-def test_a_plan_splits_evenly_and_peers_are_named(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="multiple of the 2 workers"):
-        EvaluationPlan(episodes=5)
-    with pytest.raises(ConfigError, match="openpi"):
-        measure_evaluation(FEW, peers=["openpi"], peers_python=tmp_path)
 
 
 def test_the_peers_see_these_packages_and_nothing_else_of_ours(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Other policy servers: which are measured, and a script that stands for one, its client and its server."""
+"""Clients in other languages and other policy servers: which are measured, and a script that stands for one."""
 
 from __future__ import annotations
 
@@ -8,8 +8,11 @@ import sys
 from pathlib import Path
 
 import pytest
+import typescript_client
+from client_servers import client_servers
 from eval_fakes import wait_for
 
+from benchmarks import clients
 from benchmarks.own_clients import observation, save_observation
 from benchmarks.peers import SCRIPTS, PeerClient, installed, peer_clients, peer_connected
 from vlagents_ray.bench.line_process import ProcessFailed
@@ -128,3 +131,19 @@ def test_versions_are_those_of_the_other_python() -> None:
     assert set(installed(Path(sys.executable), ["numpy", "no-such-thing"])) == {"numpy"}
     with pytest.raises(ConfigError, match="peers-python"):
         installed(Path("/bin/false"), ["numpy"])
+
+
+@pytest.mark.node
+@pytest.mark.compiler
+def test_all_clients_are_measured_in_turns() -> None:
+    typescript_client.build()
+    with client_servers() as urls:
+        found = clients.measure_clients(urls["VLAGENTS_TEST_URL"], 20)
+    assert [trips.name for trips in found.ours] == ["Python, websocket", "Python, http", clients.CPP, *clients.NODE]
+    assert all(trips.rounds.shape == (1, 20) and trips.median > 0 for trips in found.ours)
+
+
+def test_a_client_that_was_not_built_is_named_with_the_cure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(clients, "TYPESCRIPT", tmp_path)
+    with pytest.raises(ConfigError, match="npm run build"):
+        clients.measure_clients("http://127.0.0.1:9", 1)

@@ -1,12 +1,16 @@
-"""Which ways are measured, which are not and why; and that they take turns."""
+"""Round trips: which ways are measured in turns, and what medians, intervals and ratios say of known data."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 
+import numpy as np
 import pytest
 
 from benchmarks.drivers import Driver
+from benchmarks.figures import RoundTrips, lost_db, measured_on, median_interval, median_ratio, ratios
+from benchmarks.hop import CHILD, IN_PROCESS, measure_hop
 from benchmarks.own_clients import OWN_CLIENTS, connect, observation, own_clients
 from benchmarks.round_trips import ROUND, in_turns
 from vlagents_ray.errors import ConfigError
@@ -55,3 +59,70 @@ def test_a_codec_is_written_in_words() -> None:
     assert connect("http://127.0.0.1:1", "websocket", "jpeg 90 420", rank="robot").transport == "websocket"
     with pytest.raises(ValueError, match="codec"):
         connect("http://127.0.0.1:1", "websocket", "gif")
+
+
+def trips(name: str, median: float, rounds: int = 20, seed: int = 0) -> RoundTrips:
+    return RoundTrips(name, np.random.default_rng(seed).lognormal(np.log(median), 0.2, (rounds, 25)))
+
+
+def test_the_interval_holds_the_median() -> None:
+    numbers = np.arange(1, 102, dtype=float)
+    assert median_interval(numbers) == (41, 62)  # order statistics of 101 calls at 95 %
+    assert median_interval(np.array([3.0])) == (3, 3)
+    one = RoundTrips("x", numbers.reshape(1, -1))
+    assert one.median == 51
+    assert one.to_json() == {"way": "x", "calls": 101, "median_ms": 51, "ci95_ms": [41, 62], "p99_ms": 100}
+
+
+def test_a_ratio_lies_in_its_interval_and_the_truth_does_too() -> None:
+    found = median_ratio(trips("a", 1.0), trips("b", 4.0, seed=1))
+    assert found.low < found.ratio < found.high
+    assert found.low < 0.25 < found.high
+    assert found.high - found.low < 0.05
+
+
+def test_the_interval_covers_the_truth_about_as_often_as_it_says() -> None:
+    hits = 0
+    for seed in range(40):
+        found = median_ratio(trips("a", 1.0, seed=2 * seed), trips("b", 2.0, seed=2 * seed + 1))
+        hits += found.low <= 0.5 <= found.high
+    assert hits >= 33  # 95 % of 40 is 38; 33 or fewer has a chance under 1 %
+
+
+def test_what_slows_both_down_does_not_widen_the_ratio() -> None:
+    load = np.linspace(1, 3, 20)[:, None]  # the machine becomes three times as slow, for both alike
+    a, b = trips("a", 1.0), trips("b", 2.0, seed=1)
+    found = median_ratio(RoundTrips("a", a.rounds * load), RoundTrips("b", b.rounds * load))
+    assert found.low < 0.5 < found.high
+    assert found.high - found.low < 0.1
+
+
+def test_only_what_was_measured_in_one_run_is_compared() -> None:
+    with pytest.raises(ValueError, match="one run"):
+        median_ratio(trips("a", 1.0), trips("b", 1.0, rounds=3))
+
+
+def test_every_one_of_ours_is_compared_with_every_one_of_theirs() -> None:
+    found = ratios([trips("a", 1.0), trips("b", 2.0)], [trips("c", 1.0)])
+    assert {ours: list(theirs) for ours, theirs in found.items()} == {"a": ["c"], "b": ["c"]}
+    assert found["a"]["c"]["ratio"] == 1
+
+
+def test_what_images_lost() -> None:
+    sent = {"front": np.full((4, 4, 3), 100, np.uint8)}
+    assert lost_db(sent, sent) is None
+    assert lost_db({"front": sent["front"] + np.uint8(1)}, sent) == pytest.approx(48.13, abs=0.01)  # 20 log10(255)
+
+
+def test_what_figures_depend_on_is_json_without_names_of_hosts() -> None:
+    said = json.loads(json.dumps(measured_on()))
+    assert said.keys() == {"date", "command", "machine", "versions"}
+    assert said["versions"].keys() >= {"vlagents-ray", "numpy", "Python"}
+    assert said["machine"].keys() == {"cpu", "cores", "memory_gb", "kernel", "load"}
+
+
+def test_both_ways_are_measured_in_turns_and_the_child_costs_time() -> None:
+    here, there = measure_hop(200).ours
+    assert (here.name, there.name) == (IN_PROCESS, CHILD)
+    assert here.rounds.shape == there.rounds.shape == (2, 100)
+    assert 0 < here.median < there.median

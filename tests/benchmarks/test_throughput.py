@@ -1,10 +1,16 @@
-"""The arithmetic around throughput."""
+"""Throughput, autoscaling, pushes and rollouts: their arithmetic, and that they run."""
 
 from __future__ import annotations
 
+import math
+from pathlib import Path
+
 import pytest
 
+from benchmarks.autoscaling import AutoscalingPlan, LoadPhase, ScaleSample, by_second, plot_autoscaling, report
 from benchmarks.bare_policy import BarePolicy
+from benchmarks.push import measure_push
+from benchmarks.rollouts import main
 from benchmarks.throughput import ThroughputPlan
 from vlagents_ray.bench.measured_policy import rate_of
 
@@ -38,3 +44,54 @@ def test_a_bare_policy_is_run_in_full_batches() -> None:
     bare = BarePolicy("noop", {"base_ms": 10}, batch=8)
     rates = [bare.rate(0.1) for _ in range(5)]  # eight for each sleep of at least 10 ms; one at a time would be 100
     assert 100 < max(rates) <= 800
+
+
+ACTS = [(100.1, 10.0), (100.9, 20.0), (101.5, 30.0)]
+
+
+def test_acts_are_summed_up_by_the_second() -> None:
+    assert by_second(ACTS, 100.0) == [
+        {"at": 0.5, "median_ms": 15.0, "p95_ms": 19.5},
+        {"at": 1.5, "median_ms": 30.0, "p95_ms": 30.0},
+    ]
+
+
+def test_each_burst_has_its_own_figures_and_times_count_from_the_first(tmp_path: Path) -> None:
+    samples = [ScaleSample(99.0, 0, 0, 0), ScaleSample(101.0, 2, 1, 3), ScaleSample(104.0, 4, 4, 1)]
+    phases = [
+        LoadPhase("robots", 100.0, 102.0, ACTS, 1.5, 0, []),
+        LoadPhase("nobody got through", 103.0, 105.0, [], 60.0, 0, ["reset: no replica"]),
+    ]
+    found = report(AutoscalingPlan(), samples, phases)
+    assert [one["at"] for one in found["samples"]] == [-1, 1, 4]
+    robots, none = found["phases"]
+    assert (robots["begun"], robots["ended"], robots["most_replicas"], robots["acts"]) == (0, 2, 1, 3)
+    assert (robots["median_ms"], robots["longest_ms"]) == pytest.approx((20, 30))
+    assert none["failed"] == ["reset: no replica"]
+    assert math.isnan(none["median_ms"])
+    plot_autoscaling(found, tmp_path / "picture.svg")
+    assert (tmp_path / "picture.svg").stat().st_size > 1000
+
+
+@pytest.mark.slow
+@pytest.mark.integration
+@pytest.mark.server
+def test_the_sessions_act_on_with_the_weights_of_each_push() -> None:
+    rounds = measure_push(2_500_000, "float16", sessions=3, base_ms=1, rounds=2, seconds=1)
+    assert [row["push"]["newest"] for row in rounds] == [1, 2]
+    for row in rounds:
+        assert row["push_s"] > 0
+        for watched in (row["alone"], row["push"]):
+            assert watched["failed"] == 0
+            assert watched["monotone"]
+            assert watched["longest_ms"] >= 1
+
+
+@pytest.mark.slow
+@pytest.mark.integration
+@pytest.mark.server
+def test_it_measures_both(capsys: pytest.CaptureFixture[str]) -> None:
+    main("tiny", workers=2, num_envs=2, episodes=8, rounds=1, size=32)
+    loop, median = capsys.readouterr().out.splitlines()[-2:]
+    assert loop.startswith("loop ")
+    assert median.startswith("median ")

@@ -139,9 +139,6 @@ def test_what_does_not_fit_is_refused_as_ever_and_nothing_stays_open(
     changed(learner)
     for wrong, message in (
         ({**values, "part": torch.full((4,), torch.nan, device=device)}, "'part': got NaN"),
-        ({**values, "part": values["layer.bias"]}, r"'part': got shape \(32,\), want \(4,\)"),
-        ({**values, "part": values["part"].long()}, "'part': got int64, want float32"),
-        ({**values, "more": values["part"]}, "'more': unknown"),
         ({"part": values["part"]}, "'rough': missing"),
         ({**values, "part": "text"}, "'part': got str, want an array"),
     ):

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import queue
-import threading
 from collections.abc import Iterator
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -81,59 +80,3 @@ def test_mistakes_are_refused_by_name(engine: Engine) -> None:
     with pytest.raises(ConfigError, match="Publisher: got 7"):
         Publisher(7)  # type: ignore[arg-type]
     assert act(engine).info["policy"]["version"] == 0
-
-
-def test_pushes_of_several_learners_are_versions_in_some_order(engine: Engine) -> None:
-    found: list[Any] = []
-
-    def learn(seed: int) -> None:
-        weights = Publisher(engine)
-        rng = np.random.default_rng(seed)
-        for _ in range(10):
-            try:
-                found.append(weights.push({"w": rng.random(2), "b": rng.random(2)}))
-            except Exception as error:  # noqa: BLE001 - compared below
-                found.append(type(error).__name__)
-
-    threads = [threading.Thread(target=learn, args=(seed,)) for seed in range(3)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(60)
-    pushed = [version for version in found if isinstance(version, int)]
-    assert sorted(pushed) == list(range(1, len(pushed) + 1))
-    assert set(found) - set(pushed) <= {"Overloaded"}
-    assert act(engine).info["policy"]["version"] == len(pushed)
-
-
-@pytest.mark.torch
-def test_a_module_is_trained_and_served_in_one_process() -> None:
-    torch = pytest.importorskip("torch")
-
-    class Module(Agent):
-        trainable: ClassVar[str | None] = "module"
-
-        def initialize(self) -> None:
-            self.module = torch.nn.Linear(3, 2)
-
-        def act(self, obs: Obs) -> Act:
-            with torch.no_grad():
-                return Act(self.module(torch.ones(3)).numpy().copy())
-
-    engine = Engine(Module())
-    engine.start()
-    try:
-        learner = torch.nn.Linear(3, 2)
-        optimizer = torch.optim.SGD(learner.parameters(), lr=0.1)
-        weights = Publisher(engine)
-        for version in (1, 2):
-            weights.push(learner.state_dict())
-            with torch.no_grad():
-                wanted = learner(torch.ones(3)).numpy()
-            learner(torch.ones(3)).sum().backward()
-            optimizer.step()  # in place, after the push
-            acted = act(engine, f"s{version}")
-            np.testing.assert_array_equal(acted.action, wanted)
-            assert acted.info["policy"]["version"] == version
-    finally:
-        engine.close()

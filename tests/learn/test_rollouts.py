@@ -195,13 +195,6 @@ def test_a_version_that_no_act_names_is_an_error_and_not_an_endless_repetition()
             found.collect(4)
 
 
-def test_collect_goes_on_if_all_are_lost() -> None:
-    broken = {"trouble": {"raise": [0, 1]}}
-    with Rollouts(RolloutPlan(LINE, ToZero, env_options=broken, settings={"retries": 0})) as found:
-        assert set(found.collect(1).column("episode").to_pylist()) == {2}
-    assert found.stats.lost == 2
-
-
 def test_the_version_rises_with_that_of_the_acts(versioned: type[Versioned]) -> None:
     with Rollouts(RolloutPlan(LINE, versioned)) as found:
         versioned.version = 4

@@ -4,7 +4,6 @@ import copy
 import functools
 import pickle
 import re
-import warnings
 from typing import Any
 
 import numpy as np
@@ -101,17 +100,6 @@ def test_episodes_side_by_side_have_the_transitions_of_each_by_itself() -> None:
         assert recorder.finish(result, lambda *_: None).transitions.equals(alone)
 
 
-@pytest.mark.torch
-def test_torch_shares_the_memory() -> None:
-    import torch
-
-    _, got = transitions(ToZero())
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # it says that the array is not to be written to
-        for name in ("action", "reward", "truncated", "state.position", "final.state.position", "version"):
-            assert torch.from_numpy(got[name]).data_ptr() == got[name].ctypes.data
-
-
 def test_images_have_a_column_of_their_own_which_may_be_left_out() -> None:
     camera = {"camera": [4, 6]}
     _, got = transitions(ToZero(), env_options=camera)
@@ -204,6 +192,8 @@ def test_each_step_of_several_episodes_finds_its_answer(chunk: int) -> None:
     got = arrays(pa.Table.from_batches(batches))
     np.testing.assert_array_equal(got["replay.tokens"][answers(got), 0, 0], got["act"])
     assert len(got["replay.tokens"]) == 2 * -(-10 // chunk)
+    assert (got["action"].shape, got["final.state.position"].shape) == ((20, 1), (2, 1))
+    assert list(dict.fromkeys(got["key"])) == [f"{LINE}#1@1:x", f"{LINE}#2@2:x"]
 
 
 @pytest.mark.parametrize(
@@ -248,14 +238,6 @@ def test_an_observation_of_another_shape_is_the_envs_error() -> None:
     one.add_observation(Obs(state={"position": np.zeros(1, np.float32)}))
     with pytest.raises(EnvFailed, match=r"got \{'state.position': \(2,\)\}, want \{'state.position': \(1,\)\}"):
         one.add_observation(Obs(state={"position": np.zeros(2, np.float32)}))
-
-
-def test_several_episodes_are_one_table() -> None:
-    batches = [transitions(ToZero(), key=EpisodeKey(LINE, seed, seed, "x"))[0] for seed in (1, 2)]
-    got = arrays(pa.Table.from_batches(batches))
-    assert got["action"].shape == (20, 1)
-    assert got["final.state.position"].shape == (2, 1)
-    assert list(dict.fromkeys(got["key"])) == [f"{LINE}#1@1:x", f"{LINE}#2@2:x"]
 
 
 def test_a_key_with_a_seed_of_the_policy_is_another_episode_from_the_same_state() -> None:

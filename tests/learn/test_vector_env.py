@@ -1,8 +1,13 @@
+"""Our environments as Gymnasium's vector envs, of which Stable-Baselines3's PPO learns as it is."""
+
 from __future__ import annotations
 
 import itertools
+import os
+import subprocess
 import sys
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -15,7 +20,6 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from vlagents_ray.contract import CameraSpec, Contract
 from vlagents_ray.envs.base import SequentialBatch
 from vlagents_ray.errors import ConfigError, EnvFailed, InvalidAction, InvalidInput, MissingDependency, NotReset
-from vlagents_ray.evaluate.plan.jobs import EpisodeKey
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.learn import as_vector_env
 from vlagents_ray.learn.vector_env import BatchVectorEnv, observation_space
@@ -155,20 +159,6 @@ class as_vector_env_of_tabletop:  # noqa: N801 - a context manager
         self._venv.close()
 
 
-def test_episodes_have_the_seeds_of_an_evaluation() -> None:
-    key = EpisodeKey("tabletop", episode=4, seed=104, settings="")
-    with as_vector_env_of_tabletop(3, "all") as venv:
-        venv.reset(seed=100)
-        seen: dict[int, np.ndarray] = {}
-        for _ in range(6):
-            obs, _, _, _, infos = venv.step(np.zeros((3, 4), np.float32))
-        seen = {seed: obs["cameras/front"][i] for i, seed in enumerate(infos["episode_seed"].tolist())}
-        assert sorted(seen) == [103, 104, 105]
-        again, _ = venv.reset(seed=key.seed)
-        np.testing.assert_array_equal(seen[key.seed], again["cameras/front"][0])
-        assert (seen[103] != seen[104]).any()
-
-
 def test_a_list_of_seeds_is_one_for_each_environment_and_later_episodes_go_on_after_them() -> None:
     with as_vector_env_of_tabletop(3, "all") as venv:
         several, infos = venv.reset(seed=[107, 4, 100])
@@ -289,30 +279,17 @@ def test_without_gymnasium_the_error_names_the_extra(monkeypatch: pytest.MonkeyP
         __import__("importlib").import_module("vlagents_ray.learn.vector_env")
 
 
-def test_a_linear_policy_learns_to_reach_a_point_over_the_tabletop() -> None:
-    """The cross-entropy method, each environment with weights of its own; what it sees is the state alone."""
-    goal = np.array([0.1, -0.1, 0.15])
-    options = {"width": 32, "height": 32, "max_steps": 12}
-    venv, rng = as_vector_env("tabletop", 16, observation="state", env_options=options), np.random.default_rng(0)
+ROOT = Path(__file__).parents[2]
+SOURCE = "STABLE_BASELINES3_SRC"  # a checkout, or a folder of `pip install --target`
 
-    def returns(weights: np.ndarray) -> np.ndarray:
-        """Minus the mean distance to the goal, m, of one episode with each (16, 3, 4)."""
-        obs, _ = venv.reset(seed=0)
-        total = np.zeros(16)
-        for _ in range(11):
-            inputs = np.concatenate([obs[:, :3], np.ones((16, 1))], axis=1)
-            actions = np.concatenate([np.einsum("nij,nj->ni", weights, inputs), np.zeros((16, 1))], axis=1)
-            obs, *_ = venv.step(np.clip(actions, -1, 1))
-            total -= np.linalg.norm(obs[:, :3] - goal, axis=1) / 11
-        return total
 
-    mean, std = np.zeros((3, 4)), np.full((3, 4), 3.0)
-    curve = []
-    for _ in range(12):
-        weights = rng.normal(mean, std, (16, 3, 4))
-        scores = returns(weights)
-        curve.append(scores.mean())
-        best = weights[np.argsort(scores)[-5:]]
-        mean, std = best.mean(axis=0), best.std(axis=0) + 0.2
-    venv.close()
-    assert curve[-1] > 0.6 * curve[0], curve  # distances: the smaller the better
+@pytest.mark.source(SOURCE)
+@pytest.mark.torch
+@pytest.mark.slow
+def test_ppo_learns_to_swing_a_pendulum_up() -> None:
+    environment = {**os.environ, "PYTHONPATH": f"{ROOT}:{os.environ[SOURCE]}", "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, "docs/evaluation/stable_baselines.py"]
+    printed = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True).stdout
+    curve = [float(line.split()[1]) for line in printed.splitlines()]
+    assert curve[0] < -900, "or the test shows nothing: untrained"
+    assert curve[-1] > -400, curve

@@ -9,7 +9,6 @@ from vlagents_ray import Act, Obs
 from vlagents_ray.envs import make_env
 from vlagents_ray.envs.tabletop import Tabletop
 from vlagents_ray.errors import (
-    ConfigError,
     ContractMismatch,
     InvalidInput,
     InvalidObservation,
@@ -17,7 +16,6 @@ from vlagents_ray.errors import (
     MissingState,
     NotReset,
 )
-from vlagents_ray.interface import Agent
 from vlagents_ray.policies.experts import EXPERTS, expert_class
 from vlagents_ray.policies.experts.tabletop import TabletopExpert
 from vlagents_ray.policies.scripted import Scripted
@@ -47,10 +45,6 @@ def test_the_env_of_reset_comes_before_the_task_of_the_config() -> None:
         agent.reset(views[0], instructions[0], env="kitchen/Cook-v1")
 
 
-def test_a_task_within_a_suite_finds_the_suites_expert() -> None:
-    assert expert_class("tabletop/slide") is TabletopExpert
-
-
 def test_a_task_without_expert_is_refused_with_those_there_are() -> None:
     with pytest.raises(ContractMismatch, match="maniskill/PushCube-v1") as caught:
         expert_class("maniskill/PlugCharger-v1")
@@ -73,11 +67,6 @@ def test_act_before_reset_is_refused() -> None:
         Scripted().act(Obs())
     with pytest.raises(NotReset):
         TabletopExpert("tabletop").act(Obs())
-
-
-def test_an_unknown_setting_is_refused() -> None:
-    with pytest.raises(ConfigError, match="exprt"):
-        Scripted.from_config({"exprt": "x"})
 
 
 def test_a_failed_reset_keeps_no_expert() -> None:
@@ -144,20 +133,3 @@ def test_done_is_said_when_and_only_when_the_task_is_fulfilled() -> None:
             success = info["success"]
         assert act.done
         assert success
-
-
-def test_two_sessions_with_different_instructions_do_not_mix() -> None:
-    one, other = Tabletop("pick_place"), Tabletop("stack")
-    sessions: list[tuple[Tabletop, Agent, Obs]] = []
-    for env, seed in ((one, 3), (other, 4)):
-        obs, _ = env.reset(seed=seed)
-        agent = Scripted()
-        agent.reset(obs, env.instruction, env="tabletop")
-        sessions.append((env, agent, obs))
-    solved = [False, False]
-    for _ in range(60):
-        for i, (env, agent, obs) in enumerate(sessions):
-            seen, _, _, _, info = env.step(agent.act(obs))
-            sessions[i] = (env, agent, seen)
-            solved[i] = info["success"]
-    assert solved == [True, True]

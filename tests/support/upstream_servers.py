@@ -1,9 +1,9 @@
-"""Servers of other systems, one process each, in the bytes of their own packers; none of our codecs is used.
+"""Servers of other systems, in the bytes of their own packers; none of our codecs is used.
 
-`python upstream_servers.py KIND PORT`; a kind is a protocol, and for GR00T also `gr00t sim`: with
-`Gr00tSimPolicyWrapper`, or `gr00t packed`: with the newest servers' arrays. What they answer depends on each bit of the
-observation, so that an action that equals `answer` was computed from the very observation. The formats are those of
-openpi_client.msgpack_numpy, gr00t/policy/server_client.py, json_numpy and vla_eval.protocol.
+`python upstream_servers.py KIND PORT [KIND PORT …]` serves all of them. A kind is a protocol, and for GR00T also
+`gr00t sim`: with `Gr00tSimPolicyWrapper`, or `gr00t packed`: with the newest servers' arrays. What they answer depends
+on each bit of the observation, so that an action that equals `answer` was computed from the very observation. The
+formats are those of openpi_client.msgpack_numpy, gr00t/policy/server_client.py, json_numpy and vla_eval.protocol.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import io
 import json
 import subprocess
 import sys
+import threading
 import time
 import zlib
 from collections.abc import Iterator, Mapping
@@ -240,7 +241,15 @@ class OpenVLA(BaseHTTPRequestHandler):
 @contextlib.contextmanager
 def upstream(kind: str, port: int) -> Iterator[subprocess.Popen[bytes]]:
     """A server of a kind in a process of its own, which is killed at the end."""
-    process = subprocess.Popen([sys.executable, __file__, kind, str(port)])
+    with upstreams({port: kind}) as process:
+        yield process
+
+
+@contextlib.contextmanager
+def upstreams(kinds: Mapping[int, str]) -> Iterator[subprocess.Popen[bytes]]:
+    """Servers by their ports in one process, which is killed at the end."""
+    words = [word for port, kind in kinds.items() for word in (kind, str(port))]
+    process = subprocess.Popen([sys.executable, __file__, *words])
     try:
         yield process
     finally:
@@ -262,4 +271,5 @@ def _main(kind: str, port: int) -> None:
 
 
 if __name__ == "__main__":
-    _main(sys.argv[1], int(sys.argv[2]))
+    for kind, port in zip(sys.argv[1::2], sys.argv[2::2], strict=True):
+        threading.Thread(target=_main, args=(kind, int(port))).start()

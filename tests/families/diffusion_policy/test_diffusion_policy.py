@@ -1,19 +1,19 @@
-"""The authors' own code, asked through the policy: the same actions, in any company."""
+"""The authors' own code, asked through the policy: the same actions, in any company, and with compiled cores."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 import pytest
+from counting_compiler import CountingCompiler, counting_compiler
 
-from tests.families.diffusion_policy import tiny
 from tests.families.diffusion_policy.conftest import LIBRARIES, Checkpoint, begun, loaded, made, seen
 from vlagents_ray import Obs
 from vlagents_ray.contract import StateSpec
 from vlagents_ray.errors import MissingCamera, PolicyFailed
-from vlagents_ray.interface import DISTRIBUTION, SAMPLES
+from vlagents_ray.interface import DISTRIBUTION, SAMPLES, Act
 from vlagents_ray.policies.base import Row
 from vlagents_ray.policies.diffusion_policy import DiffusionPolicy, noise_of
 from vlagents_ray.testing import check_agent
@@ -89,28 +89,6 @@ def test_a_session_gets_the_same_in_any_company(kind: str, policies: Callable[[s
     assert np.ptp(np.stack(alone), axis=0).min() > 100 * ATOL  # eight answers, not one
 
 
-def test_a_queue_shows_the_model_the_frames_between_chunks(
-    checkpoint: Checkpoint, policies: Callable[[str], DiffusionPolicy]
-) -> None:
-    queue = made(checkpoint("unet"))
-    queue.model = policies("unet").model
-    session, views = begun(queue), [seen(i) for i in range(tiny.ACTION_STEPS + 1)]
-    rows = [session.act(view).action for view in views]
-    assert rows[0].shape == (tiny.ACTION,)
-    assert session.episode is not None
-    last = [frame["obs"] for frame in session.episode.frames]
-    np.testing.assert_array_equal(last, [view.state["state"] for view in views[-2:]])
-
-
-def test_samples_are_draws_of_their_own(policies: Callable[[str], DiffusionPolicy]) -> None:
-    plain, asked = begun(policies("unet")), begun(policies("unet"))
-    act = asked.act(seen(1, **{SAMPLES: 20}))
-    np.testing.assert_allclose(act.action, plain.act(seen(1)).action, atol=ATOL)
-    found = act.info[DISTRIBUTION]
-    assert found["samples"].shape == (20, 4, 2)
-    assert found["std"].min() > 100 * ATOL
-
-
 def test_an_image_of_another_size_is_made_as_the_authors_make_it(policies: Callable[[str], DiffusionPolicy]) -> None:
     policy, view = policies("image"), seen(1, (96, 200))
     from diffusion_policy.real_world.real_inference_util import get_real_obs_dict
@@ -149,3 +127,55 @@ def test_draws_that_are_no_rows_own_are_refused() -> None:
                 unfair()
     wanted = [np.random.default_rng(i).standard_normal(3, dtype=np.float32) for i in range(2)]
     np.testing.assert_array_equal(drawn.numpy(), wanted)
+
+
+CORES = {"unet": 1, "transformer": 1, "image": 2, "hybrid": 2}  # a step from noise, and what is seen in images
+SIZE = 3
+
+
+@pytest.fixture(scope="module")
+def compiler() -> Iterator[CountingCompiler]:
+    with counting_compiler() as made:
+        yield made
+
+
+@pytest.fixture(scope="module", params=CORES)
+def both(
+    request: pytest.FixtureRequest, checkpoint: Checkpoint, compiler: CountingCompiler
+) -> tuple[DiffusionPolicy, DiffusionPolicy]:
+    """A policy, and the same one compiled."""
+    file, before = checkpoint(request.param), len(compiler.rows)
+    compiled = loaded(file, actions="chunk", compile="require", batch_sizes=[SIZE])
+    assert compiler.rows[before:] == [SIZE] * CORES[request.param]
+    return loaded(file, actions="chunk"), compiled
+
+
+def acts(policy: DiffusionPolicy, views: list[Obs]) -> list[Act]:
+    found = policy.act_batch(views, [begun(policy, i) for i in range(len(views))])
+    assert all(isinstance(act, Act) for act in found)
+    return found  # type: ignore[return-value]
+
+
+def test_batches_of_any_size_are_those_without_compilation(
+    both: tuple[DiffusionPolicy, DiffusionPolicy], compiler: CountingCompiler
+) -> None:
+    made = len(compiler.rows)
+    for size in (1, 2, SIZE, SIZE + 1):
+        before = compiler.calls
+        plain, compiled = (acts(policy, [seen(i) for i in range(size)]) for policy in both)
+        for one, other in zip(plain, compiled, strict=True):
+            np.testing.assert_allclose(one.action, other.action, atol=ATOL)
+        assert compiler.calls > before
+    assert len(compiler.rows) == made
+
+
+def test_samples_are_those_without_compilation(
+    both: tuple[DiffusionPolicy, DiffusionPolicy], compiler: CountingCompiler
+) -> None:
+    made = len(compiler.rows)
+    views = [seen(0), seen(1, **{SAMPLES: 2})]
+    for one, other in zip(*(acts(policy, views) for policy in both), strict=True):
+        np.testing.assert_allclose(one.action, other.action, atol=ATOL)
+    samples = [acts(policy, views)[1].info[DISTRIBUTION]["samples"] for policy in both]
+    np.testing.assert_allclose(*samples, atol=ATOL)
+    assert len(compiler.rows) == made

@@ -9,35 +9,17 @@ from typing import Any
 import pytest
 
 from tests.families.diffusion_policy import tiny
-from tests.families.diffusion_policy.conftest import LIBRARIES
+from tests.families.diffusion_policy.conftest import LIBRARIES, Checkpoint, loaded
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.policies.diffusion_policy import DiffusionPolicy
 
 pytestmark = [pytest.mark.source("DIFFUSION_POLICY_SRC"), *LIBRARIES]
-
-Checkpoint = Callable[[str], Path]
-
-
-def load(checkpoint: Path, **config: Any) -> DiffusionPolicy:
-    policy = DiffusionPolicy.from_config({"checkpoint": str(checkpoint), "trust_checkpoint": True, **config})
-    policy.initialize()
-    return policy
 
 
 def test_a_file_of_something_else_is_named(tmp_path: Path) -> None:
     path = tmp_path / "latest.ckpt"
     path.write_bytes(b"not even a pickle")
     with pytest.raises(ConfigError, match="no payload of a Diffusion Policy workspace"):
-        load(path)
-
-
-def test_a_folder_with_several_files_says_which(checkpoint: Checkpoint, tmp_path: Path) -> None:
-    folder = checkpoint("unet").parents[1]
-    (tmp_path / "a.ckpt").symlink_to(folder / "checkpoints" / "latest.ckpt")
-    load(tmp_path)
-    (tmp_path / "b.ckpt").touch()
-    with pytest.raises(ConfigError, match=r"a folder with \['a.ckpt', 'b.ckpt'\], want one \.ckpt file"):
-        load(tmp_path)
+        loaded(path)
 
 
 @pytest.mark.verifies("loading")
@@ -53,20 +35,20 @@ def test_a_folder_with_several_files_says_which(checkpoint: Checkpoint, tmp_path
 )
 def test_settings_that_do_not_fit_the_checkpoint(checkpoint: Checkpoint, config: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
-        load(checkpoint("image"), **config)
+        loaded(checkpoint("image"), **config)
 
 
 @pytest.mark.verifies("loading")
 def test_a_checkpoint_without_its_normalizer_is_refused(tmp_path: Path) -> None:
     path = tiny.save(tmp_path / "unnormalized", "unet", normalizer=False)
     with pytest.raises(ConfigError, match=r"normalizer has nothing for \['action', 'obs'\]"):
-        load(path)
+        loaded(path)
 
 
 def test_a_checkpoint_without_the_weights_that_its_settings_want_is_refused(tmp_path: Path) -> None:
     path = tiny.save(tmp_path / "raw", "unet", use_ema=False)
     with pytest.raises(ConfigError, match=r"has no 'model'.*has \['ema_model'\]"):
-        load(path)
+        loaded(path)
 
 
 def _spoilt(path: Path, to: Path, change: Callable[[Any], None]) -> Path:
@@ -92,17 +74,17 @@ def test_a_checkpoint_that_is_not_whole(
     checkpoint: Checkpoint, tmp_path: Path, change: Callable[[Any], None], message: str
 ) -> None:
     with pytest.raises(ConfigError, match=message):
-        load(_spoilt(checkpoint("unet"), tmp_path / "spoilt.ckpt", change))
+        loaded(_spoilt(checkpoint("unet"), tmp_path / "spoilt.ckpt", change))
 
 
 def test_weights_that_training_began_with_are_not_downloaded(checkpoint: Checkpoint, tmp_path: Path) -> None:
     def began(payload: Any) -> None:
         payload["cfg"].policy.obs_encoder.rgb_model.weights = "IMAGENET1K_V1"
 
-    policy = load(_spoilt(checkpoint("image"), tmp_path / "pretrained.ckpt", began), steps=2)
+    policy = loaded(_spoilt(checkpoint("image"), tmp_path / "pretrained.ckpt", began), steps=2)
     assert policy.model.module.num_inference_steps == 2
 
 
 def test_crops_at_random_are_refused(checkpoint: Checkpoint) -> None:
     with pytest.raises(ConfigError, match="eval_fixed_crop"):
-        load(checkpoint("random_crops"))
+        loaded(checkpoint("random_crops"))

@@ -13,8 +13,9 @@ import pytest
 from tests.families.gr00t import tiny
 from tests.families.gr00t.conftest import MARKS, Checkpoint
 from vlagents_ray.errors import ConfigError
+from vlagents_ray.policies import gr00t
 from vlagents_ray.policies.base.model_code import remote_code
-from vlagents_ray.policies.gr00t import Gr00t, network
+from vlagents_ray.policies.gr00t import Gr00t
 
 pytestmark = MARKS
 
@@ -136,7 +137,7 @@ def test_a_folder_that_is_no_checkout_or_an_older_one(
 ) -> None:
     with pytest.raises(ConfigError, match=r"'gr00t': neither installed nor in .*GR00T_SRC"):
         load(checkpoint("relative"), tmp_path)
-    monkeypatch.setattr(network.importlib.util, "find_spec", lambda _: None)
+    monkeypatch.setattr(gr00t.importlib.util, "find_spec", lambda _: None)
     with pytest.raises(ConfigError, match=r"code of N1\.5 or before.*policy `upstream`"):
         load(checkpoint("relative"), checkout)
 

@@ -128,15 +128,6 @@ def test_each_row_of_one_pass_acts_as_its_adapter_merged_alone(
             assert np.abs(base.action - wanted.action).max() > 100 * ATOL
 
 
-def test_one_forward_pass_serves_all_of_them(adapted: LeRobot, monkeypatch: pytest.MonkeyPatch) -> None:
-    model, rows = adapted.model.kind.policy.model, []
-    step = model.denoise_step
-    monkeypatch.setattr(model, "denoise_step", lambda **given: (rows.append(len(given["x_t"])), step(**given))[1])
-    sessions = [session(adapted, number, name) for number, name in enumerate(CHOSEN)]
-    adapted.act_batch([view(number) for number in range(len(CHOSEN))], sessions)
-    assert rows == [len(CHOSEN)] * 4  # the steps of the flow
-
-
 def test_types_without_a_flow_take_no_adapters(made: Made, saved: dict[str, Path]) -> None:
     policy = LeRobot.from_config({"checkpoint": str(made("act")), "adapters": {"expert": str(saved["expert"])}})
     with pytest.raises(ConfigError, match=r"adapters: got them for LeRobot's 'act', want one of \['pi0'"):

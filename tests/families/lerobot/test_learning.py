@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from typing import Any
 
 import numpy as np
@@ -56,21 +55,6 @@ def test_it_offers_what_random_steps_have(loaded: Load, learnt: LeRobot) -> None
 def test_a_policy_without_a_flow_has_no_noise_level(made: Made) -> None:
     with pytest.raises(ConfigError, match=r"noise_level: got 0\.5 for LeRobot's 'act', want 0"):
         LeRobot.from_config({"checkpoint": str(made("act")), "noise_level": LEVEL}).initialize()
-
-
-def test_acts_of_which_nothing_is_wanted_are_those_without_random_steps(loaded: Load, learnt: LeRobot) -> None:
-    acts = [begun(policy, 1).act(view(1)) for policy in (loaded("smolvla"), learnt)]
-    np.testing.assert_array_equal(acts[0].action, acts[1].action)
-    assert BEHAVIOUR not in acts[1].info
-
-
-def test_random_steps_begin_from_the_noise_of_an_act_without_them(learnt: LeRobot) -> None:
-    row = begun(learnt, 1)
-    noise = copy.deepcopy(row.episode.rng).standard_normal(
-        (tiny.CHUNK, learnt.model.kind.config.max_action_dim), dtype=np.float32
-    )
-    chain = row.act(view(1, **{WANT: ["replay"]})).info[BEHAVIOUR]["replay"]["chain"]
-    np.testing.assert_array_equal(chain[0], noise)
 
 
 def test_the_log_probability_is_that_of_the_network_itself(learnt: LeRobot) -> None:

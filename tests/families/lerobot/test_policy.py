@@ -22,7 +22,6 @@ pytestmark = FILTERS
 
 ATOL = 1e-5
 INSTRUCTED = ("smolvla", "xvla", *(("vla_jepa", "eo1", "evo1", "wall_x") if tiny.NEW else ()))
-DRAWING = sorted(set(tiny.KINDS) - {"act", "ensemble"})  # those whose actions depend on a session's random numbers
 
 
 @pytest.mark.parametrize("kind", sorted(tiny.KINDS))
@@ -42,19 +41,6 @@ def test_a_session_gets_the_same_in_any_company(kind: str, loaded: Load) -> None
             acts = policy.act_batch([view(10 * tick + number) for number in range(1, size + 1)], company)
             assert isinstance(acts[0], Act)
             np.testing.assert_allclose(acts[0].action, wanted, atol=ATOL)
-
-
-@pytest.mark.parametrize("kind", DRAWING)
-def test_what_is_drawn_depends_on_the_seed_alone(kind: str, loaded: Load) -> None:
-    policy = loaded(kind)
-
-    def played(seed: int) -> np.ndarray:
-        session = begun(policy)
-        session.reset(view(), TASKS[0], seed=seed)
-        return session.act(view()).action
-
-    assert np.array_equal(played(1), played(1))
-    assert not np.allclose(played(1), played(2), atol=1e-3)
 
 
 @pytest.mark.parametrize("kind", INSTRUCTED)
@@ -113,26 +99,11 @@ def test_images_of_any_size_meet_in_a_batch_of_a_policy_that_resizes(loaded: Loa
         np.testing.assert_allclose(act.action, wanted, atol=ATOL)
 
 
-def test_frames_between_chunks_are_remembered(loaded: Load) -> None:
-    """A chunk begins in the middle of an episode: its policy gets the last two observations, not one of them twice."""
-    policy = loaded("diffusion")
-    watched, fresh = begun(policy), begun(policy)
-    watched.observe(view(5))
-    assert not np.allclose(watched.act(view(6)).action, fresh.act(view(6)).action, atol=1e-4)
-
-
 def test_an_ensemble_and_its_coefficient_are_the_checkpoints_defaults(loaded: Load) -> None:
     policy = loaded("ensemble")
     assert (policy.config.actions, policy.config.ensemble_m, policy.contract.chunk) == ("ensemble", 0.1, 1)
     assert loaded("ensemble", actions="chunk").contract.chunk == tiny.CHUNK
     assert loaded("act", actions="ensemble").config.execute is None
-
-
-def test_more_rows_than_usual_can_be_executed_and_are_the_same_at_first(loaded: Load) -> None:
-    longer = begun(loaded("diffusion", actions="chunk", execute=7)).act(view()).action
-    usual = begun(loaded("diffusion", actions="chunk")).act(view()).action
-    assert longer.shape == (7, tiny.ACTION)
-    np.testing.assert_allclose(longer[: tiny.EXECUTED], usual, atol=ATOL)
 
 
 @pytest.mark.parametrize("kind", ["diffusion", "tdmpc", "smolvla"])

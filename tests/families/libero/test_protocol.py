@@ -22,16 +22,6 @@ def test_the_step_limits_are_those_of_openpi_and_openvla() -> None:
     }
 
 
-def test_the_conventions_of_an_episode_are_theirs_too() -> None:
-    protocol = LiberoProtocol.of("libero_10")
-    assert (protocol.settling_steps, protocol.settling_action) == (10, (0, 0, 0, 0, 0, 0, -1))
-    assert protocol.image_size == (256, 256)
-    assert protocol.cameras == {"front": "agentview", "wrist": "robot0_eye_in_hand"}
-    assert (protocol.gripper_open, protocol.gripper_closed) == (-1, 1)
-    assert protocol.begins == ("seed", "reset", "set_init_state", "settle")
-    assert (protocol.simulator_seed, protocol.control_hz, protocol.controller) == (7, 20, "OSC_POSE")
-
-
 def test_what_a_user_changes_is_named_in_the_record() -> None:
     assert LiberoProtocol.of("libero_goal").to_json("libero_goal")["deviations"] == []
     changed = LiberoProtocol.of("libero_goal", simulator_seed=0, max_steps=10, settling_steps=None)

@@ -8,6 +8,12 @@ import pytest
 
 from tests.families.octo import tiny
 
+MARKS = [
+    pytest.mark.source("OCTO_SRC"),
+    # JAX 0.4.20, flax 0.7.5, tensorflow-probability 0.23 and Octo itself use what was deprecated since.
+    pytest.mark.filterwarnings("ignore::DeprecationWarning"),
+]
+
 
 @pytest.fixture(scope="session")
 def pretrained(tmp_path_factory: pytest.TempPathFactory) -> Path:

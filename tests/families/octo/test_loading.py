@@ -13,14 +13,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.families.octo.conftest import MARKS
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.octo import Octo, real_actions, resized
 
-pytestmark = [
-    pytest.mark.source("OCTO_SRC"),
-    # JAX 0.4.20, flax 0.7.5, tensorflow-probability 0.23 and Octo itself use what was deprecated since.
-    pytest.mark.filterwarnings("ignore::DeprecationWarning"),
-]
+pytestmark = MARKS
 
 
 def load(checkpoint: Path | str, **config: Any) -> Octo:

@@ -9,17 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.families.octo.conftest import MARKS
 from vlagents_ray import Obs
 from vlagents_ray.errors import InvalidObservation, MissingCamera
 from vlagents_ray.interface import DISTRIBUTION, GOAL_IMAGE, SAMPLES
 from vlagents_ray.policies.octo import Octo
 from vlagents_ray.testing import check_agent
 
-pytestmark = [
-    pytest.mark.source("OCTO_SRC"),
-    # JAX 0.4.20, flax 0.7.5, tensorflow-probability 0.23 and Octo itself use what was deprecated since.
-    pytest.mark.filterwarnings("ignore::DeprecationWarning"),
-]
+pytestmark = MARKS
 
 ATOL = 1e-4  # float32 on a CPU, actions of up to 5; measured: 3e-5, as untrained weights amplify what differs
 INSTRUCTIONS = ["pick up the cube", "push the cube", "open the drawer"]
@@ -112,17 +109,6 @@ def test_samples_are_draws_of_their_own(policy: Octo) -> None:
     assert found["samples"].shape == (10, 4, 7)
     assert found["std"].mean() > 100 * ATOL
     np.testing.assert_allclose(found["mean"], found["samples"].mean(0), atol=ATOL)
-
-
-def test_a_queue_sees_the_frames_between_chunks(pretrained: Path, policy: Octo) -> None:
-    queue = made(pretrained, actions="queue")
-    queue.model = policy.model
-    session, frames = begun(queue, seen(0)), [seen(i) for i in range(5)]
-    rows = [session.act(frame).action for frame in frames]
-    assert rows[0].shape == (7,)
-    assert session.episode is not None
-    last = [frame["image_primary"] for frame in session.episode.frames]
-    assert all(np.array_equal(a, policy.perceive(b)["image_primary"]) for a, b in zip(last, frames[3:], strict=True))
 
 
 def test_a_camera_that_is_left_out_has_no_tokens_as_in_octo(pretrained: Path) -> None:

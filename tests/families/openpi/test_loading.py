@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from tests.families.openpi.marks import MARKS
+from tests.families.openpi.conftest import MARKS
 from vlagents_ray.errors import ConfigError
 
 pytestmark = MARKS
@@ -99,8 +99,3 @@ def test_lora_weights_are_not_dropped(checkpoint: Any, tmp_path: Path, tiny: Mod
 def test_wrong_settings_are_named(checkpoint: Any, settings: dict[str, Any], says: str) -> None:
     with pytest.raises(ConfigError, match=says):
         load(checkpoint("pi0"), **settings)
-
-
-def test_unknown_settings_are_refused(checkpoint: Any) -> None:
-    with pytest.raises(ConfigError, match="num_steps"):
-        load(checkpoint("pi0"), num_steps=3)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.families.openpi.marks import MARKS
+from tests.families.openpi.conftest import MARKS
 from vlagents_ray import Obs
 from vlagents_ray.errors import ConfigError, InvalidObservation, MissingCamera
 from vlagents_ray.interface import DELAY, DISTRIBUTION, LEFTOVER, SAMPLES

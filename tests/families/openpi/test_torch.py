@@ -13,7 +13,7 @@ import pytest
 from counting_compiler import counting_compiler
 from normal_steps import logprob_of_steps
 
-from tests.families.openpi.marks import MARKS
+from tests.families.openpi.conftest import MARKS
 from tests.families.openpi.test_openpi import BATCHED, WORDS, begun, seen, theirs
 from vlagents_ray.errors import ConfigError, InvalidObservation
 from vlagents_ray.interface import BEHAVIOUR, DELAY, DISTRIBUTION, LEFTOVER, SAMPLES, WANT
@@ -159,12 +159,6 @@ def test_the_samples_of_an_observation_are_of_one_reading_of_it(port: Path, monk
         np.testing.assert_allclose(one.action, other.action, atol=10 * BATCHED)
     samples = [acts[1].info[DISTRIBUTION]["samples"] for acts in (shared, each)]
     np.testing.assert_allclose(*samples, atol=10 * BATCHED)
-
-
-@patched
-def test_acts_of_which_nothing_is_wanted_are_those_without_random_steps(port: Path) -> None:
-    acts = [begun(policy, "pi0", 0).act(seen("pi0", 0)) for policy in (made(port), made(port, noise_level=LEVEL))]
-    np.testing.assert_array_equal(acts[0].action, acts[1].action)
 
 
 @patched

@@ -129,17 +129,6 @@ def test_samples_are_drawn_from_the_distribution_whose_moments_are_stated(policy
     assert first.std() == pytest.approx(found["std"][0, 0], rel=0.1)
 
 
-def test_samples_belong_to_their_session(policy: OpenVLA) -> None:
-    def draws(act: Act) -> np.ndarray:
-        return act.info[DISTRIBUTION]["samples"]
-
-    asked = {SAMPLES: 5}
-    alone = draws(begun(policy, 1).act(seen(1, **asked)))
-    _, together = policy.act_batch([seen(0, **asked), seen(1, **asked)], [begun(policy, 0), begun(policy, 1)])
-    assert np.array_equal(draws(together), alone)
-    assert len({sample.tobytes() for sample in alone}) > 1
-
-
 def test_samples_share_their_sessions_prompt(policy: OpenVLA, monkeypatch: pytest.MonkeyPatch) -> None:
     read = []
     backbone = policy.model.base.network.vision_backbone

@@ -13,14 +13,11 @@ import pytest
 import torch
 from adapted_network import merge, pairs, save
 
-from tests.families.pi0 import tiny
-from tests.families.pi0.test_pi0 import WORDS, seen
+from tests.families.pi0.conftest import WORDS, made, seen
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import DISTRIBUTION, SAMPLES, Act
 from vlagents_ray.policies.pi0 import Pi0
 from vlagents_ray.serve.models.agent_copies import AgentCopies
-
-torch.set_num_threads(1)  # the model is too small for more: threads would wait for one another
 
 ATOL = 1e-4  # of actions of size 1, which ten steps of a flow and the merged sums round differently
 TARGETS = r".*\.(q_proj|v_proj|down_proj|fc1|fc2|patch_embedding|linear)|action_.*|embed_action_time\..*"
@@ -28,21 +25,10 @@ CHOSEN = ("first", None, "second", "first", "second")
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tiny.save(tmp_path_factory.mktemp("pi0"))
-
-
-def load(folder: Path, **config: Any) -> Pi0:
-    policy = Pi0.from_config({"checkpoint": str(folder), **config})
-    policy.initialize()
-    return policy
-
-
-@pytest.fixture(scope="module")
 def saved(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, dict[str, np.ndarray]]]:
     """Folders and values of adapters."""
     root, found = tmp_path_factory.mktemp("adapters"), {}
-    network = load(folder).model.network
+    network = made(folder).model.network
     kinds = (torch.nn.Linear, torch.nn.Conv2d)
     layers = [name for name, one in network.named_modules() if type(one) in kinds and re.fullmatch(TARGETS, name)]
     assert {type(dict(network.named_modules())[name]) for name in layers} == set(kinds)
@@ -62,13 +48,13 @@ def session(policy: Pi0, seed: int, **options: Any) -> Pi0:
 def test_each_row_of_one_pass_acts_as_its_adapter_merged_alone(
     folder: Path, saved: dict[str, tuple[Path, dict[str, np.ndarray]]]
 ) -> None:
-    policy = load(folder, adapters={name: str(path) for name, (path, _) in saved.items()})
+    policy = made(folder, adapters={name: str(path) for name, (path, _) in saved.items()})
     asked = [seen(seed, **{SAMPLES: 3 * (seed % 2)}) for seed in range(len(CHOSEN))]
     acts = policy.act_batch(asked, [session(policy, seed, adapter=name) for seed, name in enumerate(CHOSEN)])
-    base = load(folder)
+    base = made(folder)
     plain = [session(base, seed).act(asked[seed]).action for seed in range(len(CHOSEN))]
     for chosen in (None, "first", "second"):
-        alone = load(folder)
+        alone = made(folder)
         if chosen is not None:
             merge(alone.model.network, saved[chosen][1])
         for seed, act in enumerate(acts):
@@ -88,14 +74,14 @@ def test_an_adapter_with_other_statistics_is_refused(
 ) -> None:
     own = shutil.copytree(saved["first"][0], tmp_path / "own")
     shutil.copy(folder / "processor_config.json", own)
-    load(folder, adapters={"own": str(own)})
+    made(folder, adapters={"own": str(own)})
     processor = json.loads((own / "processor_config.json").read_text())
     (own / "processor_config.json").write_text(json.dumps(processor | {"state_mean": None}))  # it states none
-    load(folder, adapters={"own": str(own)})
+    made(folder, adapters={"own": str(own)})
     (own / "processor_config.json").write_text("[3]")
     with pytest.raises(ConfigError, match=r"adapter 'own': .*is no processor's config"):
-        load(folder, adapters={"own": str(own)})
+        made(folder, adapters={"own": str(own)})
     processor["state_mean"][0] += 1
     (own / "processor_config.json").write_text(json.dumps(processor))
     with pytest.raises(ConfigError, match=r"adapter 'own': .*got other \['state_mean'\] than the base has"):
-        load(folder, adapters={"own": str(own)})
+        made(folder, adapters={"own": str(own)})

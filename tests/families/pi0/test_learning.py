@@ -1,20 +1,22 @@
-"""What π0 states of its acts for learners, and what its samples cost, on a small random checkpoint."""
+"""What π0 states of its acts for learners, what its samples cost, and that compiled cores act as it does without."""
 
 from __future__ import annotations
 
-import copy
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from counting_compiler import counting_compiler
 from normal_steps import logprob_of_steps
+from pushed_weights import check_pushed_weights
 from shared_readings import check_shared_readings
 
 from tests.families.pi0 import tiny
-from tests.families.pi0.test_pi0 import BATCHED, begun, seen
-from vlagents_ray.interface import BEHAVIOUR, DISTRIBUTION, SAMPLES, WANT, Act
+from tests.families.pi0.conftest import BATCHED, begun, made, seen
+from vlagents_ray.interface import BEHAVIOUR, DELAY, DISTRIBUTION, LEFTOVER, SAMPLES, WANT, Act, Obs
 from vlagents_ray.policies import pi0
 from vlagents_ray.policies.flow import logprob_of_chain
 from vlagents_ray.policies.pi0 import Pi0
@@ -25,11 +27,6 @@ SUMMED = 2e-3  # how far a sum of 25 log-probabilities may be off, in float32: e
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tiny.save(tmp_path_factory.mktemp("pi0"))
-
-
-@pytest.fixture(scope="module")
 def plain(folder: Path) -> Pi0:
     return made(folder)
 
@@ -37,12 +34,6 @@ def plain(folder: Path) -> Pi0:
 @pytest.fixture(scope="module")
 def learnt(folder: Path) -> Pi0:
     return made(folder, noise_level=LEVEL)
-
-
-def made(folder: Path, **settings: Any) -> Pi0:
-    policy = Pi0.from_config({"checkpoint": str(folder), **settings})
-    policy.initialize()
-    return policy
 
 
 def encoded(policy: Pi0, *seeds: int) -> dict[str, Any]:
@@ -58,13 +49,6 @@ def encoded(policy: Pi0, *seeds: int) -> dict[str, Any]:
 def test_it_offers_what_random_steps_have(plain: Pi0, learnt: Pi0) -> None:
     assert plain.contract.behaviour is None
     assert learnt.contract.behaviour == tuple(ALL)
-
-
-def test_acts_of_which_nothing_is_wanted_are_those_without_random_steps(plain: Pi0, learnt: Pi0) -> None:
-    acts = [begun(policy, 0).act(seen(0, **{SAMPLES: 2})) for policy in (plain, learnt)]
-    np.testing.assert_array_equal(acts[0].action, acts[1].action)
-    np.testing.assert_array_equal(acts[0].info[DISTRIBUTION]["samples"], acts[1].info[DISTRIBUTION]["samples"])
-    assert BEHAVIOUR not in acts[1].info
 
 
 def test_the_log_probability_is_that_of_the_network_itself(learnt: Pi0) -> None:
@@ -102,16 +86,6 @@ def test_a_learner_recomputes_what_was_stated_of_several_acts(learnt: Pi0) -> No
         np.testing.assert_array_equal(act.action, learnt.model.actions(one["replay"]["chain"][-1]))
 
 
-def test_a_chain_is_less_likely_to_other_weights(folder: Path, learnt: Pi0) -> None:
-    said = begun(learnt, 0).act(seen(0, **{WANT: ALL})).info[BEHAVIOUR]
-    network = copy.deepcopy(learnt.model.network)
-    with torch.no_grad():
-        network.action_out_proj.bias.add_(0.5)
-        velocity = pi0.flow_velocity(network, encoded(learnt, 0), torch.float32)
-        other = logprob_of_chain(velocity, torch.from_numpy(said["replay"]["chain"])[None], LEVEL)
-    assert other[:, :, : tiny.ACTION_DIM].sum() < said["logprob"].sum() - 1
-
-
 def test_a_log_probability_for_each_sample_and_for_the_rows_that_are_used(folder: Path, learnt: Pi0) -> None:
     short = made(folder, noise_level=LEVEL, execute=4)
     act = begun(short, 0).act(seen(0, **{WANT: ALL, SAMPLES: 3}))
@@ -122,17 +96,6 @@ def test_a_log_probability_for_each_sample_and_for_the_rows_that_are_used(folder
         velocity = pi0.flow_velocity(learnt.model.network, encoded(learnt, 0), torch.float32, [0, 0, 0])
         again = logprob_of_chain(velocity, torch.from_numpy(found["replay"]["chain"]), LEVEL)
     np.testing.assert_allclose(again[:, :4, : tiny.ACTION_DIM], found["logprob"], atol=SUMMED)
-
-
-def test_neighbours_change_neither_what_is_drawn_nor_what_is_not(learnt: Pi0) -> None:
-    wanted = [seen(0), seen(1, **{WANT: ALL, SAMPLES: 2}), seen(2, **{WANT: ALL})]
-    together = learnt.act_batch(wanted, [begun(learnt, seed) for seed in range(3)])
-    for seed, act in enumerate(together):
-        assert isinstance(act, Act)
-        alone = begun(learnt, seed).act(wanted[seed])
-        np.testing.assert_allclose(act.action, alone.action, atol=BATCHED)
-        if BEHAVIOUR in alone.info:
-            np.testing.assert_allclose(act.info[BEHAVIOUR]["logprob"], alone.info[BEHAVIOUR]["logprob"], atol=SUMMED)
 
 
 def test_the_samples_of_an_observation_are_of_one_reading_of_it(learnt: Pi0, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -147,3 +110,56 @@ def test_the_samples_of_an_observation_are_of_one_reading_of_it(learnt: Pi0, mon
     views = [seen(0, **{SAMPLES: 8, WANT: ALL}), seen(1), seen(2, **{SAMPLES: 3})]
     check_shared_readings(learnt, views, begun, pi0, BATCHED)
     assert read == [3, 14]
+
+
+SIZE = 3
+
+
+@pytest.fixture(scope="module")
+def programs() -> Iterator[list[int]]:
+    """The rows of each program that is made."""
+    with counting_compiler() as compiler:
+        yield compiler.rows
+
+
+@pytest.fixture(scope="module")
+def compiled(folder: Path, programs: list[int]) -> Pi0:
+    policy = made(folder, noise_level=LEVEL, compile="require", batch_sizes=[SIZE])
+    assert programs == [SIZE, SIZE]  # what is seen, and one step of the flow
+    return policy
+
+
+def acts(policy: Pi0, views: list[Obs]) -> list[Act]:
+    found = policy.act_batch(views, [begun(policy, i) for i in range(len(views))])
+    assert all(isinstance(act, Act) for act in found)
+    return found  # type: ignore[return-value]
+
+
+def test_batches_of_any_size_are_those_without_compilation(learnt: Pi0, compiled: Pi0) -> None:
+    for size in (1, 2, SIZE, SIZE + 1):
+        views = [seen(i) for i in range(size)]
+        for one, other in zip(acts(learnt, views), acts(compiled, views), strict=True):
+            np.testing.assert_allclose(one.action, other.action, atol=BATCHED)
+
+
+def test_plans_samples_and_random_steps_are_those_without_compilation(
+    learnt: Pi0, compiled: Pi0, programs: list[int]
+) -> None:
+    plan = np.ones((6, tiny.ACTION_DIM), np.float32)
+    views = [
+        seen(0, **{LEFTOVER: plan, DELAY: 2}),
+        seen(1, **{SAMPLES: 2, WANT: ["logprob"]}),
+    ]
+    for one, other in zip(acts(learnt, views), acts(compiled, views), strict=True):
+        np.testing.assert_allclose(one.action, other.action, atol=BATCHED)
+        if DISTRIBUTION in one.info:
+            samples = [act.info[DISTRIBUTION]["samples"] for act in (one, other)]
+            np.testing.assert_allclose(*samples, atol=BATCHED)
+            said = [act.info[BEHAVIOUR]["logprob"] for act in (one, other)]
+            np.testing.assert_allclose(*said, atol=2e-3)  # sums over steps of a tenth
+    assert programs == [SIZE, SIZE]
+
+
+def test_it_acts_with_pushed_weights(compiled: Pi0, programs: list[int]) -> None:
+    check_pushed_weights(compiled, lambda: begun(compiled, 0).act(seen(0)).action)
+    assert programs == [SIZE, SIZE]

@@ -5,37 +5,24 @@ from __future__ import annotations
 import copy
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from pushed_weights import check_pushed_weights
 from safetensors.torch import load_file, save_file
 
 from tests.families.pi0 import tiny
+from tests.families.pi0.conftest import BATCHED, WORDS, begun, made, seen
 from vlagents_ray import Obs
 from vlagents_ray.errors import ConfigError, InvalidObservation, MissingCamera, NotTrainable
-from vlagents_ray.interface import DELAY, DISTRIBUTION, LEFTOVER, SAMPLES
+from vlagents_ray.interface import DELAY, LEFTOVER
 from vlagents_ray.policies.pi0 import Pi0
 from vlagents_ray.testing import check_agent
-
-torch.set_num_threads(1)  # the model is too small for more: threads would wait for one another
-
-WORDS = ("pick up the cube", "push", "open the upper drawer of the white cabinet")
-BATCHED = 1e-5  # how far a batch's actions may be off those of a lone row, in float32 on a CPU
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tiny.save(tmp_path_factory.mktemp("pi0"))
 
 
 @pytest.fixture(scope="module")
 def loaded(folder: Path) -> Pi0:
-    policy = Pi0.from_config({"checkpoint": str(folder)})
-    policy.initialize()
-    return policy
+    return made(folder)
 
 
 @pytest.fixture
@@ -44,25 +31,6 @@ def whole(folder: Path, tmp_path: Path) -> Path:
     for file in folder.iterdir():
         (tmp_path / file.name).write_bytes(file.read_bytes())
     return tmp_path
-
-
-def seen(seed: int, side: tuple[int, int] = (224, 224), **info: Any) -> Obs:
-    rng = np.random.default_rng(seed)
-    return Obs(
-        cameras={name: rng.integers(0, 256, (*side, 3), dtype=np.uint8) for name in ("front", "wrist")},
-        state={
-            "xyz_axis_angle": rng.normal(size=6).astype(np.float32),
-            "gripper_qpos": rng.normal(size=2).astype(np.float32),
-        },
-        info=info,
-    )
-
-
-def begun(policy: Pi0, i: int) -> Pi0:
-    """Session `i`: with its own instruction and seed."""
-    session = copy.copy(policy)
-    session.reset(seen(i), WORDS[i % len(WORDS)], seed=i)
-    return session
 
 
 def test_it_keeps_what_an_agent_promises(folder: Path) -> None:
@@ -146,19 +114,6 @@ def test_a_neighbours_plan_changes_nothing(loaded: Pi0) -> None:
     np.testing.assert_allclose(acts[1].action[:2], plan[:2], atol=1e-5)
 
 
-def test_a_plan_of_another_robot_is_refused(loaded: Pi0) -> None:
-    with pytest.raises(InvalidObservation, match=r"leftover_actions.*want \(H, 7\)"):
-        begun(loaded, 0).act(seen(0, **{LEFTOVER: np.zeros((4, 3), np.float32)}))
-
-
-def test_samples_are_of_other_noise_and_leave_the_chunk_as_it_was(loaded: Pi0) -> None:
-    act = begun(loaded, 0).act(seen(0, **{SAMPLES: 3}))
-    samples = act.info[DISTRIBUTION]["samples"]
-    assert samples.shape == (3, *act.action.shape)
-    assert np.abs(samples[0] - samples[1]).max() > 0.01
-    np.testing.assert_allclose(act.action, begun(loaded, 0).act(seen(0)).action, atol=BATCHED)
-
-
 def test_a_long_instruction_is_refused_and_not_cut_off(loaded: Pi0) -> None:
     with pytest.raises(InvalidObservation, match="want at most 48"):
         copy.copy(loaded).reset(seen(0), "pick up the cube " * 20)
@@ -176,26 +131,19 @@ def test_a_camera_that_is_not_there_is_named(loaded: Pi0) -> None:
         begun(loaded, 0).act(obs)
 
 
-def test_a_state_of_another_length_is_refused(loaded: Pi0) -> None:
-    obs = seen(0)
-    obs.state["gripper_qpos"] = np.zeros(1, np.float32)
-    with pytest.raises(InvalidObservation, match=r"got 7 numbers .* want 8"):
-        begun(loaded, 0).act(obs)
-
-
 @pytest.mark.verifies("loading")
 @pytest.mark.parametrize("file", ["config.json", "processor_config.json", "model.safetensors"])
 def test_a_missing_file_is_named(whole: Path, file: str) -> None:
     (whole / file).unlink()
     with pytest.raises(ConfigError, match=file.replace("model", "")):
-        Pi0.from_config({"checkpoint": str(whole)}).initialize()
+        made(whole)
 
 
 @pytest.mark.verifies("loading")
 def test_missing_statistics_are_an_error(tmp_path: Path) -> None:
     tiny.save(tmp_path, statistics=False)
     with pytest.raises(ConfigError, match=r"has no \['state_mean', .*'actions_std'\]"):
-        Pi0.from_config({"checkpoint": str(tmp_path)}).initialize()
+        made(tmp_path)
 
 
 @pytest.mark.verifies("loading")
@@ -204,7 +152,7 @@ def test_a_lost_tensor_is_an_error_and_not_random(whole: Path) -> None:
     del tensors["action_out_proj.bias"]
     save_file(tensors, whole / "model.safetensors", metadata={"format": "pt"})
     with pytest.raises(ConfigError, match=r"action_out_proj\.bias"):
-        Pi0.from_config({"checkpoint": str(whole)}).initialize()
+        made(whole)
 
 
 @pytest.mark.verifies("loading")
@@ -213,13 +161,7 @@ def test_a_tensor_of_another_shape_is_an_error(whole: Path) -> None:
     tensors["action_out_proj.bias"] = tensors["action_out_proj.bias"][:-1].clone()
     save_file(tensors, whole / "model.safetensors", metadata={"format": "pt"})
     with pytest.raises(ConfigError, match=r"action_out_proj\.bias|does not load"):
-        Pi0.from_config({"checkpoint": str(whole)}).initialize()
-
-
-def test_fixed_sizes_are_warmed_up_and_change_no_action(folder: Path, loaded: Pi0) -> None:
-    fixed = Pi0.from_config({"checkpoint": str(folder), "batch_sizes": [2]})
-    fixed.initialize()
-    np.testing.assert_allclose(begun(fixed, 0).act(seen(0)).action, begun(loaded, 0).act(seen(0)).action, atol=BATCHED)
+        made(whole)
 
 
 @pytest.mark.parametrize("cameras", [{}, {"agentview": "front"}])
@@ -228,14 +170,8 @@ def test_cameras_that_the_model_does_not_have_are_an_error(cameras: dict[str, st
         Pi0.from_config({"checkpoint": "any", "cameras": cameras})
 
 
-def test_an_unknown_setting_is_an_error() -> None:
-    with pytest.raises(ConfigError, match="num_steps"):
-        Pi0.from_config({"checkpoint": "any", "num_steps": 3})
-
-
 def test_in_bfloat16_it_stays_near_float32(folder: Path, loaded: Pi0) -> None:
-    half = Pi0.from_config({"checkpoint": str(folder), "dtype": "bfloat16"})
-    half.initialize()
+    half = made(folder, dtype="bfloat16")
     np.testing.assert_allclose(begun(half, 0).act(seen(0)).action, begun(loaded, 0).act(seen(0)).action, atol=0.1)
 
 
@@ -243,22 +179,14 @@ def test_statistics_are_those_that_were_saved(whole: Path) -> None:
     saved = json.loads((whole / "processor_config.json").read_text())
     saved["actions_mean"] = [100.0] * tiny.ACTION_DIM
     (whole / "processor_config.json").write_text(json.dumps(saved))
-    policy = Pi0.from_config({"checkpoint": str(whole)})
-    policy.initialize()
+    policy = made(whole)
     assert (begun(policy, 0).act(seen(0)).action > 50).all()
-
-
-def test_it_acts_with_pushed_weights(folder: Path) -> None:
-    policy = Pi0.from_config({"checkpoint": str(folder)})
-    policy.initialize()
-    check_pushed_weights(policy, lambda: begun(policy, 0).act(seen(0)).action)
 
 
 @pytest.mark.library("torchao")
 @pytest.mark.parametrize(("kind", "error"), [("int8", 0.02), ("float8", 0.1)])
 def test_quantized_it_acts_nearly_alike_from_less_memory(loaded: Pi0, folder: Path, kind: str, error: float) -> None:
-    quantized = Pi0.from_config({"checkpoint": str(folder), "quantization": kind})
-    quantized.initialize()
+    quantized = made(folder, quantization=kind)
     whole = begun(loaded, 0).act(seen(0)).action
     off = np.abs(begun(quantized, 0).act(seen(0)).action - whole).max() / np.abs(whole).max()
     assert 0 < off < error

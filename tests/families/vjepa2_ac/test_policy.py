@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from counting_compiler import counting_compiler
 
 from tests.families.vjepa2_ac.tiny import HEADS, SETTINGS, SIDE, make_checkpoint, make_hf_encoder, make_models
 from vlagents_ray import Act, Obs
@@ -205,13 +206,6 @@ def test_samples_are_other_plans_to_the_same_goal(policy: VJepa2Ac) -> None:
     assert (found["std"][:, :3] > 0).all()
 
 
-def test_every_allowed_batch_size_is_run_when_the_model_is_loaded(checkpoint: Path) -> None:
-    warm = VJepa2Ac.from_config({"checkpoint": str(checkpoint), **SETTINGS, "batch_sizes": [1, 4]})
-    warm.initialize()
-    acts = warm.act_batch([obs(i) for i in range(3)], [begun(warm, i) for i in range(3)])
-    assert all(isinstance(act, Act) for act in acts)
-
-
 def altered(checkpoint: Path, folder: Path, part: str, lose: str | None) -> Path:
     """The checkpoint without a part, or without one of its tensors."""
     import torch
@@ -265,3 +259,29 @@ def test_a_file_that_is_no_checkpoint_is_refused_and_never_unpickled(tmp_path: P
     file.write_bytes(pickle.dumps(Path))
     with pytest.raises(ConfigError, match="not a file of tensors"):
         VJepa2Ac.from_config({"checkpoint": str(file), "encoder_heads": HEADS}).initialize()
+
+
+SIZE = 2  # of compiled batches
+
+
+@pytest.mark.parametrize("pass_size", [400, 5])  # more than the 12 plans of an iteration, and no divisor of them
+def test_plans_of_batches_of_any_size_are_those_without_compilation(
+    pass_size: int, checkpoint: Path, policy: VJepa2Ac
+) -> None:
+    settings = {"checkpoint": str(checkpoint), **SETTINGS, "pass_size": pass_size}
+    with counting_compiler() as compiler:
+        compiled = VJepa2Ac.from_config({**settings, "compile": "require", "batch_sizes": [SIZE]})
+        compiled.initialize()
+        plans = min(pass_size, SETTINGS["samples"])
+        assert sorted(compiler.rows) == sorted([SIZE, plans, plans])  # the encoder, and each step of a plan
+        for size in (1, SIZE, SIZE + 1):
+            views = [obs(10 + i) for i in range(size)]
+            views[0].info[SAMPLES] = 2
+            acts = [
+                which.act_batch(views, [begun(which, i, goal=i) for i in range(size)]) for which in (policy, compiled)
+            ]
+            for one, other in zip(*acts, strict=True):
+                assert isinstance(one, Act)
+                assert isinstance(other, Act)
+                np.testing.assert_allclose(one.action, other.action, atol=1e-4)
+        assert len(compiler.rows) == 3

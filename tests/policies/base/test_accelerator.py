@@ -171,12 +171,6 @@ def acted(policy: Crowded, number: int, samples: int = 0) -> list[Act]:
     return acts  # type: ignore[return-value]
 
 
-def test_a_row_and_a_full_batch_run_while_a_model_loads_on_an_accelerator() -> None:
-    policy = Roomy.from_config({"checkpoint": "none", "max_rows": 12})
-    policy.initialize()
-    assert policy.model["passes"] == [1, 12]
-
-
 def test_a_full_batch_that_does_not_fit_is_found_while_a_model_loads(caplog: pytest.LogCaptureFixture) -> None:
     policy = Crowded.from_config({"checkpoint": "none", "max_rows": 12})
     policy.initialize()

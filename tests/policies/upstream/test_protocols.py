@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
 from typing import Any
 
 import numpy as np
 import pytest
 import upstream_servers
-from upstream_servers import BROKEN, answer, gr00t_actions, upstream
+from upstream_servers import BROKEN, answer, gr00t_actions, upstreams
 
 from vlagents_ray.errors import PolicyFailed
 from vlagents_ray.interface import Obs
@@ -98,18 +97,22 @@ def seen(number: int) -> Obs:
     )
 
 
+@pytest.fixture(scope="module")
+def ports() -> Iterator[dict[int, str]]:
+    """Two servers of each kind, by their ports."""
+    kinds = {free_port(): kind for kind in sorted(DIRECT) * 2}
+    with upstreams(kinds):
+        yield kinds
+
+
 @pytest.fixture(scope="module", params=sorted(DIRECT))
-def served(request: pytest.FixtureRequest) -> Iterator[tuple[str, dict[str, Any]]]:
+def served(request: pytest.FixtureRequest, ports: dict[int, str]) -> tuple[str, dict[str, Any]]:
     """A kind of server, and the settings that name two of it."""
-    kind, ports = request.param, [free_port(), free_port()]
+    kind = request.param
     protocol = kind.partition(" ")[0]
-    with ExitStack() as stack:
-        for port in ports:
-            stack.enter_context(upstream(kind, port))
-        scheme = SCHEMES.get(protocol, "ws")
-        urls = [f"{scheme}://127.0.0.1:{port}" for port in ports]
-        settings = {"protocol": protocol, "urls": urls, "connect_timeout_s": 30}
-        yield kind, settings | ({"mapping": MAPPINGS[kind]} if kind in MAPPINGS else {})
+    urls = [f"{SCHEMES.get(protocol, 'ws')}://127.0.0.1:{port}" for port, one in ports.items() if one == kind]
+    settings = {"protocol": protocol, "urls": urls, "connect_timeout_s": 30}
+    return kind, settings | ({"mapping": MAPPINGS[kind]} if kind in MAPPINGS else {})
 
 
 @pytest.fixture

@@ -1,20 +1,27 @@
-"""RCS's pick task, in RCS's own environment."""
+"""RCS's pick task in its own environment, a scene of two arms, and DuoBench 0.1.2 on the bodies of `stand_ins`."""
 
 from __future__ import annotations
 
+import importlib
 import math
 from collections.abc import Iterator, Sequence
+from typing import Any
 
+import gymnasium
+import mujoco
 import numpy as np
 import pytest
 from in_process_episode import Always, play
 
-from vlagents_ray.envs.rcs import Rcs
-from vlagents_ray.errors import ConfigError, EnvFailed, InvalidAction, MissingDependency, NotReset, UnknownEnv
+from vlagents_ray.contract import ActionSpec, Contract, differences
+from vlagents_ray.envs import make_env
+from vlagents_ray.envs.rcs import DuoBench, Rcs
+from vlagents_ray.errors import ConfigError, MissingDependency, UnknownEnv
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.testing import check_env
 
 pytestmark = pytest.mark.assets("rcs")
+
 HOME = (0.307, 0.0, 0.487, 1.0, 0.0, 0.0, 0.0)  # m and xyzw: where the tool is after a reset, pointing down
 
 
@@ -30,10 +37,6 @@ def led(env: Rcs, command: Sequence[float], steps: int = 40) -> Obs:
     for _ in range(steps):
         obs, *_ = env.step(Act(np.array(command, np.float32)))
     return obs
-
-
-def test_it_keeps_the_promises_of_an_env() -> None:
-    check_env(Rcs("pick", cameras=["wrist"], width=40, height=32, max_steps=8))
 
 
 def test_the_expert_picks_the_cuboid_up_and_that_ends_the_episode(pick: Rcs) -> None:
@@ -134,15 +137,110 @@ def test_what_cannot_be_evaluated_is_refused() -> None:
             env.step(Act(np.array([*HOME, 1.0], np.float32)))
 
 
-def test_an_env_that_is_not_ready_says_so(pick: Rcs) -> None:
-    fresh = Rcs("pick", cameras=[])
-    with pytest.raises(NotReset, match="reset"):
-        fresh.step(Act(np.array([*HOME, 1.0], np.float32)))
-    with pytest.raises(ConfigError, match="options"):
-        fresh.reset(seed=0, options={"place": 1})
-    fresh.close()
-    with pytest.raises(EnvFailed, match="closed"):
-        fresh.reset(seed=0)
-    pick.reset(seed=0)
-    with pytest.raises(InvalidAction, match=r"\(8,\)"):
-        pick.step(Act(np.zeros((2, 8), np.float32)))
+LAB = {"module": "tests.families.rcs.two_arms", "max_steps": 8, "instruction": "pick up the cuboid"}
+
+
+@pytest.fixture(scope="module")
+def lab() -> Iterator[Rcs]:
+    with Rcs("lab/two_arms", cameras=[], **LAB) as env:
+        yield env
+
+
+def test_each_arm_has_its_parts_under_its_name(lab: Rcs) -> None:
+    state = lab.reset(seed=0)[0].state
+    assert {name: part.shape[0] for name, part in state.items()} == {
+        f"{side}/{part}": size
+        for side in ("left", "right")
+        for part, size in (("joints", 7), ("tquat", 7), ("xyzrpy", 6), ("gripper", 1))
+    }
+    assert (lab.contract.action.dim, lab.contract.action.arms) == (16, ("left", "right"))
+    assert lab.contract.gripper is False
+    assert state["left/tquat"][1] - state["right/tquat"][1] == pytest.approx(0.8, abs=1e-3)  # in one frame
+
+
+@pytest.mark.parametrize(("moved", "still", "first"), [("left", "right", 0), ("right", "left", 8)])
+def test_each_arm_follows_its_part_of_the_action(lab: Rcs, moved: str, still: str, first: int) -> None:
+    begin = lab.reset(seed=0)[0].state
+    action = np.concatenate([[*begin[f"{side}/joints"], 1.0] for side in ("left", "right")]).astype(np.float32)
+    action[first] += 0.2
+    action[first + 7] = 0.0
+    for _ in range(30):
+        obs, *_ = lab.step(Act(action))
+    assert obs.state[f"{moved}/joints"][0] - begin[f"{moved}/joints"][0] == pytest.approx(0.2, abs=0.01)
+    np.testing.assert_allclose(obs.state[f"{still}/joints"], begin[f"{still}/joints"], atol=0.01)
+    assert obs.state[f"{moved}/gripper"][0] < 0.05
+    assert obs.state[f"{still}/gripper"][0] > 0.95
+
+
+@pytest.fixture(scope="module")
+def transfer() -> Iterator[DuoBench]:
+    with DuoBench("transfer_cube", cameras=["head"], width=32, height=32) as env:
+        yield env
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("rcs/pick", {"cameras": ["wrist"], "width": 40, "height": 32, "max_steps": 8}),
+        ("rcs/lab/two_arms", {"width": 32, "height": 32, **LAB}),  # an id that somebody registered
+        ("duobench/transfer_cube", {"cameras": ["head"], "width": 16, "height": 16, "max_steps": 6}),
+    ],
+)
+def test_it_keeps_the_promises_of_an_env(name: str, options: dict[str, Any]) -> None:
+    check_env(make_env(name, **options))
+
+
+def test_it_is_set_up_as_its_authors_evaluate(transfer: DuoBench) -> None:
+    simulator = transfer._env
+    config = simulator.get_wrapper_attr("sim").get_config()
+    assert (config.async_control, config.realtime, config.frequency) == (True, False, 30)
+    assert transfer.contract.action.space == "joint"
+    assert transfer.contract.action.delta is False
+    assert (transfer.contract.action.dim, transfer.contract.action.arms) == (16, ("left", "right"))
+    assert transfer.describe()["protocol"]["deviations"] == []
+    assert transfer.describe()["duobench"] == "0.1.2"
+
+
+def test_its_instruction_is_the_simulators(transfer: DuoBench) -> None:
+    transfer.reset(seed=0)
+    assert "right arm" in transfer.instruction
+    assert "white bowl" in transfer.instruction
+
+
+def test_the_last_stage_is_success_and_ends_the_episode(transfer: DuoBench) -> None:
+    obs, info = transfer.reset(seed=0)
+    still = np.concatenate([[*obs.state[f"{side}/joints"], 1.0] for side in ("left", "right")]).astype(np.float32)
+    *_, info = transfer.step(Act(still))
+    assert (info["success"], info["stage"], info["max_stage"]) == (False, 0, 4)
+    data = transfer._sim.data
+    bowl = obs.info["objects"]["TransferAndPlace_white_bowl_joint"]
+    data.joint("TransferAndPlace_white_long_box_joint").qpos[:3] = bowl[:3] + np.array([0.0, 0.0, 0.03])
+    _, reward, terminated, _, info = transfer.step(Act(still))
+    assert (info["success"], info["stage"], reward, terminated) == (True, 4, 1.0, True)
+
+
+def test_all_its_tasks_are_registered_by_its_package() -> None:
+    for task in DuoBench.known.values():
+        importlib.import_module(str(task.module))
+    assert {task.id for task in DuoBench.known.values()} <= set(gymnasium.registry)
+
+
+def test_rcs_own_tasks_keep_their_scene_beside_it() -> None:
+    duobench = importlib.import_module("duobench")
+    with Rcs("pick", cameras=[]) as env:
+        scene = importlib.import_module("rcs").SCENE_PATHS["empty_world"]
+        assert scene != duobench.SCENE_PATHS["empty_world"]
+        assert env._sim.model.geom("floor").type == mujoco.mjtGeom.mjGEOM_PLANE
+
+
+def test_a_policy_for_one_arm_is_refused(transfer: DuoBench) -> None:
+    [found] = differences(Contract(action=ActionSpec(dim=7)), transfer.contract)
+    assert "action.dim" in found
+
+
+def test_without_its_assets_the_cure_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: object) -> None:
+    monkeypatch.setenv("DUOBENCH_PREFIX", str(tmp_path))
+    with pytest.raises(MissingDependency, match="set DUOBENCH_PREFIX"):
+        DuoBench("transfer_cube")
+    with pytest.raises(ConfigError, match="max_steps is 0"):
+        DuoBench("transfer_cube", max_steps=0)

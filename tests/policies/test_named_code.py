@@ -1,4 +1,4 @@
-"""What a checkpoint of Octo has made is decided from its JSON, before anything of it is imported."""
+"""What a checkpoint of LeRobot or of Octo has made is decided from its JSON, before anything of it is imported."""
 
 from __future__ import annotations
 
@@ -12,9 +12,19 @@ import pytest
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.base.checkpoint import used_checkpoints
+from vlagents_ray.policies.lerobot.processors import require_known_steps
 from vlagents_ray.policies.octo import OctoConfig, OctoNetwork, require_own_classes
 
 SOURCE = {
+    "lerobot/processor.py": """
+import subprocess
+from subprocess import Popen
+
+class ProcessorStep: ...
+class Unregistered(ProcessorStep): ...
+class NoStep: ...
+def make(): return Unregistered()
+""",
     "octo/model/components/tokenizers.py": """
 from subprocess import Popen
 import os
@@ -27,8 +37,8 @@ def spec(): ...
 
 
 @pytest.fixture(autouse=True)
-def octo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """A stand-in for Octo, whose modules import others as any module does."""
+def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Stand-ins for LeRobot and Octo, whose modules import others as any module does."""
     for name, source in SOURCE.items():
         file = tmp_path / "site" / name
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -36,11 +46,71 @@ def octo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         for folder in file.relative_to(tmp_path / "site").parents:
             (tmp_path / "site" / folder / "__init__.py").touch()
     monkeypatch.syspath_prepend(str(tmp_path / "site"))
-    for name in [name for name in sys.modules if name.partition(".")[0] == "octo"]:
+    for name in imported():
         monkeypatch.delitem(sys.modules, name)
     yield
-    for name in [name for name in sys.modules if name.partition(".")[0] == "octo"]:
+    for name in imported():
         del sys.modules[name]
+
+
+def imported() -> list[str]:
+    return [name for name in sys.modules if name.partition(".")[0] in ("lerobot", "octo")]
+
+
+def pipeline(folder: Path, *steps: dict[str, Any]) -> Path:
+    file = folder / "policy_preprocessor.json"
+    file.write_text(json.dumps({"name": "policy_preprocessor", "steps": list(steps)}))
+    return file
+
+
+REGISTERED = {"registry_name": "normalizer_processor", "config": {"class": "subprocess.Popen"}}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "subprocess.Popen",
+        "os.system",
+        "lerobot.processor.Popen",
+        "lerobot.processor.subprocess.Popen",
+        "lerobot.processor.NoStep",
+        "lerobot.processor.make",
+        "lerobot.processor.Missing",
+        "lerobot.missing.Unregistered",
+        "lerobot",
+        "lerobot_evil.Step",
+        "evil.lerobot.Step",
+        "Popen",
+        "",
+        None,
+        7,
+        {"class": "os.system"},
+    ],
+)
+def test_a_step_that_is_not_lerobots_is_refused_with_the_cure(name: object, tmp_path: Path) -> None:
+    file = pipeline(tmp_path, REGISTERED, {"class": name, "config": {"args": ["/bin/sh", "-c", "exit"]}})
+    with pytest.raises(
+        ConfigError, match=r"policy_preprocessor\.json: got a step of the class .* trust_remote_code: true"
+    ):
+        require_known_steps(file)
+
+
+def test_a_step_that_says_nothing_of_its_class_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="None"):
+        require_known_steps(pipeline(tmp_path, {"config": {}}))
+
+
+def test_what_would_be_imported_is_not_when_it_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "site" / "evil.py").write_text("raise SystemExit('was imported')")
+    with pytest.raises(ConfigError, match="evil"):
+        require_known_steps(pipeline(tmp_path, {"class": "evil.Step"}))
+
+
+def test_registered_steps_and_lerobots_own_pass(tmp_path: Path) -> None:
+    require_known_steps(pipeline(tmp_path))
+    # LeRobot looks at the class only where there is no registered name.
+    both = {"registry_name": "device_processor", "class": "subprocess.Popen"}
+    require_known_steps(pipeline(tmp_path, REGISTERED, both, {"class": "lerobot.processor.Unregistered"}))
 
 
 def spec(module: object, name: object, **kwargs: Any) -> dict[str, Any]:
@@ -93,7 +163,7 @@ def test_nothing_is_imported_for_what_is_refused(tmp_path: Path) -> None:
     (tmp_path / "site" / "evil.py").write_text("raise SystemExit('was imported')")
     with pytest.raises(ConfigError, match="evil"):
         require_own_classes(config(tmp_path, text=spec("evil", "Evil")))
-    assert not [name for name in sys.modules if name.partition(".")[0] == "octo"]
+    assert imported() == []
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"model": {}}'])
