@@ -1,13 +1,16 @@
-"""What holds for all dialects."""
+"""Dialects of the server's own port: all of them, OpenVLA, vla-eval; tests/golden has the answers to each request."""
 
 from __future__ import annotations
 
 import json
+import threading
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from dialect_server import ALL, LIMITS, METADATA, body, call, image, libero, receive, seen, send, serving
+from in_memory_keys import ChangingKeys
 from served_agents import Mirror
 from starlette.testclient import TestClient, WebSocketDenialResponse
 from starlette.websockets import WebSocketDisconnect
@@ -15,6 +18,8 @@ from starlette.websockets import WebSocketDisconnect
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract
 from vlagents_ray.errors import ConfigError, PolicyFailed
 from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.serve.access.api_keys import Keys
+from vlagents_ray.serve.access.key_store import new_key, revoke
 from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.config.dialects import DialectArgs
 from vlagents_ray.serve.dialects.base import ReplicaContext
@@ -204,9 +209,81 @@ def test_cameras_that_the_mapping_does_not_read_are_logged_once(caplog: pytest.L
     assert "the mapping reads ['observation/image', 'observation/wrist_image']; if the policy takes them" in said[0]
 
 
-@pytest.mark.parametrize("key", ["states", "state"])
-def test_vla_evals_state_arrives_by_either_name(key: str) -> None:
-    theirs = {"images": {"agentview": image(4), "front": image(4)}, "task_description": "task 1", key: np.full(8, 0.5)}
-    with serving(Mirror(), {"vla_eval": {}}) as (client, _), client.websocket_connect("/vla-eval") as socket:
-        send(socket, "observation", theirs, 1)
-        assert receive(socket).payload["actions"][:2].tolist() == [4, 4]
+def test_each_key_has_openvla_sessions_of_its_own_and_pays_once_a_request() -> None:
+    known = ChangingKeys()
+    keys = {name: known.add(name, **allowed) for name, allowed in (("a", {}), ("b", {}), ("slow", {"rate": 1}))}
+    with serving(Mirror(), {"openvla": {}}, known.keys) as (client, engine):
+
+        def act(key: str, pixel: int, **headers: str) -> Any:
+            headers["authorization"] = f"Bearer {keys[key]}"
+            answer = client.post("/act", json=body(pixel), headers=headers)
+            assert answer.status_code == 200, answer.text
+            return openvla_codec.decode(b'{"action": %s}' % answer.content)[0]["action"][:3].tolist()
+
+        named = {"x-session-id": "robot"}
+        for step in (1, 2, 3):
+            assert act("a", 5, **named) == [5, 0, step]
+        assert act("b", 6, **named) == [6, 0, 1]
+        assert act("a", 7, **named) == [7, 0, 4]
+        assert act("slow", 8) == [8, 0, 1]  # a reset and an act, of the one request that its rate holds
+        assert sorted(engine.sessions.ids()) == ["a/robot", "b/robot"]
+
+
+def test_a_new_key_of_a_revoked_ones_name_goes_on_with_its_sessions(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("vlagents_ray.serve.access.api_keys._CHECK_S", 0.0)
+    file = tmp_path / "keys"
+    old = new_key(file, "arm")
+    with serving(Mirror(), {"openvla": {}}, Keys.from_file(file)) as (client, _):
+
+        def act(key: str) -> int:
+            headers = {"authorization": f"Bearer {key}", "x-session-id": "robot-1"}
+            return client.post("/act", json=body(5), headers=headers).status_code
+
+        assert act(old) == 200
+        revoke(file, "arm")
+        new = new_key(file, "arm")
+        assert (act(old), act(new)) == (401, 200)
+
+
+def test_a_hello_of_another_version_is_refused_and_the_connection_stays(context: tuple[TestClient, Engine]) -> None:
+    assert context[0].get("/health").json() == {"status": "ok"}
+    with context[0].websocket_connect("/vla-eval") as socket:
+        for version, kind in ((None, "error"), (np.zeros(2), "error"), (1, "hello")):
+            send(socket, "hello", {"protocol_version": version}, 1)
+            assert receive(socket).kind == kind
+
+
+def test_of_observations_that_nobody_waits_for_the_newest_is_acted_on() -> None:
+    begun, gate = threading.Event(), threading.Event()
+
+    class Slow(Mirror):
+        def act(self, obs: Obs) -> Act:
+            begun.set()
+            gate.wait(10)
+            return super().act(obs)
+
+    with serving(Slow(), {"vla_eval": {}}) as (client, _), client.websocket_connect("/") as socket:
+        send(socket, "observation", seen(1), 1)
+        assert begun.wait(10)
+        for seq in range(2, 50):
+            send(socket, "observation", seen(seq), seq)
+        send(socket, "hello", {"protocol_version": 1}, 50)  # its answer says that all before it are there
+        gate.set()
+        assert [receive(socket).seq for _ in range(3)] == [1, 49, 50]
+
+
+def test_a_client_that_sends_far_more_than_it_waits_for_is_cut_off() -> None:
+    with serving(Mirror(slow_s=0.1), {"vla_eval": {}}) as (client, _), client.websocket_connect("/") as socket:
+        for seq in range(100):
+            send(socket, "observation", seen(1), seq)
+            send(socket, "hello", {"protocol_version": 1}, seq)
+        received = [receive(socket)]
+        while received[-1].kind != "error":
+            received.append(receive(socket))
+        assert "wait" in received[-1].payload["error"]
+        assert len(received) < 100
+        with pytest.raises(WebSocketDisconnect) as closed:
+            receive(socket)
+        assert closed.value.code == 1008
