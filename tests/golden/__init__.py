@@ -27,11 +27,11 @@ around such a value is made to fit. How many digits or bytes a time has is compa
 begin at 10**15, since the server gets a wall clock that stands still. Bytes within ZeroMQ's and gRPC's own framing,
 API keys (tests/serve/test_access_matrix.py) and the metadata of a replica under Ray are not recorded.
 
-A difference is printed by step, field by field:
+A difference is printed by step, in lines of about a field:
 
     step 3: a gets
-    -    frame.error.detail = 'act before reset: this connection has no session yet; reset first'
-    +    frame.error.detail = 'reset first'
+    -    "detail":"act before reset: this connection has no session yet; reset first"}
+    +    "detail":"reset first"}
 
 When one is allowed. A rewrite of the server changes nothing here; it may only need another `replica`. A change that
 clients are meant to see (docs/protocol.md says which are compatible) comes in a commit of its own: with

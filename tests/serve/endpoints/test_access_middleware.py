@@ -137,14 +137,6 @@ def test_a_request_id_of_the_callers_own_comes_back_with_the_refusal(endpoint: E
     assert json.loads(body)["request_id"] == "mine"
 
 
-def test_a_right_key_is_let_in_by_each_header(endpoint: Endpoint) -> None:
-    token = endpoint.tokens["lab"]
-    for headers in (bearer(token), {"authorization": f"Api-Key {token}"}, {"x-api-key": token}):
-        assert endpoint.get("/v1/metadata", headers)[0] == 200
-        with endpoint.stream(headers) as stream:
-            stream.ping().wait(5)
-
-
 def test_a_websocket_is_refused_before_it_is_accepted(endpoint: Endpoint) -> None:
     for headers, status in (({}, 401), (bearer("wrong"), 401), (bearer(endpoint.tokens["other"]), 403)):
         with pytest.raises(InvalidStatus) as refused, endpoint.stream(headers):
@@ -204,14 +196,14 @@ def test_a_key_holds_no_more_sessions_than_it_may(endpoint: Endpoint, transport:
 
 
 def test_too_many_requests_are_told_when_to_come_again(endpoint: Endpoint) -> None:
-    found = [endpoint.get("/v1/metadata", bearer(endpoint.tokens["slow"])) for _ in range(12)]
+    found = [endpoint.get("/v1/metadata", bearer(endpoint.tokens["slow"])) for _ in range(5)]
     limited = [headers for status, headers, _ in found if status == 429]
     assert limited
     assert all(int(headers["retry-after"]) >= 1 for headers in limited)
     with endpoint.agent("slow", "websocket") as agent:
         wait_for(lambda: endpoint.get("/v1/metadata", bearer(endpoint.tokens["slow"]))[0] == 200)
         errors = []
-        for _ in range(12):
+        for _ in range(5):
             try:
                 agent.reset(Obs(), "x")
             except TooManyRequests as error:

@@ -22,9 +22,6 @@ from websockets.sync.client import connect
 from vlagents_ray.client.transports.websocket import Stream
 from vlagents_ray.errors import (
     ConfigError,
-    MalformedMessage,
-    MessageTooLarge,
-    NotReset,
 )
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.frames import Decoded, decode_reply, decode_requests, encode_request
@@ -107,26 +104,6 @@ def test_an_ordinary_websocket_client_is_served_too(endpoint: WebSocketServer) -
         assert decode_reply(socket_.recv(5)).error is None
 
 
-def test_wrong_messages_are_answered_and_the_session_stays(endpoint: WebSocketServer) -> None:
-    with connect(f"ws://127.0.0.1:{endpoint.address.port}{endpoint.address.path}", compression=None) as client:
-
-        def error_of(message: str | bytes) -> Exception | None:
-            client.send(message)
-            return decode_reply(client.recv(5)).error
-
-        assert isinstance(error_of(encode_request(Request("act", Obs()))), NotReset)
-        assert error_of(encode_request(Request("reset", Obs()))) is None
-        assert isinstance(error_of("text"), MalformedMessage)
-        assert isinstance(error_of(b"nonsense"), MalformedMessage)
-        assert isinstance(error_of(b"VLA?\x00"), MalformedMessage)
-        images = {f"c{i}": np.zeros((2, 2, 3), np.uint8) for i in range(17)}
-        assert isinstance(error_of(encode_request(Request("act", Obs(images)))), MessageTooLarge)
-        client.send(encode_request(Request("act", Obs({"front": np.full((8, 8, 3), 5, np.uint8)}))))
-        act = decode_reply(client.recv(5)).act
-        assert act is not None
-        assert act.action.tolist() == [5]
-
-
 @pytest.mark.parametrize("fragments", [True, False])
 def test_what_is_too_long_or_in_pieces_ends_the_connection_that_sent_it_alone(
     endpoint: WebSocketServer, fragments: bool
@@ -199,22 +176,6 @@ def test_a_reply_longer_than_the_connection_holds_arrives_whole(endpoint: WebSoc
         assert act is not None
         assert len(act.info["bytes"]) == 9_000_000
     client.close()
-
-
-def test_the_limit_of_sessions_is_one_of_streams(endpoint: WebSocketServer) -> None:
-    clients = [stream(endpoint) for _ in range(3)]
-    for client in clients:
-        ask(client, "reset")
-    with pytest.raises(InvalidStatus) as refused:
-        stream(endpoint)
-    assert refused.value.response.status_code == 503  # before it is accepted, so that its client tries the proxy
-    assert refused.value.response.headers["retry-after"] == "1"
-    clients.pop().close()
-    wait_for(lambda: len(endpoint._clients) == 2)
-    clients.append(stream(endpoint))
-    assert ask(clients[-1], "reset").error is None
-    for client in clients:
-        client.close()
 
 
 def test_connections_that_say_nothing_make_way(endpoint: WebSocketServer) -> None:
