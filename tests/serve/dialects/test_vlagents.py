@@ -1,30 +1,38 @@
-"""Clients of vlagents 0.2 and 0.3 over RPyC: their messages and sessions, and what a bad client can do."""
+"""Clients of vlagents 0.2 and 0.3 over RPyC: their messages, memory and sessions, and what a bad client can do."""
 
 from __future__ import annotations
 
 import base64
+import contextlib
 import json
 import os
 import random
 import socket
+import subprocess
+import sys
 import threading
 import zlib
+from collections.abc import Iterator
 from multiprocessing.shared_memory import SharedMemory as Segment
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import psutil
 import pytest
 from eval_fakes import wait_for
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from in_process_replicas import Replicas
 from many import many
+from process_resources import descriptors
 from rpyc_client import LOCAL, REMOTE, ROOT, TUPLE, VALUE, Client, call, document, request
 
-from vlagents_ray.errors import ConfigError, InvalidObservation, MalformedMessage, MessageTooLarge
+from vlagents_ray.errors import ConfigError, InvalidInput, InvalidObservation, MalformedMessage, MessageTooLarge
 from vlagents_ray.images.jpeg_png import encode_jpeg
 from vlagents_ray.interface import GOAL_IMAGE, Act
 from vlagents_ray.protocol.messages import Budget, Limits
+from vlagents_ray.serve.dialects.vlagents import SharedMemory
 from vlagents_ray.serve.ports import reserve
 from vlagents_ray.wire import json_numpy, rpyc, vlagents
 from vlagents_ray.wire.rpyc import Handler
@@ -442,3 +450,121 @@ def test_a_taken_port_is_named_with_the_cure() -> None:
 def test_a_reserved_port_accepts_nobody_before_the_dialect_is_served() -> None:
     with reserve("vlagents", "127.0.0.1", 0) as listener, pytest.raises(ConnectionRefusedError):
         socket.create_connection(listener.getsockname(), timeout=5)
+
+
+@pytest.fixture(name="segment")
+def clients_segment() -> Iterator[Segment]:
+    segment = Segment(create=True, size=4096)
+    segment.buf[:5] = b"hello"
+    yield segment
+    segment.close()
+    segment.unlink()
+
+
+def test_what_the_client_wrote_is_read_each_time_anew(segment: Segment) -> None:
+    memory = SharedMemory(same_machine=True)
+    assert memory.read(segment.name, 5) == b"hello"
+    segment.buf[:5] = b"world"
+    assert memory.read(segment.name, 5) == b"world"
+    memory.close()
+
+
+def test_a_readers_end_leaves_the_segment_to_its_client(segment: Segment) -> None:
+    """Also that of its whole process, whose resource tracker must not have heard of it."""
+    code = (
+        "import sys\nfrom vlagents_ray.serve.dialects.vlagents import SharedMemory\n"
+        "print(SharedMemory(same_machine=True).read(sys.argv[1], 5).decode())"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, segment.name], capture_output=True, text=True, check=True, timeout=60
+    )
+    assert (done.stdout, done.stderr) == ("hello\n", "")
+    assert Path("/dev/shm", segment.name).exists()
+    assert bytes(segment.buf[:5]) == b"hello"
+
+
+def test_a_segment_that_shrinks_is_an_error_and_no_crash(segment: Segment) -> None:
+    memory = SharedMemory(same_machine=True)
+    assert len(memory.read(segment.name, 4096)) == 4096
+    os.truncate(f"/dev/shm/{segment.name}", 0)
+    with pytest.raises(InvalidObservation, match="shorter"):
+        memory.read(segment.name, 4096)
+    os.truncate(f"/dev/shm/{segment.name}", 4096)
+    memory.close()
+
+
+@pytest.mark.parametrize(
+    "name", ["../../etc/passwd", "psm_../x", "/etc/passwd", "", "plasma_123", "psm_", "psm_0123\n", "psm_00000000"]
+)
+def test_only_segments_of_clients_can_be_named(name: str) -> None:
+    with pytest.raises(InvalidObservation):
+        SharedMemory(same_machine=True).read(name, 1)
+
+
+def test_a_link_to_another_file_is_not_followed(tmp_path: Path) -> None:
+    secret = tmp_path / "secret"
+    secret.write_text("secret")
+    link = Path("/dev/shm") / f"psm_{os.getpid():x}abc"
+    link.symlink_to(secret)
+    try:
+        with pytest.raises(InvalidObservation):
+            SharedMemory(same_machine=True).read(link.name, 6)
+    finally:
+        link.unlink()
+
+
+def test_a_client_on_another_machine_names_none(segment: Segment) -> None:
+    with pytest.raises(InvalidObservation, match="not on the server's machine"):
+        SharedMemory(same_machine=False).read(segment.name, 5)
+
+
+@pytest.mark.own_process
+def test_descriptors_do_not_pile_up(segment: Segment) -> None:
+    memory = SharedMemory(same_machine=True)
+    segments = [Segment(create=True, size=64) for _ in range(80)]
+    try:
+        before = descriptors()
+        for one in segments:
+            memory.read(one.name, 1)
+        assert len(descriptors() - before) <= 64
+        memory.close()
+        assert not descriptors() - before
+    finally:
+        for one in segments:
+            one.close()
+            one.unlink()
+
+
+def test_the_gripper_is_the_last_column_and_each_robot_has_its_own_rows() -> None:
+    step = {"left": {"action": np.ones(2), "gripper": 0.5, "done": False, "info": {}}, "right": {"action": [3.0]}}
+    found = vlagents.read_actions(json_numpy.dumps({"acts": [step, step]}))
+    assert found["left"].tolist() == [[1, 1, 0.5]] * 2
+    assert found["right"].tolist() == [[3]] * 2
+
+
+@pytest.mark.parametrize(
+    "acts",
+    [
+        None,
+        [],
+        [1],
+        [{}],
+        [{"a": 1}],
+        [{"a": {"action": "x"}}],
+        [{"a": {"action": [[1.0]]}}],
+        [{"a": {"action": [1.0], "gripper": "open"}}],
+        [{"a": {"action": [1.0]}}, {"b": {"action": [1.0]}}],
+        [{"a": {"action": [1.0]}}, {"a": {"action": [1.0, 2.0]}}],
+    ],
+)
+def test_what_is_no_action_is_refused(acts: Any) -> None:
+    with pytest.raises(InvalidInput):
+        vlagents.read_actions(json.dumps({"acts": acts}))
+
+
+@given(st.recursive(st.none() | st.integers(-(2**60), 2**60) | st.text(max_size=5), lambda one: st.tuples(one, one)))
+@settings(max_examples=many(200))
+def test_any_content_is_a_value_or_an_error_of_ours(content: Any) -> None:
+    for kind in (2, 3):
+        with contextlib.suppress(InvalidInput):
+            vlagents.read_result(bytes([kind]) + rpyc.write_brine((1, content)) + rpyc.END, False, 10_000)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import socket
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
+from many import many
 from websockets import frames, utils
 from websockets.frames import Frame, Opcode
 from websockets.protocol import State
@@ -46,6 +47,7 @@ def parsed_messages(stream: bytes, sizes: list[int]) -> list[bytes]:
 
 
 @pytest.mark.parametrize("mask", [frames.apply_mask, utils.apply_mask], ids=["in C", "in Python"])
+@settings(max_examples=many(40))
 @given(st.lists(SIZES, min_size=1, max_size=5), st.lists(st.integers(1, 5000), max_size=20), st.randoms())
 def test_the_pieces_of_a_stream_make_no_difference(mask, sizes: list[int], pieces: list[int], random) -> None:
     sent = [random.randbytes(size) for size in sizes]
