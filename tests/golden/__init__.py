@@ -20,7 +20,7 @@ A second line of data is what travels outside of the message: what lies in the m
 the method's name. A session that moves is played with two replicas: the last digit of a line's name counts them.
 
 What is compared. The server is sent the bytes of the file, whatever today's encoders write, and its answers must have
-the recorded bytes. A second test has today's encoders write the requests again, and compares those. Not compared is
+the recorded bytes. A second test has today's encoders write the requests again, LeRobot's aside. Not compared is
 what varies by nature, which `masks` replaces by zeros: times in ms and timestamps, ids that are drawn at random (16 or
 32 hexadecimal digits), the headers Date and Server, the CPU core, and which memory files are free again. A length
 around such a value is made to fit. How many digits or bytes a time has is compared, and so is the batch's size. Steps

@@ -29,7 +29,6 @@ from vlagents_ray.serve.endpoints.docs_page import docs_page
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.launch.deployment_file import deployment
-from vlagents_ray.wire import openpi as openpi_codec
 from vlagents_ray.wire import openvla as openvla_codec
 
 
@@ -162,25 +161,6 @@ def test_the_settings_of_dialects_survive_the_way_to_the_replicas_and_to_the_gat
     replica = ServerArgs(**args.model_dump(mode="json", exclude={"dialects": set(args.dialects.gateways())}))
     assert list(replica.dialects.on()) == list(ALL)
     assert replica.dialects.gateways() == {}
-
-
-def test_every_dialect_refuses_an_observation_of_which_its_mapping_reads_nothing() -> None:
-    """A benchmark or robot of another system, or of another version, is not acted for blindly."""
-    with serving(Mirror(), ALL) as (client, engine):
-        theirs = {"their_pictures": {"front": image(1)}, "their_state": np.ones(3), "prompt": "task 1"}
-        for path, more in (("/openpi", {}), ("/roboarena", {"endpoint": "infer"})):
-            with client.websocket_connect(path) as socket:
-                socket.receive_bytes()
-                socket.send_bytes(openpi_codec.encode(theirs | more))
-                assert "their_state" in socket.receive_text()
-        answer = client.post("/act", content=b'{"their_state": [1, 2]}')
-        assert (answer.status_code, "their_state" in answer.json()["detail"]) == (422, True)
-        with client.websocket_connect("/vla-eval") as socket:
-            send(socket, "observation", theirs, 1)
-            error = receive(socket)
-        assert error.kind == "error"
-        assert "of which the mapping reads nothing" in error.payload["error"]
-        assert len(engine.sessions) == 0
 
 
 def test_cameras_that_the_mapping_does_not_read_are_logged_once(caplog: pytest.LogCaptureFixture) -> None:

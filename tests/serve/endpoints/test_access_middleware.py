@@ -122,11 +122,9 @@ def test_without_keys_pages_of_other_sites_are_refused(endpoint: Endpoint) -> No
     with served(unkeyed) as port:
         own = Endpoint(f"http://127.0.0.1:{port}", port, endpoint.engine, endpoint.file, {})
         assert own.get("/v1/metadata", {"origin": "https://evil.example"})[0] == 403
-        assert own.get("/v1/metadata", {"origin": "null"})[0] == 403
         assert own.get("/v1/metadata", {"origin": own.url})[0] == 200
         rebound = {"origin": "http://evil.example:8000", "host": "evil.example:8000"}
         assert own.get("/v1/metadata", rebound)[0] == 403  # a name that its site has lead here
-        assert own.get("/v1/metadata")[0] == 200
         with pytest.raises(InvalidStatus) as refused, own.stream({"origin": "https://evil.example"}):
             pass
         assert refused.value.response.status_code == 403
