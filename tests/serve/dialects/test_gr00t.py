@@ -458,15 +458,3 @@ def test_mutated_messages_get_an_error_or_an_answer(open_dialect, replicas: Repl
     finally:
         bad.close()
         context.term()
-
-
-def test_bytes_that_are_no_zmq_are_hung_up_on(open_dialect) -> None:
-    port = open_dialect("gr00t")
-    choose = random.Random(1)
-    for _ in range(200):
-        with socket.create_connection(("127.0.0.1", port), timeout=20) as stranger:
-            stranger.sendall(choose.randbytes(choose.randrange(1, 200)))
-    with PolicyClient(port) as good:
-        begun = time.monotonic()
-        assert good.ping()["status"] == "ok"
-        assert time.monotonic() - begun < 10

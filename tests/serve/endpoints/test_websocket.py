@@ -242,15 +242,6 @@ def test_who_does_not_wait_for_answers_fills_no_memory_and_gets_them_all(
     wait_for(lambda: not endpoint._clients)
 
 
-def test_without_keys_pages_of_other_sites_are_refused(endpoint: WebSocketServer) -> None:
-    """Of a name that leads here, too."""
-    where = (BASE, endpoint.address.port, endpoint.address.path, 5)
-    for host in ("evil.example", f"evil.example:{endpoint.address.port}"):
-        with pytest.raises(InvalidStatus) as refused:
-            Stream(*where, {"Origin": f"http://{host}"})
-        assert refused.value.response.status_code == 403
-
-
 def test_an_endpoint_takes_a_free_port_of_those_it_may() -> None:
     engine = Engine(Echo())
     with socket.create_server(("127.0.0.1", 0)) as taken:
