@@ -35,7 +35,6 @@ def test_a_request_is_read_from_json_and_images() -> None:
         "kwargs": {"seed": 3},
     }
     request = request_from_parts("reset", json.dumps(document), {"front": encode_jpeg(IMAGE)}, Budget(DEFAULT_LIMITS))
-    assert request.obs is not None
     assert request.instruction == "push"
     assert request.kwargs == {"seed": 3}
     assert request.obs.gripper == 1.0

@@ -360,7 +360,6 @@ def test_keys_come_from_a_file_or_the_environment(file: Path) -> None:
         load_keys(None, {api_keys.FILE_VARIABLE: str(file)}),
         load_keys(None, {api_keys.TEXT_VARIABLE: file.read_text()}),
     ):
-        assert keys is not None
         keys.check(token, "noop")
     assert load_keys(None, {}) is None
     with pytest.raises(ConfigError, match="keys new"):
