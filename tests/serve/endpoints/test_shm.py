@@ -129,9 +129,16 @@ def test_a_late_reply_is_discarded_and_its_memory_is_not_reused_meanwhile(served
 
 
 @pytest.mark.own_process
-def test_a_killed_client_leaves_nothing(served: tuple[Engine, ShmServer]) -> None:
+def test_neither_descriptors_in_a_message_nor_a_killed_client_leave_anything(served: tuple[Engine, ShmServer]) -> None:
     engine, endpoint = served
     before = descriptors()
+    for message in (bytes(LocalAddress.REQUEST.size), b""):
+        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as odd, open(os.devnull) as file:
+            odd.settimeout(5)
+            odd.connect(f"\0{endpoint.address.socket}")
+            socket.send_fds(odd, [message], [file.fileno()] * 2)
+            odd.recv(1000)  # an error, or the end
+        wait_for(lambda: not endpoint._clients and not descriptors() - before)
     code = (
         "import sys, time, numpy as np\n"
         "from vlagents_ray.client.transports.shm import ShmTransport\n"
@@ -267,18 +274,6 @@ def test_who_leaves_before_hearing_that_the_replica_is_full_keeps_nobody_out(ser
     wait_for(lambda: not endpoint._clients)
     with contextlib.closing(client(endpoint)) as other:
         assert call(other, request("reset"), 5).error is None
-
-
-@pytest.mark.own_process
-def test_descriptors_that_a_message_brings_are_all_closed(served: tuple[Engine, ShmServer]) -> None:
-    before = descriptors()
-    for message in (bytes(LocalAddress.REQUEST.size), b""):
-        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as odd, open(os.devnull) as file:
-            odd.settimeout(5)
-            odd.connect(f"\0{served[1].address.socket}")
-            socket.send_fds(odd, [message], [file.fileno()] * 2)
-            odd.recv(1000)  # an error, or the end
-        wait_for(lambda: not served[1]._clients and not descriptors() - before)
 
 
 def test_faults_are_answered_and_harm_nobody(served: tuple[Engine, ShmServer]) -> None:
