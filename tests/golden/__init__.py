@@ -20,18 +20,18 @@ A second line of data is what travels outside of the message: what lies in the m
 the method's name. A session that moves is played with two replicas: the last digit of a line's name counts them.
 
 What is compared. The server is sent the bytes of the file, whatever today's encoders write, and its answers must have
-the recorded bytes. A second test has today's encoders write the requests again, and compares those. Not compared is
+the recorded bytes. A second test has today's encoders write the requests again, LeRobot's aside. Not compared is
 what varies by nature, which `masks` replaces by zeros: times in ms and timestamps, ids that are drawn at random (16 or
 32 hexadecimal digits), the headers Date and Server, the CPU core, and which memory files are free again. A length
 around such a value is made to fit. How many digits or bytes a time has is compared, and so is the batch's size. Steps
 begin at 10**15, since the server gets a wall clock that stands still. Bytes within ZeroMQ's and gRPC's own framing,
 API keys (tests/serve/test_access_matrix.py) and the metadata of a replica under Ray are not recorded.
 
-A difference is printed by step, field by field:
+A difference is printed by step, in lines of about a field:
 
     step 3: a gets
-    -    frame.error.detail = 'act before reset: this connection has no session yet; reset first'
-    +    frame.error.detail = 'reset first'
+    -    "detail":"act before reset: this connection has no session yet; reset first"}
+    +    "detail":"reset first"}
 
 When one is allowed. A rewrite of the server changes nothing here; it may only need another `replica`. A change that
 clients are meant to see (docs/protocol.md says which are compatible) comes in a commit of its own: with

@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 from golden import png
 
-from tests.golden import lerobot_requests
 from tests.golden.masks import masked
 from tests.golden.scenarios import Send, asks, gets, http, scenario
-from tests.golden.traces import Step, Trace
-from vlagents_ray.wire import gr00t, lerobot, openpi, openvla, rpyc, vla_eval, vlagents
+from tests.golden.traces import Step, Trace, read
+from vlagents_ray.wire import gr00t, openpi, openvla, rpyc, vla_eval, vlagents
 
 PIXELS = np.full((8, 8, 3), 7, np.uint8)
 JOINTS = np.array([0.25, -0.5], np.float32)
@@ -123,24 +122,8 @@ def gateways() -> Iterator[Trace]:
         dialects={"gr00t": {}},
     )
 
-    def call(method: str, *messages: bytes) -> tuple[bytes, ...]:
-        return (lerobot.method(method).encode(), *(messages or (b"",)))
-
-    def setup(message: bytes) -> tuple[bytes, ...]:
-        return call("SendPolicyInstructions", message)
-
-    def saw(step: int, task: str = "pick") -> tuple[bytes, ...]:
-        return call("SendObservations", *lerobot_requests.observation(JOINTS, PIXELS, task, step))
-
-    act = call("GetActions")
-    yield from scenario(
-        "lerobot: calls",
-        ("lerobot",),
-        asks(act, call("Ready"), saw(0), setup(lerobot_requests.instructions()), saw(0), act, saw(1), act),
-        asks(saw(2, "place it"), act, saw(3, "fail"), act, setup(lerobot.write_data(b"\x80\x04cos\nsystem\n."))),
-        asks(call("SendObservations", b"\x08\x03\x12\x04junk"), call("SendObservations", b"\x08\x09")),
-        dialects={"lerobot": {}},
-    )
+    # LeRobot's clients send pickles, which nothing here writes: its requests stay those of the file.
+    yield from (one.sent() for one in read("gateways") if one.name.startswith("lerobot"))
 
     def ask(method: str, *args: str) -> bytes:
         return vlagents.call(7, ("vlagents_ray.Policy", 1, 1), method, *args)

@@ -1,4 +1,4 @@
-"""Bytes of the wire: without what varies by nature, as text for a file, and field by field for a reader.
+"""Bytes of the wire: without what varies by nature, as text for a file, and in lines for a reader.
 
 A message is masked by taking it apart, replacing values, and putting it together again. One that does not come out as
 it was, before any value is replaced, is not what its format says: it stays as it is, and so differs from its trace.
@@ -9,12 +9,10 @@ from __future__ import annotations
 import json
 import re
 import struct
-from collections.abc import Callable, Iterator
 from itertools import groupby
 from typing import Any
 
 import msgpack
-import numpy as np
 
 _REPLY = struct.Struct("<QHh")  # of shared memory: files that are free again, flags, core
 _ANSWER = struct.Struct("<40sqBB2xIIIddddd")  # id, step, flags, dimensions, H, D, batch size, five times in ms
@@ -153,48 +151,5 @@ def from_text(text: str) -> bytes:
 
 
 def described(data: bytes) -> list[str]:
-    """A masked message, one field a line."""
-    if data.startswith(b"HTTP/1.1 "):
-        head, _, body = data.partition(b"\r\n\r\n")
-        return [*head.decode("latin-1").split("\r\n"), *described(body)]
-    header, blobs = _taken_apart(data)
-    if header is not None:
-        return list(_lines(json.loads(header), "frame", lambda at: blobs[at]))
-    if (value := _unpacked(data)) is not None:
-        return list(_lines(value, "map"))
-    if data[:1] == b"{":
-        try:
-            return list(_lines(json.loads(data), "json"))
-        except ValueError:
-            pass
-    return [as_text(data)]
-
-
-def described_locally(data: bytes) -> list[str]:
-    """A message of `masked_local`, one field a line."""
-    flags, rest = _REPLY.unpack_from(data)[1], data[_REPLY.size :]
-    if not flags & _COMPACT:
-        return [f"flags = {flags}", *described(rest)]
-    count = int.from_bytes(rest[:4], "little")
-    if len(rest) < 4 + count * _ANSWER.size:
-        return [f"flags = {flags}", as_text(rest)]
-    found = [f"flags = {flags}"]
-    names = ("request_id", "step", "flags", "dimensions", "H", "D", "batch_size")
-    for place in range(count):
-        answer = _ANSWER.unpack_from(rest, 4 + place * _ANSWER.size)
-        found += [f"answer {place}: {name} = {value}" for name, value in zip(names, answer, strict=False)]
-    return [*found, f"actions = {as_text(rest[4 + count * _ANSWER.size :])}"]
-
-
-def _lines(value: Any, path: str, blob: Callable[[int], bytes] | None = None) -> Iterator[str]:
-    if isinstance(value, dict) and blob is not None and list(value) == ["$"]:
-        kind, *rest = value["$"]
-        if kind == "nd":
-            yield f"{path} = {rest[1]} {rest[2]} {np.frombuffer(blob(rest[0]), rest[1]).tolist()}"
-        else:
-            yield f"{path} = {kind} {as_text(blob(rest[0])) if kind in ('bin', 'img') else rest}"
-    elif isinstance(value, dict | list) and value:
-        for key, item in value.items() if isinstance(value, dict) else enumerate(value):
-            yield from _lines(item, f"{path}.{key}", blob)
-    else:
-        yield f"{path} = {value!r}"
+    """A message for a reader, about one field a line."""
+    return re.sub(r',(?=")|(?<=.)(?=«)|«0d0a»', r"\g<0>\n", as_text(data)).split("\n")

@@ -1,4 +1,4 @@
-"""The server answers what it answered when the traces were recorded."""
+"""Our encoders write what they wrote when the traces were recorded, and the server answers what it answered."""
 
 from __future__ import annotations
 
@@ -6,9 +6,19 @@ from pathlib import Path
 
 import pytest
 
+from tests.golden.record import FILES
 from tests.golden.traces import TRACES, Trace, differences, read
 
-FILES = sorted(file.stem for file in TRACES.glob("*.txt"))
+
+@pytest.mark.parametrize("file", FILES)
+def test_requests_are_those_that_were_recorded(file: str) -> None:
+    recorded = {(one.name, endpoint): one for one in read(file) for endpoint in one.endpoints}
+    now = {(one.name, endpoint): one for one in FILES[file]() for endpoint in one.endpoints}
+    assert now.keys() == recorded.keys()
+    for key, one in now.items():
+        assert not (said := differences(recorded[key].sent(), one.sent())), f"{key}:\n{said}"
+
+
 CASES = [(file, trace, endpoint) for file in FILES for trace in read(file) for endpoint in trace.endpoints]
 IDS = [f"{file}-{trace.name}-{endpoint}" for file, trace, endpoint in CASES]
 
@@ -18,5 +28,6 @@ def test_the_server_answers_as_recorded(file: str, trace: Trace, endpoint: str, 
     assert not (said := differences(trace, trace.played(endpoint, tmp_path))), f"{file}:\n{said}"
 
 
-def test_traces_are_small() -> None:
+def test_traces_are_small_and_of_today() -> None:
+    assert {file.stem for file in TRACES.glob("*.txt")} == FILES.keys()
     assert sum(file.stat().st_size for file in TRACES.glob("*.txt")) < 300_000

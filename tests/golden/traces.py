@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from tests.golden.lines import Line, WebSocketLine
-from tests.golden.masks import as_text, described, described_locally, from_text
+from tests.golden.masks import as_text, described, from_text
 from tests.golden.replica import Server
 
 TRACES = Path(__file__).parent / "traces"
@@ -37,8 +37,7 @@ class Step:
     def lines(self) -> list[str]:
         """As a reader looks at it."""
         head = f"{self.who} {self.what} {self.kind}".strip()
-        describe = described_locally if self.kind.startswith("control") else described
-        return [head, *(f"    {line}" for data in self.data for line in describe(data))]
+        return [head, *(f"    {line}" for data in self.data for line in described(data))]
 
 
 @dataclass
@@ -90,8 +89,6 @@ def differences(recorded: Trace, played: Trace) -> str:
         if before == now:
             continue
         lines = list(unified_diff(before.lines(), now.lines(), "recorded", "now", n=0, lineterm=""))[2:]
-        if not any(line[0] in "+-" for line in lines):  # the same to a reader, and other bytes
-            lines = [f"-{as_text(b''.join(before.data))}", f"+{as_text(b''.join(now.data))}"]
         found += [f"step {number}: {now.who} {now.what}", *(line for line in lines if line[0] in "+-")]
     return "\n".join(found)
 

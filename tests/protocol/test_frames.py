@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import random
 import struct
 import tracemalloc
 
+import golden
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
@@ -13,6 +15,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from in_flight import read_requests
 from many import many
+from mutated_messages import mutated
 
 from vlagents_ray.errors import (
     InvalidInput,
@@ -104,7 +107,6 @@ def test_a_request_comes_back_as_it_was(obs: Obs, instruction: str | None, kwarg
 @given(hnp.arrays(np.float32, hnp.array_shapes(min_dims=1, max_dims=2)), st.booleans(), infos)
 def test_a_reply_comes_back_as_it_was(action: np.ndarray, done: bool, info: dict) -> None:
     got = decode_reply(encode_replies([Reply("r1", Act(action, done, info), timing={"queue_ms": 0.5})]))
-    assert got.act is not None
     assert same(action, got.act.action)
     assert (got.request_id, got.act.done, got.timing) == ("r1", done, {"queue_ms": 0.5})
     assert same(info, got.act.info)
@@ -116,7 +118,6 @@ def test_the_header_is_json_for_every_parser_though_a_policy_says_nan(value: flo
     header = frame[8 : 8 + struct.unpack("<I", frame[4:8])[0]]
     json.loads(header, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
     got = decode_reply(frame).act
-    assert got is not None
     assert same(got.info["loss"], [float(value)])
 
 
@@ -165,7 +166,6 @@ def test_jpeg_is_close_and_smaller() -> None:
     request = Request("act", Obs({"front": image}))
     frame = encode_request(request, ImageCodec("jpeg", quality=90))
     got = decode_request(frame).obs
-    assert got is not None
     assert len(frame) < len(encode_request(request, RAW)) / 2
     assert np.abs(got.cameras["front"].astype(int) - image).mean() < 3
 
@@ -180,23 +180,21 @@ def test_garbage_is_refused_by_name(data: bytes) -> None:
         decode_request(b"VLA\x01" + data)
 
 
-@settings(max_examples=many(500))
-@given(observations, st.data())
-def test_a_damaged_frame_is_refused_or_harmless(obs: Obs, data: st.DataObject) -> None:
-    frame = bytearray(encode_request(Request("act", obs)))
-    for _ in range(data.draw(st.integers(1, 4))):
-        frame[data.draw(st.integers(0, len(frame) - 1))] = data.draw(st.integers(0, 255))
-    try:
-        decode_request(bytes(frame))
-    except VLAgentsError:
-        return  # refused by name; anything else fails the test
-
-
-@given(observations, st.data())
-def test_a_truncated_frame_is_malformed(obs: Obs, data: st.DataObject) -> None:
-    frame = encode_request(Request("act", obs))
-    with pytest.raises(MalformedMessage):
-        decode_request(frame[: data.draw(st.integers(0, len(frame) - 1))])
+def test_a_damaged_frame_is_refused_or_harmless_and_a_truncated_one_malformed() -> None:
+    frames = [frame.data for frame in golden.frames() if frame.kind == "requests"]
+    for frame in frames:
+        for end in range(len(frame)):
+            with pytest.raises(MalformedMessage):
+                read_requests(frame[:end], Budget(DEFAULT_LIMITS))
+    choose, refused, sent = random.Random(0), 0, many(5000)
+    for _ in range(sent):
+        try:
+            [answer, *_] = read_requests(mutated(choose, choose.choice(frames)), Budget(DEFAULT_LIMITS))
+        except VLAgentsError:
+            refused += 1  # by name; anything else fails the test
+            continue
+        refused += isinstance(answer, Reply)
+    assert sent / 3 < refused < sent
 
 
 def _frame(header: dict, *blobs: bytes) -> bytes:
@@ -305,6 +303,7 @@ def test_what_the_wire_cannot_carry_is_named_by_the_sender(value: object) -> Non
         encode_request(Request("act", Obs(info={"x": value})))
 
 
+@settings(max_examples=many(30))
 @given(st.lists(observations, min_size=1, max_size=4))
 def test_requests_that_share_a_frame_come_back_in_order(seen: list[Obs]) -> None:
     sent = [
@@ -316,7 +315,6 @@ def test_requests_that_share_a_frame_come_back_in_order(seen: list[Obs]) -> None
     for i, (one, obs) in enumerate(zip(got, seen, strict=True)):
         assert isinstance(one, Request)
         assert (one.session, one.rank, one.step, one.request_id) == (f"s{i}", "simulation", i, f"r{i}")
-        assert one.obs is not None
         assert same(obs.cameras, one.obs.cameras)
         assert same(obs.info, one.obs.info)
 
@@ -348,7 +346,9 @@ def test_replies_that_share_a_frame_come_back_in_order() -> None:
         ({"session": 7}, MalformedMessage),
         ({"history": {"a": 1}}, MalformedMessage),
         ({"history": [{}] * 300}, MessageTooLarge),
-        ({"op": "export"}, MalformedMessage),
+        *(
+            ({"op": of_a_replica}, MalformedMessage) for of_a_replica in ("observe", "export", "adopt")
+        ),  # two carry pickles
     ],
 )
 def test_fields_of_a_request_are_checked(change: dict, error: type[VLAgentsError]) -> None:

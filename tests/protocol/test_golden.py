@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -147,30 +148,6 @@ REFUSED_ACTS = [
 ]
 
 
-@pytest.mark.parametrize("document", REFUSED_ACTS, ids=str)
-def test_what_the_schema_refuses_the_server_refuses_too_in_json_and_in_frames(document: dict[str, Any]) -> None:
-    engine = Engine(Chunks())
-    engine.start()
-    app = AccessMiddleware(build_http_app(engine, dict, DEFAULT_LIMITS), None, "app")
-    of_obs = {key: value for key, value in document.items() if key in ("state", "gripper")}
-    header = {"op": "act", "obs": of_obs, **{key: value for key, value in document.items() if key not in of_obs}}
-    try:
-        with TestClient(app) as client:
-            client.post("/v1/reset", json={}, headers={"x-session-id": "robot-1"})
-            for name, said, kind in (
-                ("act_request", document, "application/json"),
-                ("requests_header", header | {"blobs": []}, CONTENT_TYPE),
-            ):
-                with pytest.raises(jsonschema.ValidationError):
-                    require_valid(said, name)
-                content = b"".join(pack(header, [])) if kind == CONTENT_TYPE else json.dumps(said).encode()
-                headers = {"x-session-id": "robot-1", "content-type": kind}
-                answer = client.post("/v1/act", content=content, headers=headers)
-                assert answer.json()["code"] in ("malformed", "invalid_observation", "too_large"), answer.text
-    finally:
-        engine.close()
-
-
 class Chunks(Agent):
     """A chunk, or an error."""
 
@@ -187,38 +164,59 @@ class Chunks(Agent):
         return Act(np.ones((2, 3)), info={"nan": np.nan, "raw": b"\0", "pixels": dict(obs.cameras)})
 
 
-def test_what_a_server_answers_is_what_the_schema_says() -> None:
+@pytest.fixture(scope="module")
+def client() -> Iterator[TestClient]:
     engine = Engine(Chunks())
     engine.start()
     metadata = {"protocol": PROTOCOL_VERSION, "contract": Chunks().contract.to_json(), "stream": None}
-    app = AccessMiddleware(build_http_app(engine, lambda: metadata, DEFAULT_LIMITS), None, "app")
-    session = {"x-session-id": "robot-1"}
-    try:
-        with TestClient(app) as client:
-            require_valid(client.get("/v1/metadata").json(), "metadata")
-            unknown = client.post("/v1/act", json={}, headers=session)
-            assert (unknown.status_code, unknown.json()["code"]) == (404, "unknown_session")
-            require_valid(unknown.json(), "problem")
-            for op, name in (("reset", "reset_request"), ("act", "act_request")):
-                answer = client.post(f"/v1/{op}", json=golden.documents()[name], headers=session)
-                assert answer.status_code == 200, answer.text
-                require_valid(answer.json(), f"{op}_answer")
-            form = (golden.GOLDEN / "http" / "act_form.bin").read_bytes()
-            kind = {"content-type": f"multipart/form-data; boundary={golden.BOUNDARY}"}
-            answer = client.post("/v1/act", content=form, headers=session | kind)
-            require_valid(answer.json(), "act_answer")
-            assert answer.json()["info"]["pixels"] == {"front": golden.PIXELS.tolist()}
-            require_valid(client.post("/v1/act", json={"info": {"fail": 1}}, headers=session).json(), "problem")
-            frame = {"content-type": CONTENT_TYPE, "accept": CONTENT_TYPE}
-            answer = client.post("/v1/act", content=encode_request(Request("act", Obs())), headers=session | frame)
-            require_valid(unpack(answer.content, DEFAULT_LIMITS)[0], "replies_header")
-            require_valid(client.post("/v1/close", headers=session).json(), "close_answer")
-            with client.websocket_connect("/v1/stream") as stream:
-                for data, error in ((encode_request(Request("reset", Obs())), False), (b"VLA", True)):
-                    stream.send_bytes(data)
-                    reply = stream.receive_bytes()
-                    require_valid(unpack(reply, DEFAULT_LIMITS)[0], "replies_header")
-                    assert isinstance(decode_replies(reply)[0], Reply)
-                    assert (decode_replies(reply)[0].error is not None) == error
-    finally:
-        engine.close()
+    with TestClient(AccessMiddleware(build_http_app(engine, lambda: metadata, DEFAULT_LIMITS), None, "app")) as client:
+        yield client
+    engine.close()
+
+
+@pytest.mark.parametrize("document", REFUSED_ACTS, ids=str)
+def test_what_the_schema_refuses_the_server_refuses_too_in_json_and_in_frames(
+    document: dict[str, Any], client: TestClient
+) -> None:
+    of_obs = {key: value for key, value in document.items() if key in ("state", "gripper")}
+    header = {"op": "act", "obs": of_obs, **{key: value for key, value in document.items() if key not in of_obs}}
+    client.post("/v1/reset", json={}, headers={"x-session-id": "robot-1"})
+    for name, said, kind in (
+        ("act_request", document, "application/json"),
+        ("requests_header", header | {"blobs": []}, CONTENT_TYPE),
+    ):
+        with pytest.raises(jsonschema.ValidationError):
+            require_valid(said, name)
+        content = b"".join(pack(header, [])) if kind == CONTENT_TYPE else json.dumps(said).encode()
+        headers = {"x-session-id": "robot-1", "content-type": kind}
+        answer = client.post("/v1/act", content=content, headers=headers)
+        assert answer.json()["code"] in ("malformed", "invalid_observation", "too_large"), answer.text
+
+
+def test_what_a_server_answers_is_what_the_schema_says(client: TestClient) -> None:
+    session = {"x-session-id": "robot-2"}
+    require_valid(client.get("/v1/metadata").json(), "metadata")
+    unknown = client.post("/v1/act", json={}, headers=session)
+    assert (unknown.status_code, unknown.json()["code"]) == (404, "unknown_session")
+    require_valid(unknown.json(), "problem")
+    for op, name in (("reset", "reset_request"), ("act", "act_request")):
+        answer = client.post(f"/v1/{op}", json=golden.documents()[name], headers=session)
+        assert answer.status_code == 200, answer.text
+        require_valid(answer.json(), f"{op}_answer")
+    form = (golden.GOLDEN / "http" / "act_form.bin").read_bytes()
+    kind = {"content-type": f"multipart/form-data; boundary={golden.BOUNDARY}"}
+    answer = client.post("/v1/act", content=form, headers=session | kind)
+    require_valid(answer.json(), "act_answer")
+    assert answer.json()["info"]["pixels"] == {"front": golden.PIXELS.tolist()}
+    require_valid(client.post("/v1/act", json={"info": {"fail": 1}}, headers=session).json(), "problem")
+    frame = {"content-type": CONTENT_TYPE, "accept": CONTENT_TYPE}
+    answer = client.post("/v1/act", content=encode_request(Request("act", Obs())), headers=session | frame)
+    require_valid(unpack(answer.content, DEFAULT_LIMITS)[0], "replies_header")
+    require_valid(client.post("/v1/close", headers=session).json(), "close_answer")
+    with client.websocket_connect("/v1/stream") as stream:
+        for data, error in ((encode_request(Request("reset", Obs())), False), (b"VLA", True)):
+            stream.send_bytes(data)
+            reply = stream.receive_bytes()
+            require_valid(unpack(reply, DEFAULT_LIMITS)[0], "replies_header")
+            assert isinstance(decode_replies(reply)[0], Reply)
+            assert (decode_replies(reply)[0].error is not None) == error

@@ -1,17 +1,20 @@
-"""JSON and separate images: what curl sends and reads."""
+"""JSON, with separate images as curl sends them, and with values as a recording keeps them."""
 
 from __future__ import annotations
 
 import json
+import math
+from typing import Any
 
 import numpy as np
 import pytest
 
-from vlagents_ray.errors import InvalidObservation, MalformedMessage, MessageTooLarge, NotReset
+from vlagents_ray.errors import InvalidInput, InvalidObservation, MalformedMessage, MessageTooLarge, NotReset
 from vlagents_ray.images.jpeg_png import encode_jpeg
 from vlagents_ray.interface import Act
 from vlagents_ray.protocol.json_messages import problem, reply_to_json, request_from_parts
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Budget, Limits, Reply
+from vlagents_ray.protocol.values import from_text, to_text
 
 IMAGE = np.full((16, 16, 3), 200, np.uint8)
 
@@ -32,7 +35,6 @@ def test_a_request_is_read_from_json_and_images() -> None:
         "kwargs": {"seed": 3},
     }
     request = request_from_parts("reset", json.dumps(document), {"front": encode_jpeg(IMAGE)}, Budget(DEFAULT_LIMITS))
-    assert request.obs is not None
     assert request.instruction == "push"
     assert request.kwargs == {"seed": 3}
     assert request.obs.gripper == 1.0
@@ -83,3 +85,45 @@ def test_a_number_that_json_does_not_have_becomes_none() -> None:
 def test_a_problem_names_its_stable_code() -> None:
     document = problem(NotReset("reset first"), "r7")
     assert (document["status"], document["code"], document["request_id"]) == (409, "not_reset", "r7")
+
+
+def read(text: str) -> Any:
+    return from_text(text, Budget(DEFAULT_LIMITS))
+
+
+def test_a_text_has_the_same_values() -> None:
+    array = np.arange(6, dtype=np.float32).reshape(2, 3)
+    found = read(
+        to_text({"seed": 7, "why": "späť", "none": None, "list": [1.5, True], "raw": b"\x00\xff", "array": array})
+    )
+    assert found["array"].dtype == np.float32
+    np.testing.assert_array_equal(found.pop("array"), array)
+    assert found == {"seed": 7, "why": "späť", "none": None, "list": [1.5, True], "raw": b"\x00\xff"}
+    assert math.isnan(read(to_text({"x": math.nan}))["x"])
+
+
+def test_numbers_and_words_stay_readable() -> None:
+    assert json.loads(to_text({"seed": 7, "task": "stack"})) == {"value": {"seed": 7, "task": "stack"}}
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "7",
+        "[]",
+        "{}",
+        "[" * 100_000,
+        '{"value": {"$": ["nd", 3, "<f4", [2]]}}',
+        '{"value": {"$": ["nd", 0, "<f4", [2]]}, "blobs": ["AAAA"]}',
+        '{"value": 1, "blobs": ["*"]}',
+    ],
+)
+def test_other_texts_are_refused(text: str) -> None:
+    with pytest.raises(MalformedMessage):
+        read(text)
+
+
+def test_an_object_has_no_text() -> None:
+    with pytest.raises(InvalidInput):
+        to_text({"x": object()})

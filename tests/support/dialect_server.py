@@ -13,6 +13,7 @@ from starlette.testclient import TestClient
 from vlagents_ray.interface import Agent
 from vlagents_ray.protocol.messages import Limits
 from vlagents_ray.registry import DIALECTS, dialect_class
+from vlagents_ray.serve.access.api_keys import Keys
 from vlagents_ray.serve.config.dialects import DialectArgs
 from vlagents_ray.serve.dialects.base import ReplicaContext, RouteDialect
 from vlagents_ray.serve.dialects.routes import dialect_routes
@@ -34,12 +35,14 @@ ALL: dict[str, Any] = {  # those on the server's own port, with settings where t
 
 
 @contextmanager
-def serving(agent: Agent, dialects: dict[str, Any], **options: Any) -> Iterator[tuple[TestClient, Engine]]:
+def serving(
+    agent: Agent, dialects: dict[str, Any], keys: Keys | None = None, **options: Any
+) -> Iterator[tuple[TestClient, Engine]]:
     engine = Engine(agent, **options)
     engine.start()
     routes = dialect_routes(DialectArgs(**dialects), ReplicaContext(engine, lambda: METADATA, LIMITS))
     inside = build_http_app(engine, lambda: METADATA, LIMITS, dialects=routes)
-    with TestClient(AccessMiddleware(inside, None, "app")) as client:
+    with TestClient(AccessMiddleware(inside, keys, "app")) as client:
         yield client, engine
     engine.close()
 

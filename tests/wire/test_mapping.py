@@ -77,26 +77,6 @@ def test_no_camera_is_missed_that_a_mapping_reads(caplog: pytest.LogCaptureFixtu
     assert "the cameras ['c'], which" in caplog.text
 
 
-def test_groots_newest_frame_counts_and_names_are_the_clients() -> None:
-    video = np.stack([np.zeros_like(IMAGE), IMAGE])[None]
-    groot = {
-        "video": {"ego_view": video},
-        "state": {"left_arm": np.arange(14.0).reshape(1, 2, 7), "waist": np.ones((1, 1, 3))},
-        "language": {"task": [["pour"]]},
-    }
-    obs, instruction = presets()["gr00t"].obs(groot)
-    assert instruction == "pour"
-    np.testing.assert_array_equal(obs.cameras["ego_view"], IMAGE)
-    assert obs.state["left_arm"].tolist() == [7, 8, 9, 10, 11, 12, 13]
-    flat = {
-        "video.ego_view": video,
-        "state.waist": np.ones((1, 1, 3)),
-        "annotation.human.action.task_description": ["pour"],
-    }
-    obs, instruction = presets()["gr00t-n1.5"].obs(flat)
-    assert (list(obs.cameras), list(obs.state), instruction) == (["ego_view"], ["waist"], "pour")
-
-
 @pytest.mark.parametrize(
     ("change", "error", "key"),
     [
@@ -118,6 +98,11 @@ def test_what_is_wrong_is_said_with_their_key(change: dict[str, Any], error: typ
     flat = {name: value for name, value in (LIBERO | change).items() if value is not None}
     with pytest.raises(error, match=key):
         presets()["openpi-libero"].obs(flat, Limits(pixels=64 * 64))
+
+
+def test_an_observation_without_camera_or_state_that_the_mapping_reads_is_refused() -> None:
+    with pytest.raises(InvalidObservation, match="of which the mapping reads nothing; it looks for"):
+        KeyMapping.from_json({"cameras": {"*": "images/*"}, "state": {"*": "proprio/*"}}).obs({"prompt": "pick"})
 
 
 def test_states_are_joined_in_their_order() -> None:

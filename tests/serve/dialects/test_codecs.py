@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import json
 import random
 import tracemalloc
 from collections.abc import Callable
 from typing import Any
 
+import gr00t_client
 import msgpack
 import numpy as np
 import pytest
@@ -17,10 +19,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from many import many
+from rpyc_client import call, document
 
 from vlagents_ray.errors import InvalidInput, MalformedMessage, MessageTooLarge, VLAgentsError
 from vlagents_ray.images.jpeg_png import encode_jpeg, encode_png
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Budget, Limits
+from vlagents_ray.serve.dialects.vlagents import SharedMemory
+from vlagents_ray.wire import gr00t, rpyc, vlagents
 from vlagents_ray.wire import openpi as openpi_codec
 from vlagents_ray.wire import openvla as openvla_codec
 from vlagents_ray.wire import vla_eval as vla_eval_codec
@@ -91,30 +96,57 @@ def test_a_message_comes_back_as_it_was(dialect: str, value: dict[str, Any]) -> 
     require_equal(value, decode(encode(value), Limits()))
 
 
-@each
+def read_gr00t(data: bytes, limits: Limits) -> gr00t.Observations:
+    return gr00t.read_observations(gr00t.read_request(data, limits).data)
+
+
+def as_gr00t(encode: Callable[[Any], Any]) -> bytes:
+    seen = {"video": {"ego": IMAGE[None, None]}, "state": {"arm": np.zeros((1, 1, 2))}, "language": {"task": [["go"]]}}
+    return msgpack.packb({"endpoint": "get_action", "data": {"observation": seen}}, default=encode)
+
+
+def read_vlagents(data: bytes, limits: Limits) -> vlagents.ObservationRequest:
+    return vlagents.read_act(data.decode(errors="replace"), Budget(limits), SharedMemory(same_machine=False))
+
+
+MESSAGES: dict[str, tuple[bytes, Callable[[bytes, Limits], Any]]] = {
+    **{name: (encode(OBS), decode) for name, (encode, decode) in DECODERS.items()},
+    "gr00t": (as_gr00t(gr00t_client.encode), read_gr00t),
+    "gr00t, packed": (as_gr00t(gr00t_client.encode_packed), read_gr00t),
+    "vlagents": (document(side=2).encode(), read_vlagents),
+    "rpyc": (call("act", "text", "more")[rpyc.HEADER.size :], lambda data, _: rpyc.read_call(data, False, 2**16)),
+    "rpyc, compressed": (call("x" * 10_000)[rpyc.HEADER.size :], lambda data, _: rpyc.read_call(data, True, 2**16)),
+    "rpyc, reply": (rpyc.reply(1, "text")[rpyc.HEADER.size :], lambda data, _: vlagents.read_result(data, False, 1000)),
+    "rpyc, reply, compressed": (
+        rpyc.reply(1, "x" * 10_000)[rpyc.HEADER.size :],
+        lambda data, _: vlagents.read_result(data, True, 2**16),
+    ),
+}
+any_message = pytest.mark.parametrize("message", sorted(MESSAGES))
+
+
+@any_message
 @settings(max_examples=many(200))
 @given(data=st.binary(max_size=100))
-def test_garbage_is_refused_by_name(dialect: str, data: bytes) -> None:
-    try:
-        DECODERS[dialect][1](data, SMALL)
-    except InvalidInput:
-        return
+def test_garbage_is_refused_by_name(message: str, data: bytes) -> None:
+    for garbage in (data, data + rpyc.END) if "rpyc" in message else (data,):
+        with contextlib.suppress(VLAgentsError):
+            MESSAGES[message][1](garbage, SMALL)
 
 
-@each
-def test_every_truncation_is_malformed(dialect: str) -> None:
-    encode, decode = DECODERS[dialect]
-    data = encode(OBS)
+@any_message
+def test_every_truncation_is_malformed(message: str) -> None:
+    data, decode = MESSAGES[message]
+    decode(data, Limits())
     for end in range(len(data)):
         with pytest.raises(MalformedMessage):
             decode(data[:end], Limits())
 
 
-@each
-def test_a_mutated_message_is_refused_by_name_or_harmless(dialect: str) -> None:
-    encode, decode = DECODERS[dialect]
-    data, choose = encode(OBS), random.Random(7)
-    refused, sent = 0, many(3000)
+@any_message
+def test_a_mutated_message_is_refused_by_name_or_harmless(message: str) -> None:
+    data, decode = MESSAGES[message]
+    choose, refused, sent = random.Random(7), 0, many(3000)
     for _ in range(sent):
         try:
             decode(mutated(choose, data), SMALL)

@@ -1,13 +1,17 @@
-"""What holds for all dialects."""
+"""Dialects of the server's own port: all of them, OpenVLA, vla-eval; tests/golden has the answers to each request."""
 
 from __future__ import annotations
 
 import json
-from typing import Any
+import threading
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 from dialect_server import ALL, LIMITS, METADATA, body, call, image, libero, receive, seen, send, serving
+from in_memory_keys import ChangingKeys
 from served_agents import Mirror
 from starlette.testclient import TestClient, WebSocketDenialResponse
 from starlette.websockets import WebSocketDisconnect
@@ -15,16 +19,18 @@ from starlette.websockets import WebSocketDisconnect
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract
 from vlagents_ray.errors import ConfigError, PolicyFailed
 from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.serve.access.api_keys import Keys
+from vlagents_ray.serve.access.key_store import new_key, revoke
 from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.config.dialects import DialectArgs
 from vlagents_ray.serve.dialects.base import ReplicaContext
+from vlagents_ray.serve.dialects.openvla import OpenVLADialect
 from vlagents_ray.serve.dialects.routes import describe, dialect_routes, require_fit
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.docs_page import docs_page
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.launch.deployment_file import deployment
-from vlagents_ray.wire import openpi as openpi_codec
 from vlagents_ray.wire import openvla as openvla_codec
 
 
@@ -159,25 +165,6 @@ def test_the_settings_of_dialects_survive_the_way_to_the_replicas_and_to_the_gat
     assert replica.dialects.gateways() == {}
 
 
-def test_every_dialect_refuses_an_observation_of_which_its_mapping_reads_nothing() -> None:
-    """A benchmark or robot of another system, or of another version, is not acted for blindly."""
-    with serving(Mirror(), ALL) as (client, engine):
-        theirs = {"their_pictures": {"front": image(1)}, "their_state": np.ones(3), "prompt": "task 1"}
-        for path, more in (("/openpi", {}), ("/roboarena", {"endpoint": "infer"})):
-            with client.websocket_connect(path) as socket:
-                socket.receive_bytes()
-                socket.send_bytes(openpi_codec.encode(theirs | more))
-                assert "their_state" in socket.receive_text()
-        answer = client.post("/act", content=b'{"their_state": [1, 2]}')
-        assert (answer.status_code, "their_state" in answer.json()["detail"]) == (422, True)
-        with client.websocket_connect("/vla-eval") as socket:
-            send(socket, "observation", theirs, 1)
-            error = receive(socket)
-        assert error.kind == "error"
-        assert "of which the mapping reads nothing" in error.payload["error"]
-        assert len(engine.sessions) == 0
-
-
 def test_cameras_that_the_mapping_does_not_read_are_logged_once(caplog: pytest.LogCaptureFixture) -> None:
     """openpi's simple_client in ALOHA mode, of whose four cameras pi0 takes three, was answered without a word."""
     keyed = {"cameras": {"front": "images/front"}, "state": {"joints": "state"}, "instruction": "task_description"}
@@ -204,9 +191,102 @@ def test_cameras_that_the_mapping_does_not_read_are_logged_once(caplog: pytest.L
     assert "the mapping reads ['observation/image', 'observation/wrist_image']; if the policy takes them" in said[0]
 
 
-@pytest.mark.parametrize("key", ["states", "state"])
-def test_vla_evals_state_arrives_by_either_name(key: str) -> None:
-    theirs = {"images": {"agentview": image(4), "front": image(4)}, "task_description": "task 1", key: np.full(8, 0.5)}
-    with serving(Mirror(), {"vla_eval": {}}) as (client, _), client.websocket_connect("/vla-eval") as socket:
-        send(socket, "observation", theirs, 1)
-        assert receive(socket).payload["actions"][:2].tolist() == [4, 4]
+def test_each_key_has_openvla_sessions_of_its_own_and_pays_once_a_request() -> None:
+    known = ChangingKeys()
+    keys = {name: known.add(name, **allowed) for name, allowed in (("a", {}), ("b", {}), ("slow", {"rate": 1}))}
+    with serving(Mirror(), {"openvla": {}}, known.keys) as (client, engine):
+
+        def act(key: str, pixel: int, **headers: str) -> Any:
+            headers["authorization"] = f"Bearer {keys[key]}"
+            answer = client.post("/act", json=body(pixel), headers=headers)
+            assert answer.status_code == 200, answer.text
+            return openvla_codec.decode(b'{"action": %s}' % answer.content)[0]["action"][:3].tolist()
+
+        named = {"x-session-id": "robot"}
+        for step in (1, 2, 3):
+            assert act("a", 5, **named) == [5, 0, step]
+        assert act("b", 6, **named) == [6, 0, 1]
+        assert act("a", 7, **named) == [7, 0, 4]
+        assert act("slow", 8) == [8, 0, 1]  # a reset and an act, of the one request that its rate holds
+        assert sorted(engine.sessions.ids()) == ["a/robot", "b/robot"]
+
+
+def test_a_new_key_of_a_revoked_ones_name_goes_on_with_its_sessions(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("vlagents_ray.serve.access.api_keys._CHECK_S", 0.0)
+    file = tmp_path / "keys"
+    old = new_key(file, "arm")
+    with serving(Mirror(), {"openvla": {}}, Keys.from_file(file)) as (client, _):
+
+        def act(key: str) -> int:
+            headers = {"authorization": f"Bearer {key}", "x-session-id": "robot-1"}
+            return client.post("/act", json=body(5), headers=headers).status_code
+
+        assert act(old) == 200
+        revoke(file, "arm")
+        new = new_key(file, "arm")
+        assert (act(old), act(new)) == (401, 200)
+
+
+def test_a_hello_of_another_version_is_refused_and_the_connection_stays(context: tuple[TestClient, Engine]) -> None:
+    assert context[0].get("/health").json() == {"status": "ok"}
+    with context[0].websocket_connect("/vla-eval") as socket:
+        for version, kind in ((None, "error"), (np.zeros(2), "error"), (1, "hello")):
+            send(socket, "hello", {"protocol_version": version}, 1)
+            assert receive(socket).kind == kind
+
+
+def test_of_observations_that_nobody_waits_for_the_newest_is_acted_on() -> None:
+    begun, gate = threading.Event(), threading.Event()
+
+    class Slow(Mirror):
+        def act(self, obs: Obs) -> Act:
+            begun.set()
+            gate.wait(10)
+            return super().act(obs)
+
+    with serving(Slow(), {"vla_eval": {}}) as (client, _), client.websocket_connect("/") as socket:
+        send(socket, "observation", seen(1), 1)
+        assert begun.wait(10)
+        for seq in range(2, 50):
+            send(socket, "observation", seen(seq), seq)
+        send(socket, "hello", {"protocol_version": 1}, 50)  # its answer says that all before it are there
+        gate.set()
+        assert [receive(socket).seq for _ in range(3)] == [1, 49, 50]
+
+
+def test_a_client_that_sends_far_more_than_it_waits_for_is_cut_off() -> None:
+    with serving(Mirror(slow_s=0.1), {"vla_eval": {}}) as (client, _), client.websocket_connect("/") as socket:
+        for seq in range(100):
+            send(socket, "observation", seen(1), seq)
+            send(socket, "hello", {"protocol_version": 1}, seq)
+        received = [receive(socket)]
+        while received[-1].kind != "error":
+            received.append(receive(socket))
+        assert "wait" in received[-1].payload["error"]
+        assert len(received) < 100
+        with pytest.raises(WebSocketDisconnect) as closed:
+            receive(socket)
+        assert closed.value.code == 1008
+
+
+class WithReset(OpenVLADialect):
+    """A protocol over HTTP that has a reset."""
+
+    paths: ClassVar[Mapping[str, str]] = {**OpenVLADialect.paths, "POST /reset": "end_episode"}
+
+
+def test_a_reset_over_http_begins_an_episode_of_the_session_that_it_names() -> None:
+    with serving(Mirror(), {f"{__name__}:WithReset": {}}) as (client, _):
+
+        def count(session: str) -> float:
+            answer = client.post("/act", json=body(5), headers={"x-session-id": session})
+            return float(openvla_codec.decode(b'{"action": %s}' % answer.content)[0]["action"][2])
+
+        assert client.post("/reset", headers={"x-session-id": "a"}).status_code == 200
+        assert [count("a"), count("a"), count("b")] == [1, 2, 1]
+        answer = client.post("/reset", headers={"x-session-id": "a"})
+        assert (answer.status_code, answer.json()) == (200, {})
+        assert [count("a"), count("b")] == [1, 2]
+        assert client.post("/reset").json()["code"] == "malformed"

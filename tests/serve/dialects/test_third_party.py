@@ -25,7 +25,6 @@ CLASS = f"{PACKAGE}:PlainDialect"
 @pytest.fixture(name="package")
 def installed_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The example as a module that can be imported; returns the folder that it lies in."""
-    assert base.__doc__ is not None
     _, _, rest = base.__doc__.partition("::\n\n")
     (tmp_path / f"{PACKAGE}.py").write_text(textwrap.dedent(rest.partition("\n`tests/")[0]))
     monkeypatch.syspath_prepend(tmp_path)

@@ -3,24 +3,20 @@
 from __future__ import annotations
 
 import gzip
-import io
 import json
-import struct
 import threading
-import zlib
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
 from starlette.testclient import TestClient, WebSocketDenialResponse
 
 from vlagents_ray.contract import CameraSpec, Contract, StateSpec
 from vlagents_ray.images.jpeg_png import encode_jpeg
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.policies.loading import report_progress, report_uncompiled
-from vlagents_ray.protocol.frames import CONTENT_TYPE, decode_reply, encode_request
+from vlagents_ray.protocol.frames import CONTENT_TYPE, encode_request
 from vlagents_ray.protocol.messages import Limits, Request
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
@@ -96,18 +92,6 @@ def test_a_form_that_does_not_say_how_long_it_is_has_the_limit_of_all(client: Te
     assert (answer.status_code, answer.json()["code"]) == (413, "too_large")
 
 
-def test_curl_style_reset_and_act(client: TestClient) -> None:
-    good_act(client)
-
-
-def test_png_is_lossless(client: TestClient) -> None:
-    file = io.BytesIO()
-    Image.fromarray(IMAGE).save(file, "PNG")
-    post(client, "reset", files={"cameras.front": file.getvalue()})
-    document = post(client, "act", files={"cameras.front": file.getvalue()}).json()
-    np.testing.assert_allclose(document["action"][:3], IMAGE.mean((0, 1)), rtol=1e-6)
-
-
 def test_what_json_cannot_hold_in_the_info_of_a_policy_costs_no_action(client: TestClient) -> None:
     post(client, "reset")
     answer = post(client, "act", {**GOOD, "info": {"odd": True}})
@@ -176,25 +160,6 @@ def test_an_identity_coding_is_none(client: TestClient) -> None:
     assert post(client, "reset", headers={"content-encoding": "identity"}).status_code == 200
 
 
-def test_a_frame_gets_a_frame(client: TestClient) -> None:
-    obs = Obs({"front": IMAGE}, 1.0, {"joints": np.zeros(2, np.float32)})
-    headers = {"x-session-id": "framed", "content-type": CONTENT_TYPE, "accept": CONTENT_TYPE}
-    for op in ("reset", "act"):
-        body = encode_request(Request(op, obs, instruction="lift" if op == "reset" else None, request_id=op))
-        answer = client.post(f"/v1/{op}", content=body, headers=headers)
-        assert answer.headers["content-type"] == CONTENT_TYPE
-        reply = decode_reply(answer.content)
-        assert reply.request_id == op
-    assert reply.act is not None
-    assert reply.act.info["instruction"] == "lift"
-
-
-def test_close_ends_the_session(client: TestClient) -> None:
-    post(client, "reset", session="closing")
-    assert client.post("/v1/close", headers={"x-session-id": "closing"}).status_code == 200
-    assert post(client, "act", session="closing").json()["code"] == "unknown_session"
-
-
 def test_health_metadata_and_docs(client: TestClient) -> None:
     assert client.get("/healthz").text == "OK\n"
     metadata = client.get("/v1/metadata").json()
@@ -203,15 +168,6 @@ def test_health_metadata_and_docs(client: TestClient) -> None:
     assert "/v1/reset" in page.text
     assert "missing_camera" in page.text
     assert "encode_ms" in page.text
-
-
-def test_health_is_503_until_the_policy_is_loaded() -> None:
-    endpoint = build_http_app(Engine(Mean()), dict, LIMITS)
-    with TestClient(AccessMiddleware(endpoint, None, "app")) as client:
-        for path in ("/healthz", "/v1/metadata"):
-            answer = client.get(path)
-            assert (answer.status_code, answer.json()["code"]) == (503, "unavailable")
-        assert post(client, "reset").status_code == 503
 
 
 class Slow(Mean):
@@ -250,24 +206,13 @@ def test_health_and_refusals_name_the_step_of_a_long_start() -> None:
 NAN, HUGE = float("nan"), 10**400
 
 
-def png_of(side: int, pixels: bytes) -> bytes:
-    chunks = (b"IHDR" + struct.pack(">IIBBBBB", side, side, 8, 2, 0, 0, 0), b"IDAT" + zlib.compress(pixels), b"IEND")
-    return b"\x89PNG\r\n\x1a\n" + b"".join(
-        struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk)) for chunk in chunks
-    )
-
-
-HUGE_PNG, EMPTY_PNG = png_of(60_000, b"few"), png_of(0, b"")
-HUGE_JPEG = bytearray(JPEG)
-_SOF = HUGE_JPEG.index(b"\xff\xc0")
-HUGE_JPEG[_SOF + 5 : _SOF + 9] = struct.pack(">HH", 65_000, 65_000)
 FRAME = encode_request(Request("act", Obs({"front": IMAGE}, 1.0, {"joints": np.zeros(2, np.float32)})))
 FRAMED = {"content-type": CONTENT_TYPE}
 
-# (request, status, code): each kind of fault that a robot's software can commit.
+# (request, status, code): each kind of fault that a robot's software can commit; tests/protocol has more of frames.
 FAULTS: list[tuple[dict[str, Any], int, str]] = [
-    *[({"files": {"cameras.front": JPEG[:cut]}}, 400, "malformed") for cut in range(0, len(JPEG) - 2, len(JPEG) // 20)],
-    *[({"content": FRAME[: len(FRAME) * i // 20], "headers": FRAMED}, 400, "malformed") for i in range(20)],
+    *[({"files": {"cameras.front": JPEG[:-cut]}}, 400, "malformed") for cut in (20, 700)],
+    *[({"content": FRAME[:-cut], "headers": FRAMED}, 400, "malformed") for cut in (1, 900)],
     *[({"obs": text}, 400, "malformed") for text in ("", "{", "null", "[1]", "nan", "[" * 9999, '{"a": 1}', "\xff")],
     *[({"obs": json.dumps({**GOOD, "info": {text: text}})}, 400, "malformed") for text in ("\ud800", "a\udfff")],
     *[({"obs": {**GOOD, key: 1}}, 400, "malformed") for key in ("camera", "images", "prompt", "session", "x" * 999)],
@@ -283,18 +228,12 @@ FAULTS: list[tuple[dict[str, Any], int, str]] = [
     ({"files": {"cameras.front": encode_jpeg(IMAGE[:8])}}, 422, "invalid_observation"),
     ({"files": {"cameras.front": b"GIF89a" + JPEG}}, 400, "malformed"),
     ({"files": {"cameras.front": b""}}, 400, "malformed"),
-    ({"files": {"cameras.front": bytes(HUGE_JPEG)}}, 413, "too_large"),
-    ({"files": {"cameras.front": HUGE_PNG}}, 413, "too_large"),
-    ({"files": {"cameras.front": EMPTY_PNG}}, 422, "invalid_observation"),
     ({"files": {"cameras.front": encode_jpeg(np.zeros((65, 65, 3), np.uint8))}}, 413, "too_large"),
     ({"files": {"cameras.front": JPEG, "image": JPEG}}, 400, "malformed"),
     ({"files": {f"cameras.{i}": JPEG for i in range(30)}}, 400, "malformed"),
     ({"files": {"cameras.front": JPEG, "x": bytes(400_000)}}, 413, "too_large"),
-    ({"obs": {**GOOD, "info": {"a": [[[[[[[[[1]]]]]]]]]}}}, 413, "too_large"),
     ({"obs": {**GOOD, "info": {"a": list(range(20_000))}}}, 413, "too_large"),
     ({"obs": {**GOOD, "info": [1]}}, 400, "malformed"),
-    ({"obs": {**GOOD, "info": {"$": 1}}}, 400, "malformed"),
-    ({"obs": {**GOOD, "info": {"a": {"$": ["nd", 0, "|O", [1]]}}}}, 400, "malformed"),
     ({"obs": {**GOOD, "instruction": 3}}, 400, "malformed"),
     ({"obs": {**GOOD, "instruction": "x"}}, 400, "malformed"),
     ({"obs": {**GOOD, "kwargs": {"seed": 1}}}, 400, "malformed"),
@@ -311,13 +250,8 @@ FAULTS: list[tuple[dict[str, Any], int, str]] = [
     ({"content": b"{}", "headers": {"content-type": "multipart/form-data"}}, 400, "malformed"),
     ({"content": b"--x", "headers": {"content-type": "multipart/form-data; boundary=x"}}, 400, "malformed"),
     ({"content": bytes(400_000), "headers": FRAMED}, 413, "too_large"),
-    ({"content": FRAME.replace(b'"op":"act"', b'"op":"fly"'), "headers": FRAMED}, 400, "malformed"),
     ({"content": encode_request(Request("close")), "headers": FRAMED}, 400, "malformed"),
     ({"content": FRAME.replace(b'"<f4"', b'"|O8"'), "headers": FRAMED}, 400, "malformed"),
-    ({"content": FRAME.replace(b'"<f4"', b'"<c8"'), "headers": FRAMED}, 400, "malformed"),
-    ({"content": FRAME.replace(b'"<f4"', b'"<i2"'), "headers": FRAMED}, 400, "malformed"),
-    ({"content": FRAME.replace(b"[32,48,3]", b"[32,48,4]"), "headers": FRAMED}, 400, "malformed"),
-    ({"content": FRAME.replace(b"VLA\x01", b"VLA\x02"), "headers": FRAMED}, 400, "malformed"),
 ]  # fmt: skip
 
 
@@ -328,8 +262,7 @@ def send(client: TestClient, fault: dict[str, Any]):
     return post(client, "act", **fault)
 
 
-def test_a_hundred_faults_each_get_their_code_and_harm_nobody(client: TestClient) -> None:
-    assert len(FAULTS) >= 100
+def test_each_fault_gets_its_code_and_harms_nobody(client: TestClient) -> None:
     good_act(client)
     for fault, status, code in FAULTS:
         answer = send(client, fault)
@@ -378,39 +311,8 @@ def test_unknown_paths_and_methods_are_problems(client: TestClient) -> None:
     assert client.get("/v1/act").headers["content-type"] == "application/problem+json"
 
 
-def test_a_stream_is_a_session(client: TestClient) -> None:
-    obs = Obs({"front": IMAGE}, 1.0, {"joints": np.zeros(2, np.float32)})
-    with client.websocket_connect("/v1/stream") as first, client.websocket_connect("/v1/stream") as second:
-
-        def call(socket: Any, op: str, **fields: Any):
-            socket.send_bytes(encode_request(Request(op, obs, **fields)))  # type: ignore[arg-type]
-            return decode_reply(socket.receive_bytes())
-
-        assert call(first, "act").error.code == "not_reset"
-        call(first, "reset", instruction="one")
-        call(second, "reset", instruction="two")
-        assert call(first, "act").act.info["instruction"] == "one"
-        assert call(second, "act").act.info["instruction"] == "two"
-        first.send_bytes(b"garbage")
-        assert decode_reply(first.receive_bytes()).error.code == "malformed"
-        first.send_text("hello")
-        assert decode_reply(first.receive_bytes()).error.code == "malformed"
-        assert call(first, "act").act.info["instruction"] == "one"
-
-
 @pytest.mark.parametrize("name", ["a b", "\xe9", "x" * 129])
 def test_a_request_id_that_could_forge_a_line_in_the_log_is_replaced(client: TestClient, name: str) -> None:
     answer = client.get("/nope", headers=[(b"x-request-id", name.encode("latin-1"))])
     assert answer.json()["request_id"].isalnum()
     assert client.get("/nope", headers={"x-request-id": "mine-1"}).json()["request_id"] == "mine-1"
-
-
-def test_a_full_replica_says_when_to_try_again() -> None:
-    engine = Engine(Mean(), session_limit=1)
-    engine.start()
-    inside = build_http_app(engine, dict, LIMITS)
-    with TestClient(AccessMiddleware(inside, None, "app")) as full:
-        assert post(full, "reset", session="first").status_code == 200
-        answer = post(full, "reset", session="second")
-    engine.close()
-    assert (answer.status_code, answer.headers["retry-after"], answer.json()["code"]) == (503, "1", "unavailable")

@@ -24,7 +24,6 @@ from vlagents_ray.errors import (
     InvalidWeights,
     MalformedMessage,
     MessageTooLarge,
-    NotTrainable,
     Overloaded,
     PolicyUnavailable,
     TooManyRequests,
@@ -59,11 +58,6 @@ class Gain(Agent):
 
     def act(self, obs: Obs) -> Act:
         return Act(self.tree["offset"])
-
-
-class Fixed(Agent):
-    def act(self, obs: Obs) -> Act:
-        return Act(np.zeros(1))
 
 
 class Alone:
@@ -166,15 +160,9 @@ def test_what_does_not_fit_is_refused_before_it_is_sent(serving: Serving, monkey
         with pytest.raises(InvalidWeights, match=says):
             weights.push(wrong)
         assert sum(sent) < 1000
-    for wrong, error in (
-        (gains(np.nan), InvalidWeights),
-        (gains(0), UnchangedWeights),
-        ({"offset": [0.0]}, InvalidWeights),
-    ):
+    for wrong, error in ((gains(np.nan), InvalidWeights), (gains(0), UnchangedWeights)):  # after it was
         with pytest.raises(error):
             weights.push(wrong)
-    with pytest.raises(NotTrainable):
-        Publisher(serving(Fixed()).url).push(gains(1))
     assert server.engine.weights.number == 0
 
 
@@ -278,9 +266,8 @@ def test_a_header_beyond_the_policys_own_names_is_not_parsed(serving: Serving, m
     assert not parsed
 
 
-@pytest.mark.parametrize(
-    ("query", "parts", "error"),
-    [
+def test_garbage_is_refused_with_its_reason(serving: Serving) -> None:
+    wrong: list[tuple[str, list[Any], type[Exception]]] = [
         ("?mode=abort", [], InvalidInput),
         ("?partial=yes", [], InvalidInput),
         ("?pickle=true", [], InvalidInput),
@@ -293,20 +280,17 @@ def test_a_header_beyond_the_policys_own_names_is_not_parsed(serving: Serving, m
         ("?partial=true", [header_of({"offset": np.zeros(2, np.float32)}), b""], MalformedMessage),
         ("", [b"\0" * (MESSAGE_BYTES + 1)], MessageTooLarge),
         ("?partial=true", [header_of({"offset": np.zeros(2, np.float32)}), b"\0" * 9], MalformedMessage),
-    ],
-)
-def test_garbage_is_refused_with_its_reason(serving: Serving, query: str, parts: list[bytes], error: type) -> None:
+        ("", ["text"], MalformedMessage),
+    ]
     server = serving()
-    with opened(server, query) as socket:
-        for part in parts or [b"garbage"]:
-            found = answer(socket, part)
-        assert type(read_error(found)) is error
+    for query, parts, error in wrong:
+
+        def found(query: str = query, parts: list[Any] = parts) -> type:
+            with opened(server, query) as socket:
+                return type(read_error([answer(socket, part) for part in parts or [b"garbage"]][-1]))
+
+        wait_for(lambda error=error, found=found: found() is error)  # one push at a time: the last may not have ended
     assert server.engine.weights.number == 0
-
-
-def test_text_is_no_part(serving: Serving) -> None:
-    with opened(serving()) as socket:
-        assert "want a binary one" in str(read_error(answer(socket, "{}")))  # type: ignore[arg-type]
 
 
 def test_an_error_of_the_server_itself_is_not_shown(serving: Serving, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,27 +1,19 @@
-"""openpi's `infer_batch`, as the client of its pull request 941 sends it, and the `reset` of its derivatives."""
+"""openpi's and RoboArena's clients: sessions, `infer_batch` of openpi's pull request 941, and `reset`."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
-from asgi_server import served
-from dialect_server import ALL, LIMITS, METADATA, call, image, libero, serving
+from dialect_server import ALL, call, image, libero, serving
 from in_memory_keys import ChangingKeys
 from served_agents import Mirror
 from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
-from websockets.sync.client import connect
 
 from vlagents_ray.interface import Act, Obs
-from vlagents_ray.serve.config.dialects import DialectArgs
-from vlagents_ray.serve.dialects.base import ReplicaContext
-from vlagents_ray.serve.dialects.routes import dialect_routes
-from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
-from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.wire import openpi
 
@@ -104,6 +96,7 @@ def test_a_batch_of_another_size_ends_the_episodes_of_all_its_places(served_batc
 
 def test_nothing_is_acted_on_if_one_observation_is_wrong(served_batches: Any) -> None:
     client, _, sizes = served_batches
+    # One observation alone that is wrong is in tests/golden.
     wrong = openpi.encode({"batch": [{"observation/image": image(0), "observation/state": STATE, "prompt": "task 1"}]})
     for asked, said in (
         (batch((1, "task 1"), (2, None)), "instruction"),
@@ -111,11 +104,11 @@ def test_nothing_is_acted_on_if_one_observation_is_wrong(served_batches: Any) ->
         (openpi.encode({"batch": []}), "want a list of one observation or more"),
         (openpi.encode({"batch": np.zeros(3)}), "want a list of one observation or more"),
         (openpi.encode({"batch": [1]}), "want a map"),
-        (openpi.encode({"reset": 1}), "want true"),
+        ("text", "binary"),
     ):
         with client.websocket_connect("/openpi") as socket:
             socket.receive_bytes()
-            socket.send_bytes(asked)
+            socket.send_text(asked) if isinstance(asked, str) else socket.send_bytes(asked)
             assert said in socket.receive_text()
             with pytest.raises(WebSocketDisconnect):
                 socket.receive_bytes()
@@ -131,21 +124,14 @@ def test_a_key_called_batch_beside_others_is_one_of_an_observation(served_batche
 
 def test_each_observation_of_a_batch_counts_for_its_key_before_any_is_acted_on() -> None:
     keys, agent = ChangingKeys(), Together()
-    token = keys.add("slow", rate=4)  # and so many at once
-    engine = Engine(agent)
-    engine.start()
-    routes = dialect_routes(DialectArgs(**ALL), ReplicaContext(engine, lambda: METADATA, LIMITS))
-    app = AccessMiddleware(build_http_app(engine, lambda: METADATA, LIMITS, dialects=routes), keys.keys, "app")
-    header = {"authorization": f"Bearer {token}"}
-    with served(app) as port, connect(f"ws://127.0.0.1:{port}/openpi", additional_headers=header) as socket:
-        socket.recv()
-        ask = partial(batch, *[(1, "task 1")] * 3)
-        socket.send(ask())
-        assert openpi.decode(socket.recv())["actions"].shape == (3, 2, 7)  # type: ignore[arg-type]
-        socket.send(ask())
-        assert "requests a second" in str(socket.recv())
+    header = {"authorization": f"Bearer {keys.add('slow', rate=4)}"}  # and so many at once
+    ask = batch(*[(1, "task 1")] * 3)
+    with serving(agent, ALL, keys.keys) as (client, _), client.websocket_connect("/openpi", headers=header) as socket:
+        socket.receive_bytes()
+        assert call(socket, ask)["actions"].shape == (3, 2, 7)
+        socket.send_bytes(ask)
+        assert "requests a second" in socket.receive_text()
         assert agent.sizes == [3]
-    engine.close()
 
 
 @pytest.mark.parametrize("answered", [False, True])
@@ -159,3 +145,52 @@ def test_a_reset_begins_the_next_episode_of_every_session(answered: bool) -> Non
             socket.send_bytes(openpi.encode({"reset": True}))
             if answered:
                 assert openpi.decode(socket.receive_bytes()) == {"reset": True}
+
+
+def test_a_sessions_end_is_its_connections(context: tuple[TestClient, Engine]) -> None:
+    client, engine = context
+    before = len(engine.sessions)
+    with client.websocket_connect("/openpi") as one:
+        one.receive_bytes()
+        with client.websocket_connect("/openpi") as two:
+            two.receive_bytes()
+            for socket in (one, two):
+                call(socket, libero(1))
+            assert len(engine.sessions) == before + 2
+        assert call(one, libero(1))["actions"][0, 2] == 2
+    assert len(engine.sessions) == before
+
+
+def test_openpi_and_roboarena_share_the_root(context: tuple[TestClient, Engine]) -> None:
+    with context[0].websocket_connect("/") as socket:
+        config = openpi.decode(socket.receive_bytes())
+        assert config.keys() == {
+            *("image_resolution", "needs_wrist_camera", "n_external_cameras", "needs_stereo_camera"),
+            *("needs_session_id", "action_space"),
+        }
+        counts = [call(socket, libero(1, **more))["actions"][0, 2] for more in ({}, {}, *[{"endpoint": "infer"}] * 2)]
+        assert counts == [1, 2, 1, 2]
+        socket.send_bytes(openpi.encode({"endpoint": "reset"}))
+        assert socket.receive_text() == "reset successful"
+        assert call(socket, libero(1, endpoint="infer"))["actions"][0, 2] == 1
+        assert call(socket, libero(1, endpoint="infer", session_id="a"))["actions"][0, 2] == 2
+        assert call(socket, libero(1, endpoint="infer", session_id="b"))["actions"][0, 2] == 1
+
+
+def test_an_old_roboarena_client_gets_the_array_itself() -> None:
+    with serving(Mirror(), {"roboarena": {"mapping": "openpi-libero", "bare": True}}) as (client, _):
+        with client.websocket_connect("/") as socket:
+            socket.receive_bytes()
+            socket.send_bytes(libero(3, endpoint="infer"))
+            data = socket.receive_bytes()
+        assert openpi.decode(openpi.encode({"": 0})[:-1] + data)[""].shape == (1, 7)
+
+
+def test_a_session_that_was_forgotten_begins_again(context: tuple[TestClient, Engine]) -> None:
+    client, engine = context
+    with client.websocket_connect("/openpi") as socket:
+        socket.receive_bytes()
+        call(socket, libero(1))
+        for session in engine.sessions.ids():
+            engine.sessions.close(session)
+        assert call(socket, libero(1))["actions"][0, 2] == 1

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import random
 import socket
 import threading
 from collections.abc import Iterator
+from functools import partial
+from typing import Any
 
 import grpc
 import numpy as np
@@ -16,10 +19,13 @@ from in_process_replicas import Replicas
 from lerobot_messages import BEGIN, END, FEATURES, MIDDLE, AsyncClient, field_of, parts_of, pickled, robot_saw, setup
 from many import many
 
-from vlagents_ray.errors import ConfigError
-from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.dialects.gateway_sessions import GatewaySessions
 from vlagents_ray.wire import lerobot
+
+
+@pytest.fixture
+def open_lerobot(open_dialect: Any) -> Any:
+    return partial(open_dialect, "lerobot")
 
 
 def sessions(replicas: Replicas) -> int:
@@ -101,9 +107,9 @@ def test_a_mapping_gives_the_policys_names(open_lerobot) -> None:
         robot.send(robot_saw(0))
 
 
-@pytest.mark.parametrize(
-    ("changes", "says"),
-    [
+def test_policy_instructions_that_do_not_fit_are_refused(open_lerobot) -> None:
+    many_images = {f"observation.images.{n}": {"dtype": "image"} for n in range(17)}
+    wrong: list[tuple[dict[str, Any], str]] = [
         ({"checkpoint": "you/pi0"}, "this server acts for 'me/act'"),
         ({"rename_map": {"a": "b"}}, "rename_map"),
         ({"actions_per_chunk": 0}, "an integer of 1 or more"),
@@ -111,49 +117,40 @@ def test_a_mapping_gives_the_policys_names(open_lerobot) -> None:
         ({"lerobot_features": {"observation.state": {"dtype": "float32", "names": None}}}, "want `names`"),
         ({"lerobot_features": {"observation.state": None}}, "got NoneType, want a dict"),
         ({"lerobot_features": []}, "got list, dict, want dicts"),
-        ({"lerobot_features": {f"observation.images.{n}": {"dtype": "image"} for n in range(17)}}, "17 cameras"),
+        ({"lerobot_features": many_images}, "17 cameras"),
         ({"policy_type": 3}, "policy_type: got 3, want text"),
         ({"policy_type": len}, "names 'builtins' 'len'"),
-    ],
-)
-def test_policy_instructions_that_do_not_fit_are_refused(open_lerobot, changes: dict, says: str) -> None:
-    with AsyncClient(open_lerobot(checkpoint="me/act")) as robot, pytest.raises(grpc.RpcError) as error:
-        robot.begin(**changes)
-    assert error.value.code() in (grpc.StatusCode.INVALID_ARGUMENT, grpc.StatusCode.RESOURCE_EXHAUSTED)
-    assert says in error.value.details()
+    ]
+    with AsyncClient(open_lerobot(checkpoint="me/act")) as robot:
+        for changes, says in wrong:
+            with pytest.raises(grpc.RpcError) as error:
+                robot.begin(**changes)
+            assert status_of(error)[0] in ("INVALID_ARGUMENT", "RESOURCE_EXHAUSTED")
+            assert says in status_of(error)[1]
 
 
-@pytest.mark.parametrize(
-    ("observation", "says"),
-    [
-        (robot_saw(0, front=None), "front"),
-        (robot_saw(0, front=np.zeros((8, 8, 3), np.float64) + 7), "float64 from 7 to 7"),
-        (robot_saw(0, front=np.zeros((8, 8), np.uint8)), "camera 'observation.images.front'"),
-        (robot_saw(0, **{"gripper.pos": "open"}), "'gripper.pos': got str, want a number"),
+def test_a_bad_observation_is_refused_and_the_next_is_acted_on(open_lerobot) -> None:
+    wrong = [
+        (robot_saw(99, front=None), "front"),
+        (robot_saw(99, front=np.zeros((8, 8, 3), np.float64) + 7), "float64 from 7 to 7"),
+        (robot_saw(99, front=np.zeros((8, 8), np.uint8)), "camera 'observation.images.front'"),
+        (robot_saw(99, **{"gripper.pos": "open"}), "'gripper.pos': got str, want a number"),
         (robot_saw(-1), "timestep: got -1"),
         (robot_saw(2**31), "timestep: got 2147483648"),
         (setup(), "got RemotePolicyConfig, want a TimedObservation"),
         (b"no pickle", "protocol 4 or 5"),
-    ],
-    ids=lambda value: value if isinstance(value, str) else "",
-)
-def test_a_bad_observation_is_refused_and_the_next_is_acted_on(open_lerobot, observation, says: str) -> None:
-    data = observation if isinstance(observation, bytes) else pickled(observation)
+    ]
     with AsyncClient(open_lerobot()).begin() as robot:
-        with pytest.raises(grpc.RpcError) as error:
-            robot.send_parts(parts_of(data), timeout=20)
-        assert status_of(error)[0] == "INVALID_ARGUMENT"
-        assert says in status_of(error)[1]
-        assert rows(robot.act(robot_saw(0, pixel=3)))[0][0] == 3
-
-
-def test_a_feature_that_is_missing_is_named(open_lerobot) -> None:
-    features = {**FEATURES, "observation.images.wrist": {"dtype": "image"}}
-    with (
-        AsyncClient(open_lerobot()).begin(lerobot_features=features) as robot,
-        pytest.raises(grpc.RpcError, match="missing_camera: camera 'wrist'"),
-    ):
-        robot.send(robot_saw(0))
+        for step, (observation, says) in enumerate(wrong):
+            data = observation if isinstance(observation, bytes) else pickled(observation)
+            with pytest.raises(grpc.RpcError) as error:
+                robot.send_parts(parts_of(data), timeout=20)
+            assert status_of(error)[0] == "INVALID_ARGUMENT"
+            assert says in status_of(error)[1]
+            assert rows(robot.act(robot_saw(step, pixel=3)))[0][0] == 3
+        robot.begin(lerobot_features={**FEATURES, "observation.images.wrist": {"dtype": "image"}})
+        with pytest.raises(grpc.RpcError, match="missing_camera: camera 'wrist'"):
+            robot.send(robot_saw(0))
 
 
 def test_nothing_is_done_before_ready_and_the_instructions(open_lerobot, replicas: Replicas) -> None:
@@ -176,34 +173,23 @@ def _unended() -> Iterator[bytes]:
     yield field_of(1, BEGIN) + field_of(2, b"abc")
 
 
-def _twice() -> Iterator[bytes]:
-    yield from (*_unended(), *_unended())
-
-
-def _endless() -> Iterator[bytes]:
-    while True:
-        yield field_of(1, MIDDLE) + field_of(2, bytes(2**18))
-
-
-@pytest.mark.parametrize(
-    ("messages", "says"),
-    [
+def test_messages_that_are_none_are_refused(open_lerobot) -> None:
+    wrong: list[tuple[Iterator[bytes], str]] = [
         (iter([]), "ended before its last part"),
         (_unended(), "ended before its last part"),
-        (_twice(), "begins twice"),
+        (iter([*_unended(), *_unended()]), "begins twice"),
         (iter([field_of(1, 0)]), "got transfer state 0"),
         (iter([field_of(1, 9)]), "got transfer state 9"),
         (iter([b"\x12\xff"]), "ends too early"),
         (iter([b"\x80" * 20]), "a number that ends too early"),
         (iter([b"\x0b"]), "unknown type"),
-        (_endless(), "more than 2097152 bytes"),
-    ],
-)
-def test_messages_that_are_none_are_refused(open_lerobot, messages: Iterator[bytes], says: str) -> None:
+        (itertools.repeat(field_of(1, MIDDLE) + field_of(2, bytes(2**18))), "more than 2097152 bytes"),
+    ]
     with AsyncClient(open_lerobot()).begin() as robot:
-        with pytest.raises(grpc.RpcError, match=says):
-            robot.send_parts(messages, timeout=20)
-        assert rows(robot.act(robot_saw(0, pixel=3)))[0][0] == 3
+        for step, (messages, says) in enumerate(wrong):
+            with pytest.raises(grpc.RpcError, match=says):
+                robot.send_parts(messages, timeout=20)
+            assert rows(robot.act(robot_saw(step, pixel=3)))[0][0] == 3
 
 
 def test_a_compressed_message_is_not_decompressed(open_lerobot) -> None:
@@ -306,10 +292,3 @@ def test_garbage_instead_of_grpc_holds_up_nobody(open_lerobot) -> None:
                     connection.sendall(b"\0\0" + bytes([9, choose.randrange(11)]) + choose.randbytes(5))
                 connection.sendall(choose.randbytes(choose.randrange(200)))
         assert rows(robot.act(robot_saw(1, pixel=4)))[0] == [4, 0.5, -1, 3, 2]
-
-
-def test_with_keys_on_the_deployment_must_accept_clients_without_one(open_lerobot) -> None:
-    with pytest.raises(ConfigError, match="without_key: true"):
-        open_lerobot(check=lambda _: NoKey.OPEN)
-    with AsyncClient(open_lerobot(check=lambda _: NoKey.OPEN, without_key=True)).begin() as robot:
-        assert rows(robot.act(robot_saw(0, pixel=8)))[0][0] == 8

@@ -1,13 +1,16 @@
-"""ZMQ clients: their sessions, and what a bad client can do to the others."""
+"""GR00T's clients, of N1.5 and newer, over ZMQ: their messages and sessions, and what a bad client can do."""
 
 from __future__ import annotations
 
 import contextlib
+import io
+import itertools
 import os
 import random
 import socket
 import threading
 import time
+from collections.abc import Callable
 from typing import Any
 
 import gr00t_client
@@ -22,9 +25,154 @@ from in_memory_keys import ChangingKeys
 from in_process_replicas import Replicas
 from many import many
 
-from vlagents_ray.errors import InvalidInput
+from vlagents_ray.errors import InvalidObservation, MalformedMessage, MessageTooLarge, VLAgentsError
+from vlagents_ray.protocol.messages import Limits
 from vlagents_ray.serve.access import api_keys
-from vlagents_ray.serve.access.api_keys import NoKey
+from vlagents_ray.wire import gr00t as gr00t_codec
+
+LIMITS = Limits()
+
+
+def said(endpoint: str, data: Any = None, encode: Callable[[Any], Any] = gr00t_client.encode, **more: Any) -> bytes:
+    """As the client packs it."""
+    return msgpack.packb({"endpoint": endpoint, "data": data, **more}, default=encode)
+
+
+def nested(b: int = 1, t: int = 1, texts: Any = None) -> dict[str, Any]:
+    """N1.6 and newer."""
+    video = np.arange(b * t, dtype=np.uint8).reshape(b, t, 1, 1, 1) * np.ones((4, 6, 3), np.uint8)
+    state = np.arange(b * t, dtype=np.float32).reshape(b, t, 1) * np.ones(2, np.float32)
+    return {"video": {"ego": video}, "state": {"arm": state}, "language": {"task": texts or [["go"]] * b}}
+
+
+@pytest.mark.parametrize("encode", [gr00t_client.encode, gr00t_client.encode_packed])
+def test_arrays_come_as_numpy_writes_them(encode: Callable[[Any], Any]) -> None:
+    for dtype, shape in itertools.product(("|u1", "<f4", "<f8", "<i8", "|b1"), ((), (3,), (2, 0, 3), (1, 2, 3, 4))):
+        array = np.ones(shape, dtype)
+        request = gr00t_codec.read_request(said("get_action", {"a": array}, encode), LIMITS)
+        assert request.packed == (encode is gr00t_client.encode_packed)
+        assert request.data["a"].dtype == array.dtype
+        assert np.array_equal(request.data["a"], array)
+
+
+def test_a_fortran_array_and_text_arrays_are_read() -> None:
+    array = np.asfortranarray(np.arange(6.0).reshape(2, 3))
+    data = gr00t_codec.read_request(said("get_action", {"a": array, "t": np.array(["go"])}), LIMITS).data
+    assert np.array_equal(data["a"], array)
+    assert data["t"] == ["go"]
+
+
+def test_observations_of_a_batch_are_taken_apart_and_actions_joined() -> None:
+    asked = gr00t_codec.read_observations({"observation": nested(3, 2, [["a"], ["b"], ["c"]]), "options": None})
+    assert (len(asked.each), asked.batched, asked.flat, asked.paired) == (3, True, False, True)
+    last = [gr00t_codec.newest(one) for one in asked.each]
+    assert [int(one["video"]["ego"].max()) for one in last] == [1, 3, 5]
+    assert [one["state"]["arm"].tolist() for one in last] == [[1, 1], [3, 3], [5, 5]]
+    assert [one["language"] for one in last] == [{"task": "a"}, {"task": "b"}, {"task": "c"}]
+    action, info = gr00t_codec.write_actions([{"arm": np.full((4, 2), i)} for i in range(3)], asked, {"done": []})
+    assert action["arm"].shape == (3, 4, 2)
+    assert info == {"done": []}
+
+
+@pytest.mark.parametrize("batched", [True, False])
+def test_n1_5_sends_flat_keys_and_gets_the_actions_alone(batched: bool) -> None:
+    lead = (1, 1) if batched else (1,)
+    data = {
+        "video.ego": np.zeros((*lead, 4, 6, 3), np.uint8),
+        "state.arm": np.zeros((*lead, 2)),
+        "annotation.human.action.task_description": ["go"],
+    }
+    asked = gr00t_codec.read_observations(data)
+    assert (asked.batched, asked.flat, asked.paired) == (batched, True, False)
+    assert gr00t_codec.newest(asked.each[0])["language"] == {"task": "go"}
+    answer = gr00t_codec.write_actions([{"arm": np.zeros((4, 2))}], asked, {})
+    assert answer["action.arm"].shape == ((1, 4, 2) if batched else (4, 2))
+
+
+@pytest.mark.parametrize(
+    "observation",
+    [
+        {},
+        {"video": {"ego": np.zeros((4, 6, 3), np.uint8)}},
+        {"video": {"ego": np.zeros((1, 1, 4, 6, 3), np.uint8)}, "state": {"arm": np.zeros((2, 1, 2))}},
+        {"video": {"ego": np.zeros((1, 0, 4, 6, 3), np.uint8)}},
+        {"video": {"ego": "x"}},
+        {"video": {"ego": np.zeros((0, 1, 4, 6, 3), np.uint8)}},
+        {"video": [], "state": {"arm": np.zeros((1, 1, 2))}},
+        nested(2, 1, [["a"], ["b"], ["c"]]),
+        nested() | {"language": {"task": 3}},
+        nested() | {"language": {"task": [["a"]], "other": [["b"]]}},
+    ],
+)
+def test_an_observation_that_does_not_fit_is_refused(observation: dict[str, Any]) -> None:
+    with pytest.raises(InvalidObservation):
+        gr00t_codec.read_observations({"observation": observation})
+
+
+def npy(header: bytes, content: bytes = b"") -> dict[str, Any]:
+    return {
+        "__ndarray_class__": True,
+        "as_npy": b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + content,
+    }
+
+
+def pickled() -> dict[str, Any]:
+    file = io.BytesIO()
+    np.save(file, np.array([{"a": 1}], dtype=object), allow_pickle=True)
+    return {"__ndarray_class__": True, "as_npy": file.getvalue()}
+
+
+@pytest.mark.parametrize(
+    "array",
+    [
+        pickled(),
+        npy(b"{'descr': '|u1', 'fortran_order': False, 'shape': (999999999999,), }\n"),
+        npy(b"{'descr': '|u1', 'fortran_order': False, 'shape': (-1,), }\n"),
+        npy(b"{'descr': [('a', '<f4')], 'fortran_order': False, 'shape': (1,), }\n", bytes(4)),
+        npy(b"{'descr': '<c16', 'fortran_order': False, 'shape': (1,), }\n", bytes(16)),
+        npy(b"(" * 900),
+        {"__ndarray_class__": True, "as_npy": "text"},
+        {"__ndarray_class__": True},
+        {b"nd": True, b"kind": b"O", b"type": "|O", b"shape": [1], b"data": b"pickle"},
+        {b"nd": True, b"kind": b"V", b"type": [["a", "<f4"]], b"shape": [1], b"data": bytes(4)},
+        {b"nd": True, b"kind": b"", b"type": "<f4", b"shape": [2**40], b"data": bytes(4)},
+    ],
+)
+def test_arrays_that_hold_objects_or_lie_are_refused(array: dict[str, Any]) -> None:
+    with pytest.raises(MalformedMessage):
+        gr00t_codec.read_request(said("get_action", {"a": array}), LIMITS)
+
+
+@pytest.mark.parametrize("endpoint", ["kill", "", 3, "get_action2"])
+def test_there_is_no_kill(endpoint: Any) -> None:
+    with pytest.raises(MalformedMessage, match="endpoint"):
+        gr00t_codec.read_request(said(endpoint), LIMITS)
+
+
+def test_too_many_values_and_too_deep_ones_are_refused() -> None:
+    with pytest.raises(VLAgentsError):
+        gr00t_codec.read_request(said("get_action", {str(i): {} for i in range(20_000)}), LIMITS)
+    with pytest.raises(VLAgentsError):
+        gr00t_codec.read_request(said("get_action", {str(i): [0] * 500 for i in range(100)}), LIMITS)
+    with pytest.raises(MalformedMessage):
+        gr00t_codec.read_request(b"\x91" * 100_000, LIMITS)
+    with pytest.raises(MessageTooLarge):
+        gr00t_codec.read_request(bytes(2000), Limits(body_bytes=1024))
+
+
+def test_a_header_made_to_be_searched_for_long_is_refused_at_once() -> None:
+    header = b"{'descr': '<f4', 'fortran_order': False, 'shape': (" + b"1" * 28 + b"x"
+    file = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header
+    begun = time.process_time()
+    with pytest.raises(MalformedMessage):
+        gr00t_codec.read_request(said("get_action", {"a": {"__ndarray_class__": True, "as_npy": file}}), LIMITS)
+    assert time.process_time() - begun < 1.0  # each digit doubled it once, 28 take ten seconds
+
+
+def test_arrays_of_text_count_by_their_texts() -> None:
+    with pytest.raises(MessageTooLarge, match="values"):
+        gr00t_codec.read_request(said("get_action", {str(i): np.full((60, 100), "x") for i in range(2)}), LIMITS)
+
 
 FRAMES = int(os.environ.get("VLAGENTS_RAY_FUZZ", many(5000)))
 GROWTH = 64 * 2**20  # bytes, whatever the number of frames
@@ -58,10 +206,9 @@ def rows(action: dict[str, np.ndarray], of: int = 0) -> list[float]:
     return action["action"][of, 0].tolist()
 
 
-@pytest.mark.parametrize("packed", [False, True])
-def test_each_client_has_a_session(open_gr00t, replicas: Replicas, packed: bool) -> None:
-    port = open_gr00t()
-    with PolicyClient(port, packed=packed) as red, PolicyClient(port) as blue:
+def test_each_client_has_a_session(open_dialect, replicas: Replicas) -> None:
+    port = open_dialect("gr00t")
+    with PolicyClient(port, packed=True) as red, PolicyClient(port) as blue:
         assert red.ping() == {"status": "ok", "message": "Server is running"}
         action, info = red.get_action(seen(10))
         assert action["action"].shape == (1, 2, 5)
@@ -76,8 +223,8 @@ def test_each_client_has_a_session(open_gr00t, replicas: Replicas, packed: bool)
         assert rows(blue.get_action(seen(21, "abcdef"))[0])[-1] == 2
 
 
-def test_a_batch_is_as_many_sessions(open_gr00t, replicas: Replicas) -> None:
-    with PolicyClient(open_gr00t()) as client:
+def test_a_batch_is_as_many_sessions(open_dialect, replicas: Replicas) -> None:
+    with PolicyClient(open_dialect("gr00t")) as client:
         for step in (1, 2):
             action, _ = client.get_action(seen(100, batch=4))
             assert [rows(action, i) for i in range(4)] == [[100 + i, 0.5, -1, 3, step] for i in range(4)]
@@ -86,23 +233,11 @@ def test_a_batch_is_as_many_sessions(open_gr00t, replicas: Replicas) -> None:
         assert sessions(replicas) == 1
 
 
-def test_a_client_of_n1_5_sends_flat_keys(open_gr00t) -> None:
-    mapping = {"preset": "gr00t", "action": {"arm": {"stop": 3}, "hand": {"start": 3}}}
-    flat = {
-        "video.ego": np.full((1, 8, 8, 3), 9, np.uint8),
-        "state.arm": np.ones((1, 3)),
-        "annotation.human.action.task_description": ["abcd"],
-    }
-    with PolicyClient(open_gr00t(mapping=mapping), n15=True) as client:
-        action = client.get_action_n15(flat)
-        assert action["action.arm"][0].tolist() == [9, 1, -1]
-        assert action["action.hand"].tolist() == [[4, 1], [4, 2]]
-        assert client.get_modality_config()["action"]["modality_keys"] == ["action.arm", "action.hand"]
-
-
 @pytest.mark.parametrize("preset", ["gr00t", "gr00t-n1.5"])
-def test_each_preset_delivers_what_either_generation_sends(open_gr00t, replicas: Replicas, preset: str) -> None:
-    port = open_gr00t(mapping={"preset": preset, "action": {"action.arm": {"stop": 3}, "hand": {"start": 3}}})
+def test_each_preset_delivers_what_either_generation_sends(open_dialect, replicas: Replicas, preset: str) -> None:
+    port = open_dialect(
+        "gr00t", mapping={"preset": preset, "action": {"action.arm": {"stop": 3}, "hand": {"start": 3}}}
+    )
     with PolicyClient(port, n15=True) as client:
         action = client.get_action_n15(so100(9, "abcd"))
         assert (action["action.arm"][0].tolist(), action["action.hand"][0].tolist()) == ([9, 3, -1], [4, 1])
@@ -111,25 +246,26 @@ def test_each_preset_delivers_what_either_generation_sends(open_gr00t, replicas:
         assert (action["arm"][0, 0].tolist(), action["hand"][0, 0].tolist()) == ([10, 0.5, -1], [3, 1])
 
 
-def test_a_config_is_as_its_generation_reads_it_before_it_has_acted(open_gr00t) -> None:
-    mapping = {"preset": "gr00t-n1.5", "cameras": {"front": "video.webcam"}, "state": {"joints": "state.single_arm"}}
-    with PolicyClient(open_gr00t(mapping=mapping), n15=True) as client:
+@pytest.mark.parametrize(
+    ("n15", "mapping", "names"),
+    [
+        (True, {"preset": "gr00t-n1.5", "cameras": {"front": "video.webcam"}, "state": {"joints": "state.single_arm"}},
+         {"video": ["video.webcam"], "state": ["state.single_arm"], "action": ["action"],
+          "language": ["annotation.human.task_description"]}),
+        (False, {"cameras": {"front": "video/ego_view"}, "state": {"joints": ["state/arm", "state/hand"]}},
+         {"video": ["ego_view"], "state": ["arm", "hand"], "action": ["action"], "language": ["task"]}),
+        (False, "gr00t", {"action": ["action"], "language": ["task"]}),  # the policy states no contract
+    ],
+)  # fmt: skip
+def test_a_config_has_the_clients_names_as_its_generation_reads_them(open_dialect, n15, mapping, names) -> None:
+    with PolicyClient(open_dialect("gr00t", mapping=mapping), n15=n15) as client:
         config = client.get_modality_config()
-    assert {name: one["modality_keys"] for name, one in config.items()} == {
-        "video": ["video.webcam"],
-        "state": ["state.single_arm"],
-        "action": ["action"],
-        "language": ["annotation.human.task_description"],
-    }
+    assert {name: one["modality_keys"] for name, one in config.items()} == names
+    assert all("delta_indices" in one for one in config.values())
 
 
-def test_a_modality_without_known_keys_is_left_out_of_the_config(open_gr00t) -> None:
-    with PolicyClient(open_gr00t()) as client:  # the policy states no contract
-        assert sorted(client.get_modality_config()) == ["action", "language"]
-
-
-def test_cameras_that_the_mapping_does_not_read_are_logged_once(open_gr00t, caplog: pytest.LogCaptureFixture) -> None:
-    port = open_gr00t(mapping={"cameras": {"front": "video/front"}, "state": {"*": "state/*"}})
+def test_cameras_that_the_mapping_does_not_read_are_logged_once(open_dialect, caplog: pytest.LogCaptureFixture) -> None:
+    port = open_dialect("gr00t", mapping={"cameras": {"front": "video/front"}, "state": {"*": "state/*"}})
     for _ in range(2):
         with PolicyClient(port, n15=True) as client:
             for _ in range(2):
@@ -138,63 +274,21 @@ def test_cameras_that_the_mapping_does_not_read_are_logged_once(open_gr00t, capl
     assert said.startswith("gr00t: a client sends the cameras ['video/wrist']")
 
 
-def test_an_observation_of_which_the_mapping_reads_nothing_is_refused(open_gr00t) -> None:
-    mapping = {"cameras": {"*": "images/*"}, "state": {"*": "proprio/*"}}
-    told = pytest.raises(RuntimeError, match=r"invalid_observation: .*the mapping reads nothing")
-    with PolicyClient(open_gr00t(mapping=mapping)) as client, told:
-        client.get_action(seen(1))
-
-
-def test_a_client_is_told_its_own_names(open_gr00t) -> None:
-    mapping = {"cameras": {"front": "video/ego_view"}, "state": {"joints": ["state/arm", "state/hand"]}}
-    with PolicyClient(open_gr00t(mapping=mapping)) as client:
-        config = client.get_modality_config()
-    assert config["video"] == {"delta_indices": [0], "modality_keys": ["ego_view"]}
-    assert config["state"]["modality_keys"] == ["arm", "hand"]
-
-
-def test_errors_are_told_without_a_traceback_and_the_client_goes_on(open_gr00t) -> None:
-    with PolicyClient(open_gr00t(mapping={"cameras": {"front": "video/front"}})) as client:
-        with pytest.raises(RuntimeError, match="missing_camera: camera 'video/front' is missing") as error:
-            client.get_action(seen(1))
-        assert ".py" not in str(error.value)
-        with pytest.raises(RuntimeError, match="unknown endpoint 'kill'"):
-            client.call_endpoint("kill", requires_input=False)
-        assert client.ping()["status"] == "ok"
-
-
-def test_a_key_is_checked_before_anything_is_done(open_gr00t, replicas: Replicas) -> None:
-    def check(key: str | None) -> NoKey:
-        if key != "right":
-            raise InvalidInput("no such key")
-        return NoKey.OPEN
-
-    port = open_gr00t(check=check)
-    for token in (None, "wrong"):
-        with PolicyClient(port, token) as client:
-            for ask in (client.ping, client.reset, client.get_modality_config, lambda: client.get_action(seen(1))):
-                with pytest.raises(RuntimeError, match="no such key"):
-                    ask()
-    assert sessions(replicas) == 0
-    with PolicyClient(port, "right") as client:
-        assert rows(client.get_action(seen(1))[0])[0] == 1
-
-
 class Limited:
     """Clients of a gateway with keys, whose replica knows of no key: as one on another machine."""
 
-    def __init__(self, open_gr00t: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    def __init__(self, open_dialect: Any, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(api_keys, "_CHECK_S", 0.0)
         self.known = ChangingKeys()
-        self.port = open_gr00t(check=lambda key: self.known.keys.check(key, "noop"))
+        self.port = open_dialect("gr00t", check=lambda key: self.known.keys.check(key, "noop"))
 
     def client(self, name: str, **allowed: Any) -> PolicyClient:
         return PolicyClient(self.port, self.known.add(name, **allowed))
 
 
 @pytest.fixture
-def limited(open_gr00t: Any, monkeypatch: pytest.MonkeyPatch) -> Limited:
-    return Limited(open_gr00t, monkeypatch)
+def limited(open_dialect: Any, monkeypatch: pytest.MonkeyPatch) -> Limited:
+    return Limited(open_dialect, monkeypatch)
 
 
 def test_a_keys_rate_holds_wherever_the_replica_is(limited: Limited, replicas: Replicas) -> None:
@@ -218,10 +312,10 @@ def test_who_is_over_the_rate_of_its_key_is_not_read_for_a_while(limited: Limite
     with limited.client("greedy", rate=1e-3) as client, limited.client("lab") as other:
         client.ping()
         begun = time.monotonic()
-        for _ in range(3):
+        for _ in range(2):
             with pytest.raises(RuntimeError, match="too_many_requests"):
                 client.ping()
-        assert time.monotonic() - begun >= 2.0  # a second after each refusal, of which the last one's is to come
+        assert time.monotonic() - begun >= 1.0  # a second after each refusal, of which the last one's is to come
         assert other.ping()["status"] == "ok"
 
 
@@ -281,9 +375,9 @@ def _raw(port: int, message: bytes) -> bytes:
 
 
 @pytest.mark.parametrize("greeting", [b"\x04\x00one\x02\x00x", b"\xff" + bytes(8) + b"\x7f\x01\x05\x00\x00"])
-def test_peers_of_zmqs_first_protocols_are_hung_up_on(open_gr00t, greeting: bytes) -> None:
+def test_peers_of_zmqs_first_protocols_are_hung_up_on(open_dialect, greeting: bytes) -> None:
     """ZMQ kept the dead connections of some of them for ever: about one in 6,000 of the fuzzer's."""
-    port = open_gr00t()
+    port = open_dialect("gr00t")
     with socket.create_connection(("127.0.0.1", port), timeout=30) as peer, contextlib.suppress(ConnectionError):
         peer.sendall(greeting)
         while peer.recv(4096):
@@ -292,15 +386,15 @@ def test_peers_of_zmqs_first_protocols_are_hung_up_on(open_gr00t, greeting: byte
         client.ping()
 
 
-def test_a_client_that_says_nothing_is_forgotten(open_gr00t, replicas: Replicas) -> None:
-    with PolicyClient(open_gr00t(idle_s=0.5)) as client:
+def test_a_client_that_says_nothing_is_forgotten(open_dialect, replicas: Replicas) -> None:
+    with PolicyClient(open_dialect("gr00t", idle_s=0.5)) as client:
         assert rows(client.get_action(seen(1))[0])[-1] == 1
         wait_for(lambda: sessions(replicas) == 0)
         assert rows(client.get_action(seen(2))[0]) == [2, 0.5, -1, 3, 1]
 
 
-def test_one_client_more_than_the_limit_is_told_so_unless_another_has_no_session(open_gr00t) -> None:
-    port = open_gr00t(sessions=2)
+def test_one_client_more_than_the_limit_is_told_so_unless_another_has_no_session(open_dialect) -> None:
+    port = open_dialect("gr00t", sessions=2)
     with PolicyClient(port) as one, PolicyClient(port) as two, PolicyClient(port) as three:
         one.get_action(seen(1))
         two.ping()
@@ -310,8 +404,8 @@ def test_one_client_more_than_the_limit_is_told_so_unless_another_has_no_session
         assert rows(one.get_action(seen(1))[0])[-1] == 2
 
 
-def test_a_slow_and_a_greedy_client_hold_up_nobody(open_gr00t) -> None:
-    port = open_gr00t()
+def test_a_slow_and_a_greedy_client_hold_up_nobody(open_dialect) -> None:
+    port = open_dialect("gr00t")
     context = zmq.Context()
     deaf = context.socket(zmq.DEALER)  # sends and never reads
     deaf.setsockopt(zmq.LINGER, 0)
@@ -335,9 +429,9 @@ def test_a_slow_and_a_greedy_client_hold_up_nobody(open_gr00t) -> None:
 
 
 @pytest.mark.own_process
-def test_mutated_messages_get_an_error_or_an_answer(open_gr00t, replicas: Replicas) -> None:
+def test_mutated_messages_get_an_error_or_an_answer(open_dialect, replicas: Replicas) -> None:
     """A good client acts all the while; memory and threads stay what they were."""
-    port = open_gr00t(sessions=16)
+    port = open_dialect("gr00t", sessions=16)
     choose = random.Random(3)
     request = {"endpoint": "get_action", "data": {"observation": seen(9), "options": None}}
     messages = [msgpack.packb(request, default=encode) for encode in (gr00t_client.encode, gr00t_client.encode_packed)]
@@ -364,15 +458,3 @@ def test_mutated_messages_get_an_error_or_an_answer(open_gr00t, replicas: Replic
     finally:
         bad.close()
         context.term()
-
-
-def test_bytes_that_are_no_zmq_are_hung_up_on(open_gr00t) -> None:
-    port = open_gr00t()
-    choose = random.Random(1)
-    for _ in range(200):
-        with socket.create_connection(("127.0.0.1", port), timeout=20) as stranger:
-            stranger.sendall(choose.randbytes(choose.randrange(1, 200)))
-    with PolicyClient(port) as good:
-        begun = time.monotonic()
-        assert good.ping()["status"] == "ok"
-        assert time.monotonic() - begun < 10
