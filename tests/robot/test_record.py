@@ -201,11 +201,6 @@ def test_a_full_disk_costs_its_episode_and_no_later_one(tmp_path: Path) -> None:
     assert info(tmp_path)["total_episodes"] == 1
 
 
-def test_an_episode_without_frames_leaves_nothing(tmp_path: Path) -> None:
-    record(tmp_path, 0)
-    assert not (tmp_path / "meta").exists()
-
-
 def test_a_killed_process_loses_the_running_episode_and_no_other(tmp_path: Path) -> None:
     code = f"""
 import os, pathlib, signal, sys, time
@@ -258,23 +253,17 @@ def test_a_kill_at_any_moment_of_a_save_leaves_nothing_of_its_episode(
             assert json.loads((left / name).read_text()) == json.loads((expected / name).read_text()), (left, name)
         for name in ("meta/tasks.parquet", "data/chunk-000/file-001.parquet"):
             assert pq.read_table(left / name) == pq.read_table(expected / name), (left, name)
+        with av.open(str(left / "videos/observation.images.front/chunk-000/file-001.mp4")) as video:
+            assert sum(1 for _ in video.decode(video=0)) == 7
 
 
-def test_what_info_does_not_count_is_removed(tmp_path: Path) -> None:
-    record(tmp_path, 3)
-    for name in ("data/chunk-000/file-001.parquet", "videos/observation.images.front/chunk-000/file-001.mp4"):
-        (tmp_path / name).write_bytes(b"whole, but of an episode that was not counted")
-    record(tmp_path, 4)
-    assert pq.read_table(tmp_path / "data/chunk-000/file-001.parquet").num_rows == 4
-
-
-def test_a_folder_that_holds_something_else_is_left_alone(tmp_path: Path) -> None:
-    (tmp_path / "thesis.tex").write_text("...")
-    with pytest.raises(ConfigError, match="not a LeRobotDataset"):
-        Recorder(tmp_path, FPS)
-
-
-def test_a_dataset_of_another_rate_is_not_mixed_in(tmp_path: Path) -> None:
+def test_a_folder_is_taken_only_as_an_empty_one_or_a_dataset_of_this_rate(tmp_path: Path) -> None:
+    record(tmp_path, 0)
+    assert not (tmp_path / "meta").exists(), "an episode without frames leaves nothing"
     record(tmp_path, 2)
     with pytest.raises(ConfigError, match="has fps 25, want 50"):
         Recorder(tmp_path, 50)
+    (tmp_path / "else").mkdir()
+    (tmp_path / "else/thesis.tex").write_text("...")
+    with pytest.raises(ConfigError, match="not a LeRobotDataset"):
+        Recorder(tmp_path / "else", FPS)

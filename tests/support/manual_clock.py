@@ -1,4 +1,4 @@
-"""A clock that tests set."""
+"""Clocks that tests set."""
 
 from __future__ import annotations
 
@@ -10,3 +10,17 @@ class Clock:
 
     def __call__(self) -> float:
         return self.now
+
+
+class SimulatedTime:
+    """A clock that goes on when a thread sleeps, in place of the module `time`."""
+
+    now = 0.0
+
+    def monotonic(self) -> float:
+        return self.now
+
+    perf_counter = monotonic
+
+    def sleep(self, seconds: float) -> None:
+        self.now += max(seconds, 1e-4)
