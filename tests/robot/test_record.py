@@ -28,6 +28,7 @@ from vlagents_ray.robot.record import Recorder
 
 FPS = 25
 SIDE = 48
+VIDEO = "videos/observation.images.front/chunk-000"
 
 
 def obs(i: int, side: int = SIDE) -> Obs:
@@ -224,7 +225,11 @@ for episode in range(3):
         os.kill(process.pid, signal.SIGKILL)
     assert info(tmp_path)["total_episodes"] == 2
     assert len(list(tmp_path.glob("data/*/*.parquet"))) == 2
+    strays = [tmp_path / f"{part}/file-002.{end}" for part, end in (("data/chunk-000", "parquet"), (VIDEO, "mp4"))]
+    for stray in strays:
+        stray.write_bytes(b"whole, but of an episode that was not counted")
     assert Dataset(tmp_path, FPS).episodes == 2
+    assert not any(stray.exists() for stray in strays)
     assert not (tmp_path / "unfinished").exists()
 
 
@@ -253,8 +258,6 @@ def test_a_kill_at_any_moment_of_a_save_leaves_nothing_of_its_episode(
             assert json.loads((left / name).read_text()) == json.loads((expected / name).read_text()), (left, name)
         for name in ("meta/tasks.parquet", "data/chunk-000/file-001.parquet"):
             assert pq.read_table(left / name) == pq.read_table(expected / name), (left, name)
-        with av.open(str(left / "videos/observation.images.front/chunk-000/file-001.mp4")) as video:
-            assert sum(1 for _ in video.decode(video=0)) == 7
 
 
 def test_a_folder_is_taken_only_as_an_empty_one_or_a_dataset_of_this_rate(tmp_path: Path) -> None:

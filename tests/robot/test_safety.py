@@ -130,8 +130,9 @@ def test_a_silence_calls_the_stop_hook_once_on_its_own_thread_until_there_is_new
     with Watchdog(barks, {"server": 0.1}) as watchdog:
         for _ in range(2):
             assert barks.next() == "server"
-            watchdog.heard("server", ago_s=0.2)
             time.sleep(0.3)  # several times the limit
+            watchdog.heard("server", ago_s=0.2)
+            assert watchdog.control.silent
             assert barks.heard.empty()
             watchdog.heard("server")
         assert barks.next() == "server"
