@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import network_links
 import numpy as np
 import pytest
@@ -11,7 +9,6 @@ from camera_images import photograph
 
 from vlagents_ray import Obs, RemoteAgent
 from vlagents_ray.client.transports.base import CodecChoice, CodecName
-from vlagents_ray.client.transports.select import TransportName
 from vlagents_ray.images.codecs import JPEG, LOSSLESS, RAW, ImageCodec
 
 OBS = Obs({"front": photograph(seed=1), "wrist": photograph(seed=2)})
@@ -41,26 +38,19 @@ def test_a_named_codec_is_taken_wherever_the_server_is(named: CodecName | ImageC
         assert choice.codec_for(OBS, most_bytes=1) == codec
 
 
-@pytest.fixture(scope="module")
-def near() -> Iterator[str]:
-    with network_links.loopback() as url:
-        yield url
+def test_loopback_gets_raw_pixels() -> None:
+    with network_links.loopback() as near:
+        for transport in ("websocket", "http"):
+            with RemoteAgent(near, transport=transport) as agent:  # type: ignore[arg-type]
+                assert agent.codec is None
+                agent.reset(OBS, "look")
+                assert agent.codec == RAW
+                agent.act(OBS)
 
 
-@pytest.mark.parametrize("transport", ["websocket", "http"])
-def test_loopback_gets_raw_pixels(near: str, transport: TransportName) -> None:
-    with RemoteAgent(near, transport=transport) as agent:
-        assert agent.codec is None
-        agent.reset(OBS, "look")
-        assert agent.codec == RAW
-        agent.act(OBS)
-
-
-@pytest.mark.parametrize("transport", ["websocket", "http"])
-@pytest.mark.parametrize(("codec", "chosen"), [("auto", JPEG), ("exact", LOSSLESS)])
-def test_a_server_in_another_network_gets_compressed_images(
-    transport: TransportName, codec: CodecName, chosen: ImageCodec
-) -> None:
-    with network_links.shaped("1gbit") as url, RemoteAgent(url, transport=transport, codec=codec) as agent:
-        agent.reset(OBS, "look")
-        assert agent.codec == chosen
+def test_a_server_in_another_network_gets_compressed_images() -> None:
+    with network_links.shaped("1gbit") as url:
+        for transport, codec, chosen in (("websocket", "auto", JPEG), ("http", "exact", LOSSLESS)):
+            with RemoteAgent(url, transport=transport, codec=codec) as agent:  # type: ignore[arg-type]
+                agent.reset(OBS, "look")
+                assert agent.codec == chosen

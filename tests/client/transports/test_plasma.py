@@ -6,6 +6,7 @@ import os
 import socket
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -18,27 +19,20 @@ HERE, ELSEWHERE = "a" * 56, "b" * 56
 
 
 @pytest.mark.parametrize(
-    ("node", "address", "said"),
+    ("node", "address", "error", "said"),
     [
-        (HERE, {"socket": "/nowhere", "node": ELSEWHERE}, "use transport 'handle'"),
-        (HERE, None, "no plasma endpoint"),
-        (None, {"socket": "/nowhere", "node": HERE}, "use http://"),
+        (HERE, {"socket": "/nowhere", "node": ELSEWHERE}, ConfigError, "use transport 'handle'"),
+        (HERE, None, ConfigError, "no plasma endpoint"),
+        (None, {"socket": "/nowhere", "node": HERE}, ConfigError, "use http://"),
+        (HERE, {"socket": "/no/endpoint", "node": HERE}, PolicyUnavailable, "does not answer"),
     ],
 )
-def test_who_is_not_on_the_replicas_node_is_told_what_to_use(
-    monkeypatch: pytest.MonkeyPatch, node: str | None, address: dict[str, Any] | None, said: str
+def test_without_an_endpoint_on_this_node_plasma_is_refused_with_what_to_use(
+    monkeypatch: pytest.MonkeyPatch, node: str | None, address: dict[str, Any] | None, error: type, said: str
 ) -> None:
     monkeypatch.setattr("vlagents_ray.client.transports.serve_handle.this_node", lambda: node)
-    with pytest.raises(ConfigError, match=said):
+    with pytest.raises(error, match=said):
         PlasmaTransport("app").connect_to(HandleTransport("app"), {"plasma": address}, 1)
-
-
-def test_an_endpoint_that_is_gone_is_unavailable(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vlagents_ray.client.transports.serve_handle.this_node", lambda: HERE)
-    with pytest.raises(PolicyUnavailable, match="does not answer"):
-        PlasmaTransport("app").connect_to(
-            HandleTransport("app"), {"plasma": {"socket": "/no/endpoint", "node": HERE}}, 1
-        )
 
 
 def test_outside_of_a_cluster_there_is_no_plasma() -> None:
@@ -62,21 +56,16 @@ def test_a_replicas_socket_that_is_another_users_is_sent_nothing(
 
 
 @pytest.mark.own_process
-@pytest.mark.parametrize("broken", [KeyboardInterrupt(), UnicodeError("a key that is no text"), OSError("gone")])
-def test_a_connection_that_fails_is_closed_at_once(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, broken: BaseException
-) -> None:
-    def fail(_: socket.socket) -> None:
-        raise broken
-
+def test_a_connection_that_fails_is_closed_at_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr("vlagents_ray.client.transports.serve_handle.this_node", lambda: HERE)
-    monkeypatch.setattr("vlagents_ray.client.transports.shm._require_same_user", fail)
     path = str(tmp_path / "s")
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener:
         listener.bind(path)
         listener.listen()
         endpoint = {"plasma": {"socket": path, "node": HERE}}
-        before = os.listdir("/proc/self/fd")
-        with pytest.raises((type(broken), PolicyUnavailable)) as raised:  # which holds the frame with the socket
-            PlasmaTransport("app").connect_to(HandleTransport("app"), endpoint, 1)
-        assert len(os.listdir("/proc/self/fd")) == len(before), raised.value
+        for broken in (KeyboardInterrupt(), UnicodeError("a key that is no text"), OSError("gone")):
+            monkeypatch.setattr("vlagents_ray.client.transports.shm._require_same_user", Mock(side_effect=broken))
+            before = os.listdir("/proc/self/fd")
+            with pytest.raises((type(broken), PolicyUnavailable)) as raised:  # which holds the frame with the socket
+                PlasmaTransport("app").connect_to(HandleTransport("app"), endpoint, 1)
+            assert len(os.listdir("/proc/self/fd")) == len(before), raised.value

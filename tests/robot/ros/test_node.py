@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import ros_arm
 import yaml
-from asgi_server import served
+from asgi_server import policy_server
 from eval_fakes import wait_for
 from ros_arm import BEAT, CAMERA, COMMANDS, JOINTS, NAMES, SIDE, RosArm, header
 from rosbridge_double import RosbridgeDouble, rosbridge_double
@@ -22,15 +22,11 @@ from rosbridge_double import RosbridgeDouble, rosbridge_double
 import vlagents_ray.cli.robot as command
 from vlagents_ray import Act, ActionSpec, Agent, CameraSpec, ChunkPlayer, Contract, Obs, PlayerSettings, StateSpec
 from vlagents_ray.errors import ConfigError, InvalidAction
-from vlagents_ray.protocol.messages import DEFAULT_LIMITS, PROTOCOL_VERSION
 from vlagents_ray.robot import Guard, Watchdog, run_loop
 from vlagents_ray.robot.loop import LoopReport
 from vlagents_ray.robot.ros import RosRobot
 from vlagents_ray.robot.ros.settings import settings_from
 from vlagents_ray.robot.safety import measured_state
-from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
-from vlagents_ray.serve.endpoints.http import build_http_app
-from vlagents_ray.serve.engine.engine import Engine
 
 STEP = 0.01
 MAX_STEP = 0.05
@@ -130,30 +126,20 @@ def driving(agent: Agent, **more: Any) -> Iterator[Drive]:
             thread.join()
 
 
-@contextlib.contextmanager
-def policy_server(agent: Agent) -> Iterator[str]:
-    """The URL of a server of a policy, without Ray."""
-    metadata = {"policy": "ahead", "protocol": PROTOCOL_VERSION, "contract": agent.contract.to_json(), "local": None}  # type: ignore[union-attr]
-    engine = Engine(agent)
-    engine.start()
-    try:
-        app = AccessMiddleware(build_http_app(engine, lambda: metadata, DEFAULT_LIMITS), None, "app")
-        with served(app) as port:
-            yield f"http://127.0.0.1:{port}"
-    finally:
-        engine.close()
+def ahead_server(agent: Ahead) -> contextlib.AbstractContextManager[int]:
+    return policy_server(agent, contract=agent.contract.to_json(), local=None)
 
 
 def test_the_command_drives_an_arm_from_its_topics_and_stops_it_where_it_is(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     agent = Ahead(last=15)
-    with policy_server(agent) as url, rosbridge_double() as double:
+    with ahead_server(agent) as port, rosbridge_double() as double:
         (tmp_path / "arm.yaml").write_text(yaml.safe_dump(ros_arm.settings(double.url)))
         with RosArm(double.publish, lambda: double.on(COMMANDS)) as arm:
             options = f"--ros {tmp_path / 'arm.yaml'} --hz 30 --mode open_loop --restart auto".split()
             said = ["--instruction", "stack the cups", "--measure", "joints", "--max-step", str(MAX_STEP)]
-            status = command.main([url, *options, *said])
+            status = command.main([f"http://127.0.0.1:{port}", *options, *said])
     assert status != 2, capsys.readouterr().out  # a busy machine may be late at a tick
     assert list(agent.instructions) == ["stack the cups"]
     obs = agent.seen[0]
@@ -315,7 +301,7 @@ def test_an_image_that_is_no_news_holds_the_arm(change: str) -> None:
 
 def test_a_killed_server_stops_the_arm(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     server = contextlib.ExitStack()
-    url = server.enter_context(policy_server(Ahead()))
+    url = f"http://127.0.0.1:{server.enter_context(ahead_server(Ahead()))}"
     with server, rosbridge_double() as double:
         (tmp_path / "arm.yaml").write_text(yaml.safe_dump(ros_arm.settings(double.url)))
         with RosArm(double.publish, lambda: double.on(COMMANDS)) as arm:
@@ -374,11 +360,11 @@ def test_clocks_that_differ_are_an_error_with_the_cure(ago_s: int, said: str) ->
 
 
 def test_a_policy_for_another_robot_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with policy_server(Ahead()) as url, rosbridge_double() as double:
+    with ahead_server(Ahead()) as port, rosbridge_double() as double:
         with RosArm(double.publish, lambda: double.on(COMMANDS)):
             cameras = {"cameras": {"top": {"topic": CAMERA}}}
             (tmp_path / "arm.yaml").write_text(yaml.safe_dump(ros_arm.settings(double.url, **cameras)))
-            assert command.main([url, "--ros", str(tmp_path / "arm.yaml")]) == 2
+            assert command.main([f"http://127.0.0.1:{port}", "--ros", str(tmp_path / "arm.yaml")]) == 2
         assert double.on(COMMANDS) == []
     assert "camera 'front': the policy needs it, the env gives ['top']" in capsys.readouterr().err
 
