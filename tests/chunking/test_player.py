@@ -88,7 +88,7 @@ def playing() -> Iterator[Callable[..., tuple[Counting, ChunkPlayer]]]:
 def let(agent: Counting, player: ChunkPlayer) -> None:
     """One answer, and wait until the player could take it."""
     agent.gate.release()
-    wait_for(lambda: player._asker is not None and not player._asker.busy)
+    wait_for(lambda: player._asker is not None and not player._asker.busy, every_s=0.001)
 
 
 Playing = Callable[..., tuple[Counting, ChunkPlayer]]
@@ -493,7 +493,7 @@ def test_a_reply_that_was_lost_replays_nothing() -> None:
         served.lose_reply |= t == 10
         act = player.act(obs(t))
         assert player._asker is not None
-        wait_for(lambda: not player._asker.busy)
+        wait_for(lambda: not player._asker.busy, every_s=0.001)
         resumed |= "resumed" in act.info
         done.append((t, round(float(act.action[0]), 4), act.info["age_ticks"]))
     player.close()
@@ -524,7 +524,7 @@ def test_real_time_chunking_over_the_wire_joins_chunks_without_a_jump(real_time:
     assert asker is not None
     for tick in range(60):
         if tick % 10 == 9:  # no answer takes longer, however busy the machine is
-            wait_for(lambda: not asker.busy)
+            wait_for(lambda: not asker.busy, every_s=0.001)
         act = player.act(Obs())
         assert "safe" not in act.info
         actions.append(float(act.action[0]))

@@ -85,9 +85,9 @@ def until(lines: Iterator[str], text: str) -> None:
 def test_a_human_drives_a_simulation_and_labels_its_episodes(tmp_path: Path) -> None:
     words = ["robot", *QUICK, "--leader", "keyboard", "--record", str(tmp_path)]
     with at_a_terminal(MAIN, *words) as (process, press, lines):
-        for verdict in ("y", "x", "n"):
+        for verdict, repeats in (("y", REPEATS), ("x", REPEATS // 2), ("n", REPEATS // 2)):
             until(lines, "seed")
-            for _ in range(REPEATS):  # as a terminal does while the key is down
+            for _ in range(repeats):  # as a terminal does while the key is down
                 press("w")
                 time.sleep(0.05)
             press(verdict)

@@ -88,7 +88,7 @@ def drive(
         for tick in range(60 + 2 * stall):
             if tick == due:
                 delayed.gate.release()
-                wait_for(lambda: not asker.busy)
+                wait_for(lambda: not asker.busy, every_s=0.001)
                 due, fresh = None, tick if delayed.asked == 6 else fresh
             act = player.act(see())
             if due is None and not asker.idle:
