@@ -9,10 +9,8 @@ import pytest
 
 from vlagents_ray import ConfigError, NotReset, Obs, PolicyUnavailable, RemoteAgent
 from vlagents_ray.client.credentials import warn_of_plain_http
-from vlagents_ray.client.transports.base import CodecName
 from vlagents_ray.client.transports.select import TransportName
 from vlagents_ray.errors import InvalidInput
-from vlagents_ray.images.codecs import JPEG, LOSSLESS, RAW, ImageCodec
 from vlagents_ray.interface import copied
 
 
@@ -38,22 +36,6 @@ def test_the_url_and_the_option_decide_or_are_refused_at_once(
 ) -> None:
     with contextlib.nullcontext() if name is not None else pytest.raises(ConfigError):
         assert RemoteAgent(url, transport=transport).transport == name
-
-
-@pytest.mark.parametrize(
-    ("codec", "forced"),
-    [
-        ("auto", None),
-        ("exact", None),
-        ("raw", RAW),
-        ("lossless", LOSSLESS),
-        ("jpeg", JPEG),
-        (ImageCodec("jpeg", 50, "420"), ImageCodec("jpeg", 50, "420")),
-    ],
-)
-def test_a_codec_is_forced_or_left_to_the_connection(codec: ImageCodec | CodecName, forced: ImageCodec | None) -> None:
-    agent = RemoteAgent("http://gpu-box:8000", codec=codec)
-    assert agent.codec == forced
 
 
 def test_what_is_wrong_without_a_server_needs_none() -> None:

@@ -1,4 +1,4 @@
-"""Each check of `check_agent` fails for a policy that is broken in just that way."""
+"""Each check of `check_agent` fails for a policy that is broken in just that way, and says where two values differ."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ import pytest
 from vlagents_ray import Act, Agent, Obs
 from vlagents_ray.contract import ActionSpec, Contract, StateSpec
 from vlagents_ray.testing import ContractViolation, check_agent
+from vlagents_ray.testing.comparing import difference, require_wireable
 
 CONTRACT = Contract(state={"joints": StateSpec(2)}, action=ActionSpec(dim=2))
 
@@ -279,3 +280,19 @@ def test_an_agent_without_contract_is_shown_some_observation() -> None:
             return Act(obs.state["joints"] + obs.cameras["front"].mean(dtype=np.float32))
 
     check_agent(Plain())
+
+
+def test_a_difference_says_where_it_is() -> None:
+    assert difference(Obs(gripper=0.5), Obs(gripper=0.5), "obs") is None
+    assert "'gripper'" in str(difference(Obs(gripper=0.5), Obs(gripper=0.6), "obs"))
+    assert "has ['a'] once" in str(difference({"a": 1}, {"b": 1}, "info"))
+    assert "2 items once" in str(difference([1, 2], [1], "info"))
+    assert "(2,) float32 once" in str(difference(np.zeros(2, np.float32), np.zeros(3, np.float32), "x"))
+    assert difference(np.zeros(2), np.full(2, 1e-6), "x", atol=1e-5) is None
+
+
+def test_what_the_wire_carries_is_accepted_and_nothing_else() -> None:
+    require_wireable({"a": [None, True, 1, 1.5, "x", b"y", np.zeros(2, bool)], "b": {}}, "info")
+    for value in (object(), (1, 2), {1: "a"}, np.float32(1), np.array(["a"]), {"a": [object()]}, {1}):
+        with pytest.raises(ContractViolation, match="info"):
+            require_wireable(value, "info")
