@@ -1,3 +1,5 @@
+"""What `vlagents-ray doctor` finds on a machine, and the cures that it names."""
+
 from __future__ import annotations
 
 import io
