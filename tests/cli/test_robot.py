@@ -103,7 +103,7 @@ def test_a_human_drives_a_simulation_and_labels_its_episodes(tmp_path: Path) -> 
 
 
 def test_a_human_corrects_a_policy(tmp_path: Path) -> None:
-    words = ["robot", "scripted", *QUICK, "--leader", "keyboard", "--record", str(tmp_path), "--hz", "5"]
+    words = ["robot", "scripted", *QUICK, "--leader", "keyboard", "--record", str(tmp_path), "--hz", "10"]
     with at_a_terminal(MAIN, *words) as (process, press, lines):
         until(lines, "the policy moves the robot")
         press("s")
