@@ -95,6 +95,7 @@ EVAL = ("--out", "runs/x", "--policy")
         (("serve", "my_policies:Reach", "--set", "gian=1"), "it takes .'gain'.; did you mean 'gain'"),
         (("serve", "my_policies:Reech"), "module 'my_policies' has no class 'Reech'; did you mean 'Reach'"),
         (("serve", "my_polices:Reach"), "did you mean 'my_policies'"),
+        (("serve", "scriptd"), "did you mean 'scripted'"),
         (("serve", "noop", "--set", "chnk=3"), "chnk: there is no such setting; .*did you mean 'chunk'"),
         (
             ("serve", "noop", "--serve-set", "batch.maxsize=3"),
