@@ -1,12 +1,15 @@
-"""Chunks that overlap, and what is done next."""
+"""Chunks that overlap, and what is done next; the age of observations, whatever the wall clock does."""
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
+from eval_fakes import SimulatedTime
 
-from vlagents_ray import ConfigError, PolicyFailed
-from vlagents_ray.chunking.buffer import Chunk, ChunkBuffer
+from vlagents_ray import ConfigError, InvalidObservation, Obs, PolicyFailed
+from vlagents_ray.chunking.buffer import CaptureClock, Chunk, ChunkBuffer
 
 
 def chunk(number: int, step: int, values: list[float], *, done: bool = False) -> Chunk:
@@ -76,6 +79,8 @@ def test_a_tick_that_two_chunks_have_a_row_for_is_merged_as_chosen(merge: object
     plan.add(chunk(0, 0, [1, 2]))
     plan.add(chunk(1, 1, [20, 30]))
     assert values(plan, 3) == pytest.approx(expected)
+    with pytest.raises(ConfigError, match="want one of"):
+        ChunkBuffer("median")
 
 
 def test_the_ensemble_weighs_as_act_does_oldest_first() -> None:
@@ -117,11 +122,6 @@ def test_what_was_planned_from_an_old_observation_is_forgotten() -> None:
     assert plan.next is None
 
 
-def test_an_unknown_merge_is_refused_with_what_there_is() -> None:
-    with pytest.raises(ConfigError, match="want one of"):
-        ChunkBuffer("median")
-
-
 def test_rows_are_handed_out_one_by_one_and_replaced_at_once() -> None:
     plan = ChunkBuffer()
     plan.replace(np.array([[1.0], [2.0], [3.0]], np.float32))
@@ -134,3 +134,60 @@ def test_rows_are_handed_out_one_by_one_and_replaced_at_once() -> None:
     plan.replace(np.array([[6.0], [7.0], [8.0]], np.float32), step=2)  # two of its rows would have been executed before
     assert plan.take().row == 2
     assert plan.next is None
+
+
+class Clocks(SimulatedTime):
+    """Those of the machine, and the age of what was captured at a time of its wall clock."""
+
+    def __init__(self) -> None:
+        self.now, self.wall_s = 100.0, 1.8e9
+        self.capture = CaptureClock()
+
+    def time(self) -> float:
+        return self.wall_s
+
+    def go_on(self, seconds: float) -> None:
+        self.wall_s += seconds
+        self.now += seconds
+
+    def age(self, stamp: float | None) -> float:
+        return self.now - self.capture(Obs(info={} if stamp is None else {"captured_at": stamp}))
+
+
+@pytest.fixture
+def clocks(monkeypatch: pytest.MonkeyPatch) -> Clocks:
+    clocks = Clocks()
+    monkeypatch.setattr("vlagents_ray.chunking.buffer.time", clocks)
+    return clocks
+
+
+@pytest.mark.parametrize("jump_s", [-3600.0, -0.05, 0.0, 3600.0])
+def test_one_that_is_handed_in_again_grows_old_whatever_the_clock_does(clocks: Clocks, jump_s: float) -> None:
+    stamp = clocks.wall_s - 0.3
+    clocks.age(stamp)
+    clocks.wall_s += jump_s
+    clocks.go_on(1.0)
+    assert clocks.age(stamp) == pytest.approx(1.3)
+
+
+@pytest.mark.parametrize("jump_s", [-3600.0, 3600.0])
+def test_a_jump_costs_the_observation_that_it_fell_into_and_no_other(clocks: Clocks, jump_s: float) -> None:
+    before = clocks.wall_s
+    clocks.go_on(0.01)
+    clocks.wall_s += jump_s
+    assert clocks.age(before) > 3000
+    clocks.go_on(0.02)
+    assert clocks.age(clocks.wall_s - 0.01) == pytest.approx(0.01)
+
+
+def test_an_observation_is_as_old_as_it_says_and_a_clock_only_a_little_ahead_is_borne(clocks: Clocks) -> None:
+    assert clocks.age(clocks.wall_s - 0.3) == pytest.approx(0.3)
+    assert clocks.age(None) == 0
+    assert clocks.age(clocks.wall_s + 0.05) == 0
+    assert clocks.age(clocks.wall_s + 5) == math.inf
+
+
+@pytest.mark.parametrize("wrong", ["now", math.nan, math.inf])
+def test_a_time_that_is_none_is_refused(wrong: object) -> None:
+    with pytest.raises(InvalidObservation, match="captured_at"):
+        CaptureClock()(Obs(info={"captured_at": wrong}))

@@ -66,7 +66,7 @@ class Arm:
 
     def settle(self) -> None:
         """Wait until the policy has answered what it was asked."""
-        wait_for(lambda: self.player._asker is None or not self.player._asker.busy)
+        wait_for(lambda: self.player._asker is None or not self.player._asker.busy, every_s=0.001)
 
 
 def row(value: float) -> np.ndarray:
@@ -227,14 +227,6 @@ def test_every_action_of_a_human_passes_the_guard(make: Any) -> None:
     assert all(action.tolist() in seen for action in (row(3.0), leader.command))
 
 
-def test_a_human_without_a_safe_action_that_passes_ends_the_loop(make: Any) -> None:
-    arm, leader = make(Near(), safe=row(9.0), check=Guard(Near.contract))
-    leader.held = True
-    leader.command = row(9.0)
-    with pytest.raises(InvalidAction, match="above the limit"):
-        arm.tick()
-
-
 def test_the_policy_is_told_what_was_executed_in_its_place(make: Any) -> None:
     agent = Near()
     arm, leader = make(agent, execute=3)
@@ -248,6 +240,12 @@ def test_the_policy_is_told_what_was_executed_in_its_place(make: Any) -> None:
     for _ in range(4):
         arm.tick()
     assert EXECUTED not in agent.asked[2], "it is said once"
+    leader.held = True
+    arm.tick()
+    leader.held = False
+    arm.player.reset(arm.seen(), "again")
+    arm.tick()
+    assert EXECUTED not in agent.asked[-1], "in another episode"
 
 
 def test_a_served_policy_is_told_with_its_next_request(players: list[ChunkPlayer]) -> None:
@@ -388,17 +386,6 @@ def test_what_a_stopped_robot_did_not_execute_is_not_said_to_be(make: Any) -> No
     assert told == given[:2]
 
 
-def test_an_episode_begins_without_what_was_executed_in_the_last_one(make: Any) -> None:
-    agent = Near()
-    arm, leader = make(agent)
-    leader.held = True
-    arm.tick()
-    leader.held = False
-    arm.player.reset(arm.seen(), "again")
-    arm.tick()
-    assert EXECUTED not in agent.asked[-1]
-
-
 def test_a_human_takes_over_from_a_pause_and_gives_back_to_the_policy(make: Any) -> None:
     arm, leader = make(Near())
     control = arm.player.control
@@ -410,14 +397,10 @@ def test_a_human_takes_over_from_a_pause_and_gives_back_to_the_policy(make: Any)
         arm.tick()
         states.append(control.state)
     assert states == ["autonomous", "paused", "human", "human", "autonomous"]
-
-
-def test_a_pause_while_a_human_moves_the_robot_begins_when_he_lets_go(make: Any) -> None:
-    arm, leader = make(Near())
     leader.held = True
     arm.tick()
-    arm.player.control.pause("look first")
-    assert SAFE not in arm.tick().info
+    control.pause("look first")
+    assert SAFE not in arm.tick().info, "it begins at the release"
     leader.held = False
     assert arm.tick().info[SAFE] == "look first"
 
@@ -438,7 +421,12 @@ def test_a_leader_that_breaks_pauses_the_robot(make: Any) -> None:
     assert "division by zero" in arm.tick().info[SAFE]
 
 
-def test_without_an_action_that_keeps_it_still_a_robot_is_not_paused_but_the_loop_ends() -> None:
+def test_without_a_safe_action_that_passes_a_pause_or_a_wrong_human_ends_the_loop(make: Any) -> None:
+    arm, leader = make(Near(), safe=row(9.0), check=Guard(Near.contract))
+    leader.held = True
+    leader.command = row(9.0)
+    with pytest.raises(InvalidAction, match="above the limit"):
+        arm.tick()
     with ChunkPlayer(Near()) as player:
         arm = Arm(player)
         arm.tick()
@@ -446,8 +434,6 @@ def test_without_an_action_that_keeps_it_still_a_robot_is_not_paused_but_the_loo
         with pytest.raises(InvalidAction, match="paused by an operator"):
             arm.tick()
 
-
-def test_a_leader_needs_a_safe_action_that_is_no_guess() -> None:
     class Unstated(Near):
         contract = Contract(action=ActionSpec(dim=2))
 

@@ -87,27 +87,27 @@ def playing() -> Iterator[Callable[..., tuple[Counting, ChunkPlayer]]]:
 def let(agent: Counting, player: ChunkPlayer) -> None:
     """One answer, and wait until the player could take it."""
     agent.gate.release()
-    wait_for(lambda: player._asker is not None and not player._asker.busy)
+    wait_for(lambda: player._asker is not None and not player._asker.busy, every_s=0.001)
 
 
 Playing = Callable[..., tuple[Counting, ChunkPlayer]]
 
 
-def test_open_loop_executes_whole_chunks(playing: Playing) -> None:
-    agent, player = playing(Counting(rows=3))
-    assert play(player, range(7)) == [0, 0.1, 0.2, 3, 3.1, 3.2, 6]
-    assert [info["t"] for info in agent.seen] == [0, 3, 6]
-
-
-def test_open_loop_executes_as_many_rows_as_told(playing: Playing) -> None:
-    _, player = playing(Counting(rows=3), execute=2)
-    assert play(player, range(5)) == [0, 0.1, 2, 2.1, 4]
-
-
-def test_the_ensemble_asks_at_each_tick_and_averages(playing: Playing) -> None:
-    agent, player = playing(Counting(), mode="ensemble", ensemble_m=0.0)
-    assert play(player, range(3)) == pytest.approx([0, (0.1 + 1) / 2, (0.2 + 1.1 + 2) / 3], abs=1e-3)
-    assert len(agent.seen) == 3
+@pytest.mark.parametrize(
+    ("rows", "options", "played", "asked"),
+    [
+        (3, {}, [0, 0.1, 0.2, 3, 3.1, 3.2, 6], [0, 3, 6]),  # whole chunks
+        (3, {"execute": 2}, [0, 0.1, 2, 2.1, 4], [0, 2, 4]),
+        (1, {"deadline_s": 30.0}, [0, 1, 2, 3], [0, 1, 2, 3]),  # within the deadline an answer is waited for
+        (6, {"mode": "ensemble", "ensemble_m": 0.0}, [0, (0.1 + 1) / 2, (0.2 + 1.1 + 2) / 3], [0, 1, 2]),
+    ],
+)
+def test_a_chunk_is_executed_as_far_as_the_mode_says(
+    playing: Playing, rows: int, options: dict[str, Any], played: list[float], asked: list[int]
+) -> None:
+    agent, player = playing(Counting(rows=rows), **options)
+    assert play(player, range(len(played))) == pytest.approx(played, abs=1e-3)
+    assert [info["t"] for info in agent.seen] == asked
 
 
 def test_async_executes_the_old_chunk_while_the_next_is_made(playing: Playing) -> None:
@@ -149,6 +149,17 @@ def test_async_asks_no_more_often_than_told(playing: Playing) -> None:
     assert agent.seen[1]["t"] == 4
 
 
+def test_async_executes_no_row_beyond_the_horizon_or_for_which_others_were_executed(playing: Playing) -> None:
+    _, player = playing(Counting(gated=True), mode="async", horizon=2)
+    play(player, range(2))
+    assert "safe" in player.act(obs(2)).info
+    agent, player = playing(Counting(gated=True), mode="async")
+    agent.rows = 2
+    play(player, range(HORIZON))
+    let(agent, player)  # to tick 1: rows for ticks 1 and 2
+    assert "so late" in player.act(obs(HORIZON)).info["safe"]
+
+
 def test_without_an_action_in_time_the_safe_one_is_given_and_says_so(playing: Playing) -> None:
     agent, player = playing(Counting(gated=True), mode="async")
     play(player, range(HORIZON))
@@ -167,14 +178,6 @@ def test_without_an_action_in_time_the_safe_one_is_given_and_says_so(playing: Pl
     assert player.act(obs(HORIZON + 3)).action[0] == pytest.approx(HORIZON + 1 + 0.1)
 
 
-def test_an_answer_that_others_were_executed_in_place_of_altogether_says_so(playing: Playing) -> None:
-    agent, player = playing(Counting(gated=True), mode="async")
-    agent.rows = 2
-    play(player, range(HORIZON))
-    let(agent, player)  # to tick 1: rows for ticks 1 and 2
-    assert "so late" in player.act(obs(HORIZON)).info["safe"]
-
-
 def test_a_deadline_is_kept_in_every_mode(playing: Playing) -> None:
     for mode in ("open_loop", "ensemble", "async"):
         agent, player = playing(Counting(gated=True, rows=1), mode=mode, deadline_s=0.02)
@@ -183,12 +186,6 @@ def test_a_deadline_is_kept_in_every_mode(playing: Playing) -> None:
         assert "safe" in player.act(obs(1)).info
         assert 0.02 <= time.monotonic() - begun < 25
         agent.gate.release(100)
-
-
-def test_an_answer_within_the_deadline_is_waited_for(playing: Playing) -> None:
-    agent, player = playing(Counting(rows=1), deadline_s=30.0)
-    assert play(player, range(4)) == [0, 1, 2, 3]
-    assert len(agent.seen) == 4
 
 
 def test_an_action_says_how_old_it_is_and_where_it_is_from(playing: Playing) -> None:
@@ -218,13 +215,6 @@ def test_the_callers_observation_is_neither_changed_nor_kept(playing: Playing) -
     asked.state["joints"][:] = 77
     assert asked.info == {"t": 1}
     wait_for(lambda: len(agent.seen) == 2)
-
-
-def test_rows_beyond_the_horizon_are_never_executed(playing: Playing) -> None:
-    agent, player = playing(Counting(gated=True), mode="async", horizon=2)
-    play(player, range(2))
-    assert "safe" in player.act(obs(2)).info
-    assert agent.seen[0]["t"] == 0
 
 
 def test_rows_of_an_observation_from_before_the_loop_hung_are_not_executed(
@@ -354,27 +344,31 @@ def test_after_safe_actions_one_may_begin_at_the_measured_pose_or_at_the_last_ac
     assert play(player, range(9, 11)) == [8, 8.1]
 
 
-@pytest.mark.parametrize("failure", [PolicyFailed("out of memory"), PolicyUnavailable("restarting")])
-def test_a_policy_in_trouble_gives_safe_actions_until_it_answers_again(playing: Playing, failure: Exception) -> None:
+@pytest.mark.parametrize(
+    ("failure", "curable"),
+    [
+        (PolicyFailed("out of memory"), True),
+        (PolicyUnavailable("restarting"), True),
+        (InvalidObservation("no wrist camera"), False),
+        (ZeroDivisionError(), False),
+    ],
+)
+def test_a_policy_in_trouble_gives_safe_actions_until_it_answers_again_unless_that_cures_nothing(
+    playing: Playing, failure: Exception, curable: bool
+) -> None:
     agent, player = playing(Counting(gated=True, rows=1), mode="async")
     agent.failure = failure
     play(player, range(2))
     let(agent, player)
+    if not curable:
+        with pytest.raises(type(failure)):
+            player.act(obs(2))
+        return
     assert str(failure) in player.act(obs(2)).info["safe"]
     agent.failure = None
     agent.rows = 3
     let(agent, player)
     assert "safe" not in player.act(obs(3)).info
-
-
-@pytest.mark.parametrize("failure", [InvalidObservation("no wrist camera"), ZeroDivisionError()])
-def test_what_asking_again_will_not_cure_is_raised(playing: Playing, failure: Exception) -> None:
-    agent, player = playing(Counting(gated=True), mode="async")
-    agent.failure = failure
-    play(player, range(2))
-    let(agent, player)
-    with pytest.raises(type(failure)):
-        player.act(obs(2))
 
 
 def test_a_broken_answer_is_not_executed(playing: Playing) -> None:
@@ -387,22 +381,32 @@ def test_a_broken_answer_is_not_executed(playing: Playing) -> None:
     assert act.info["chunk"] == 0
 
 
-def test_an_action_that_the_guard_refuses_is_replaced(playing: Playing) -> None:
-    _, player = playing(Counting(rows=3), deadline_s=30.0, check=Guard(high=2.5))
+@pytest.mark.parametrize("safe", ["hold", np.full(2, -9.0, np.float32)])
+def test_an_action_that_the_guard_refuses_is_replaced_by_the_safe_one_or_by_the_last(
+    playing: Playing, safe: Any
+) -> None:
+    _, player = playing(Counting(rows=3), deadline_s=30.0, check=Guard(low=0.0, high=2.5), safe=safe)
     assert play(player, range(3)) == [0, 0.1, 0.2]
     act = player.act(obs(3))
-    assert "above the limit 2.5" in act.info["safe"]
-    assert act.action.tolist() == pytest.approx([0.2, 0.2])
-
-
-def test_a_safe_action_that_the_guard_refuses_is_replaced_by_the_last_one(playing: Playing) -> None:
-    home = np.full(2, -9.0, np.float32)
-    _, player = playing(Counting(rows=3), deadline_s=30.0, check=Guard(low=0.0, high=2.5), safe=home)
-    play(player, range(3))
-    act = player.act(obs(3))
     assert act.action.tolist() == pytest.approx([0.2, 0.2])
     assert "above the limit 2.5" in act.info["safe"]
-    assert "below the limit 0" in act.info["safe"]
+    assert ("below the limit 0" in act.info["safe"]) is not isinstance(safe, str)
+
+
+@pytest.mark.parametrize(
+    ("guard", "options", "passed"),
+    [
+        (Guard(high=0.15), {}, 2),  # which has no safe action in open loop without a deadline
+        (Guard(low=5.0), {"mode": "async"}, 0),  # before the first one there is none to hold
+    ],
+)
+def test_without_a_safe_action_what_the_guard_refuses_is_raised(
+    playing: Playing, guard: Guard, options: dict[str, Any], passed: int
+) -> None:
+    _, player = playing(Counting(rows=3), check=guard, **options)
+    play(player, range(passed))
+    with pytest.raises(InvalidAction, match="the limit"):
+        player.act(obs(passed))
 
 
 @pytest.mark.parametrize("wrong", [np.full(3, 0.1), np.full((1, 2), 0.1), np.full(2, np.nan)])
@@ -425,12 +429,6 @@ def test_where_holding_would_go_on_moving_a_refused_safe_action_is_raised() -> N
         agent.gate.release(100)
 
 
-def test_without_an_action_to_hold_a_refused_first_one_is_raised(playing: Playing) -> None:
-    _, player = playing(Counting(), mode="async", check=Guard(low=5.0))
-    with pytest.raises(InvalidAction, match="below the limit 5"):
-        player.act(obs(0))
-
-
 @pytest.mark.parametrize("delta", [None, False])
 def test_a_safe_action_that_does_not_fit_is_refused_before_the_robot_moves(delta: bool | None) -> None:
     agent = Counting()
@@ -440,13 +438,6 @@ def test_a_safe_action_that_does_not_fit_is_refused_before_the_robot_moves(delta
             player.initialize()
         with pytest.raises(ConfigError, match="safe"):
             player.reset(obs(0))
-
-
-def test_without_a_safe_action_what_the_guard_refuses_is_raised(playing: Playing) -> None:
-    _, player = playing(Counting(rows=3), check=Guard(high=0.15))
-    play(player, range(2))
-    with pytest.raises(InvalidAction, match="above the limit"):
-        player.act(obs(2))
 
 
 def test_a_reset_forgets_what_was_planned_and_what_is_under_way(playing: Playing) -> None:
@@ -465,11 +456,6 @@ def test_done_is_said_with_the_last_row_of_the_chunk_that_says_so(playing: Playi
     assert len(agent.seen) == 2
 
 
-def test_act_before_reset_is_refused() -> None:
-    with pytest.raises(NotReset):
-        ChunkPlayer(Counting()).act(obs(0))
-
-
 @pytest.mark.parametrize(
     "options",
     [
@@ -484,6 +470,8 @@ def test_act_before_reset_is_refused() -> None:
 def test_options_that_mean_nothing_are_refused(options: dict[str, Any]) -> None:
     with pytest.raises(ConfigError):
         ChunkPlayer(Counting(), PlayerSettings(**options))
+    with pytest.raises(NotReset):
+        ChunkPlayer(Counting()).act(obs(0))
 
 
 @pytest.mark.parametrize("mode", ["open_loop", "ensemble"])
@@ -504,7 +492,7 @@ def test_a_reply_that_was_lost_replays_nothing() -> None:
         served.lose_reply |= t == 10
         act = player.act(obs(t))
         assert player._asker is not None
-        wait_for(lambda: not player._asker.busy)
+        wait_for(lambda: not player._asker.busy, every_s=0.001)
         resumed |= "resumed" in act.info
         done.append((t, round(float(act.action[0]), 4), act.info["age_ticks"]))
     player.close()
@@ -535,7 +523,7 @@ def test_real_time_chunking_over_the_wire_joins_chunks_without_a_jump(real_time:
     assert asker is not None
     for tick in range(60):
         if tick % 10 == 9:  # no answer takes longer, however busy the machine is
-            wait_for(lambda: not asker.busy)
+            wait_for(lambda: not asker.busy, every_s=0.001)
         act = player.act(Obs())
         assert "safe" not in act.info
         actions.append(float(act.action[0]))

@@ -1,9 +1,13 @@
+"""What `vlagents-ray doctor` finds on a machine, and the cures that it names."""
+
 from __future__ import annotations
 
 import io
 import os
 import socket
+from collections.abc import Callable
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from rich.console import Console
@@ -39,52 +43,33 @@ def test_every_check_gives_a_row_of_its_own_and_none_breaks() -> None:
     found = list(doctor.checks(port=0))
     rows = [row for _, row in found]
     names = [name for name, _ in found]
-    for expected in (
-        "Python",
-        "Ray",
-        "HAProxy",
-        "GPU",
-        "Vulkan",
-        "EGL",
-        "shared memory",
-        "open files",
-    ):
+    for expected in ("Python", "Ray", "HAProxy", "GPU", "Vulkan", "EGL", "shared memory", "open files"):
         assert names.count(expected) == 1
     assert [row for row in rows if "the check itself broke" in row.detail] == []
     assert [row for row in rows if row.status != "ok" and not row.cure] == []
 
 
-def test_the_exit_code_is_1_only_if_a_check_failed(monkeypatch: pytest.MonkeyPatch) -> None:
-    fine, slow, broken = Check("ok", "x"), Check("warn", "x", "y"), Check("fail", "x", "y")
+def test_the_table_shows_findings_as_written_and_its_exit_code_is_1_only_if_a_check_failed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    fine, slow = Check("ok", "x"), Check("warn", "x", "y")
+    broken = Check("fail", "not [red]here", "pip install 'vlagents-ray[serve]'")
     assert table(monkeypatch, fine, slow)[0] == 0
-    assert table(monkeypatch, fine, broken, slow)[0] == 1
+    code, text = table(monkeypatch, fine, broken, slow)
+    assert code == 1
+    assert broken.detail in text
+    assert broken.cure in text
 
 
-def test_the_table_shows_finding_and_cure_as_written(monkeypatch: pytest.MonkeyPatch) -> None:
-    _, text = table(monkeypatch, Check("fail", "not [red]here", "pip install 'vlagents-ray[serve]'"))
-    assert "not [red]here" in text
-    assert "pip install 'vlagents-ray[serve]'" in text
+def test_a_check_that_raises_becomes_a_row_with_its_cure_if_there_is_one() -> None:
+    def raising(error: Exception) -> Callable[[], Check]:
+        return Mock(side_effect=error)
 
-
-def test_a_check_that_raises_becomes_a_row() -> None:
-    def breaks() -> Check:
-        raise ZeroDivisionError("driver")
-
-    row = doctor.guarded(breaks)
+    row = doctor.guarded(raising(ZeroDivisionError("driver")))
     assert row.status == "warn"
     assert "ZeroDivisionError: driver" in row.detail
-
-
-def test_a_missing_package_becomes_a_row_with_the_command_that_installs_it() -> None:
-    def lacks() -> Check:
-        raise MissingDependency("'av' is not installed; pip install 'vlagents-ray[sim]'")
-
-    assert doctor.guarded(lacks) == Check("warn", "'av' is not installed", "pip install 'vlagents-ray[sim]'")
-
-
-def test_an_old_python_fails() -> None:
-    assert doctor.python((3, 9, 18)).status == "fail"
-    assert doctor.python((3, 10, 0)).status == "ok"
+    missing = MissingDependency("'av' is not installed; pip install 'vlagents-ray[sim]'")
+    assert doctor.guarded(raising(missing)) == Check("warn", "'av' is not installed", "pip install 'vlagents-ray[sim]'")
 
 
 def test_another_ray_than_those_that_are_tested_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -113,12 +98,10 @@ def test_an_haproxy_that_does_not_start_is_a_warning(monkeypatch: pytest.MonkeyP
     assert "no libssl" in row.detail
 
 
-def test_no_nvidia_smi_is_a_warning(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_no_gpu_or_one_that_its_driver_lost_is_a_warning(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     assert doctor.gpu().status == "warn"
-
-
-def test_a_driver_that_lost_its_gpu_is_told_in_its_own_words(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.undo()
     nvidia_smi(tmp_path, monkeypatch, "echo 'Driver/library version mismatch'; exit 18")
     row = doctor.gpu()
     assert row.status == "warn"
@@ -156,28 +139,27 @@ def test_a_machine_on_which_workers_without_a_gpu_could_not_render_is_told(
     assert ("gpus: 0.25" in row.cure) is not software
 
 
-def test_shared_memory_must_hold_the_object_store_that_ray_will_make() -> None:
-    assert doctor.judge_shared_memory(total=32 * GB, free=30 * GB, memory=64 * GB).status == "ok"
-    docker_default = doctor.judge_shared_memory(total=0.064 * GB, free=0.064 * GB, memory=16 * GB)
-    assert docker_default.status == "warn"
-    assert "--shm-size=5g" in docker_default.cure
-
-
-def test_a_small_share_of_a_huge_memory_is_enough_as_ray_caps_its_store() -> None:
-    assert doctor.judge_shared_memory(total=100 * GB, free=100 * GB, memory=1000 * GB).status == "ok"
-
-
 @pytest.mark.parametrize(
-    ("free", "status"), [(0.5 * GB, "fail"), (3 * GB, "warn"), (20 * GB, "warn"), (200 * GB, "ok")]
+    ("judged", "status", "said"),
+    [
+        (doctor.python((3, 9, 18)), "fail", ""),
+        (doctor.python((3, 10, 0)), "ok", ""),
+        (doctor.judge_shared_memory(total=32 * GB, free=30 * GB, memory=64 * GB), "ok", ""),
+        (doctor.judge_shared_memory(total=0.064 * GB, free=0.064 * GB, memory=16 * GB), "warn", "--shm-size=5g"),
+        (doctor.judge_shared_memory(total=100 * GB, free=100 * GB, memory=1000 * GB), "ok", ""),  # Ray caps its store
+        (doctor.judge_temp_dir("/tmp", total=1000 * GB, free=0.5 * GB), "fail", ""),
+        (doctor.judge_temp_dir("/tmp", total=1000 * GB, free=3 * GB), "warn", ""),
+        (doctor.judge_temp_dir("/tmp", total=1000 * GB, free=20 * GB), "warn", ""),
+        (doctor.judge_temp_dir("/tmp", total=1000 * GB, free=200 * GB), "ok", ""),
+        (doctor.judge_temp_dir("/tmp/" + "x" * 60, total=100 * GB, free=90 * GB), "fail", "107"),  # bytes of a socket
+        (doctor.judge_open_files(1024, 1024), "warn", ""),
+        (doctor.judge_open_files(1024, 1_048_576), "ok", ""),  # as Ray raises them
+        (doctor.judge_open_files(65536, 65536), "ok", ""),
+    ],
 )
-def test_temporary_space_is_judged_by_what_is_free(free: float, status: str) -> None:
-    assert doctor.judge_temp_dir("/tmp", total=1000 * GB, free=free).status == status
-
-
-def test_a_temporary_folder_with_a_long_path_fails_as_sockets_will_not_fit() -> None:
-    row = doctor.judge_temp_dir("/tmp/" + "x" * 60, total=100 * GB, free=90 * GB)
-    assert row.status == "fail"
-    assert "107" in row.detail
+def test_what_a_machine_has_is_judged_by_what_ray_will_need(judged: Check, status: str, said: str) -> None:
+    assert judged.status == status
+    assert said in judged.detail + judged.cure
 
 
 def test_rays_temporary_folder_is_the_one_that_is_judged(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -185,13 +167,6 @@ def test_rays_temporary_folder_is_the_one_that_is_judged(monkeypatch: pytest.Mon
     row = doctor.temp_dir()
     assert row.status == "fail"
     assert "missing" in row.detail
-
-
-@pytest.mark.parametrize(
-    ("soft", "hard", "status"), [(1024, 1024, "warn"), (1024, 1_048_576, "ok"), (65536, 65536, "ok")]
-)
-def test_open_files_count_as_ray_will_raise_them(soft: int, hard: int, status: str) -> None:
-    assert doctor.judge_open_files(soft, hard).status == status
 
 
 def test_a_taken_port_has_another_one_as_cure() -> None:

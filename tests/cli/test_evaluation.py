@@ -1,4 +1,4 @@
-"""What the options of `eval` make of the settings."""
+"""What the options of `eval` make of the settings, and what `--dry-run` says that it would take."""
 
 from __future__ import annotations
 
@@ -7,23 +7,28 @@ import inspect
 import logging
 import socket
 import sqlite3
+from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NoReturn
 
 import pytest
+from eval_fakes import LINE, OTHER_LINE
+from in_process_evaluation import flat_config, play
 from typer.testing import CliRunner
 
 import vlagents_ray.evaluate
 from vlagents_ray.cli import evaluate as command
 from vlagents_ray.cli import evaluation as run
 from vlagents_ray.cli import policies
+from vlagents_ray.cli.evaluation import forecasts, print_plan
 from vlagents_ray.cli.live import live_address
 from vlagents_ray.cli.main import app
 from vlagents_ray.evaluate import EvalConfig, OutOfTime, PolicyConfig, Results, SuiteConfig, WorkerConfig
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.episode.records import EpisodeResult
+from vlagents_ray.evaluate.plan.cases import cells
 from vlagents_ray.evaluate.plan.jobs import plan
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.evaluate.results.summary import summarize
@@ -31,12 +36,26 @@ from vlagents_ray.evaluate.results.summary import summarize
 WORDS = ["eval", "tabletop", "--policy", "http://127.0.0.1:9"]
 
 
-def test_no_retry_is_a_number_of_retries(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    seen: list[EvalConfig] = []
-    monkeypatch.setattr(run, "run_evaluation", lambda config, _address, **_: seen.append(config))
-    done = CliRunner().invoke(app, [*WORDS, "--out", str(tmp_path / "out"), "--retries", "0"])
-    assert done.exit_code == 0, done.output
-    assert [config.retries for config in seen] == [0]
+def said(*words: str) -> str:
+    """What the command says that is refused before anything starts."""
+    done = CliRunner().invoke(app, words, env={"COLUMNS": "200"})
+    assert done.exit_code == 2, done.output
+    return " ".join(done.stderr.split())
+
+
+@pytest.fixture
+def no_server(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(policies, "running_server", lambda *_, **__: pytest.fail("started a server"))
+
+
+def test_a_zero_is_a_number_of_retries_steps_and_seconds(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    seen: list[Any] = []
+    monkeypatch.setattr(run, "run_evaluation", lambda config, _address, **_: seen.append(config.retries))
+    monkeypatch.setattr(run, "watch_training", lambda *_args, **options: seen.append(options))
+    for options in (["--retries", "0"], ["--watch", str(tmp_path), "--settle", "0", "--until", "0"]):
+        done = CliRunner().invoke(app, [*WORDS, "--out", str(tmp_path / "out"), *options])
+        assert done.exit_code == 0, done.output
+    assert seen == [0, {"settle_s": 0.0, "until": 0, "marker": None, "live": None}]
 
 
 def test_workers_take_the_resources_that_are_said_unless_the_file_says_more(
@@ -53,17 +72,6 @@ def test_workers_take_the_resources_that_are_said_unless_the_file_says_more(
     [config] = seen
     kinds = [suite.worker or config.worker for suite in config.suites]
     assert [(worker.cpus, worker.gpus) for worker in kinds] == [(1.0, 0.25), (1.0, 0.25), (3.0, 0.25)]
-
-
-def test_a_checkpoint_may_count_at_once_and_the_first_step_be_the_last(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    seen: list[dict[str, Any]] = []
-    monkeypatch.setattr(run, "watch_training", lambda *_args, **options: seen.append(options))
-    words = [*WORDS, "--out", str(tmp_path / "out"), "--watch", str(tmp_path), "--settle", "0", "--until", "0"]
-    done = CliRunner().invoke(app, words)
-    assert done.exit_code == 0, done.output
-    assert seen == [{"settle_s": 0.0, "until": 0, "marker": None, "live": None}]
 
 
 def test_out_of_time_has_an_exit_status_of_its_own(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -83,21 +91,13 @@ def test_out_of_time_has_an_exit_status_of_its_own(monkeypatch: pytest.MonkeyPat
     assert "out of time after 3 of 9 episodes; go on with --resume" in " ".join(done.stderr.split())
 
 
-@pytest.mark.parametrize(
-    ("env", "policy", "said"),
-    [
-        ("tabletop", ["noop"], "'noop' in 'tabletop': policy and env do not fit: - action.dim: the policy gives 7"),
-        ("libero/libero_spatial/0", ["noop", "--set", "action_dim=4"], "the policy gives 4, the env takes 7"),
-    ],
-)
-def test_a_policy_that_does_not_fit_is_told_before_anything_starts(
-    env: str, policy: list[str], said: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setattr(policies, "running_server", lambda *_, **__: pytest.fail("started a server"))
-    words = ["eval", env, "--policy", *policy, "--out", str(tmp_path / "out")]
-    done = CliRunner().invoke(app, words, env={"COLUMNS": "200"})
+@pytest.mark.usefixtures("no_server")
+def test_a_policy_that_does_not_fit_is_refused_before_anything_starts(tmp_path: Path) -> None:
+    words = ["eval", "libero/libero_spatial/0", "--policy", "noop", "--set", "action_dim=4"]
+    done = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "out")], env={"COLUMNS": "200"})
     assert done.exit_code == 1, done.output
-    assert said in " ".join(done.stderr.split())
+    fits_not = "'noop' in 'libero/libero_spatial/0': policy and env do not fit: - action.dim: the policy gives 4, the"
+    assert fits_not in " ".join(done.stderr.split())
     assert not (tmp_path / "out").exists()
 
 
@@ -105,9 +105,7 @@ def test_a_file_of_several_policies_is_refused_with_its_cure(tmp_path: Path) -> 
     app_of = "{{name: {0}, route_prefix: /{0}, import_path: 'vlagents_ray.serve.app:build', args: {{policy: noop}}}}"
     file = tmp_path / "two.yaml"
     file.write_text(f"applications: [{app_of.format('a')}, {app_of.format('b')}]")
-    done = CliRunner().invoke(app, ["eval", "tabletop", "--policy", str(file), "--out", str(tmp_path / "out")])
-    assert done.exit_code == 2, done.output
-    assert "want one application" in " ".join(done.stderr.split())
+    assert "want one application" in said("eval", "tabletop", "--policy", str(file), "--out", str(tmp_path / "out"))
 
 
 def lost(out: Path, **changes: Any) -> EvalConfig:
@@ -141,9 +139,9 @@ def end_of(config: EvalConfig, monkeypatch: pytest.MonkeyPatch) -> tuple[int, st
 def test_an_episode_without_a_result_ends_the_command_with_status_1(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    status, said = end_of(lost(tmp_path), monkeypatch)
+    status, stated = end_of(lost(tmp_path), monkeypatch)
     assert status == 1
-    assert said == (
+    assert stated == (
         "error 1 of 4 episodes have no result: lost to infrastructure, the last one to env_failed: "
         "env step: RuntimeError: it exploded; the report lists every attempt under Errors, --resume tries them again"
     )
@@ -175,13 +173,19 @@ def test_only_what_was_asked_for_now_is_missed(monkeypatch: pytest.MonkeyPatch, 
     [
         (["--end-at", "soon"], "2027-01-31T18:30"),
         (["--end-at", "1", "--watch", "."], "exclude each other"),
-        (["--replica-per-gpu"], "--address"),
+        (["--replica-per-gpu", "--policy", "http://127.0.0.1:9"], "--address"),
+        (["--live-at", "8050"], "want HOST:PORT"),
+        (["--live-at", "127.0.0.1:many"], "want HOST:PORT"),
+        (["--live-at", "0.0.0.0:8050"], "without keys all cameras would be public"),
+        (["--live", "--dry-run"], "nothing is played"),
     ],
 )
-def test_options_that_cannot_hold_are_told(words: list[str], text: str, tmp_path: Path) -> None:
-    done = CliRunner().invoke(app, [*WORDS, "--out", str(tmp_path / "out"), *words], env={"COLUMNS": "200"})
-    assert done.exit_code == 2, done.output
-    assert text in done.stderr
+@pytest.mark.usefixtures("no_server")
+def test_options_that_cannot_hold_are_refused_before_anything_starts(
+    words: list[str], text: str, tmp_path: Path
+) -> None:
+    assert text in said("eval", "tabletop", "--policy", "scripted", "--out", str(tmp_path / "out"), *words)
+    assert not (tmp_path / "out").exists()
 
 
 def test_each_option_that_is_a_setting_is_one_of_a_single_model() -> None:
@@ -191,58 +195,26 @@ def test_each_option_that_is_a_setting_is_one_of_a_single_model() -> None:
         for option in inspect.signature(command.evaluate_command).parameters
     }
     of_the_run_itself = {
-        "what",
-        "watch",
-        "until",
-        "settle",
-        "marker",
-        "dry_run",
-        "end_at",
-        "replica_per_gpu",
-        "address",
-        "live",
-        "live_at",
-        "arm",
-        "operator",
-        "unblind",
-    }
+        "what", "watch", "until", "settle", "marker", "dry_run", "end_at", "replica_per_gpu", "address", "live",
+        "live_at", "arm", "operator", "unblind",
+    }  # fmt: skip
     assert {option for option, found in places.items() if len(found) != 1} == of_the_run_itself
     assert all(not places[option] for option in of_the_run_itself)
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["--live-at", "8050"], "want HOST:PORT"),
-        (["--live-at", "127.0.0.1:many"], "want HOST:PORT"),
-        (["--live-at", "0.0.0.0:8050"], "without keys all cameras would be public"),
-        (["--live", "--dry-run"], "nothing is played"),
-    ],
-)
-def test_a_page_that_cannot_be_is_told_before_anything_starts(
-    words: list[str], said: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setattr(policies, "running_server", lambda *_, **__: pytest.fail("started a server"))
-    words = ["eval", "tabletop", "--policy", "scripted", "--out", str(tmp_path / "out"), *words]
-    done = CliRunner().invoke(app, words, env={"COLUMNS": "200"})
-    assert done.exit_code == 2, done.output
-    assert said in " ".join(done.stderr.split())
-    assert not (tmp_path / "out").exists()
 
 
 def test_a_dry_run_keeps_warnings_of_what_is_meant_off_the_terminal(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, tmp_path: Path
 ) -> None:
-    said = ("Token authentication is enabled for this Ray cluster", "the disk is almost full")
+    warnings = ("Token authentication is enabled for this Ray cluster", "the disk is almost full")
 
     def measure(_config: EvalConfig) -> None:
-        for line in said:
+        for line in warnings:
             logging.getLogger("ray._private.worker").warning(line)
 
     monkeypatch.setattr(run, "print_plan", measure)
     done = CliRunner().invoke(app, [*WORDS, "--out", str(tmp_path / "out"), "--dry-run"])
     assert done.exit_code == 0, done.output
-    assert [record.getMessage() for record in caplog.records if record.getMessage() in said] == [said[1]]
+    assert [record.getMessage() for record in caplog.records if record.getMessage() in warnings] == [warnings[1]]
 
 
 def test_a_page_has_a_port_of_its_own_if_another_has_the_usual_one() -> None:
@@ -251,3 +223,40 @@ def test_a_page_has_a_port_of_its_own_if_another_has_the_usual_one() -> None:
         with contextlib.suppress(OSError):  # it may be taken already
             taken.bind(("127.0.0.1", 8050))
         assert live_address(None) == ("127.0.0.1", 0)
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> Callable[..., EvalConfig]:
+    def make(**changes: Any) -> EvalConfig:
+        return flat_config(**{"envs": [LINE], "out": tmp_path / "out", **changes})
+
+    return make
+
+
+def test_what_was_played_is_not_planned_again_and_tells_the_time(config: Callable[..., EvalConfig]) -> None:
+    results = play(config(episodes=3))
+    [played, other] = forecasts(cells(config(envs=[LINE, OTHER_LINE], episodes=9)), results)
+    assert (played.finished, played.left) == (3, 6)
+    assert played.seconds == pytest.approx(sum(one.seconds for one in results.cells[0].counted) / 3)
+    assert (other.finished, other.left, other.seconds) == (0, 9, None)
+
+
+def test_nothing_is_left_of_a_cell_that_stopped(config: Callable[..., EvalConfig]) -> None:
+    settings = config(episodes=30, stop={"target": 0.3})
+    play(settings, left_out=range(20, 30))
+    [found] = forecasts(cells(settings), Results.load(settings.out))
+    assert (found.finished, found.left) == (20, 0)
+
+
+def test_the_plan_is_printed_without_asking_any_policy(
+    config: Callable[..., EvalConfig], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "150")
+    settings = config(episodes=5, policy_url="http://127.0.0.1:9", steps=[10, 20], envs=[LINE, OTHER_LINE])
+    print_plan(settings)
+    text = capsys.readouterr().out
+    assert "4 cells" in text
+    assert "20 episodes, 0 of them finished" in text
+    assert "policy@20" in text
+    assert "and 4 cells whose envs were not played yet" in " ".join(text.split())
+    assert not settings.out.exists(), "nothing is written"

@@ -57,7 +57,6 @@ def test_a_key_may_push_weights_if_it_is_made_for_that(tmp_path: Path) -> None:
         (["new", "arm", "--scope", "root"], "weights"),
         (["new", "arm", "--rate", "-1"], "positive"),
         (["revoke", "arm"], "keys new"),
-        (["list"], "keys new"),
     ],
 )
 def test_mistakes_are_told_in_a_line(words: list[str], text: str, tmp_path: Path) -> None:

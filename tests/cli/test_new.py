@@ -69,12 +69,16 @@ def test_clients_of_a_skeleton_of_a_dialect_are_answered(folder: Path, monkeypat
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("there", ["mine.py", "test_mine.py", "mine.yaml"])
-def test_what_is_there_stays_and_nothing_is_written_beside_it(kind: str, there: str, folder: Path) -> None:
-    (folder / there).write_text("years of work")
-    status, said = new(kind, "mine")
-    assert (status, there in said) == (2, True)
-    assert [(path.name, path.read_text()) for path in folder.iterdir()] == [(there, "years of work")]
+def test_what_is_there_stays_and_nothing_is_written_beside_it(kind: str, folder: Path) -> None:
+    for there in ("mine.py", "test_mine.py", "mine.yaml"):
+        (folder / there).write_text("years of work")
+        status, said = new(kind, "mine")
+        assert (status, there in said) == (2, True)
+        assert [(path.name, path.read_text()) for path in folder.iterdir()] == [(there, "years of work")]
+        (folder / there).unlink()
+    said = new(kind, "mine")[1]
+    assert "pytest test_mine.py" in said
+    assert f"vlagents-ray {'eval' if kind == 'env' else 'serve'} mine.yaml" in said
 
 
 @pytest.mark.parametrize("name", ["", "My", "my-policy", "../up", "a/b", "class", "1st", "numpy", "vlagents_ray"])
@@ -82,10 +86,3 @@ def test_a_name_that_is_no_module_of_ones_own_is_refused(name: str, folder: Path
     status, said = new("policy", name)
     assert (status, "NAME" in said) == (2, True)
     assert list(folder.iterdir()) == []
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_the_commands_to_run_next_are_said(kind: str) -> None:
-    said = new(kind, "mine")[1]
-    assert "pytest test_mine.py" in said
-    assert f"vlagents-ray {'eval' if kind == 'env' else 'serve'} mine.yaml" in said

@@ -20,18 +20,16 @@ def report(*words: str) -> Result:
     return CliRunner().invoke(app, ["report", *words], env={"COLUMNS": "200"})
 
 
-def test_the_page_stands_beside_the_results(tmp_path: Path) -> None:
-    record(runs(tmp_path))
-    done = report(str(tmp_path))
-    assert done.exit_code == 0, done.output
-    assert done.stdout.strip() == f"report: {tmp_path / 'report.html'}"
-    assert (tmp_path / "report.html").read_text().startswith("<!doctype html>")
-
-
-def test_several_folders_make_one_page_where_it_is_wanted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_page_stands_beside_its_results_and_one_of_several_folders_where_it_is_wanted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for name in ("a", "b"):
         policies = [{"name": name, "url": "http://localhost:1"}]
         record(runs(tmp_path / name, policies=policies), videos=True)
+    done = report(str(tmp_path / "a"))
+    assert done.exit_code == 0, done.output
+    assert done.stdout.strip() == f"report: {tmp_path / 'a' / 'report.html'}"
+    assert (tmp_path / "a" / "report.html").read_text().startswith("<!doctype html>")
     words = [str(tmp_path / "a"), str(tmp_path / "b"), "--inline"]
     assert report(*words, "--html", str(tmp_path / "pages" / "both.html")).exit_code == 0
     page = (tmp_path / "pages" / "both.html").read_text()
@@ -40,12 +38,6 @@ def test_several_folders_make_one_page_where_it_is_wanted(tmp_path: Path, monkey
     monkeypatch.chdir(tmp_path)
     assert report(*words).exit_code == 0
     assert (tmp_path / "report.html").is_file()
-
-
-def test_a_folder_without_results_is_refused(tmp_path: Path) -> None:
-    done = report(str(tmp_path))
-    assert done.exit_code == 2
-    assert "want a folder that an evaluation wrote its results to" in done.stderr
 
 
 def test_results_that_another_process_writes_are_watched_until_ctrl_c(tmp_path: Path) -> None:
@@ -62,5 +54,8 @@ def test_results_that_another_process_writes_are_watched_until_ctrl_c(tmp_path: 
     assert not (tmp_path / "out" / "report.html").exists()
 
 
-def test_one_folder_is_watched_at_a_time(tmp_path: Path) -> None:
+def test_what_is_no_folder_of_results_or_more_than_one_to_watch_is_refused(tmp_path: Path) -> None:
+    done = report(str(tmp_path))
+    assert done.exit_code == 2
+    assert "want a folder that an evaluation wrote its results to" in done.stderr
     assert "want one OUT" in report(str(tmp_path), str(tmp_path), "--live").stderr

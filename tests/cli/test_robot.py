@@ -2,23 +2,35 @@
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
+import itertools
 import os
 import pty
+import re
 import signal
 import subprocess
 import sys
+import termios
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from typer.testing import CliRunner
 
+from vlagents_ray import Act, ActionSpec, Agent, Contract, Obs
 from vlagents_ray.cli.main import app
+from vlagents_ray.cli.robot import _restarting as restarting
+from vlagents_ray.cli.robot import main as drive
 from vlagents_ray.policies.scripted import Scripted
+from vlagents_ray.robot import Watchdog
 
+MAIN = "from vlagents_ray.cli import main; main()"
 REPEATS = 20  # the loop has ten ticks in that time
 QUICK = ["--env", "tabletop/lift", "--env-set", "width=32", "--env-set", "height=32"]
 
@@ -27,33 +39,29 @@ def robot(*words: str) -> Any:
     return CliRunner().invoke(app, ["robot", *words], env={"COLUMNS": "200"})
 
 
-def at_terminal(words: list[str], keys: Callable[[Callable[[str], None], Callable[[str], None]], None]) -> str:
-    """Run the command at a terminal where `keys` types, and waits for what it prints; returns its output."""
+@contextlib.contextmanager
+def at_a_terminal(code: str, *options: str) -> Iterator[tuple[Any, Callable[[str], object], Iterator[str]]]:
+    """Run Python code at a terminal of its own: its process, a function that types keys there, and its output."""
     ours, its = pty.openpty()
-    code = "from vlagents_ray.cli import main; main()"
-    printed: list[str] = []
     with subprocess.Popen(
-        [sys.executable, "-c", code, "robot", *words],
+        [sys.executable, "-c", code, *options],
         stdin=its,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
+        start_new_session=True,
+        preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),  # noqa: PLW1509 - nothing else is started meanwhile
     ) as process:
         assert process.stdout is not None
-
-        def wait(text: str) -> None:
-            for line in process.stdout or ():
-                printed.append(line)
-                if text in line:
-                    return
-            raise AssertionError(f"{text!r} was not printed: {''.join(printed)}")
-
-        keys(lambda typed: os.write(ours, typed.encode()) and None, wait)
-        printed.append(process.stdout.read())
-        assert process.wait(30) == 0, "".join(printed)
+        too_long = threading.Timer(60, process.kill)  # then no further line comes
+        too_long.start()
+        try:
+            yield process, lambda keys: os.write(ours, keys.encode()), map(str.strip, process.stdout)
+        finally:
+            too_long.cancel()
+            process.kill()
     os.close(ours)
     os.close(its)
-    return "".join(printed)
 
 
 def frames(root: Path, episode: int) -> dict[str, Any]:
@@ -64,19 +72,29 @@ def labels(root: Path) -> list[str]:
     return [pq.read_table(path).to_pylist()[0]["label"] for path in sorted(root.glob("meta/episodes/*/*.parquet"))]
 
 
+def until(lines: Iterator[str], text: str) -> None:
+    """Wait until a line has this text."""
+    printed = []
+    for line in lines:
+        printed.append(line)
+        if text in line:
+            return
+    raise AssertionError(f"{text!r} was not printed: {printed}")
+
+
 def test_a_human_drives_a_simulation_and_labels_its_episodes(tmp_path: Path) -> None:
-    def keys(press: Callable[[str], None], wait: Callable[[str], None]) -> None:
-        for verdict in ("y", "x", "n"):
-            wait("seed")
-            for _ in range(REPEATS):  # as a terminal does while the key is down
+    words = ["robot", *QUICK, "--leader", "keyboard", "--record", str(tmp_path)]
+    with at_a_terminal(MAIN, *words) as (process, press, lines):
+        for verdict, repeats in (("y", REPEATS), ("x", REPEATS // 2), ("n", REPEATS // 2)):
+            until(lines, "seed")
+            for _ in range(repeats):  # as a terminal does while the key is down
                 press("w")
                 time.sleep(0.05)
             press(verdict)
-        wait("seed")
+        until(lines, "seed")
         press("q")
-
-    said = at_terminal([*QUICK, "--leader", "keyboard", "--record", str(tmp_path)], keys)
-    assert "recorded: 2 episodes" in said
+        until(lines, "recorded: 2 episodes")
+        assert process.wait(30) == 0
     assert labels(tmp_path) == ["success", "failure"]
     first = frames(tmp_path, 0)
     assert all(first["intervention"])
@@ -85,18 +103,17 @@ def test_a_human_drives_a_simulation_and_labels_its_episodes(tmp_path: Path) -> 
 
 
 def test_a_human_corrects_a_policy(tmp_path: Path) -> None:
-    def keys(press: Callable[[str], None], wait: Callable[[str], None]) -> None:
-        wait("the policy moves the robot")
+    words = ["robot", "scripted", *QUICK, "--leader", "keyboard", "--record", str(tmp_path), "--hz", "10"]
+    with at_a_terminal(MAIN, *words) as (process, press, lines):
+        until(lines, "the policy moves the robot")
         press("s")
-        wait("you move the robot")
+        until(lines, "you move the robot")
         press("\n")  # gives back
-        wait("the policy moves the robot")
-        wait("seed")
+        until(lines, "the policy moves the robot")
+        until(lines, "success")  # the policy solves it after the correction
+        until(lines, "seed")
         press("q")
-
-    words = ["scripted", *QUICK, "--leader", "keyboard", "--record", str(tmp_path), "--hz", "5"]
-    said = at_terminal(words, keys)
-    assert "success" in said, "the policy solves it after the correction"
+        assert process.wait(30) == 0
     seen = frames(tmp_path, 0)
     human = seen["intervention"]
     first, last = human.index(True), len(human) - human[::-1].index(True)
@@ -106,12 +123,17 @@ def test_a_human_corrects_a_policy(tmp_path: Path) -> None:
     assert labels(tmp_path) == ["success"]
 
 
-def test_a_policy_alone_is_recorded_without_columns_that_nobody_fills(tmp_path: Path) -> None:
+def test_a_policy_alone_is_loaded_once_and_recorded_without_columns_that_nobody_fills(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    loads: list[Scripted] = []
+    monkeypatch.setattr(Scripted, "initialize", lambda self: loads.append(self))  # noqa: PLW0108 - a method
     run = robot("scripted", *QUICK, "--episodes", "2", "--hz", "200", "--record", str(tmp_path))
     assert run.exit_code == 0, run.output
     assert run.output.count("success: ") == 2
     assert "recorded: 2 episodes" in run.output
     assert "intervention" not in frames(tmp_path, 1)
+    assert len(loads) == 1
 
 
 @pytest.mark.library("rerun")
@@ -122,10 +144,9 @@ def test_episodes_are_shown_in_a_viewer(tmp_path: Path) -> None:
 
 
 def test_ctrl_c_says_what_was_recorded(tmp_path: Path) -> None:
-    code = "from vlagents_ray.cli import main; main()"
     words = ["robot", "scripted", *QUICK, "--episodes", "9", "--hz", "200", "--record", str(tmp_path)]
     with subprocess.Popen(
-        [sys.executable, "-c", code, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        [sys.executable, "-c", MAIN, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE
     ) as process:
         assert process.stdout is not None
         while b"seed 2" not in process.stdout.readline():
@@ -135,17 +156,6 @@ def test_ctrl_c_says_what_was_recorded(tmp_path: Path) -> None:
     kept = len(list(tmp_path.glob("data/*/*.parquet")))
     assert kept in (2, 3), "with the running one, if it had begun"
     assert (process.returncode, said.decode()) == (130, f"error interrupted; {kept} episodes are in {tmp_path}\n")
-
-
-def test_a_policy_of_this_process_is_loaded_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    loads: list[Scripted] = []
-
-    def load(self: Scripted) -> None:
-        loads.append(self)
-
-    monkeypatch.setattr(Scripted, "initialize", load)
-    assert robot("scripted", *QUICK, "--episodes", "3", "--hz", "200").exit_code == 0
-    assert len(loads) == 1
 
 
 @pytest.mark.parametrize(
@@ -162,3 +172,258 @@ def test_wrong_settings_are_refused_with_the_cure(words: list[str], cure: str) -
     run = robot(*QUICK, *words)
     assert run.exit_code == 2
     assert cure in run.output
+
+
+def test_a_person_restarts_the_command_by_a_signal() -> None:
+    said: list[str] = []
+    stopped = threading.Event()
+    with Watchdog(lambda _: stopped.set(), {"loop": 0.05}) as watchdog, restarting(watchdog, said.append):
+        assert stopped.wait(30)
+        os.kill(os.getpid(), signal.SIGUSR1)
+        assert watchdog.control.stopped  # it hangs still
+        watchdog._limits["loop"] = 60.0
+        watchdog.heard("loop")
+        assert watchdog.control.stopped
+        watchdog.control.pause("paused from the live page")
+        os.kill(os.getpid(), signal.SIGUSR1)
+        assert not watchdog.control.stopped
+        assert watchdog.control.reason is None
+    assert signal.getsignal(signal.SIGUSR1) == signal.SIG_DFL
+
+
+def test_a_person_restarts_the_command_by_enter_at_its_terminal() -> None:
+    code = """
+import threading
+from vlagents_ray.robot import Watchdog
+from vlagents_ray.cli.robot import _restarting
+
+stopped, restarted = threading.Event(), threading.Event()
+
+def say(line):
+    print(line, flush=True)
+    if line == "restarted":
+        restarted.set()
+
+with Watchdog(lambda _: stopped.set(), {"loop": 0.05}) as watchdog, _restarting(watchdog, say):
+    assert stopped.wait(30)
+    watchdog._limits["loop"] = 60.0
+    watchdog.heard("loop")
+    print("stopped", flush=True)
+    assert restarted.wait(30)
+    assert not watchdog.control.stopped
+"""
+    with at_a_terminal(code) as (process, type_keys, lines):
+        assert next(lines) == "stopped"
+        type_keys("\n")
+        assert next(lines) == "restarted"
+        assert process.wait(30) == 0
+
+
+def test_with_a_keyboard_as_leader_each_key_has_one_consumer_and_enter_restarts_nothing() -> None:
+    """The command line of docs/interventions.md, whose server is a policy in its process."""
+    code = """
+import sys
+import vlagents_ray.cli.robot as command
+from vlagents_ray import Act, ActionSpec, Agent, Contract
+from vlagents_ray.robot.teleoperation import Keyboard
+import numpy as np
+
+class Still(Agent):
+    contract = Contract(action=ActionSpec(dim=6, delta=True))
+    transport = "local"
+
+    def __init__(self, *_, **__): ...
+
+    def act(self, obs):
+        return Act(np.zeros(6, np.float32))
+
+class Seen(Keyboard):
+    def _press(self, key):
+        taken = super()._press(key)
+        print("keyboard", repr(key), taken, flush=True)
+        return taken
+
+class Stopped(command.Watchdog):
+    def start(self):
+        super().start()
+        self.trip("a person is in the way")
+
+command.RemoteAgent, command.Watchdog, command._DEVICES["keyboard"] = Still, Stopped, Seen
+sys.exit(command.main(sys.argv[1:]))
+"""
+    options = ["http://gpu-box:8000", "--leader", "keyboard", "--step", "0.01"]
+    with at_a_terminal(code, *options) as (process, type_keys, lines):
+        while "a person is in the way" not in next(lines):
+            pass
+        for _ in range(20):
+            type_keys("w")
+        type_keys("\n\nc")
+        said = list(itertools.islice(lines, 24))
+        assert said[:20] == ["keyboard 'w' True"] * 20
+        assert said[20:22] == [r"keyboard '\n' True"] * 2, "Enter gives back and takes over"
+        assert said[22:] == ["keyboard 'c' False", "restarted"]
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(30) == 128 + signal.SIGTERM
+
+
+@pytest.mark.parametrize("wish", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
+def test_the_command_stops_the_robot_when_it_is_told_to_end(wish: signal.Signals) -> None:
+    code = """
+import sys, time
+import vlagents_ray.cli.robot as command
+
+def run(options):
+    try:
+        print("moving", flush=True)
+        time.sleep(60)
+    finally:
+        print("stopped", flush=True)
+
+command._run = run
+command.main(["http://nowhere"])
+"""
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "moving\n"
+        process.send_signal(wish)
+        assert process.stdout.read() == "stopped\n"
+
+
+class Served(Agent):
+    """In place of the agent that the command would connect: absolute targets that grow by 0.01 a tick."""
+
+    transport = "local"
+    contract: Contract | None = Contract(action=ActionSpec(dim=2, delta=False), chunk=1)  # type: ignore[assignment]
+    slow_s = 0.0
+    tick = 0
+
+    def __init__(self, *_: object, **__: object) -> None: ...
+
+    def act(self, obs: Obs) -> Act:
+        time.sleep(self.slow_s * (self.tick > 0))
+        self.tick += 1
+        return Act(np.full(2, 0.01 * (self.tick - 1), np.float32))
+
+
+@pytest.fixture
+def served(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Let the command connect an agent with these attributes."""
+
+    def serve(**attributes: Any) -> None:
+        for name, value in attributes.items():
+            monkeypatch.setattr(Served, name, value)
+
+    monkeypatch.setattr("vlagents_ray.cli.robot.RemoteAgent", Served)
+    return serve
+
+
+SHORT = ["http://nowhere", "--seconds", "1"]
+ATTEMPTS = 5  # what else the machine does in such a second may mislead
+
+
+@pytest.mark.parametrize("mode", ["async", "open_loop", "ensemble"])
+@pytest.mark.usefixtures("served")
+def test_a_policy_of_single_actions_drives_in_each_mode(capsys: pytest.CaptureFixture[str], mode: str) -> None:
+    for _ in range(ATTEMPTS):
+        status = drive([*SHORT, "--hz", "10", "--mode", mode])
+        said = re.search(r"ticks without an action of the policy: (\d+) of (\d+)", capsys.readouterr().out)
+        assert said is not None
+        safe, ticks = map(int, said.groups())
+        if safe < 0.5 * ticks:  # none where the machine is not busy
+            break
+    assert safe < 0.5 * ticks
+    assert status == (1 if safe else 0)
+
+
+def test_the_simulated_robot_takes_actions_of_which_nothing_is_stated(served: Callable[..., None]) -> None:
+    served(contract=Contract(action=ActionSpec(dim=2)))
+    assert drive(["http://nowhere", "--seconds", "0.3", "--hz", "10"]) in (0, 1, 3)  # a busy machine may miss ticks
+
+
+def test_a_run_of_safe_actions_does_not_look_like_success(
+    served: Callable[..., None], capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    served(slow_s=0.3)
+    for _ in range(ATTEMPTS):  # on a busy machine there may be hardly a tick within the time
+        status = drive(SHORT)
+        said = capsys.readouterr()
+        if status == 3:
+            break
+        caplog.clear()
+    assert status == 3
+    assert "MOSTLY SAFE ACTIONS, exit status 3" in said.out
+    assert (said.out + said.err + caplog.text).count("--deadline-ms") == 1
+
+
+def test_the_command_lets_a_human_take_over_and_records_that(
+    served: Callable[..., None], capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    served(contract=Contract(action=ActionSpec(dim=2, delta=False)))
+    assert drive([*SHORT, "--leader", "scripted_leader:HoldingLeader", "--record", str(tmp_path)]) == 0
+    said = capsys.readouterr().out
+    ticks = int(re.search(r"an operator moved the robot: (\d+)", said)[1])  # type: ignore[index]
+    rows = pq.read_table(tmp_path / "data/chunk-000/file-000.parquet").to_pydict()
+    assert rows["intervention"] == [True] * ticks
+    assert rows["action"] == [[0.25, 0.25]] * ticks
+
+
+RELATIVE = Contract(action=ActionSpec(dim=2, delta=True))
+SIMULATED = "vlagents_ray.robot.simulated:SimulatedRobot"
+
+
+@pytest.mark.parametrize(
+    ("contract", "words", "said"),
+    [
+        (RELATIVE, [*SHORT, "--safe", "hold"], "ConfigError: safe: got 'hold', which .*give safe='zero', or 'auto'"),
+        (RELATIVE, [*SHORT, "--measure", "joints"], "ConfigError: measure: got one for relative actions"),
+        (None, ["http://nowhere", "--robot", SIMULATED], "safe='hold'"),
+        (None, [*SHORT, "--robot", "builtins:dict"], "--robot builtins:dict: lacks observe, apply, stop; want a class"),
+    ],
+)
+def test_what_does_not_fit_ends_the_command_before_anything_is_timed(
+    served: Callable[..., None],
+    capsys: pytest.CaptureFixture[str],
+    contract: Contract | None,
+    words: list[str],
+    said: str,
+) -> None:
+    served(contract=contract)
+    assert drive(words) == 2
+    printed = capsys.readouterr()
+    assert re.search(said, printed.err, re.DOTALL)
+    assert "empty loop" not in printed.out
+
+
+@pytest.mark.parametrize(
+    ("options", "wanted"),
+    [
+        (["--hz", "0"], "argument --hz: got '0', want a number above 0"),
+        (["--hz", "nan"], "argument --hz: got 'nan', want a number above 0"),
+        (["--seconds", "-1"], "argument --seconds: got '-1', want a number above 0"),
+        (["--execute", "0"], "argument --execute: got '0', want a whole number from 1"),
+        (["--horizon", "1.5"], "argument --horizon: got '1.5', want a whole number from 1"),
+        (["--max-age-s", "0"], "argument --max-age-s: got '0', want a number above 0"),
+        (["--deadline-ms", "-1"], "argument --deadline-ms: got '-1', want a number from 0"),
+        (["--silent-s", "soon"], "argument --silent-s: got 'soon', want a number above 0"),
+        (["--mode", "open_loop", "--rtc"], "--merge and --rtc: got one of them with --mode open_loop"),
+        (["--leader", "elsewhere:Pedal"], "--leader elsewhere:Pedal: No module named 'elsewhere'; go to the folder of"),
+        (["--robot", "elsewhere:Arm"], "--robot elsewhere:Arm: No module named 'elsewhere'; go to the folder of"),
+    ],
+)
+def test_options_are_checked_before_a_server_is_asked(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], options: list[str], wanted: str
+) -> None:
+    monkeypatch.setattr("vlagents_ray.cli.robot.RemoteAgent", None)
+    try:
+        status: object = drive([*SHORT, *options])
+    except SystemExit as ended:
+        status = ended.code
+    assert status == 2
+    assert wanted in capsys.readouterr().err
+
+
+def test_an_address_that_is_none_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert drive(["nonsense"]) == 2
+    assert "want http(s)://" in capsys.readouterr().err

@@ -138,12 +138,9 @@ def test_the_traceback_of_a_policy_that_does_not_load_is_in_the_file_until_the_s
 def test_an_empty_file_does_not_stay(ray: Processes, tmp_path: Path) -> None:
     with pytest.raises(ConfigError), quiet_ray("serve"):
         raise ConfigError("the port is taken")
-    assert list((tmp_path / "kept").iterdir()) == []
-
-
-def test_without_a_name_there_is_no_file() -> None:
     with quiet_ray(None) as file:
         assert file is None
+    assert list((tmp_path / "kept").iterdir()) == []
 
 
 def test_a_server_says_its_policy_its_page_and_where_each_kind_of_client_connects() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -91,37 +92,29 @@ EVAL = ("--out", "runs/x", "--policy")
 @pytest.mark.parametrize(
     ("words", "wanted"),
     [
-        (("serve", "my_policies:Reach", "--set", "gian=1"), "it takes ['gain']; did you mean 'gain'?"),
-        (("serve", "my_policies:Reach", "--set", "gain=high"), "policy Reach: gain: got 'high', want float"),
-        (("eval", "my_envs:MyEnv", *EVAL, "my_policies:Reach", "--env-set", "width=wide"), "width: got 'wide', want "),
-        (("serve", "my_policies:Reech"), "module 'my_policies' has no class 'Reech'; did you mean 'Reach'?"),
-        (("serve", "my_polices:Reach"), "did you mean 'my_policies'?"),
-        (("serve", "scriptd"), "did you mean 'scripted'?"),
-        (("serve", "noop", "--set", "chnk=3"), "chnk: there is no such setting; want one of ['action_dim', "),
-        (("serve", "noop", "--set", "chnk=3"), "did you mean 'chunk'?"),
-        (("serve", "noop", "--serve-set", "batch.maxsize=3"), "batch.maxsize: there is no such setting"),
-        (("serve", "noop", "--serve-set", "batch.maxsize=3"), "did you mean 'max_size'?"),
-        (("serve", "noop", "--serve-set", "wrapers=[arro]"), "did you mean 'wrappers'?"),
-        (("eval", "my_envs:MyEnv", *EVAL, "my_policies:Reach", "--set", "gian=1"), "did you mean 'gain'?"),
-        (("eval", "my_envs:MyEnv", *EVAL, "my_policies:Reach", "--env-set", "widht=9"), "did you mean 'width'?"),
-        (("eval", "tabletop/lft", *EVAL, "scripted"), "tabletop has no task 'lft': want one of "),
-        (("eval", "tabletop/lft", *EVAL, "scripted"), "did you mean 'lift'?"),
-        (("eval", "libero/libero_spatail/1", *EVAL, "scripted"), "did you mean 'libero_spatial'?"),
-        (("eval", "libero/libero_spatial/12", *EVAL, "scripted"), "has no task '12': want 0 to 9, or a name"),
-        (("eval", "tabeltop", *EVAL, "scripted"), "did you mean 'tabletop'?"),
+        (("serve", "my_policies:Reach", "--set", "gian=1"), "it takes .'gain'.; did you mean 'gain'"),
+        (("serve", "my_policies:Reech"), "module 'my_policies' has no class 'Reech'; did you mean 'Reach'"),
+        (("serve", "my_polices:Reach"), "did you mean 'my_policies'"),
+        (("serve", "scriptd"), "did you mean 'scripted'"),
+        (("serve", "noop", "--set", "chnk=3"), "chnk: there is no such setting; .*did you mean 'chunk'"),
         (
-            ("eval", "tabletop", *EVAL, "scripted", "--worker-gpus", "0.5"),
-            "a worker wants 0.5 GPUs, this",
+            ("serve", "noop", "--serve-set", "batch.maxsize=3"),
+            "batch.maxsize: there is no such setting.*did you mean 'max_size'",
         ),
+        (("serve", "noop", "--serve-set", "wrapers=[arro]"), "did you mean 'wrappers'"),
+        (("eval", "my_envs:MyEnv", *EVAL, "my_policies:Reach", "--set", "gian=1"), "did you mean 'gain'"),
+        (("eval", "my_envs:MyEnv", *EVAL, "my_policies:Reach", "--env-set", "widht=9"), "did you mean 'width'"),
+        (("eval", "tabletop/lft", *EVAL, "scripted"), "tabletop has no task 'lft': want one of .*did you mean 'lift'"),
+        (("eval", "libero/libero_spatail/1", *EVAL, "scripted"), "did you mean 'libero_spatial'"),
+        (("eval", "libero/libero_spatial/12", *EVAL, "scripted"), "has no task '12': want 0 to 9, or a name"),
+        (("eval", "tabletop", *EVAL, "scripted", "--worker-gpus", "0.5"), "a worker wants 0.5 GPUs, this"),
         (("eval", "tabletop", *EVAL, "scripted", "--video", "alll"), "video: got str, want 'none', "),
-        (("eval", "tabletop", "--policy", "scripted"), "error got no --out, want --out; or a file of runs (.yaml)"),
-        (("eval", "tabletop", "--out", "runs/x"), "error got no --policy, want --policy; or a file of runs (.yaml)"),
+        (("eval", "tabletop", "--policy", "scripted"), "error got no --out, want --out; or a file of runs"),
+        (("eval", "tabletop", "--out", "runs/x"), "error got no --policy, want --policy; or a file of runs"),
         (("eval", "absent.yaml"), "'absent.yaml' does not exist"),
-        (("eval", "typo.yaml"), "worker: got 2, want a mapping with some of ['cpus', "),
-        (("eval", "typo.yaml"), "did you mean 'workers'?"),
+        (("eval", "typo.yaml"), "worker: got 2, want a mapping with some of .'cpus', .*did you mean 'workers'"),
         (("eval", "low.yaml"), "workers: got 0, want greater than 0"),
-        (("eval", "listed.yaml"), "suites.0.episods: there is no such setting; want one of ["),
-        (("eval", "listed.yaml"), "did you mean 'episodes'?"),
+        (("eval", "listed.yaml"), "suites.0.episods: there is no such setting; .*did you mean 'episodes'"),
         (("serve", "my_policies:Loaded"), "policy Loaded: checkpoint: is missing; give --set checkpoint=…"),
         (("serve", "my_policies:Reach", "--set", "gain"), "got 'gain', want KEY=VALUE"),
     ],
@@ -135,7 +128,7 @@ def test_what_is_wrong_is_said_at_once_in_one_line_and_with_what_was_meant(
     for name in ("my_policies", "my_envs"):
         monkeypatch.delitem(sys.modules, name, raising=False)
     said = said_by(*words)
-    assert wanted in said
+    assert re.search(wanted, said)
     assert said.count("\n") == 1
     assert not (folder / "runs").exists()
 
@@ -160,11 +153,6 @@ def test_a_family_whose_packages_are_missing_is_said_before_anything_starts_or_i
     assert not (folder / "runs").exists()
 
 
-def test_modules_are_found_in_the_folder_where_a_command_is_typed(folder: Path) -> None:
-    words = ("eval", "my_envs:MyEnv", *EVAL, "my_policies:Reach", "--set", "gian=1")
-    assert "policy Reach: got an unexpected keyword argument 'gian'" in said_by_a_process(folder, *words)
-
-
 def test_a_module_that_is_nowhere_is_looked_for_in_the_working_directory_which_is_named(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -173,9 +161,11 @@ def test_a_module_that_is_nowhere_is_looked_for_in_the_working_directory_which_i
     assert f"no module 'elsewhere' is installed, or lies in the working directory {folder}; go to its folder" in said
 
 
-@pytest.mark.skipif(sys.version_info < (3, 11), reason="Python 3.10 does not know PYTHONSAFEPATH")
-def test_python_is_kept_from_the_working_directory_by_its_own_variable(folder: Path) -> None:
-    assert "no module 'my_policies'" in said_by_a_process(folder, "serve", "my_policies:Reach", PYTHONSAFEPATH="1")
+def test_modules_are_found_in_the_folder_where_a_command_is_typed_unless_python_is_kept_from_it(folder: Path) -> None:
+    words = ("my_policies:Reech", "--env", "tabletop")
+    assert "module 'my_policies' has no class 'Reech'" in said_by_a_process(folder, "serve", words[0])
+    if sys.version_info >= (3, 11):  # Python 3.10 does not know PYTHONSAFEPATH
+        assert "no module 'my_policies'" in said_by_a_process(folder, "robot", *words, PYTHONSAFEPATH="1")
 
 
 def test_a_url_where_nothing_answers_is_told_once_and_waited_for(

@@ -29,34 +29,23 @@ FIXED = {"name": "fixed", "url": "http://127.0.0.1:9", "checkpoint": "/runs/9"}
 
 
 @pytest.mark.parametrize(
-    ("policies", "text"),
+    ("policies", "file", "text"),
     [
-        ([FIXED], "in the checkpoints of 0 policies, want it in that of one"),
-        ([SWEPT, SWEPT | {"name": "other"}], "in the checkpoints of 2 policies"),
-        ([SWEPT | {"steps": [10]}], "--watch finds its steps; leave `steps` out"),
+        ([FIXED], None, "in the checkpoints of 0 policies, want it in that of one"),
+        ([SWEPT, SWEPT | {"name": "other"}], None, "in the checkpoints of 2 policies"),
+        ([SWEPT | {"steps": [10]}], None, "--watch finds its steps; leave `steps` out"),
+        ([SWEPT], "runs/training_finished", "ended without a checkpoint"),
+        ([SWEPT], "results.db", "resume them"),
     ],
 )
-def test_one_policy_has_a_place_for_the_step_and_names_none(
-    policies: list[dict[str, Any]], text: str, tmp_path: Path
+def test_what_cannot_be_watched_is_refused_at_once(
+    policies: list[dict[str, Any]], file: str | None, text: str, tmp_path: Path
 ) -> None:
-    config = EvalConfig.model_validate(
-        {"policies": policies, "suites": [{"envs": ["tabletop"]}], "out": tmp_path / "o"}
-    )
+    (tmp_path / "runs").mkdir()
+    if file is not None:
+        (tmp_path / file).touch()
+    config = EvalConfig.model_validate({"policies": policies, "suites": [{"envs": ["tabletop"]}], "out": tmp_path})
     with pytest.raises(ConfigError, match=text):
-        watch_training(config, tmp_path)
-
-
-def test_a_training_that_ends_without_a_checkpoint_is_an_error(tmp_path: Path) -> None:
-    (tmp_path / "training_finished").touch()
-    config = EvalConfig.model_validate({"policies": [SWEPT], "suites": [{"envs": ["tabletop"]}], "out": tmp_path / "o"})
-    with pytest.raises(ConfigError, match="ended without a checkpoint"):
-        watch_training(config, tmp_path)
-
-
-def test_results_of_before_are_told_before_the_first_checkpoint_is_there(tmp_path: Path) -> None:
-    (tmp_path / "results.db").touch()
-    config = EvalConfig.model_validate({"policies": [SWEPT], "suites": [{"envs": ["tabletop"]}], "out": tmp_path})
-    with pytest.raises(ConfigError, match="resume them"):
         watch_training(config, tmp_path / "runs")
 
 
@@ -111,33 +100,30 @@ def swept(family: str, tmp_path: Path, place: str, **settings: Any) -> EvalConfi
     )
 
 
-@pytest.mark.parametrize("place", ["evaluation", "deployment"])
 @pytest.mark.parametrize("family", FAMILIES)
-class TestTheStepOfABuiltInFamily:
-    def test_it_is_not_missed_before_the_first_checkpoint_is_there(
-        self, family: str, place: str, tmp_path: Path
-    ) -> None:
-        assert _watched(swept(family, tmp_path, place)) == (0, "/runs/{step}/pretrained_model")
+def test_a_step_is_not_missed_before_the_first_checkpoint_is_there_and_its_first_is_the_deployments_own(
+    family: str, tmp_path: Path
+) -> None:
+    config = swept(family, tmp_path, "evaluation")
+    assert _watched(config) == (0, "/runs/{step}/pretrained_model")
+    policies = [config.policies[0].model_copy(update={"steps": [30, 60]})]
+    _, parts = resolve_policies(config.model_copy(update={"policies": policies}))
+    assert own_settings(parts["swept"].applications[0])["checkpoint_step"] == 30
 
-    def test_all_other_settings_are_checked_before_that(self, family: str, place: str, tmp_path: Path) -> None:
-        with pytest.raises(ConfigError, match="chekpoint_dir"):
-            _watched(swept(family, tmp_path, place, chekpoint_dir="/runs"))
-        with pytest.raises(ConfigError, match="max_rows"):
-            _watched(swept(family, tmp_path, place, max_rows=0))
 
-    def test_the_first_step_of_a_sweep_is_the_deployments_own(self, family: str, place: str, tmp_path: Path) -> None:
-        config = swept(family, tmp_path, place)
-        policies = [config.policies[0].model_copy(update={"steps": [30, 60]})]
-        _, parts = resolve_policies(config.model_copy(update={"policies": policies}))
-        assert own_settings(parts["swept"].applications[0])["checkpoint_step"] == 30
-
-    def test_without_a_sweep_it_is_missed(self, family: str, place: str, tmp_path: Path) -> None:
-        config = swept(family, tmp_path, place)
+@pytest.mark.parametrize("place", ["evaluation", "deployment"])
+def test_of_the_settings_only_a_step_that_is_swept_may_be_missing(place: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="chekpoint_dir"):
+        _watched(swept("pi0", tmp_path, place, chekpoint_dir="/runs"))
+    with pytest.raises(ConfigError, match="max_rows"):
+        _watched(swept("pi0", tmp_path, place, max_rows=0))
+    config = swept("pi0", tmp_path, place)
+    assert _watched(config) == (0, "/runs/{step}/pretrained_model")
+    with pytest.raises(ConfigError, match="checkpoint_step None: give both"):
+        resolve_policies(config)
+    if place == "deployment":
         with pytest.raises(ConfigError, match="checkpoint_step None: give both"):
-            resolve_policies(config)
-        if place == "deployment":
-            with pytest.raises(ConfigError, match="checkpoint_step None: give both"):
-                read_deployment(str(config.policies[0].source))
+            read_deployment(str(config.policies[0].source))
 
 
 def test_the_families_with_checkpoints_are_found() -> None:

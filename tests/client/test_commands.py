@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -45,7 +43,7 @@ def test_a_command_that_could_start_a_motion_does_not_exist(do: str) -> None:
     assert "no such command" in inbox.asking(Obs()).info[COMMANDED][f"id of {do}"]
 
 
-def test_what_is_not_allowed_is_refused() -> None:
+def test_what_is_not_allowed_is_refused_and_what_has_another_form_left_out() -> None:
     inbox, control = CommandInbox(allow=["stop"]), Control()
     for act in (told("pause"), told("stop")):
         inbox.came(act)
@@ -54,11 +52,8 @@ def test_what_is_not_allowed_is_refused() -> None:
     assert "not allowed" in inbox.asking(Obs()).info[COMMANDED]["id of pause"]
     with pytest.raises(ConfigError, match="dance"):
         CommandInbox(allow=["dance"])
-
-
-@pytest.mark.parametrize("stated", [None, "stop", {"do": "stop"}, {"id": 1, "do": "stop"}])
-def test_a_command_of_another_form_is_left_out(stated: Any) -> None:
-    inbox = CommandInbox()
-    inbox.came(Act(np.zeros(2, np.float32), info={COMMAND: stated}))
-    assert inbox.obey(Control()) == []
-    assert inbox.asking(Obs()).info == {}
+    for stated in (None, "stop", {"do": "stop"}, {"id": 1, "do": "stop"}):
+        inbox = CommandInbox()
+        inbox.came(Act(np.zeros(2, np.float32), info={COMMAND: stated}))
+        assert inbox.obey(Control()) == []
+        assert inbox.asking(Obs()).info == {}

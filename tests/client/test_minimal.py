@@ -10,15 +10,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from asgi_server import served
+from asgi_server import policy_server
 
 from vlagents_ray import Act, Agent, Obs
 from vlagents_ray.client import minimal
 from vlagents_ray.client.minimal import Policy, PolicyError
-from vlagents_ray.protocol.messages import DEFAULT_LIMITS
-from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
-from vlagents_ray.serve.endpoints.http import build_http_app
-from vlagents_ray.serve.engine.engine import Engine
 
 SLOW_S = 0.5
 IMAGE = np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8)
@@ -43,12 +39,8 @@ class Seeing(Agent):
 
 @pytest.fixture(scope="module")
 def url() -> Iterator[str]:
-    engine = Engine(Seeing())
-    engine.start()
-    app = build_http_app(engine, lambda: {"protocol": 1}, DEFAULT_LIMITS)
-    with served(AccessMiddleware(app, None, "app")) as port:
+    with policy_server(Seeing()) as port:
         yield f"ws://127.0.0.1:{port}/v1/stream"
-    engine.close()
 
 
 def joints(first: float) -> dict[str, np.ndarray]:

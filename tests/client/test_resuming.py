@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections import deque
@@ -10,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from eval_fakes import SimulatedTime
 from in_process_replicas import InProcess, Replicas
 
 from vlagents_ray import (
@@ -33,25 +35,10 @@ from vlagents_ray.errors import NoReplica, UnknownApp, VLAgentsError
 from vlagents_ray.serve.scaling import session_migration
 
 
-class Clock:
-    """Time that passes in a pause, or when the test says so."""
-
-    def __init__(self) -> None:
-        self.now = 0.0
-
-    def monotonic(self) -> float:
-        return self.now
-
-    perf_counter = monotonic
-
-    def sleep(self, seconds: float) -> None:
-        self.now += seconds
-
-
 @pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+def clock(monkeypatch: pytest.MonkeyPatch) -> SimulatedTime:
     """The client's."""
-    clock = Clock()
+    clock = SimulatedTime()
     for module in (connection, client_agent):
         monkeypatch.setattr(module, "time", clock)
     return clock
@@ -86,28 +73,39 @@ def obs(value: int) -> Obs:
 
 @pytest.fixture
 def replicas() -> Iterator[Callable[[int], Replicas]]:
-    made: list[Replicas] = []
+    with contextlib.ExitStack() as made:
 
-    def make(n: int) -> Replicas:
-        made.append(Replicas([Window() for _ in range(n)]))
-        return made[-1]
+        def make(n: int) -> Replicas:
+            return made.enter_context(contextlib.closing(Replicas([Window() for _ in range(n)])))
 
-    yield make
-    for each in made:
-        each.close()
+        yield make
 
 
-def test_a_session_of_a_replica_that_stops_moves_with_all_it_has(replicas: Callable[[int], Replicas]) -> None:
-    served = replicas(2)
-    agent = served.agent()
-    agent.reset(obs(1), "stack", seed=3)
+Begun = Callable[..., tuple[Replicas, RemoteAgent]]
+
+
+@pytest.fixture
+def begun(replicas: Callable[[int], Replicas]) -> Iterator[Begun]:
+    """Some replicas and a session that begins at the first of them, with frame 1 and the instruction "stack"."""
+    with contextlib.ExitStack() as made:
+
+        def begin(n: int, seed: int | None = None, **options: Any) -> tuple[Replicas, RemoteAgent]:
+            served = replicas(n)
+            agent = made.enter_context(served.agent(**options))
+            agent.reset(obs(1), "stack", **({} if seed is None else {"seed": seed}))
+            return served, agent
+
+        yield begin
+
+
+def test_a_session_of_a_replica_that_stops_moves_with_all_it_has(begun: Begun) -> None:
+    served, agent = begun(2, seed=3)
     drawn = [agent.act(obs(value)).info["random"] for value in (2, 3)]
     served.engines[0].drain()
     drawn += act_until_moved(agent, served)
     assert drawn == np.random.default_rng(3).random(len(drawn)).tolist()
     assert len(served.engines[1].sessions) == 1
     assert len(served.engines[0].sessions) == 0
-    agent.close()
 
 
 def act_until_moved(agent: RemoteAgent, served: Replicas) -> list[float]:
@@ -122,12 +120,10 @@ def act_until_moved(agent: RemoteAgent, served: Replicas) -> list[float]:
 
 @pytest.mark.parametrize("look_up", ["is refused", "finds no application", "hangs"])
 def test_a_session_stays_where_it_is_until_another_replica_has_answered(
-    look_up: str, replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch
+    look_up: str, begun: Begun, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A replica that sends it away goes on answering, while the load balancer may be gone."""
-    served = replicas(2)
-    agent = served.agent(timeout_s=5.0)
-    agent.reset(obs(1), "stack", seed=3)
+    served, agent = begun(2, timeout_s=5.0, seed=3)
     connect, tried, back = InProcess.connect, threading.Semaphore(0), threading.Event()
 
     def fail(self: InProcess, timeout_s: float) -> Any:
@@ -150,16 +146,13 @@ def test_a_session_stays_where_it_is_until_another_replica_has_answered(
     back.set()
     drawn += act_until_moved(agent, served)
     assert drawn == np.random.default_rng(3).random(len(drawn)).tolist()  # not one act was lost or repeated
-    agent.close()
 
 
 @pytest.mark.parametrize("status", ["ended", "broken"])
 def test_a_look_up_for_a_session_that_no_longer_needs_it_leaves_no_connection(
-    status: str, replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch
+    status: str, begun: Begun, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    served = replicas(2)
-    agent = served.agent()
-    agent.reset(obs(1), "stack")
+    served, agent = begun(2)
     connect, looked, back = InProcess.connect, threading.Event(), threading.Event()
     found: list[InProcess] = []
 
@@ -203,11 +196,9 @@ def test_a_session_of_a_dead_replica_begins_again_and_sees_its_history(replicas:
 
 
 def test_the_first_action_since_says_that_the_session_began_again_though_its_own_act_got_none(
-    replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch
+    begun: Begun, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    served = replicas(2)
-    agent = served.agent()
-    agent.reset(obs(1), "stack")
+    served, agent = begun(2)
     served.dead.add(0)
     call, broken = InProcess.call, True
 
@@ -223,17 +214,14 @@ def test_the_first_action_since_says_that_the_session_began_again_though_its_own
     broken = False
     assert agent.act(obs(3)).info["resumed"]
     assert "resumed" not in agent.act(obs(4)).info
-    agent.close()
 
 
 @pytest.mark.parametrize("executed", [False, True])
 def test_a_session_that_did_not_begin_again_in_time_says_so_with_the_next_act(
-    executed: bool, replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch
+    executed: bool, begun: Begun, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Beside load the reset's deadline passes, and the next act comes while the reset is in the queue, or after it."""
-    served = replicas(2)
-    agent = served.agent()
-    agent.reset(obs(1), "stack")
+    served, agent = begun(2)
     served.dead.add(0)
     call, late = InProcess.call, [True]
 
@@ -252,16 +240,13 @@ def test_a_session_that_did_not_begin_again_in_time_says_so_with_the_next_act(
     assert not late, "it was not to begin again"
     act = agent.act(obs(3))
     assert (act.info["resumed"], act.info["instruction"], act.info["acts"]) == (True, "stack", 1)
-    agent.close()
 
 
 def test_an_act_without_time_to_begin_again_exceeds_its_deadline_and_asks_for_no_reset(
-    replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch, clock: Clock
+    begun: Begun, monkeypatch: pytest.MonkeyPatch, clock: SimulatedTime
 ) -> None:
     """Another replica has looked for the session until the deadline, and says then that it is unknown."""
-    served = replicas(2)
-    agent = served.agent()
-    agent.reset(obs(1), "stack")
+    served, agent = begun(2)
     served.dead.add(0)
     call, late = InProcess.call, [True]
 
@@ -278,16 +263,13 @@ def test_an_act_without_time_to_begin_again_exceeds_its_deadline_and_asks_for_no
         agent.act(obs(2))
     assert not late
     assert agent.act(obs(3)).info["resumed"]
-    agent.close()
 
 
 def test_an_act_for_which_little_time_is_left_is_not_sent_again(
-    replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch, clock: Clock
+    begun: Begun, monkeypatch: pytest.MonkeyPatch, clock: SimulatedTime
 ) -> None:
     """It would arrive, and be executed, when its caller has given up."""
-    served = replicas(2)
-    agent = served.agent()
-    agent.reset(obs(1), "stack")
+    served, agent = begun(2)
     served.dead.add(0)
     call, sent = InProcess.call, []
 
@@ -305,7 +287,6 @@ def test_an_act_for_which_little_time_is_left_is_not_sent_again(
     assert sent == ["act", "act", "reset"]
     act = agent.act(obs(3))
     assert (act.info["resumed"], act.info["instruction"], act.info["acts"]) == (True, "stack", 1)
-    agent.close()
 
 
 def test_a_reset_waits_for_a_replica_while_none_runs_but_not_for_room_at_a_full_one(
@@ -329,22 +310,17 @@ def test_a_reset_waits_for_a_replica_while_none_runs_but_not_for_room_at_a_full_
     agent.close()
 
 
-def test_an_answer_that_was_lost_is_not_acted_on_twice(replicas: Callable[[int], Replicas]) -> None:
-    served = replicas(1)
-    agent = served.agent()
-    agent.reset(obs(1), "stack")
+def test_an_answer_that_was_lost_is_not_acted_on_twice(begun: Begun) -> None:
+    served, agent = begun(1)
     agent.act(obs(2))
     served.lose_reply = True
     act = agent.act(obs(3))
     assert act.info["resumed"]
     assert act.action.tolist() == [1, 2, 3]
-    agent.close()
 
 
-def test_without_resuming_the_loss_is_raised_and_a_reset_is_needed(replicas: Callable[[int], Replicas]) -> None:
-    served = replicas(2)
-    agent = served.agent(resume=False)
-    agent.reset(obs(1), "stack")
+def test_without_resuming_the_loss_is_raised_and_a_reset_is_needed(begun: Begun) -> None:
+    served, agent = begun(2, resume=False)
     served.dead.add(0)
     with pytest.raises(ConnectionLost):
         agent.act(obs(2))
@@ -352,15 +328,12 @@ def test_without_resuming_the_loss_is_raised_and_a_reset_is_needed(replicas: Cal
         agent.act(obs(2))
     agent.reset(obs(1), "stack")
     assert agent.act(obs(2)).info["acts"] == 1
-    agent.close()
 
 
 def test_when_nobody_lives_the_loss_is_raised_in_time_and_a_later_act_goes_on(
-    replicas: Callable[[int], Replicas],
+    begun: Begun,
 ) -> None:
-    served = replicas(1)
-    agent = served.agent()
-    agent.reset(obs(1), "stack")
+    served, agent = begun(1)
     agent.act(obs(2))
     served.dead.add(0)
     agent._connection.timeout_s = 0.3
@@ -370,15 +343,12 @@ def test_when_nobody_lives_the_loss_is_raised_in_time_and_a_later_act_goes_on(
     agent._connection.timeout_s = 30.0
     act = agent.act(obs(4))
     assert act.action.tolist() == [1, 2, 4]
-    agent.close()
 
 
 def test_a_server_that_stops_and_starts_again_is_waited_for(
-    replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch, clock: Clock
+    begun: Begun, monkeypatch: pytest.MonkeyPatch, clock: SimulatedTime
 ) -> None:
-    served = replicas(1)
-    agent = served.agent()
-    agent.reset(obs(1), "stack")
+    served, agent = begun(1)
     agent.act(obs(2))
     agent._connection.timeout_s = 0.3
     served.dead.add(0)
@@ -394,13 +364,10 @@ def test_a_server_that_stops_and_starts_again_is_waited_for(
     monkeypatch.setattr(clock, "sleep", sleep)
     agent._connection.timeout_s = 30.0
     assert agent.act(obs(4)).action.tolist() == [1, 2, 4]
-    agent.close()
 
 
-def test_an_observation_may_allow_less_time(replicas: Callable[[int], Replicas]) -> None:
-    served = replicas(1)
-    agent = served.agent(timeout_s=30.0)
-    agent.reset(obs(1), "stack")
+def test_an_observation_may_allow_less_time(begun: Begun) -> None:
+    served, agent = begun(1, timeout_s=30.0)
     served.dead.add(0)
     begun = time.monotonic()
     hasty = obs(2)
@@ -411,7 +378,6 @@ def test_an_observation_may_allow_less_time(replicas: Callable[[int], Replicas])
     hasty.info["deadline_ms"] = -1
     with pytest.raises(InvalidObservation, match="deadline_ms"):
         agent.act(hasty)
-    agent.close()
 
 
 @pytest.mark.parametrize(("timeout_s", "way_s"), [(0.1, 0.01), (2.0, 0.2), (30.0, 0.2)])
@@ -480,7 +446,7 @@ def test_one_session_that_fails_leaves_its_neighbours_alone(replicas: Callable[[
 
 
 def test_a_replica_that_has_fallen_silent_is_left(
-    replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch, clock: Clock
+    replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch, clock: SimulatedTime
 ) -> None:
     monkeypatch.setattr(session_migration, "_ANSWER_S", 0.2)
     served = replicas(2)
@@ -513,11 +479,9 @@ def test_a_replica_that_has_fallen_silent_is_left(
 
 
 def test_a_call_that_connects_again_too_late_sends_nothing_and_the_next_one_has_the_connection(
-    replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch, clock: Clock
+    begun: Begun, monkeypatch: pytest.MonkeyPatch, clock: SimulatedTime
 ) -> None:
-    served = replicas(2)
-    agent = served.agent(timeout_s=2.0)
-    agent.reset(obs(1), "stack")
+    served, agent = begun(2, timeout_s=2.0)
     connect, connected = InProcess.connect, []
 
     def slowly(self: InProcess, timeout_s: float) -> Any:
@@ -535,17 +499,14 @@ def test_a_call_that_connects_again_too_late_sends_nothing_and_the_next_one_has_
     assert len(served.frames) == sent
     assert agent.act(obs(3)).info["resumed"]
     assert len(connected) == 1
-    agent.close()
 
 
 @pytest.mark.parametrize("waits", [False, True])
 def test_a_server_that_has_just_answered_is_not_left_for_the_silence_before_that(
-    waits: bool, replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch, clock: Clock
+    waits: bool, begun: Begun, monkeypatch: pytest.MonkeyPatch, clock: SimulatedTime
 ) -> None:
     """It was: the first late answer on a new connection, which is slow to begin with, threw that away, too."""
-    served = replicas(1)
-    agent = served.agent(timeout_s=2.0)
-    agent.reset(obs(1), "stack")
+    _, agent = begun(1, timeout_s=2.0)
     late, lost = DeadlineExceeded("no answer"), ConnectionLost("gone")
     errors: list[Exception] = [late, late, lost, late] if waits else [late, lost, late]
     call = InProcess.call
@@ -563,11 +524,10 @@ def test_a_server_that_has_just_answered_is_not_left_for_the_silence_before_that
             agent.act(obs(2))
     assert agent.act(obs(3)).action[-1] == 3
     assert agent.reconnects == 1
-    agent.close()
 
 
 def test_a_replica_that_is_only_slow_keeps_the_session_or_gives_it_on(
-    replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch, clock: Clock
+    replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch, clock: SimulatedTime
 ) -> None:
     call, slow = InProcess.call, False
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -87,7 +88,7 @@ def drive(
         for tick in range(60 + 2 * stall):
             if tick == due:
                 delayed.gate.release()
-                wait_for(lambda: not asker.busy)
+                wait_for(lambda: not asker.busy, every_s=0.001)
                 due, fresh = None, tick if delayed.asked == 6 else fresh
             act = player.act(see())
             if due is None and not asker.idle:
@@ -136,24 +137,21 @@ def check_recovery(run: Run, stall: int) -> None:
     assert still[resumed:].mean() < 0.1  # and goes on moving
 
 
+@pytest.mark.parametrize("killed", [False, True])
 @pytest.mark.parametrize("guarded", [False, True])
 @pytest.mark.parametrize("delta", [False, True])
 @pytest.mark.parametrize("stall", STALLS)
-def test_after_a_stall_the_robot_goes_on_from_where_it_is(stall: int, delta: bool, guarded: bool) -> None:
-    agent = Approaching(delta)
+def test_after_a_stall_the_robot_goes_on_from_where_it_is(
+    stall: int, *, delta: bool, guarded: bool, killed: bool
+) -> None:
+    """Whether the policy answers late, or its replica was killed."""
+    agent: Agent = Approaching(delta)
     guard = Guard(agent.contract, max_step=1.5 * GAIN * GOAL) if guarded else None
-    check_recovery(drive(agent, delta, stall, guard), stall)
-
-
-@pytest.mark.parametrize("guarded", [False, True])
-@pytest.mark.parametrize("delta", [False, True])
-@pytest.mark.parametrize("stall", STALLS)
-def test_after_a_replica_was_killed_the_robot_goes_on_from_where_it_is(stall: int, delta: bool, guarded: bool) -> None:
-    served = Replicas([Approaching(delta), Approaching(delta)])
-    agent = served.agent()
-    guard = Guard(agent.contract, max_step=1.5 * GAIN * GOAL) if guarded else None
-    check_recovery(drive(agent, delta, stall, guard, lambda: served.dead.add(0)), stall)
-    served.close()
+    if not killed:
+        check_recovery(drive(agent, delta, stall, guard), stall)
+        return
+    with contextlib.closing(Replicas([agent, Approaching(delta)])) as served:
+        check_recovery(drive(served.agent(), delta, stall, guard, lambda: served.dead.add(0)), stall)
 
 
 @pytest.mark.parametrize("delta", [False, True])

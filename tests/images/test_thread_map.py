@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 import time
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -26,10 +27,7 @@ def four_cores(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def no_helpers(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(_: int) -> None:
-        raise AssertionError("asked for helpers")
-
-    monkeypatch.setattr(thread_map, "_helpers", refuse)
+    monkeypatch.setattr(thread_map, "_helpers", Mock(side_effect=AssertionError("asked for helpers")))
 
 
 def helpers() -> list[threading.Thread]:
@@ -50,13 +48,9 @@ def test_much_work_is_done_by_several_threads() -> None:
 
 
 @pytest.mark.usefixtures("no_helpers")
-def test_little_work_and_one_item_need_no_helper() -> None:
+def test_little_work_one_item_and_one_core_need_no_helper(monkeypatch: pytest.MonkeyPatch) -> None:
     assert thread_map.thread_map(abs, [-1, -2, -3], LITTLE) == [1, 2, 3]
     assert thread_map.thread_map(abs, [-1], MUCH) == [1]
-
-
-@pytest.mark.usefixtures("no_helpers")
-def test_one_core_needs_no_helper(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(thread_map, "allowed", lambda: 1)
     assert thread_map.thread_map(abs, [-1, -2], MUCH) == [1, 2]
 
@@ -65,22 +59,15 @@ def test_one_core_needs_no_helper(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_large_images_are_shared_with_helpers_and_small_ones_are_not(
     codec: ImageCodec, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked: list[int] = []
-    of_process = thread_map._helpers
-
-    def record(process: int) -> thread_map._Helpers:
-        asked.append(process)
-        return of_process(process)
-
-    monkeypatch.setattr(thread_map, "_helpers", record)
+    asked = Mock(side_effect=thread_map._helpers)
+    monkeypatch.setattr(thread_map, "_helpers", asked)
     for side, shared in ((64, False), (640, True)):
-        images = [np.full((side, side, 3), n, np.uint8) for n in range(2)]
-        files = encode_files(images, codec)
-        assert bool(asked) == shared
-        asked.clear()
+        files = encode_files([np.full((side, side, 3), n, np.uint8) for n in range(2)], codec)
+        assert asked.called == shared
+        asked.reset_mock()
         assert [int(image[0, 0, 0]) for image in decode_files(files, Budget(DEFAULT_LIMITS))] == [0, 1]
-        assert bool(asked) == shared
-        asked.clear()
+        assert asked.called == shared
+        asked.reset_mock()
 
 
 @pytest.mark.parametrize("work_s", [LITTLE, MUCH])
@@ -119,9 +106,7 @@ def test_many_callers_share_a_few_helpers() -> None:
     for caller in callers:
         caller.join()
     assert not wrong
-    assert (
-        1 <= sum("vlagents-ray-images" in thread.name for thread in threading.enumerate()) <= thread_map._MOST_HELPERS
-    )
+    assert 1 <= len(helpers()) <= thread_map._MOST_HELPERS
 
 
 def test_a_caller_does_not_wait_for_busy_helpers() -> None:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 from unittest.mock import patch
 
 import numpy as np
 import pytest
+from eval_fakes import SimulatedTime
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule, run_state_machine_as_test
@@ -35,18 +36,6 @@ GARBAGE = st.one_of(
     st.just(-1e9),
 )
 ENDING_S = 30.0  # a loop that does not end in this time is what fails
-
-
-class SimulatedTime:
-    """A clock that goes on when a thread sleeps, in place of the module `time`."""
-
-    now = 0.0
-
-    def perf_counter(self) -> float:
-        return self.now
-
-    def sleep(self, seconds: float) -> None:
-        self.now += max(seconds, 1e-4)
 
 
 def event(**drawn: Any) -> Callable[[Callable[..., None]], Any]:
@@ -345,18 +334,6 @@ class Loop(Agent):
         return Act(np.zeros((4, 2), np.float32), info=dict(self._info))
 
 
-@contextlib.contextmanager
-def _played(info: dict[str, Any], *, served: bool) -> Iterator[ChunkPlayer]:
-    if not served:
-        with ChunkPlayer(Loop(info)) as player:
-            yield player
-        return
-    replicas = Replicas([Loop(info)])
-    with ChunkPlayer(replicas.agent()) as player:
-        yield player
-    replicas.close()
-
-
 def test_no_answer_of_a_server_has_a_name_of_the_loop() -> None:
     replicas = Replicas([Loop({**dict.fromkeys(OF_THE_LOOP, 1.0), "other": 1})])
     with replicas.agent() as agent:
@@ -369,13 +346,12 @@ def test_no_answer_of_a_server_has_a_name_of_the_loop() -> None:
         assert act.info["other"] == 1
 
 
-@pytest.mark.parametrize("served", [False, True])
 @pytest.mark.parametrize("name", OF_THE_LOOP)
-def test_an_answer_with_a_name_of_the_loop_changes_nothing(name: str, *, served: bool) -> None:
+def test_an_answer_with_a_name_of_the_loop_changes_nothing(name: str) -> None:
     seen = []
     for value in (None, True, "fine", float("nan"), -1e9, 10**6, np.full(2, 9.0, np.float32), [1], {"row": 1}):
         for info in ({}, {name: value, "other": 1}):
-            with _played(info, served=served) as player:
+            with ChunkPlayer(Loop(info)) as player:
                 player.initialize()
                 player.reset(Obs())
                 acts = [player.act(Obs()) for _ in range(5)]

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from eval_fakes import wait_for
+from eval_fakes import SimulatedTime, wait_for
 from scripted_leader import ScriptedLeader
 
 from vlagents_ray import Act, ActionSpec, Agent, ConfigError, Contract, Obs
@@ -21,19 +21,6 @@ from vlagents_ray.robot.simulated import SimulatedRobot
 
 HZ = 50.0
 MAX_STEP = 0.05
-
-
-class SimulatedTime:
-    """A clock that goes on when somebody sleeps, in place of the module `time`."""
-
-    def __init__(self) -> None:
-        self.now = 0.0
-
-    def perf_counter(self) -> float:
-        return self.now
-
-    def sleep(self, seconds: float) -> None:
-        self.now += max(seconds, 1e-4)
 
 
 @pytest.fixture
@@ -93,7 +80,7 @@ def test_a_correction_of_a_second_is_recorded_from_its_first_tick_with_both_acti
 
     def answered() -> bool:
         """Let the policy answer within a tick, as no time passes between ticks."""
-        wait_for(lambda: player._asker is None or not player._asker.busy)
+        wait_for(lambda: player._asker is None or not player._asker.busy, every_s=0.001)
         return False
 
     with recorder, ChunkPlayer(Going(), PlayerSettings(**options), override=leader, check=guard) as player:
@@ -168,13 +155,6 @@ def add(recorder: Recorder, label: Any = None) -> None:
             recorder.label(label)
 
 
-def test_what_the_policy_wanted_is_marked_where_it_is_not_known(tmp_path: Path) -> None:
-    with Recorder(tmp_path, HZ, interventions=True) as recorder:
-        add(recorder)
-    seen = rows(tmp_path)
-    assert (seen["policy_action"], seen["policy_known"]) == ([[1, 1], [0, 0]], [True, False])
-
-
 def test_episodes_have_a_label_and_discarded_ones_are_dropped(tmp_path: Path) -> None:
     with Recorder(tmp_path, HZ, interventions=True) as recorder:
         for label in ("success", "discard", "failure", None):
@@ -186,33 +166,25 @@ def test_episodes_have_a_label_and_discarded_ones_are_dropped(tmp_path: Path) ->
     assert json.loads((tmp_path / "meta/info.json").read_text())["total_episodes"] == 3
 
 
-def test_an_episode_of_any_dataset_can_be_discarded_and_only_some_have_labels(tmp_path: Path) -> None:
-    with Recorder(tmp_path, HZ) as recorder:
+def test_a_dataset_goes_on_with_its_own_columns(tmp_path: Path) -> None:
+    with Recorder(tmp_path / "new", HZ, interventions=True) as recorder:
+        add(recorder)
+    seen = rows(tmp_path / "new")
+    assert (seen["policy_action"], seen["policy_known"]) == ([[1, 1], [0, 0]], [True, False])
+    with Recorder(tmp_path / "new", HZ) as recorder:
+        add(recorder, "success")
+    assert rows(tmp_path / "new", 1)["intervention"] == [False, True]
+    with Recorder(tmp_path / "old", HZ) as recorder:
         add(recorder, "discard")
         add(recorder)
         with pytest.raises(ConfigError, match="interventions=True"):
             recorder.label("success")
-    assert json.loads((tmp_path / "meta/info.json").read_text())["total_episodes"] == 1
-
-
-def test_a_dataset_from_before_goes_on_without_interventions_or_is_refused(tmp_path: Path) -> None:
-    with Recorder(tmp_path, HZ) as recorder:
-        add(recorder)
     with pytest.raises(ConfigError, match="recorded without interventions"):
-        Recorder(tmp_path, HZ, interventions=True)
-    with Recorder(tmp_path, HZ) as recorder:
+        Recorder(tmp_path / "old", HZ, interventions=True)
+    with Recorder(tmp_path / "old", HZ) as recorder:
         add(recorder)
-    assert json.loads((tmp_path / "meta/info.json").read_text())["total_episodes"] == 2
-    assert "intervention" not in rows(tmp_path, 1)
-
-
-def test_a_dataset_with_interventions_keeps_its_columns(tmp_path: Path) -> None:
-    with Recorder(tmp_path, HZ, interventions=True) as recorder:
-        add(recorder)
-    with Recorder(tmp_path, HZ) as recorder:
-        assert recorder.interventions
-        add(recorder, "success")
-    assert rows(tmp_path, 1)["intervention"] == [False, True]
+    assert json.loads((tmp_path / "old/meta/info.json").read_text())["total_episodes"] == 2
+    assert "intervention" not in rows(tmp_path / "old", 1)
 
 
 def test_a_recorder_without_a_place_for_interventions_is_refused_before_anything_moves(tmp_path: Path) -> None:

@@ -2,35 +2,21 @@
 
 from __future__ import annotations
 
-import contextlib
-import fcntl
 import gc
-import itertools
 import os
-import pty
-import re
-import signal
-import subprocess
 import sys
-import termios
 import threading
 import time
 import weakref
-from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 
 from vlagents_ray import Act, ActionSpec, Agent, CameraSpec, ConfigError, Contract, Obs, PolicyFailed, StateSpec
 from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
-from vlagents_ray.cli.robot import _restarting as restarting
-from vlagents_ray.cli.robot import main
 from vlagents_ray.errors import InvalidAction
 from vlagents_ray.robot import Guard, Watchdog, run_loop
-from vlagents_ray.robot.loop import ROBOT, import_class
 from vlagents_ray.robot.pacing import Pacer, jitter, undisturbed
 from vlagents_ray.robot.simulated import SimulatedRobot
 
@@ -136,11 +122,8 @@ def test_the_schedule_does_not_drift_and_says_what_it_missed() -> None:
     assert pacer.missed == ticks[-1] + 1 - len(ticks) >= 3
     assert time.perf_counter() - begun >= ticks[-1] / HZ
     assert min(pacer.late_s) >= 0
-
-
-def test_jitter_counts_a_missed_tick_as_one_that_was_late() -> None:
     told = jitter([0.0001, 0.0001, 0.003], missed=1)
-    assert told["on_time"] == 0.5
+    assert told["on_time"] == 0.5, "a missed tick counts as one that was late"
     assert told["p50_ms"] == pytest.approx(0.1)
     assert told["max_ms"] == pytest.approx(3.0)
 
@@ -185,16 +168,11 @@ def test_a_robot_is_driven_for_as_long_as_was_said_and_then_stopped() -> None:
     assert (robot.stops, agent.instruction, report.safe_ticks) == (1, "go", 0)
 
 
-def test_a_slow_tick_costs_the_ticks_that_it_covers_and_no_others() -> None:
-    robot = Watched(Going.contract)
-    report = run_loop(robot, Going(slow_at=5), hz=HZ, seconds=0.3)
-    assert report.jitter["missed"] >= 4  # the sixth begins late, but in its time
-    assert report.jitter["ticks"] + report.jitter["missed"] == 60
-
-
-def test_ticks_after_the_end_are_not_counted_as_missed() -> None:
-    report = run_loop(Watched(Going.contract), Going(slow_at=9), hz=HZ, seconds=10 / HZ)
-    assert report.jitter["ticks"] + report.jitter["missed"] == 10
+@pytest.mark.parametrize(("slow_at", "ticks", "missed"), [(5, 60, 4), (9, 10, 0)])
+def test_a_slow_tick_costs_the_ticks_until_the_end_that_it_covers(slow_at: int, ticks: int, missed: int) -> None:
+    report = run_loop(Watched(Going.contract), Going(slow_at=slow_at), hz=HZ, seconds=ticks / HZ)
+    assert report.jitter["missed"] >= missed  # the next one begins late, but in its time
+    assert report.jitter["ticks"] + report.jitter["missed"] == ticks
 
 
 def test_the_loop_ends_when_the_policy_is_done_or_the_caller_says_so() -> None:
@@ -207,12 +185,31 @@ def test_the_loop_ends_when_the_policy_is_done_or_the_caller_says_so() -> None:
     assert len(robot.commanded) == 12
 
 
-def test_an_action_out_of_bounds_never_reaches_the_robot_which_is_stopped() -> None:
+class Chunks(Agent):
+    def act(self, obs: Obs) -> Act:
+        return Act(np.zeros((5, 7), np.float32))
+
+
+class Refusing(Agent):
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: object) -> dict:
+        raise PolicyFailed("no weights")
+
+
+@pytest.mark.parametrize(
+    ("agent", "error", "said", "commanded"),
+    [
+        (Going(wrong_at=3), InvalidAction, "above the limit 1", [0, 0.01, 0.02]),
+        (Chunks(), InvalidAction, "ChunkPlayer", []),
+        (Refusing(), PolicyFailed, "no weights", []),
+    ],
+)
+def test_an_error_stops_the_robot_before_an_action_of_it(
+    agent: Agent, error: type[Exception], said: str, commanded: list[float]
+) -> None:
     robot = Watched(Going.contract)
-    with pytest.raises(InvalidAction, match="above the limit 1"):
-        run_loop(robot, Going(wrong_at=3), hz=HZ, seconds=1)
-    assert robot.commanded == [0, 0.01, 0.02]
-    assert robot.stops == 1
+    with pytest.raises(error, match=said):
+        run_loop(robot, agent, hz=HZ, seconds=1)
+    assert (robot.commanded, robot.stops) == (commanded, 1)
 
 
 def test_with_a_player_the_loop_goes_on_with_a_safe_action() -> None:
@@ -249,30 +246,12 @@ def test_a_safe_action_without_any_guard_passes_the_contracts_bounds() -> None:
     assert robot.stops == 1
 
 
-def test_a_chunk_needs_a_player() -> None:
-    class Chunks(Agent):
-        def act(self, obs: Obs) -> Act:
-            return Act(np.zeros((5, 7), np.float32))
-
-    with pytest.raises(InvalidAction, match="ChunkPlayer"):
-        run_loop(Watched(), Chunks(), hz=HZ, seconds=1)
-
-
-def test_a_robot_is_stopped_when_the_reset_fails() -> None:
-    class Refusing(Agent):
-        def reset(self, obs: Obs, instruction: str | None, **kwargs: object) -> dict:
-            raise PolicyFailed("no weights")
-
-    robot = Watched()
-    with pytest.raises(PolicyFailed):
-        run_loop(robot, Refusing(), hz=HZ)
-    assert robot.stops == 1
-
-
-def test_a_hanging_loop_is_noticed_by_the_watchdog() -> None:
-    agent = Hanging()
-    report = run_loop(Watched(Going.contract), agent, hz=HZ, watchdog=agent.watchdog)
+def test_a_hanging_loop_is_noticed_by_the_watchdog_and_its_late_action_not_applied() -> None:
+    robot, agent = Watched(Going.contract), Hanging()
+    report = run_loop(robot, agent, hz=HZ, watchdog=agent.watchdog)
     assert [bark.partition(":")[0] for bark in report.barks] == ["loop"]
+    assert 0.03 not in robot.commanded
+    assert robot.commanded[-1] == 0.05
 
 
 def test_a_robot_that_the_watchdog_stopped_stays_so_until_the_server_is_heard_again() -> None:
@@ -327,9 +306,13 @@ class Silenced(Going):
         self.interrupts += 1
 
 
-@pytest.mark.parametrize("restart", [None, "manual", "auto"])
-def test_after_a_protective_stop_hardware_moves_only_when_it_is_told(restart: Any) -> None:
-    robot, agent = Hardware(Going.contract), Silenced()
+@pytest.mark.parametrize(
+    ("kind", "restart"), [(Hardware, None), (Hardware, "manual"), (Hardware, "auto"), (Watched, None)]
+)
+def test_after_a_protective_stop_only_a_simulation_moves_by_itself_unless_it_is_told(
+    kind: type[Watched], restart: Any
+) -> None:
+    robot, agent = kind(Going.contract), Silenced()
     told: list[tuple[bool, int]] = []  # whether a restart was granted, and at which tick
     barked_at: list[int] = []
 
@@ -358,32 +341,13 @@ def test_after_a_protective_stop_hardware_moves_only_when_it_is_told(restart: An
     assert told[0][0] is False  # while it was silent
     assert told[1][0] is True
     assert ticks[-1] >= barked_at[0] + 75
-    if restart == "auto":
+    if restart == "auto" or kind is Watched:
         assert barked_at[0] + 18 <= again < barked_at[0] + 30
     else:
         assert again >= told[1][1] - 1
         assert report.safe["stopped"] >= 20
     assert agent.interrupts >= again - barked_at[0] - 3  # nothing of what it returned meanwhile was executed
     assert len(watchdog.barks) == 1
-
-
-def test_a_simulated_robot_restarts_by_itself() -> None:
-    robot, agent = Watched(Going.contract), Silenced()
-    stopped_at: list[int] = []
-
-    def bark(_: str) -> None:
-        agent.silent = False
-        watchdog._limits["server"] = 1e3
-
-    watchdog = Watchdog(bark, {"server": 0.05})
-
-    def over() -> bool:
-        if watchdog.barks and not stopped_at:
-            stopped_at.append(agent.tick)
-        return bool(stopped_at) and agent.tick > stopped_at[0] + 30
-
-    run_loop(robot, agent, hz=HZ, until=over, watchdog=watchdog)
-    assert round(100 * robot.commanded[-1]) > stopped_at[0] + 20
 
 
 @pytest.mark.parametrize("silent_s", [float("nan"), float("inf"), -5.0, "long", None, [1]])
@@ -436,127 +400,6 @@ def test_waiting_for_the_next_chunk_is_counted_apart_from_safe_actions() -> None
     assert "waiting for an answer" in str(report.mostly_safe)
 
 
-def test_an_unknown_restart_is_refused() -> None:
-    with pytest.raises(ConfigError, match="want one of"):
-        run_loop(Watched(), Going(), hz=HZ, restart="later")  # type: ignore[arg-type]
-
-
-def test_a_person_restarts_the_command_by_a_signal() -> None:
-    said: list[str] = []
-    stopped = threading.Event()
-    with Watchdog(lambda _: stopped.set(), {"loop": 0.05}) as watchdog, restarting(watchdog, said.append):
-        assert stopped.wait(30)
-        os.kill(os.getpid(), signal.SIGUSR1)
-        assert watchdog.control.stopped  # it hangs still
-        watchdog._limits["loop"] = 60.0
-        watchdog.heard("loop")
-        assert watchdog.control.stopped
-        watchdog.control.pause("paused from the live page")
-        os.kill(os.getpid(), signal.SIGUSR1)
-        assert not watchdog.control.stopped
-        assert watchdog.control.reason is None
-    assert signal.getsignal(signal.SIGUSR1) == signal.SIG_DFL
-
-
-def test_a_person_restarts_the_command_by_enter_at_its_terminal() -> None:
-    code = """
-import threading
-from vlagents_ray.robot import Watchdog
-from vlagents_ray.cli.robot import _restarting
-
-stopped, restarted = threading.Event(), threading.Event()
-
-def say(line):
-    print(line, flush=True)
-    if line == "restarted":
-        restarted.set()
-
-with Watchdog(lambda _: stopped.set(), {"loop": 0.05}) as watchdog, _restarting(watchdog, say):
-    assert stopped.wait(30)
-    watchdog._limits["loop"] = 60.0
-    watchdog.heard("loop")
-    print("stopped", flush=True)
-    assert restarted.wait(30)
-    assert not watchdog.control.stopped
-"""
-    with at_a_terminal(code) as (process, type_keys, lines):
-        assert next(lines) == "stopped"
-        type_keys("\n")
-        assert next(lines) == "restarted"
-        assert process.wait(30) == 0
-
-
-def test_with_a_keyboard_as_leader_each_key_has_one_consumer_and_enter_restarts_nothing() -> None:
-    """The command line of docs/interventions.md, whose server is a policy in its process."""
-    code = """
-import sys
-import vlagents_ray.cli.robot as command
-from vlagents_ray import Act, ActionSpec, Agent, Contract
-from vlagents_ray.robot.teleoperation import Keyboard
-import numpy as np
-
-class Still(Agent):
-    contract = Contract(action=ActionSpec(dim=6, delta=True))
-    transport = "local"
-
-    def __init__(self, *_, **__): ...
-
-    def act(self, obs):
-        return Act(np.zeros(6, np.float32))
-
-class Seen(Keyboard):
-    def _press(self, key):
-        taken = super()._press(key)
-        print("keyboard", repr(key), taken, flush=True)
-        return taken
-
-class Stopped(command.Watchdog):
-    def start(self):
-        super().start()
-        self.trip("a person is in the way")
-
-command.RemoteAgent, command.Watchdog, command._DEVICES["keyboard"] = Still, Stopped, Seen
-sys.exit(command.main(sys.argv[1:]))
-"""
-    options = ["http://gpu-box:8000", "--leader", "keyboard", "--step", "0.01"]
-    with at_a_terminal(code, *options) as (process, type_keys, lines):
-        while "a person is in the way" not in next(lines):
-            pass
-        for _ in range(20):
-            type_keys("w")
-        type_keys("\n\nc")
-        said = list(itertools.islice(lines, 24))
-        assert said[:20] == ["keyboard 'w' True"] * 20
-        assert said[20:22] == [r"keyboard '\n' True"] * 2, "Enter gives back and takes over"
-        assert said[22:] == ["keyboard 'c' False", "restarted"]
-        process.send_signal(signal.SIGTERM)
-        assert process.wait(30) == 128 + signal.SIGTERM
-
-
-@contextlib.contextmanager
-def at_a_terminal(code: str, *options: str) -> Iterator[tuple[Any, Callable[[str], object], Iterator[str]]]:
-    """Run Python code at a terminal of its own: its process, what types keys there, and the lines that it prints."""
-    ours, its = pty.openpty()
-    with subprocess.Popen(
-        [sys.executable, "-c", code, *options],
-        stdin=its,
-        stdout=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-        preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),  # noqa: PLW1509 - nothing else is started meanwhile
-    ) as process:
-        assert process.stdout is not None
-        too_long = threading.Timer(30, process.kill)  # then no further line comes
-        too_long.start()
-        try:
-            yield process, lambda keys: os.write(ours, keys.encode()), map(str.strip, process.stdout)
-        finally:
-            too_long.cancel()
-            process.kill()
-    os.close(ours)
-    os.close(its)
-
-
 def test_before_the_first_action_and_after_a_stop_the_loops_guard_measures_where_the_robot_stands() -> None:
     guard = Guard(Going.contract, max_step=0.05, measure=lambda obs: obs.state["joints"])
     robot = Watched(Going.contract)
@@ -597,13 +440,6 @@ def test_before_the_first_action_no_safe_one_is_commanded() -> None:
     assert (report.safe, report.reasons) == ({"other": 4}, {"other": "waiting"})
 
 
-def test_an_action_that_a_hanging_loop_was_late_with_is_not_applied() -> None:
-    robot, agent = Watched(Going.contract), Hanging()
-    run_loop(robot, agent, hz=HZ, watchdog=agent.watchdog)
-    assert 0.03 not in robot.commanded
-    assert robot.commanded[-1] == 0.05
-
-
 def test_a_loop_that_runs_for_days_keeps_no_more_than_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("vlagents_ray.robot.pacing.KEPT_TICKS", 10)
     monkeypatch.setattr("vlagents_ray.robot.loop._COLLECT_S", 0.05)
@@ -638,34 +474,17 @@ def test_a_loop_that_runs_for_days_keeps_no_more_than_it_needs(monkeypatch: pyte
     assert jitter(pacer.late_s, pacer.missed, pacer.ticks)["ticks"] == 30
 
 
-@pytest.mark.parametrize("wish", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
-def test_the_command_stops_the_robot_when_it_is_told_to_end(wish: signal.Signals) -> None:
-    code = """
-import sys, time
-import vlagents_ray.cli.robot as command
-
-def run(options):
-    try:
-        print("moving", flush=True)
-        time.sleep(60)
-    finally:
-        print("stopped", flush=True)
-
-command._run = run
-command.main(["http://nowhere"])
-"""
-    with subprocess.Popen(
-        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-    ) as process:
-        assert process.stdout is not None
-        assert process.stdout.readline() == "moving\n"
-        process.send_signal(wish)
-        assert process.stdout.read() == "stopped\n"
-
-
-@pytest.mark.parametrize("options", [{"hz": 0.0}, {"hz": float("nan")}, {"hz": 50.0, "seconds": 0.0}])
-def test_a_rate_or_a_time_of_nothing_is_refused(options: dict) -> None:
-    with pytest.raises(ConfigError, match="above 0"):
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"hz": 0.0}, "above 0"),
+        ({"hz": float("nan")}, "above 0"),
+        ({"hz": 50.0, "seconds": 0.0}, "above 0"),
+        ({"hz": HZ, "restart": "later"}, "want one of"),
+    ],
+)
+def test_options_that_mean_nothing_are_refused(options: dict, said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
         run_loop(Watched(), Going(), **options)
 
 
@@ -687,135 +506,3 @@ def test_the_simulated_robot_gives_what_a_contract_asks_for() -> None:
     assert first.gripper is not None
     assert last.gripper is not None
     assert last.gripper > first.gripper
-
-
-class Served(Going):
-    """In place of the agent that the command would connect."""
-
-    transport = "local"
-    contract: Contract | None = Contract(action=ActionSpec(dim=2, delta=False), chunk=1)  # type: ignore[assignment]
-    slow_s = 0.0
-
-    def __init__(self, *_: object, **__: object) -> None:
-        super().__init__()
-
-    def act(self, obs: Obs) -> Act:
-        time.sleep(self.slow_s * (self.tick > 0))
-        return super().act(obs)
-
-
-SHORT = ["http://nowhere", "--seconds", "1"]
-ATTEMPTS = 5  # what else the machine does in such a second may mislead
-
-
-@pytest.mark.parametrize("mode", ["async", "open_loop", "ensemble"])
-def test_the_command_drives_with_single_actions_as_it_is(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], mode: str
-) -> None:
-    monkeypatch.setattr("vlagents_ray.cli.robot.RemoteAgent", Served)
-    for _ in range(ATTEMPTS):
-        status = main([*SHORT, "--hz", "10", "--mode", mode])
-        said = re.search(r"ticks without an action of the policy: (\d+) of (\d+)", capsys.readouterr().out)
-        assert said is not None
-        safe, ticks = map(int, said.groups())
-        if safe < 0.5 * ticks:  # none where the machine is not busy
-            break
-    assert safe < 0.5 * ticks
-    assert status == (1 if safe else 0)
-
-
-def test_the_simulated_robot_takes_actions_of_which_nothing_is_stated(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vlagents_ray.cli.robot.RemoteAgent", Served)
-    monkeypatch.setattr(Served, "contract", Contract(action=ActionSpec(dim=2)))
-    assert main([*SHORT, "--hz", "10"]) in (0, 1, 3)  # a busy machine leaves ticks without an action
-
-
-def test_a_run_of_safe_actions_does_not_look_like_success(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
-) -> None:
-    monkeypatch.setattr("vlagents_ray.cli.robot.RemoteAgent", Served)
-    monkeypatch.setattr(Served, "slow_s", 0.3)
-    for _ in range(ATTEMPTS):  # on a busy machine there may be hardly a tick within the time
-        status = main(SHORT)
-        said = capsys.readouterr()
-        if status == 3:
-            break
-        caplog.clear()
-    assert status == 3
-    assert "MOSTLY SAFE ACTIONS, exit status 3" in said.out
-    assert (said.out + said.err + caplog.text).count("--deadline-ms") == 1
-
-
-def test_the_command_lets_a_human_take_over_and_records_that(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    monkeypatch.setattr("vlagents_ray.cli.robot.RemoteAgent", Served)
-    monkeypatch.setattr(Served, "contract", Contract(action=ActionSpec(dim=2, delta=False)))
-    assert main([*SHORT, "--leader", "scripted_leader:HoldingLeader", "--record", str(tmp_path)]) == 0
-    said = capsys.readouterr().out
-    ticks = int(re.search(r"an operator moved the robot: (\d+)", said)[1])  # type: ignore[index]
-    rows = pq.read_table(tmp_path / "data/chunk-000/file-000.parquet").to_pydict()
-    assert rows["intervention"] == [True] * ticks
-    assert rows["action"] == [[0.25, 0.25]] * ticks
-
-
-def test_a_setting_that_does_not_fit_is_refused_before_anything_is_timed(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr("vlagents_ray.cli.robot.RemoteAgent", Served)
-    monkeypatch.setattr(Served, "contract", None)
-    assert main(["http://nowhere", "--robot", "vlagents_ray.robot.simulated:SimulatedRobot"]) == 2
-    said = capsys.readouterr()
-    assert "safe='hold'" in said.err
-    assert "empty loop" not in said.out
-
-
-@pytest.mark.parametrize(
-    ("options", "wanted"),
-    [
-        (["--hz", "0"], "argument --hz: got '0', want a number above 0"),
-        (["--hz", "nan"], "argument --hz: got 'nan', want a number above 0"),
-        (["--seconds", "-1"], "argument --seconds: got '-1', want a number above 0"),
-        (["--execute", "0"], "argument --execute: got '0', want a whole number from 1"),
-        (["--horizon", "1.5"], "argument --horizon: got '1.5', want a whole number from 1"),
-        (["--max-age-s", "0"], "argument --max-age-s: got '0', want a number above 0"),
-        (["--deadline-ms", "-1"], "argument --deadline-ms: got '-1', want a number from 0"),
-        (["--silent-s", "soon"], "argument --silent-s: got 'soon', want a number above 0"),
-        (["--mode", "open_loop", "--rtc"], "--merge and --rtc: got one of them with --mode open_loop"),
-        (["--leader", "elsewhere:Pedal"], "--leader elsewhere:Pedal: No module named 'elsewhere'; go to the folder of"),
-        (["--robot", "elsewhere:Arm"], "--robot elsewhere:Arm: No module named 'elsewhere'; go to the folder of"),
-    ],
-)
-def test_options_are_checked_before_a_server_is_asked(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], options: list[str], wanted: str
-) -> None:
-    monkeypatch.setattr("vlagents_ray.cli.robot.RemoteAgent", None)
-    try:
-        status: object = main([*SHORT, *options])
-    except SystemExit as ended:
-        status = ended.code
-    assert status == 2
-    assert wanted in capsys.readouterr().err
-
-
-def test_errors_of_the_library_end_the_command_with_their_message(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr("vlagents_ray.cli.robot.RemoteAgent", Served)
-    monkeypatch.setattr(Served, "contract", Contract(action=ActionSpec(dim=2, delta=True)))
-    assert main([*SHORT, "--safe", "hold"]) == 2
-    said = capsys.readouterr().err
-    assert said.startswith("ConfigError: safe: got 'hold', which ")
-    assert "give safe='zero', or 'auto'" in said
-    assert main([*SHORT, "--measure", "joints"]) == 2
-    assert capsys.readouterr().err.startswith("ConfigError: measure: got one for relative actions")
-
-
-def test_the_command_says_what_it_cannot_do(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["nonsense"]) == 2
-    assert "want http(s)://" in capsys.readouterr().err
-
-
-def test_a_class_that_is_no_robot_is_refused_with_what_it_lacks() -> None:
-    with pytest.raises(ConfigError, match="--robot builtins:dict: lacks observe, apply, stop; want a class with"):
-        import_class("--robot", "builtins:dict", ROBOT)

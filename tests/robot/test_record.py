@@ -28,6 +28,7 @@ from vlagents_ray.robot.record import Recorder
 
 FPS = 25
 SIDE = 48
+VIDEO = "videos/observation.images.front/chunk-000"
 
 
 def obs(i: int, side: int = SIDE) -> Obs:
@@ -201,11 +202,6 @@ def test_a_full_disk_costs_its_episode_and_no_later_one(tmp_path: Path) -> None:
     assert info(tmp_path)["total_episodes"] == 1
 
 
-def test_an_episode_without_frames_leaves_nothing(tmp_path: Path) -> None:
-    record(tmp_path, 0)
-    assert not (tmp_path / "meta").exists()
-
-
 def test_a_killed_process_loses_the_running_episode_and_no_other(tmp_path: Path) -> None:
     code = f"""
 import os, pathlib, signal, sys, time
@@ -229,7 +225,11 @@ for episode in range(3):
         os.kill(process.pid, signal.SIGKILL)
     assert info(tmp_path)["total_episodes"] == 2
     assert len(list(tmp_path.glob("data/*/*.parquet"))) == 2
+    strays = [tmp_path / f"{part}/file-002.{end}" for part, end in (("data/chunk-000", "parquet"), (VIDEO, "mp4"))]
+    for stray in strays:
+        stray.write_bytes(b"whole, but of an episode that was not counted")
     assert Dataset(tmp_path, FPS).episodes == 2
+    assert not any(stray.exists() for stray in strays)
     assert not (tmp_path / "unfinished").exists()
 
 
@@ -260,21 +260,13 @@ def test_a_kill_at_any_moment_of_a_save_leaves_nothing_of_its_episode(
             assert pq.read_table(left / name) == pq.read_table(expected / name), (left, name)
 
 
-def test_what_info_does_not_count_is_removed(tmp_path: Path) -> None:
-    record(tmp_path, 3)
-    for name in ("data/chunk-000/file-001.parquet", "videos/observation.images.front/chunk-000/file-001.mp4"):
-        (tmp_path / name).write_bytes(b"whole, but of an episode that was not counted")
-    record(tmp_path, 4)
-    assert pq.read_table(tmp_path / "data/chunk-000/file-001.parquet").num_rows == 4
-
-
-def test_a_folder_that_holds_something_else_is_left_alone(tmp_path: Path) -> None:
-    (tmp_path / "thesis.tex").write_text("...")
-    with pytest.raises(ConfigError, match="not a LeRobotDataset"):
-        Recorder(tmp_path, FPS)
-
-
-def test_a_dataset_of_another_rate_is_not_mixed_in(tmp_path: Path) -> None:
+def test_a_folder_is_taken_only_as_an_empty_one_or_a_dataset_of_this_rate(tmp_path: Path) -> None:
+    record(tmp_path, 0)
+    assert not (tmp_path / "meta").exists(), "an episode without frames leaves nothing"
     record(tmp_path, 2)
     with pytest.raises(ConfigError, match="has fps 25, want 50"):
         Recorder(tmp_path, 50)
+    (tmp_path / "else").mkdir()
+    (tmp_path / "else/thesis.tex").write_text("...")
+    with pytest.raises(ConfigError, match="not a LeRobotDataset"):
+        Recorder(tmp_path / "else", FPS)

@@ -13,7 +13,7 @@ from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.client.commands import COMMAND, CommandInbox
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.robot.loop import LoopReport, run_loop
+from vlagents_ray.robot.loop import run_loop
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.safety import Watchdog
 
@@ -52,25 +52,6 @@ class Commanding(Agent):
         return act
 
 
-def run(
-    told: dict[int, str],
-    *,
-    ticks: int = 20,
-    simulated: bool = True,
-    watchdog: Watchdog | None = None,
-) -> tuple[Arm, LoopReport, CommandInbox]:
-    arm, inbox = Arm(simulated=simulated), CommandInbox()
-    report = run_loop(
-        arm,
-        Commanding(inbox, told),
-        hz=200,
-        until=lambda: arm.ticks > ticks,
-        commands=inbox,
-        watchdog=watchdog,
-    )
-    return arm, report, inbox
-
-
 def applied(arm: Arm) -> list[int]:
     return [tick - 1 for tick, did in arm.did if did == "apply"]  # the first observation is that of the reset
 
@@ -93,7 +74,8 @@ def test_a_paused_robot_stands_still_until_it_resumes_at_the_robot() -> None:
 
 @pytest.mark.parametrize("label", ["success", "failure"])
 def test_a_mark_ends_the_loop_before_another_action(label: str) -> None:
-    arm, report, _ = run({6: label})
+    arm, inbox = Arm(simulated=True), CommandInbox()
+    report = run_loop(arm, Commanding(inbox, {6: label}), hz=200, commands=inbox, until=lambda: arm.ticks > 20)
     assert report.outcome == label
     assert applied(arm)[-1] == 5
     assert arm.did[-1][1] == "stop"

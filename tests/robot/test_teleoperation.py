@@ -53,7 +53,9 @@ def terminal() -> Iterator[Terminal]:
 
 
 def test_keys_move_along_their_axes_while_they_are_pressed(clock: Clock, terminal: Terminal) -> None:
+    before = termios.tcgetattr(terminal.its)
     with Keyboard(terminal=terminal.its) as device:
+        assert not termios.tcgetattr(terminal.its)[3] & termios.ECHO
         assert not device.engaged()
         terminal.type("wd")
         assert device.engaged()
@@ -67,6 +69,7 @@ def test_keys_move_along_their_axes_while_they_are_pressed(clock: Clock, termina
         clock.now = 1.0
         assert device.axes().tolist() == [0] * 6
         assert device.engaged(), "until Enter gives back"
+    assert termios.tcgetattr(terminal.its) == before
 
 
 def test_enter_takes_over_and_gives_back_and_other_keys_do_what_was_said(terminal: Terminal) -> None:
@@ -79,13 +82,6 @@ def test_enter_takes_over_and_gives_back_and_other_keys_do_what_was_said(termina
         assert engaged == [True, False, True, False, False, True]
         assert device.axes().tolist() == [0] * 6, "a robot given back is not moved by keys of before"
         assert (pressed, device.gripper_presses(), device.gripper_presses()) == (["y"], 1, 0)
-
-
-def test_the_terminal_is_as_it_was_afterwards(terminal: Terminal) -> None:
-    before = termios.tcgetattr(terminal.its)
-    with Keyboard(terminal=terminal.its):
-        assert not termios.tcgetattr(terminal.its)[3] & termios.ECHO
-    assert termios.tcgetattr(terminal.its) == before
 
 
 def test_a_keyboard_wants_a_terminal_and_keys_of_its_own(terminal: Terminal) -> None:
@@ -108,6 +104,10 @@ class Stick:
 
     def engaged(self) -> bool:
         return self.held
+
+    def take_over_again(self, leader: AxesLeader) -> None:
+        for self.held in (False, True):
+            leader.engaged()
 
     def axes(self) -> np.ndarray:
         return self.at
@@ -134,10 +134,7 @@ def test_a_gripper_that_may_hold_something_stays_closed_until_its_button_is_pres
     assert leader.action(Obs(gripper=1.0))[-1] == -1
     stick.presses = 1
     assert leader.action(Obs(gripper=0.1))[-1] == 1
-    stick.held = False
-    leader.engaged()
-    stick.held = True
-    leader.engaged()
+    stick.take_over_again(leader)
     assert leader.action(Obs(gripper=0.1))[-1] == -1, "when it is taken over again, as it is"
 
 
@@ -149,21 +146,15 @@ def test_absolute_targets_begin_where_the_robot_stands_and_stay_within_the_bound
     leader.engaged()
     for expected in ([0.4, 0.95, 0], [0.3, 1, 0]):
         assert leader.action(obs) == pytest.approx(expected)
-    stick.held = False
-    leader.engaged()
-    stick.held = True
-    leader.engaged()
+    stick.take_over_again(leader)
     assert leader.action(obs) == pytest.approx([0.4, 0.95, 0])
     with pytest.raises(MissingState):
         AxesLeader(JOINTS, stick, step=0.1).action(Obs())
+    for contract in (None, Contract(), Contract(action=ActionSpec(dim=7)), JOINTS):
+        with pytest.raises(ConfigError, match=r"teleoperation|step"):
+            AxesLeader(contract, stick)
     measured = AxesLeader(JOINTS, stick, step=0.1, measure=lambda _: np.array([-0.5, 0, 0]))
     assert measured.action(Obs()) == pytest.approx([-0.6, 0.1, 0])
-
-
-@pytest.mark.parametrize("contract", [None, Contract(), Contract(action=ActionSpec(dim=7)), JOINTS])
-def test_axes_need_a_contract_that_says_what_actions_are(contract: Contract | None) -> None:
-    with pytest.raises(ConfigError, match=r"teleoperation|step"):
-        AxesLeader(contract, Stick())
 
 
 class Mouse:

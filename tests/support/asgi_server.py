@@ -5,12 +5,19 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import threading
+from collections import Counter
 from collections.abc import Iterator
+from typing import Any
 
 import uvicorn
 from eval_fakes import wait_for
-from starlette.types import ASGIApp
+from starlette.types import ASGIApp, Receive, Scope, Send
 
+from vlagents_ray import Agent
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, PROTOCOL_VERSION
+from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
+from vlagents_ray.serve.endpoints.http import build_http_app
+from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.ports import free_port
 
 
@@ -29,3 +36,23 @@ def served(app: ASGIApp) -> Iterator[int]:
     finally:
         server.should_exit = server.force_exit = True
         thread.join()
+
+
+@contextlib.contextmanager
+def policy_server(agent: Agent, asked: Counter[str] | None = None, **metadata: Any) -> Iterator[int]:
+    """The port of a server of a policy, without Ray; `asked` counts the paths of its requests."""
+    engine = Engine(agent)
+    engine.start()
+    about = {"policy": "p", "version": "0", "protocol": PROTOCOL_VERSION, **metadata}
+    inside = AccessMiddleware(build_http_app(engine, lambda: about, DEFAULT_LIMITS), None, "app")
+
+    async def app(scope: Scope, receive: Receive, send: Send) -> None:
+        if asked is not None:
+            asked[scope["path"]] += 1
+        await inside(scope, receive, send)
+
+    try:
+        with served(app) as port:
+            yield port
+    finally:
+        engine.close()

@@ -1,4 +1,4 @@
-"""Each check of `check_agent` fails for a policy that is broken in just that way."""
+"""Each check of `check_agent` fails for a policy that is broken in just that way, and says where two values differ."""
 
 from __future__ import annotations
 
@@ -14,20 +14,21 @@ import pytest
 from vlagents_ray import Act, Agent, Obs
 from vlagents_ray.contract import ActionSpec, Contract, StateSpec
 from vlagents_ray.testing import ContractViolation, check_agent
+from vlagents_ray.testing.comparing import difference, require_wireable
+
+CONTRACT = Contract(state={"joints": StateSpec(2)}, action=ActionSpec(dim=2))
 
 
 class GoodAgent(Agent):
     """Stateful, seeded, looks at its observation and instruction: the parent of all broken ones."""
+
+    contract = CONTRACT
 
     def __init__(self) -> None:
         self.weights = np.zeros(0, np.float32)
         self.told = ""
         self.count = 0
         self.rng = np.random.default_rng(0)
-
-    @property
-    def contract(self) -> Contract | None:
-        return Contract(state={"joints": StateSpec(2)}, action=ActionSpec(dim=2))
 
     def initialize(self) -> None:
         self.weights = np.full(2, 0.5, np.float32)
@@ -74,28 +75,35 @@ class SharesItsCount(GoodAgent):
         return Act(np.full(2, self.box.count, np.float32))
 
 
-class Unrepeatable(GoodAgent):
-    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
-        return super().reset(obs, instruction, seed=np.random.SeedSequence().entropy)
+def with_reset(change: Callable[[GoodAgent, Obs], object]) -> type[GoodAgent]:
+    """An agent whose reset ends with this change, and returns its result."""
+
+    class Changed(GoodAgent):
+        def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> Any:
+            super().reset(obs, instruction, **kwargs)
+            return change(self, obs)
+
+    return Changed
 
 
-class ChangesObsInAct(GoodAgent):
-    def act(self, obs: Obs) -> Any:
-        obs.state["joints"] += 1
-        return super().act(obs)
+def with_act(change: Callable[[Act, Obs], object]) -> type[GoodAgent]:
+    class Changed(GoodAgent):
+        def act(self, obs: Obs) -> Any:
+            return change(super().act(obs), obs)
+
+    return Changed
 
 
-class ChangesObsInReset(GoodAgent):
-    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
-        obs.cameras["front"] = obs.cameras["front"][:2]
-        return super().reset(obs, instruction, **kwargs)
+def with_batch(change: Callable[[list[Act | Exception], Sequence[Obs]], object]) -> type[GoodAgent]:
+    class Changed(GoodAgent):
+        def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> Any:
+            return change(super().act_batch(obs, sessions), obs)
+
+    return Changed
 
 
-class ChangesObsInBatch(GoodAgent):
-    def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
-        acts = super().act_batch(obs, sessions)
-        obs[0].info["seen"] = True
-        return acts
+def with_contract(contract: object) -> type[GoodAgent]:
+    return type("Changed", (GoodAgent,), {"contract": contract})
 
 
 class OneActionBuffer(GoodAgent):
@@ -108,39 +116,11 @@ class OneActionBuffer(GoodAgent):
         return Act(self.buffer)
 
 
-class SwapsBatch(GoodAgent):
-    def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
-        return super().act_batch(obs, sessions)[::-1]
-
-
-class BatchesOfTwo(GoodAgent):
-    def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
-        return super().act_batch(obs, sessions)[:2]
-
-
-class FailsInBatch(GoodAgent):
-    def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
-        return [RuntimeError("out of memory") for _ in obs]
-
-
 class ActsByItself(GoodAgent):
     """Forgets the sessions and asks the shared agent."""
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
         return [self.act(one) for one in obs]
-
-
-class BatchTuple(GoodAgent):
-    def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> Any:
-        return tuple(super().act_batch(obs, sessions))
-
-
-def with_act(change: Callable[[Act], object]) -> type[GoodAgent]:
-    class Changed(GoodAgent):
-        def act(self, obs: Obs) -> Any:
-            return change(super().act(obs))
-
-    return Changed
 
 
 class PreparesOtherwise(GoodAgent):
@@ -236,29 +216,6 @@ class ParsesItInAct(ParsesItsInstruction):
         return super().act(obs)
 
 
-class WrongChunk(GoodAgent):
-    @property
-    def contract(self) -> Contract | None:
-        return replace(super().contract or Contract(), chunk=4)
-
-
-class DictContract(GoodAgent):
-    @property
-    def contract(self) -> Any:
-        return {}
-
-
-class ResetsToNone(GoodAgent):
-    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> Any:
-        super().reset(obs, instruction, **kwargs)
-
-
-class ResetsToObject(GoodAgent):
-    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> Any:
-        super().reset(obs, instruction, **kwargs)
-        return {"agent": self}
-
-
 class AgentClosesOnce(GoodAgent):
     closed = False
 
@@ -271,33 +228,33 @@ class AgentClosesOnce(GoodAgent):
 BROKEN_AGENTS: list[tuple[type[GoodAgent], str]] = [
     (CannotCopy, "cannot be copied.*`shared`"),
     (SharesItsCount, "depends on other sessions"),
-    (Unrepeatable, "must give the same actions"),
-    (ChangesObsInAct, "act changed the caller's"),
-    (ChangesObsInReset, "reset changed the caller's"),
-    (ChangesObsInBatch, "act_batch changed the caller's"),
+    (with_reset(lambda agent, _: setattr(agent, "rng", np.random.default_rng()) or {}), "must give the same actions"),
+    (with_act(lambda act, obs: obs.state["joints"].fill(9) or act), "act changed the caller's"),
+    (with_reset(lambda _, obs: obs.cameras.update(front=obs.cameras["front"][:2]) or {}), "reset changed the caller's"),
+    (with_batch(lambda acts, obs: obs[0].info.update(seen=True) or acts), "act_batch changed the caller's"),
     (OneActionBuffer, "an earlier act.*a later one changed it"),
-    (SwapsBatch, "session 0 in a batch of 2"),
-    (BatchesOfTwo, "got 2 of them, want a list of 3"),
-    (FailsInBatch, "out of memory"),
+    (with_batch(lambda acts, _: acts[::-1]), "session 0 in a batch of 2"),
+    (with_batch(lambda acts, _: acts[:2]), "got 2 of them, want a list of 3"),
+    (with_batch(lambda _, obs: [RuntimeError("out of memory") for _ in obs]), "out of memory"),
     (ActsByItself, "act_batch must give each session"),
-    (BatchTuple, "got tuple"),
-    (with_act(lambda act: act.action), "act: got ndarray, want an Act"),
-    (with_act(lambda act: replace(act, action=act.action.astype(np.float64))), "float64"),
-    (with_act(lambda act: replace(act, action=act.action.tolist())), "action is list"),
-    (with_act(lambda act: replace(act, action=act.action * np.nan)), "NaN"),
-    (with_act(lambda act: replace(act, action=act.action[:1])), "want 2 numbers a row"),
-    (with_act(lambda act: replace(act, done=np.bool_(True))), "done is bool"),
-    (with_act(lambda act: replace(act, info={"t": np.float32(1)})), r"info\['t'\]"),
+    (with_batch(lambda acts, _: tuple(acts)), "got tuple"),
+    (with_act(lambda act, _: act.action), "act: got ndarray, want an Act"),
+    (with_act(lambda act, _: replace(act, action=act.action.astype(np.float64))), "float64"),
+    (with_act(lambda act, _: replace(act, action=act.action.tolist())), "action is list"),
+    (with_act(lambda act, _: replace(act, action=act.action * np.nan)), "NaN"),
+    (with_act(lambda act, _: replace(act, action=act.action[:1])), "want 2 numbers a row"),
+    (with_act(lambda act, _: replace(act, done=np.bool_(True))), "done is bool"),
+    (with_act(lambda act, _: replace(act, info={"t": np.float32(1)})), r"info\['t'\]"),
     (PreparesOtherwise, "on a prepared observation.*`prepare` must compute what"),
     (SharesItsTokenizer, r"prepare of session . on a thread.*\['tokens'\].*a tokenizer's padding"),
     (CountsTokensWithIt, "reset: raised ValueError.*too many tokens.*on several threads"),
     (PreparesOnOneThread, "prepare: raised RuntimeError.*Already borrowed.*on several threads"),
     (ParsesItsInstruction, r"reset: raised KeyError.* for the instruction 'pick up the cube', .*instructions=\["),
     (ParsesItInAct, r"act: raised KeyError.* for the instruction 'pick up the cube' .*instructions=\["),
-    (WrongChunk, "has 1 rows, the contract states 4"),
-    (DictContract, "contract: got dict"),
-    (ResetsToNone, "reset: got NoneType"),
-    (ResetsToObject, r"info\['agent'\]"),
+    (with_contract(replace(CONTRACT, chunk=4)), "has 1 rows, the contract states 4"),
+    (with_contract({}), "contract: got dict"),
+    (with_reset(lambda *_: None), "reset: got NoneType"),
+    (with_reset(lambda agent, _: {"agent": agent}), r"info\['agent'\]"),
     (AgentClosesOnce, "the second call raised"),
 ]
 
@@ -323,3 +280,19 @@ def test_an_agent_without_contract_is_shown_some_observation() -> None:
             return Act(obs.state["joints"] + obs.cameras["front"].mean(dtype=np.float32))
 
     check_agent(Plain())
+
+
+def test_a_difference_says_where_it_is() -> None:
+    assert difference(Obs(gripper=0.5), Obs(gripper=0.5), "obs") is None
+    assert "'gripper'" in str(difference(Obs(gripper=0.5), Obs(gripper=0.6), "obs"))
+    assert "has ['a'] once" in str(difference({"a": 1}, {"b": 1}, "info"))
+    assert "2 items once" in str(difference([1, 2], [1], "info"))
+    assert "(2,) float32 once" in str(difference(np.zeros(2, np.float32), np.zeros(3, np.float32), "x"))
+    assert difference(np.zeros(2), np.full(2, 1e-6), "x", atol=1e-5) is None
+
+
+def test_what_the_wire_carries_is_accepted_and_nothing_else() -> None:
+    require_wireable({"a": [None, True, 1, 1.5, "x", b"y", np.zeros(2, bool)], "b": {}}, "info")
+    for value in (object(), (1, 2), {1: "a"}, np.float32(1), np.array(["a"]), {"a": [object()]}, {1}):
+        with pytest.raises(ContractViolation, match="info"):
+            require_wireable(value, "info")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
@@ -15,29 +16,24 @@ from vlagents_ray.envs import EvalEnv
 from vlagents_ray.testing import ContractViolation, check_env
 from vlagents_ray.validation import check_action
 
+CONTRACT = Contract(
+    cameras={"front": CameraSpec(4, 4)},
+    state={"joints": StateSpec(2)},
+    gripper=False,
+    instruction=True,
+    action=ActionSpec(dim=2, low=-1.0, high=1.0),
+)
+
 
 class GoodEnv(EvalEnv):
     """A point that moves, seen on a small image: the parent of all broken ones."""
 
-    max_steps = 6
+    max_steps = truncated_at = 6
+    contract, instruction = CONTRACT, "go right"
 
     def __init__(self) -> None:
         self.position = np.zeros(2, np.float32)
         self.count = 0
-
-    @property
-    def contract(self) -> Contract:
-        return Contract(
-            cameras={"front": CameraSpec(4, 4)},
-            state={"joints": StateSpec(2)},
-            gripper=False,
-            instruction=True,
-            action=ActionSpec(dim=2, low=-1.0, high=1.0),
-        )
-
-    @property
-    def instruction(self) -> str:
-        return "go right"
 
     def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> Any:
         self.position = np.random.default_rng(seed).uniform(-1, 1, 2).astype(np.float32)
@@ -49,7 +45,7 @@ class GoodEnv(EvalEnv):
         self.position = self.position + action
         self.count += 1
         success = bool(self.position[0] > 1)
-        return self.observe(), float(success), False, self.count >= self.max_steps, {"success": success}
+        return self.observe(), float(success), False, self.count >= self.truncated_at, {"success": success}
 
     def observe(self) -> Obs:
         shade = int(abs(float(self.position[0])) * 40) % 256
@@ -57,11 +53,6 @@ class GoodEnv(EvalEnv):
 
     def close(self) -> None:
         pass
-
-
-class Unseeded(GoodEnv):
-    def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> Any:
-        return super().reset(seed=np.random.SeedSequence().entropy % 2**32, options=options)  # type: ignore[operator]
 
 
 class CarriesOver(GoodEnv):
@@ -125,40 +116,19 @@ def with_step(change: Callable[[list[Any]], object]) -> type[GoodEnv]:
     return Changed
 
 
+def variant(**attributes: Any) -> type[GoodEnv]:
+    return type("Changed", (GoodEnv,), attributes)
+
+
 def with_contract(**fields: Any) -> type[GoodEnv]:
-    class Changed(GoodEnv):
-        @property
-        def contract(self) -> Contract:
-            return replace(super().contract, **fields)
-
-    return Changed
+    return variant(contract=replace(CONTRACT, **fields))
 
 
-class NoContract(GoodEnv):
-    @property
-    def contract(self) -> Any:
-        return {"action": 2}
+def with_reset(result: Callable[[Obs], object]) -> type[GoodEnv]:
+    return variant(reset=lambda self, **options: result(GoodEnv.reset(self, **options)[0]))
 
 
-class NoLimit(GoodEnv):
-    max_steps = 0
-
-
-class NeverTruncates(GoodEnv):
-    def step(self, act: Act) -> Any:
-        obs, reward, terminated, _, info = super().step(act)
-        return obs, reward, terminated, False, info
-
-
-class TruncatesEarly(GoodEnv):
-    def step(self, act: Act) -> Any:
-        obs, reward, terminated, _, info = super().step(act)
-        return obs, reward, terminated, self.count >= 5, info
-
-
-class TakesAnything(GoodEnv):
-    def step(self, act: Act) -> Any:
-        return super().step(Act(np.nan_to_num(np.resize(act.action, 2))))
+NEVER_TRUNCATES = variant(truncated_at=99)
 
 
 class FailsOtherwise(GoodEnv):
@@ -184,35 +154,16 @@ class ClosesOnce(GoodEnv):
         self.closed = True
 
 
-class InfoOfReset(GoodEnv):
-    def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> Any:
-        obs, _ = super().reset(seed=seed, options=options)
-        return obs, {"scene": object()}
-
-
-class BareReset(GoodEnv):
-    def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> Any:
-        return super().reset(seed=seed, options=options)[0]
-
-
-class Silent(GoodEnv):
-    @property
-    def instruction(self) -> str:
-        return ""
-
-
-class Describes(GoodEnv):
-    def describe(self) -> dict[str, Any]:
-        return {"mode": {1, 2}}
-
-
 BROKEN_ENVS: list[tuple[type[GoodEnv], str]] = [
-    (Unseeded, "first observation.*pure function"),
+    (
+        variant(reset=lambda self, **_: GoodEnv.reset(self, seed=random.getrandbits(32))),
+        "first observation.*pure function",
+    ),
     (CarriesOver, "observation after step 1.*pure function"),
     (ChangingInstruction, "instruction is 'attempt"),
     (OneBuffer, r"cameras.*front.*a later step or reset changed it"),
     (OneState, r"state.*joints.*a later step or reset changed it"),
-    (NoContract, "contract: got dict"),
+    (variant(contract={"action": 2}), "contract: got dict"),
     (with_contract(action=ActionSpec()), "action.dim: got None"),
     (with_contract(cameras={"front": CameraSpec(8, 8)}), "want 8x8"),
     (with_contract(cameras={"wrist": CameraSpec()}), "camera 'wrist' is missing"),
@@ -233,17 +184,20 @@ BROKEN_ENVS: list[tuple[type[GoodEnv], str]] = [
     (with_step(lambda result: result.__setitem__(4, {"success": np.bool_(False)})), "info.'success'. is bool"),
     (with_step(lambda result: result.__setitem__(4, None)), "info is NoneType"),
     (with_step(lambda result: result[4].update(score=np.float64(1))), r"info\['score'\]"),
-    (NoLimit, "max_steps: got 0"),
-    (NeverTruncates, "is not truncated, but max_steps is 6"),
-    (TruncatesEarly, "step 5 is truncated"),
-    (TakesAnything, r"of shape \(3,\) was executed"),
+    (variant(max_steps=0), "max_steps: got 0"),
+    (NEVER_TRUNCATES, "is not truncated, but max_steps is 6"),
+    (variant(truncated_at=5), "step 5 is truncated"),
+    (
+        variant(step=lambda self, act: GoodEnv.step(self, Act(np.nan_to_num(np.resize(act.action, 2))))),
+        r"of shape \(3,\) was executed",
+    ),
     (FailsOtherwise, "raised ValueError.*want InvalidAction"),
     (ChangesAction, "leave the caller's array"),
     (ClosesOnce, "the second call raised"),
-    (InfoOfReset, r"info\['scene'\]"),
-    (BareReset, "reset: got Obs"),
-    (Silent, "instruction: is empty"),
-    (Describes, "describe"),
+    (with_reset(lambda obs: (obs, {"scene": object()})), r"info\['scene'\]"),
+    (with_reset(lambda obs: obs), "reset: got Obs"),
+    (variant(instruction=""), "instruction: is empty"),
+    (variant(describe=lambda _: {"mode": {1, 2}}), "describe"),
 ]
 
 
@@ -266,4 +220,4 @@ def test_an_env_whose_steps_are_not_reproducible_passes_if_told_so() -> None:
 
 
 def test_the_step_limit_is_left_alone_if_told_so() -> None:
-    check_env(NeverTruncates(), step_limit=False)
+    check_env(NEVER_TRUNCATES(), step_limit=False)

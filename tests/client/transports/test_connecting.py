@@ -2,86 +2,93 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
 import pytest
 import ray
+from asgi_server import policy_server
+from eval_fakes import SimulatedTime
 
+from vlagents_ray import RemoteAgent
 from vlagents_ray.client.credentials import Credentials
 from vlagents_ray.client.transports import base, http, serve_handle, websocket
-from vlagents_ray.client.transports.base import CodecChoice
+from vlagents_ray.client.transports.base import CodecChoice, first_timeout_s
 from vlagents_ray.client.transports.http import HttpTransport
+from vlagents_ray.client.transports.select import TransportName
 from vlagents_ray.client.transports.serve_handle import HandleTransport
 from vlagents_ray.client.transports.websocket import WebSocketTransport
 from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, NoReplica, PolicyUnavailable
 from vlagents_ray.interface import Obs
+from vlagents_ray.policies.noop import Noop
 from vlagents_ray.protocol.messages import Request
 from vlagents_ray.serve.ports import free_port
 
 TIMEOUT_S = 2.0  # of an act, in which a session whose replica froze connects to another
 
 
-class Clock:
-    """Time that passes while somebody waits, and no other."""
+class Clock(SimulatedTime):
+    """Time that passes while the first replicas that are asked do not answer."""
 
-    def __init__(self) -> None:
-        self.now = 0.0
-        self.asked = 0
+    def __init__(self, hanging: int = 1) -> None:
+        self.hanging = hanging
+        self.waited: list[float] = []  # s, for each that was asked
 
-    def hang_once(self, timeout_s: float, error: Exception) -> None:
-        """The first replica that is asked says nothing."""
-        self.asked += 1
-        if self.asked == 1:
+    def ask(self, timeout_s: float, error: Exception) -> None:
+        self.waited.append(timeout_s)
+        if len(self.waited) <= self.hanging:
             self.now += timeout_s
             raise error
 
-    def monotonic(self) -> float:
-        return self.now
 
-    def sleep(self, seconds: float) -> None:
-        self.now += seconds
-
-
-def over_http(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
+def over_http(clock: Clock, timeout_s: float, monkeypatch: pytest.MonkeyPatch) -> None:
     def metadata(self: HttpTransport, timeout_s: float) -> dict[str, Any]:
-        clock.hang_once(timeout_s, DeadlineExceeded("no answer"))
+        clock.ask(timeout_s, DeadlineExceeded("no answer"))
         return {"protocol": 1}
 
     monkeypatch.setattr(HttpTransport, "_metadata", metadata)
-    HttpTransport("http://127.0.0.1:1", CodecChoice("raw")).connect(TIMEOUT_S)
+    HttpTransport("http://127.0.0.1:1", CodecChoice("raw")).connect(timeout_s)
 
 
-def through_the_proxy(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
+def through_the_proxy(clock: Clock, timeout_s: float, monkeypatch: pytest.MonkeyPatch) -> None:
     def proxied(url: str, credentials: Credentials, timeout_s: float) -> str:
-        clock.hang_once(timeout_s, TimeoutError("timed out"))
+        clock.ask(timeout_s, TimeoutError("timed out"))
         return "connected"
 
     monkeypatch.setattr(websocket, "ProxiedSocket", proxied)
-    WebSocketTransport("http://127.0.0.1:1", CodecChoice("raw"))._stream(TIMEOUT_S)
+    WebSocketTransport("http://127.0.0.1:1", CodecChoice("raw"))._stream(timeout_s)
 
 
-def by_the_handle(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
+def by_the_handle(clock: Clock, timeout_s: float, monkeypatch: pytest.MonkeyPatch) -> None:
     def attach(self: HandleTransport, timeout_s: float) -> dict[str, Any]:
-        clock.hang_once(timeout_s, DeadlineExceeded("no answer"))
+        clock.ask(timeout_s, DeadlineExceeded("no answer"))
         return {"policy": "p"}
 
     monkeypatch.setattr(ray, "is_initialized", lambda: True)
     monkeypatch.setattr(HandleTransport, "_attach", attach)
-    HandleTransport("app").connect(TIMEOUT_S)
+    HandleTransport("app").connect(timeout_s)
 
 
 @pytest.mark.parametrize("connect", [over_http, through_the_proxy, by_the_handle])
-def test_an_act_that_connects_has_time_left_when_the_first_replica_hangs(
-    connect: Callable[[Clock, pytest.MonkeyPatch], None], monkeypatch: pytest.MonkeyPatch
+def test_what_connects_has_time_left_when_the_first_replicas_hang(
+    connect: Callable[[Clock, float, pytest.MonkeyPatch], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """All of it went to the replica that was chosen first, which might be the frozen one again."""
-    clock = Clock()
+    act, reset = Clock(), Clock(hanging=2)
+    for clock, timeout_s in ((act, TIMEOUT_S), (reset, 60.0)):
+        for module in (http, websocket, serve_handle):
+            monkeypatch.setattr(module, "time", clock)
+        connect(clock, timeout_s, monkeypatch)
+    assert len(act.waited) == 2
+    assert act.now <= TIMEOUT_S / 2, "less than half is left for the act"
+    first = first_timeout_s(60)
+    assert reset.waited == [first, 2 * first, 4 * first]
+    never = Clock(hanging=99)
     for module in (http, websocket, serve_handle):
-        monkeypatch.setattr(module, "time", clock)
-    connect(clock, monkeypatch)
-    assert clock.asked == 2
-    assert clock.now <= TIMEOUT_S / 2, "less than half is left for the act"
+        monkeypatch.setattr(module, "time", never)
+    with pytest.raises(PolicyUnavailable):
+        connect(never, 0.0, monkeypatch)
 
 
 @pytest.mark.parametrize(
@@ -126,3 +133,12 @@ def test_a_server_that_refuses_connections_is_one_without_replicas(
     transport = kind(f"http://127.0.0.1:{free_port()}", CodecChoice("raw"))
     with pytest.raises(NoReplica, match="is it running"):
         transport.call([Request("reset", Obs(), request_id="1")], 1.0)
+
+
+@pytest.mark.parametrize("transport", ["auto", "websocket", "http"])
+def test_the_metadata_is_fetched_once(transport: TransportName) -> None:
+    asked: Counter[str] = Counter()
+    with policy_server(Noop(), asked) as port, RemoteAgent(f"http://127.0.0.1:{port}", transport=transport) as agent:
+        agent.reset(Obs(), "stack")
+        agent.act(Obs())
+    assert asked["/v1/metadata"] == 1, asked

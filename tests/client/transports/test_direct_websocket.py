@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import queue
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from http import HTTPStatus
-from urllib.parse import SplitResult, urlsplit
+from typing import Any
+from urllib.parse import urlsplit
 
 import pytest
 from websockets.exceptions import ConnectionClosed, ConnectionClosedError, ConnectionClosedOK
@@ -18,56 +20,59 @@ from websockets.server import ServerProtocol
 from websockets.sync.server import ServerConnection, serve
 
 from vlagents_ray.client.credentials import Credentials
-from vlagents_ray.client.transports import websocket
-from vlagents_ray.client.transports.base import CodecChoice, first_timeout_s
+from vlagents_ray.client.transports.base import CodecChoice
 from vlagents_ray.client.transports.websocket import ProxiedSocket, Stream, WebSocketTransport
 from vlagents_ray.errors import PolicyUnavailable
 
 
+@contextlib.contextmanager
+def serving(handle: Callable[[ServerConnection], None], **options: Any) -> Iterator[int]:
+    """The port of a WebSocket server."""
+    with serve(handle, "127.0.0.1", 0, **options) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            yield server.socket.getsockname()[1]
+        finally:
+            server.shutdown()
+            thread.join()
+
+
 @pytest.fixture
-def base() -> Iterator[SplitResult]:
+def port() -> Iterator[int]:
     def answer_and_close(connection: ServerConnection) -> None:
         if connection.recv() == b"answer first":
             connection.send(b"answered")
         connection.close()
 
-    with serve(answer_and_close, "127.0.0.1", 0) as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        yield urlsplit(f"http://127.0.0.1:{server.socket.getsockname()[1]}")
-        server.shutdown()
-        thread.join()
+    with serving(answer_and_close) as port:
+        yield port
+
+
+def connected(port: int, *headers: Any) -> Stream:
+    return Stream(urlsplit("http://127.0.0.1"), port, "/", 5, *headers)
 
 
 @pytest.fixture
-def stream(base: SplitResult) -> Iterator[Stream]:
-    assert base.port is not None
-    stream = Stream(base, base.port, "/", 5)
-    yield stream
-    stream.close()
+def stream(port: int) -> Iterator[Stream]:
+    with contextlib.closing(connected(port)) as stream:
+        yield stream
 
 
-@pytest.mark.parametrize("size", [0, 1, 125, 126, 65535, 65536, 2**20, 3 * 2**20 + 1])
-def test_a_message_arrives_whole_in_pieces_of_any_length(size: int) -> None:
-    message = os.urandom(size)
+def test_a_message_arrives_whole_in_pieces_of_any_length() -> None:
     received: queue.SimpleQueue[str | bytes] = queue.SimpleQueue()
 
     def receive(connection: ServerConnection) -> None:
-        for _ in range(3):
-            received.put(connection.recv())
+        for message in connection:
+            received.put(message)
 
-    with serve(receive, "127.0.0.1", 0, max_size=None) as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        port = server.socket.getsockname()[1]
-        stream = Stream(urlsplit("http://127.0.0.1"), port, "/", 5)
-        stream.send(b"before", 30)
-        stream.send_pieces([message[: size // 3], b"", memoryview(message)[size // 3 :]], 30)
-        stream.send(b"after", 30)
-        assert [received.get(timeout=30) for _ in range(3)] == [b"before", message, b"after"]
-        stream.close()
-        server.shutdown()
-        thread.join()
+    with serving(receive, max_size=None) as port, contextlib.closing(connected(port)) as stream:
+        for size in (0, 1, 125, 126, 65535, 65536, 2**20, 3 * 2**20 + 1):
+            message = os.urandom(size)
+            stream.send(b"before", 30)
+            stream.send_pieces([message[: size // 3], b"", memoryview(message)[size // 3 :]], 30)
+            stream.send(b"after", 30)
+            assert [received.get(timeout=30) for _ in range(3)] == [b"before", message, b"after"], size
 
 
 def test_a_server_that_closes_in_place_of_an_answer_is_a_connection_that_is_gone(stream: Stream) -> None:
@@ -97,10 +102,8 @@ def test_a_server_that_does_not_answer_is_left_by_a_reset_so_that_it_holds_nothi
         except ConnectionClosed as end:
             ends.put(end)
 
-    with serve(listen, "127.0.0.1", 0) as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        stream = Stream(urlsplit("http://127.0.0.1"), server.socket.getsockname()[1], "/", 5)
+    with serving(listen) as port:
+        stream = connected(port)
         stream.send(b"hello", 5)
         if answered:
             assert stream.recv(30) == b"here"
@@ -109,16 +112,13 @@ def test_a_server_that_does_not_answer_is_left_by_a_reset_so_that_it_holds_nothi
                 stream.recv(0.01)
         stream.close()
         assert isinstance(ends.get(timeout=30), ConnectionClosedOK if answered else ConnectionClosedError)
-        server.shutdown()
-        thread.join()
 
 
-def test_the_key_is_in_no_log(base: SplitResult, caplog: pytest.LogCaptureFixture) -> None:
+def test_the_key_is_in_no_log(port: int, caplog: pytest.LogCaptureFixture) -> None:
     credentials = Credentials("the-secret-key")
-    assert base.port is not None
     with caplog.at_level(logging.DEBUG):
-        Stream(base, base.port, "/", 5, credentials.headers).close()
-        ProxiedSocket(f"ws://127.0.0.1:{base.port}/", credentials, 5).close()
+        connected(port, credentials.headers).close()
+        ProxiedSocket(f"ws://127.0.0.1:{port}/", credentials, 5).close()
     client = [record.getMessage() for record in caplog.records if not record.name.startswith("websockets.server")]
     assert "> Sec-WebSocket-Version: 13" in client  # the others are logged
     assert not [line for line in client if "the-secret-key" in line]
@@ -159,38 +159,11 @@ def test_a_proxy_that_waits_for_a_replica_is_asked_again_and_no_other_refusal_is
     def refuse(connection: ServerConnection, request: Request) -> Response | None:
         return connection.respond(HTTPStatus(left.pop(0)), "not now\n") if left else None
 
-    with serve(lambda connection: connection.close(), "127.0.0.1", 0, process_request=refuse) as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        transport = WebSocketTransport(f"ws://127.0.0.1:{server.socket.getsockname()[1]}", CodecChoice("raw"))
-        try:
-            if accepted:
-                transport._proxied(10).close()
-            else:
-                with pytest.raises(PolicyUnavailable, match="400"):
-                    transport._proxied(10)
-        finally:
-            server.shutdown()
-            thread.join()
+    with serving(lambda connection: connection.close(), process_request=refuse) as port:
+        transport = WebSocketTransport(f"ws://127.0.0.1:{port}", CodecChoice("raw"))
+        if accepted:
+            transport._proxied(10).close()
+        else:
+            with pytest.raises(PolicyUnavailable, match="400"):
+                transport._proxied(10)
     assert not left
-
-
-def test_a_proxy_that_says_nothing_is_asked_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It may have chosen a replica that hangs. All of a `reset`'s minute went to that."""
-    waited: list[float] = []
-
-    def proxied(url: str, credentials: Credentials, timeout_s: float) -> str:
-        waited.append(timeout_s)
-        if len(waited) < 3:
-            raise TimeoutError("timed out while waiting for handshake response")
-        return "connected"
-
-    monkeypatch.setattr(websocket, "ProxiedSocket", proxied)
-    monkeypatch.setattr(websocket, "_PAUSE_S", 0.0)
-    transport = WebSocketTransport("http://127.0.0.1:1", CodecChoice("raw"))
-    assert transport._stream(60.0) == "connected"  # type: ignore[comparison-overlap]
-    first = first_timeout_s(60)
-    assert waited == [first, 2 * first, 4 * first]
-    waited.clear()
-    with pytest.raises(PolicyUnavailable):
-        WebSocketTransport("http://127.0.0.1:1", CodecChoice("raw"))._stream(0.0)

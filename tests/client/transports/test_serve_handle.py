@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import ray
@@ -12,9 +13,8 @@ from ray import serve
 from ray.exceptions import ActorDiedError, LocalRayletDiedError, ObjectStoreFullError, OutOfDiskError, RayTaskError
 
 from vlagents_ray.client.transports import serve_handle
-from vlagents_ray.client.transports.base import first_timeout_s
 from vlagents_ray.client.transports.serve_handle import HandleTransport
-from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, PolicyUnavailable
+from vlagents_ray.errors import ConnectionLost, PolicyUnavailable
 from vlagents_ray.interface import Obs
 from vlagents_ray.protocol.messages import Request
 
@@ -81,24 +81,10 @@ class TestConnecting:
 
     def test_one_that_hangs_is_not_waited_for_while_another_may_answer(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """`reset` connects with `connect_timeout_s`, a minute: all of it went to the replica that was chosen first."""
-        waited: list[float] = []
         cancelled: list[bool] = []
-
-        def result(timeout_s: float) -> Any:
-            waited.append(timeout_s)
-            if len(waited) < 3:
-                raise TimeoutError
-            return {"policy": "p"}, "replica"
-
+        result = Mock(side_effect=[TimeoutError, TimeoutError, ({"policy": "p"}, "replica")])
         attaching = SimpleNamespace(result=result, cancel=lambda: cancelled.append(True))
         attach = SimpleNamespace(remote=lambda *_: attaching)
         monkeypatch.setattr(serve, "get_app_handle", lambda _: SimpleNamespace(attach=attach))
         assert HandleTransport("app").connect(60) == {"policy": "p"}
-        first = first_timeout_s(60)
-        assert waited == [first, 2 * first, 4 * first]
         assert len(cancelled) == 2, "asked on, of a replica whose answer nobody wants"
-
-    def test_where_all_hang_the_time_limit_holds(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(HandleTransport, "_attach", failing(DeadlineExceeded("no answer")))
-        with pytest.raises(PolicyUnavailable, match="no replica within 0"):
-            HandleTransport("app").connect(0.0)

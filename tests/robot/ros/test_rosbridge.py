@@ -6,14 +6,16 @@ a client that subscribed without compression.
 
 from __future__ import annotations
 
+import contextlib
 import json
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import rosbridge_double
 from eval_fakes import wait_for
+from rosbridge_double import RosbridgeDouble, rosbridge_double
 
 from vlagents_ray.errors import ConnectionLost, MalformedMessage
 from vlagents_ray.robot.ros import messages
@@ -45,87 +47,67 @@ def test_a_frame_that_is_no_message_is_refused(frame: str) -> None:
         decoded(frame)
 
 
+@contextlib.contextmanager
+def linked(double: RosbridgeDouble, take: Callable[[Any], None], *topics: str) -> Iterator[Rosbridge]:
+    """An open link that is subscribed to these topics, and publishes to /arm."""
+    link = Rosbridge(double.url)
+    for topic in topics:
+        link.subscribe(topic, "std_msgs/msg/Float64MultiArray", take)
+    link.advertise("/arm", "std_msgs/msg/Float64MultiArray")
+    link.open()
+    try:
+        yield link
+    finally:
+        link.close()
+
+
 def test_a_link_subscribes_receives_and_publishes() -> None:
     came: list[Any] = []
-    with rosbridge_double.rosbridge_double() as double:
-        link = Rosbridge(double.url)
-        link.subscribe("/numbers", "std_msgs/msg/Float64MultiArray", came.append)
-        link.advertise("/arm", "std_msgs/msg/Float64MultiArray")
-        link.open()
-        try:
+    with rosbridge_double() as double:
+        with linked(double, came.append, "/numbers") as link:
             wait_for(lambda: "/numbers" in double.subscribed)
             double.publish("/numbers", {"data": [1.0, 2.0]})
             double.publish("/another", {"data": [3.0]})
             double.publish("/numbers", {"data": [4.0]})
             wait_for(lambda: len(came) == 2)
             assert [list(message["data"]) for message in came] == [[1.0, 2.0], [4.0]]
+            with pytest.raises(ValueError, match="not JSON compliant"):
+                link.publish("/arm", {"data": [float("nan")]})
             assert link.publish("/arm", {"data": [0.5]})
             wait_for(lambda: double.on("/arm"))
             assert double.on("/arm") == [{"data": [0.5]}]
             assert double.advertised == {"/arm": "std_msgs/msg/Float64MultiArray"}
-        finally:
-            link.close()
-    assert not link.up
+        assert not link.up
+    with pytest.raises(ConnectionLost, match="does a rosbridge_server run there"):
+        Rosbridge(double.url).open()
 
 
 def test_a_link_that_is_lost_publishes_nothing_and_comes_back_with_its_topics() -> None:
     came: list[Any] = []
-    with rosbridge_double.rosbridge_double() as double:
-        link = Rosbridge(double.url)
-        link.subscribe("/text", "std_msgs/msg/String", came.append)
-        link.advertise("/arm", "std_msgs/msg/Float64MultiArray")
-        link.open()
-        try:
-            double.close()
-            wait_for(lambda: not link.up)
-            assert not link.publish("/arm", {"data": [0.5]})
-            double.advertised.clear()
-            double.subscribed.clear()
-            double.open()
-            wait_for(lambda: link.up and bool(double.subscribed))
-            assert link.connections == 2
-            double.publish("/text", {"data": "again"})
-            wait_for(lambda: came == [{"data": "again"}])
-            assert "/arm" in double.advertised
-        finally:
-            link.close()
+    with rosbridge_double() as double, linked(double, came.append, "/text") as link:
+        double.close()
+        wait_for(lambda: not link.up)
+        assert not link.publish("/arm", {"data": [0.5]})
+        double.advertised.clear()
+        double.subscribed.clear()
+        double.open()
+        wait_for(lambda: link.up and bool(double.subscribed))
+        assert link.connections == 2
+        double.publish("/text", {"data": "again"})
+        wait_for(lambda: came == [{"data": "again"}])
+        assert "/arm" in double.advertised
 
 
 @pytest.mark.parametrize("busy", [True, False])
 def test_a_silent_sensor_is_subscribed_to_again(busy: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """A real server that subscribed before it knew the publisher may have chosen a quality that does not match it."""
     monkeypatch.setattr("vlagents_ray.robot.ros.links._SILENT_S", 0.2)
-    with rosbridge_double.rosbridge_double() as double:
-        link = Rosbridge(double.url)
-        for topic in ("/silent", "/busy"):
-            link.subscribe(topic, "std_msgs/msg/String", lambda _: None)
-        link.open()
+    with rosbridge_double() as double, linked(double, lambda _: None, "/silent", "/busy"):
 
         def again() -> bool:
             if busy:
                 double.publish("/busy", {"data": "here"})
             return double.subscriptions.count("/silent") >= 3
 
-        try:
-            wait_for(again)
-        finally:
-            link.close()
+        wait_for(again)
         assert not busy or double.subscriptions.count("/busy") < 3
-
-
-def test_a_server_that_is_not_there_is_an_error_with_the_cure() -> None:
-    with rosbridge_double.rosbridge_double() as double:
-        pass
-    with pytest.raises(ConnectionLost, match="does a rosbridge_server run there"):
-        Rosbridge(double.url).open()
-
-
-def test_a_number_that_is_not_finite_is_never_sent() -> None:
-    with rosbridge_double.rosbridge_double() as double:
-        link = Rosbridge(double.url)
-        link.open()
-        try:
-            with pytest.raises(ValueError, match="not JSON compliant"):
-                link.publish("/arm", {"data": [float("nan")]})
-        finally:
-            link.close()

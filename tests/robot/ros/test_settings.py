@@ -40,17 +40,16 @@ def test_the_files_and_commands_of_the_documentation_are_read() -> None:
     assert [robot_command.parse(shlex.split(words)).policy for words in commands] == 2 * ["http://gpu-box:8000"]
 
 
-def test_types_and_limits_have_defaults(tmp_path: Path) -> None:
+def test_types_and_limits_have_defaults_and_an_action_the_numbers_of_all_its_topics(tmp_path: Path) -> None:
     (tmp_path / "arm.yaml").write_text(yaml.safe_dump(ARM))
     settings = read_settings(tmp_path / "arm.yaml")
-    assert settings.cameras["front"].type == "sensor_msgs/msg/Image"
-    assert settings.state["joints"].type == "sensor_msgs/msg/JointState"
-    assert settings.state["joints"].names == ("a", "b")
-    assert (settings.max_age_of(settings.cameras["front"]), settings.silent_of(settings.cameras["front"])) == (0.3, 1.0)
-    assert settings.dim == 2
-
-
-def test_the_numbers_of_an_action_go_to_the_topics_in_their_order() -> None:
+    front, joints = settings.cameras["front"], settings.state["joints"]
+    assert (front.type, joints.type, joints.names) == (
+        "sensor_msgs/msg/Image",
+        "sensor_msgs/msg/JointState",
+        ("a", "b"),
+    )
+    assert (settings.max_age_of(front), settings.silent_of(front), settings.dim) == (0.3, 1.0, 2)
     actions = [
         {"topic": "/t", "type": "trajectory_msgs/msg/JointTrajectory", "names": ["a", "b"], "stop": "joints"},
         {"topic": "/g", "type": "sensor_msgs/msg/JointState", "names": ["finger"], "stop": "nothing"},
