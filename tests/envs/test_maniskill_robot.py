@@ -94,21 +94,10 @@ def test_a_delta_pose_states_frame_rotation_and_gripper() -> None:
     assert (spec.gripper_open, spec.gripper_closed, spec.low, spec.high) == (1.0, -1.0, -1.0, 1.0)
 
 
-def test_a_robot_without_gripper_states_none() -> None:
+def test_what_is_not_known_or_differs_by_component_is_not_stated() -> None:
     spec = action_spec("pd_ee_delta_pose", box(-1.0, 1.0, 6), has_gripper=False)
-    assert spec.gripper_open is None
-    assert spec.gripper_closed is None
-
-
-def test_bounds_that_differ_by_component_are_not_stated() -> None:
+    assert (spec.gripper_open, spec.gripper_closed) == (None, None)
     spec = action_spec("pd_joint_pos", box(-2.9, 2.9, 8), has_gripper=True)
-    assert spec.low is None
-    assert spec.high is None
-    assert spec.delta is False
-
-
-def test_an_unknown_control_mode_states_only_its_size() -> None:
+    assert (spec.low, spec.high, spec.delta) == (None, None, False)
     spec = action_spec("a_mode_of_another_robot", box(-1.0, 1.0, 5), has_gripper=False)
-    assert spec.dim == 5
-    assert spec.space is None
-    assert spec.delta is None
+    assert (spec.dim, spec.space, spec.delta) == (5, None, None)
