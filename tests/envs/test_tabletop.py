@@ -56,7 +56,7 @@ def test_following_the_instruction_succeeds_and_another_one_does_not(task: str) 
     assert np.mean(wrong) <= 0.20
 
 
-@pytest.mark.parametrize(("width", "height"), [(96, 96), (320, 240), (240, 320), (512, 512)])
+@pytest.mark.parametrize(("width", "height"), [(96, 96), (320, 240), (240, 320)])
 def test_the_expert_sees_at_every_image_size(width: int, height: int) -> None:
     env = Tabletop(width=width, height=height)
     assert env.reset(seed=0)[0].cameras["front"].shape == (height, width, 3)

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import io
 import json
-import threading
-import time
 import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
-from eval_fakes import wait_for
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.checkpoint_watcher import FINISHED, CheckpointWatcher, rounds
@@ -104,34 +101,6 @@ def test_what_is_cut_short_is_told(write: Write, tmp_path: Path) -> None:
     assert unfinished(tmp_path / "100") is not None
     list(steps)
     assert unfinished(tmp_path / "100") is None
-
-
-@pytest.mark.parametrize("write", KINDS)
-def test_it_is_so_with_a_trainer_that_writes_at_the_same_time(write: Write, tmp_path: Path) -> None:
-    going = threading.Semaphore(0)
-    list(write(tmp_path / "elsewhere" / "000200"))
-
-    def train() -> None:
-        for _ in write(tmp_path / "000200"):
-            going.acquire()
-
-    def content(folder: Path) -> dict[Path, bytes]:
-        return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-    trainer = threading.Thread(target=train)
-    trainer.start()
-    whole_when_found: list[bool] = []
-    watcher = CheckpointWatcher(str(tmp_path / "{step}"), settle_s=0.2)
-
-    def found() -> bool:
-        going.release()
-        steps = watcher.scan(time.monotonic())
-        whole_when_found.extend(content(tmp_path / "000200") == content(tmp_path / "elsewhere/000200") for _ in steps)
-        return bool(steps)
-
-    wait_for(found)
-    trainer.join()
-    assert whole_when_found == [True]
 
 
 def test_a_marker_says_that_it_is_done_and_no_waiting_is_needed(tmp_path: Path) -> None:

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
-import pytest
-from rerun_files import read_rrd
 
 from vlagents_ray import Act, ActionSpec, Agent, Contract, Obs
 from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.robot import run_loop
 from vlagents_ray.robot.simulated import SimulatedRobot
-from vlagents_ray.viewers import EpisodeViewer, LoopView, ViewerFrame, open_viewer
+from vlagents_ray.viewers import EpisodeViewer, LoopView, ViewerFrame
 
 HZ, ROWS, CHUNKS = 100.0, 4, 3
 
@@ -74,22 +70,6 @@ def test_each_tick_is_shown_with_what_was_planned_and_executed() -> None:
     assert ticks == sorted(set(ticks))
 
 
-def test_an_action_without_a_plan_is_shown_too() -> None:
-    target = Kept()
-    with EpisodeViewer(target) as viewer:
-        one = Contract(action=ActionSpec(dim=2, delta=False))
-
-        class Single(Agent):
-            contract = one
-
-            def act(self, obs: Obs) -> Act:
-                return Act(np.zeros(2, np.float32))
-
-        run_loop(SimulatedRobot(one), Single(), hz=HZ, seconds=1, viewer=viewer)
-    assert {frame.planned is None for frame in target.frames} == {True}
-    assert {tuple(frame.executed) for frame in target.frames} == {(0.0, 0.0)}
-
-
 def test_spells_without_the_policy_are_shown_with_their_reason_once() -> None:
     target, wanted = Kept(), np.array([3, 4], np.float32)
     acts = [
@@ -110,14 +90,3 @@ def test_spells_without_the_policy_are_shown_with_their_reason_once() -> None:
     assert spells == [[1, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
     assert [None if frame.planned is None else frame.planned.tolist() for frame in shown] == [None, None, [3, 4], None]
     assert shown[3].executed is None
-
-
-@pytest.mark.library("rerun")
-def test_a_run_becomes_a_recording(tmp_path: Path) -> None:
-    with open_viewer(str(tmp_path)) as viewer:
-        run(viewer)
-    [file] = tmp_path.glob("*.rrd")
-    shown = read_rrd(file)
-    assert shown["instruction"] == {None: "count"}
-    executed = [values[0] for _, values in sorted(shown["action/executed"].items())]
-    assert executed == list(range(len(executed)))

@@ -11,7 +11,7 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
-from eval_fakes import LINE, ToZero
+from eval_fakes import ToZero
 from in_process_evaluation import play
 
 from vlagents_ray.errors import ConfigError, EnvFailed
@@ -144,24 +144,9 @@ def test_states_of_several_arms_and_a_gripper_survive_the_file(tmp_path: Path) -
     assert found.cameras == ()
 
 
-def test_a_trajectory_that_is_gone_is_said_to_be(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"a\.npz: got no file, want the one that results\.db names"):
-        Trajectory.load(tmp_path / "a.npz")
-
-
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04", b"{}"])
 def test_a_file_that_is_no_trajectory_is_said_to_be_none(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "a.npz"
     path.write_bytes(content)
     with pytest.raises(ConfigError, match=r"a\.npz: cannot be read as a trajectory"):
         Trajectory.load(path)
-
-
-def test_a_repeated_episode_replaces_its_trajectory(config: Config) -> None:
-    settings = config(episodes=1, record="all", envs=[LINE], env_options=CAMERA)
-    folder = settings.out / "trajectories" / "policy" / "eval_fakes_Line"
-    folder.mkdir(parents=True)
-    for left in ("ep0000_seed0_side.mp4", "ep0000_seed0.npz.part"):
-        (folder / left).write_bytes(b"of an attempt that died")
-    play(settings)
-    assert sorted(path.name for path in folder.iterdir()) == ["ep0000_seed0.npz", "ep0000_seed0_front.mp4"]

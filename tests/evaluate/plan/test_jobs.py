@@ -32,21 +32,11 @@ def keys(config: EvalConfig) -> list[EpisodeKey]:
 
 
 def test_a_plan_numbers_and_seeds_every_episode_of_every_env(config: Config) -> None:
-    found = keys(config(envs=[LINE, OTHER_LINE], episodes=3, seed=7))
+    found = keys(config(envs=[LINE, OTHER_LINE], episodes=2, seeds=[7, 100]))
     assert [(key.env, key.episode, key.seed) for key in found] == [
-        (LINE, 0, 7),
-        (LINE, 1, 8),
-        (LINE, 2, 9),
-        (OTHER_LINE, 0, 7),
-        (OTHER_LINE, 1, 8),
-        (OTHER_LINE, 2, 9),
+        (env, episode, seed + episode) for env in (LINE, OTHER_LINE) for seed in (7, 100) for episode in (0, 1)
     ]
-    assert len(set(map(str, found))) == 6
-
-
-def test_a_further_seed_is_a_further_set_of_episodes(config: Config) -> None:
-    found = keys(config(episodes=2, seeds=[0, 100]))
-    assert [(key.episode, key.seed) for key in found] == [(0, 0), (1, 1), (0, 100), (1, 101)]
+    assert len(set(map(str, found))) == 8
 
 
 def test_pushed_weights_are_a_checkpoint_and_part_of_the_key(config: Config) -> None:
@@ -112,29 +102,16 @@ def test_what_does_not_change_the_outcome_keeps_the_key(
     assert keys(config()) == keys(config(**change))
 
 
-def test_suites_have_options_of_their_own(config: Config) -> None:
-    plain, changed = (
-        keys(
-            EvalConfig(
-                policies=[PolicyConfig()],
-                suites=[SuiteConfig(envs=[LINE]), SuiteConfig(envs=[OTHER_LINE], env_options=options)],
-                out=Path("out"),
-            )
-        )
-        for options in ({}, {"width": 8})
-    )
-    assert {key.env for key in plain if key in changed} == {LINE}
-
-
-def test_an_env_in_two_suites_of_one_name_is_refused() -> None:
-    suites = [SuiteConfig(envs=[LINE]), SuiteConfig(envs=[LINE], env_options={"width": 8})]
-    with pytest.raises(ConfigError, match="are in two suites of one name"):
-        cells(EvalConfig(policies=[PolicyConfig()], suites=suites, out=Path("out")))
-
-
-def test_an_env_in_two_suites_that_do_not_differ_is_refused() -> None:
-    suites = [SuiteConfig(name="few", envs=[LINE]), SuiteConfig(name="all", envs=[LINE, OTHER_LINE], seeds=[100])]
-    with pytest.raises(ConfigError, match=r"\['eval_fakes:Line'\] stand in two suites with the same settings"):
+@pytest.mark.parametrize(
+    ("second", "said"),
+    [
+        ({"envs": [LINE], "env_options": {"width": 8}}, "are in two suites of one name"),
+        ({"name": "all", "envs": [LINE, OTHER_LINE], "seeds": [100]}, "stand in two suites with the same settings"),
+    ],
+)
+def test_an_env_in_two_suites_of_one_name_or_that_do_not_differ_is_refused(second: dict[str, Any], said: str) -> None:
+    suites = [SuiteConfig(envs=[LINE]), SuiteConfig.model_validate(second)]
+    with pytest.raises(ConfigError, match=said):
         cells(EvalConfig(policies=[PolicyConfig()], suites=suites, out=Path("out")))
 
 

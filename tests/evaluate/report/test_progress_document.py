@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from recorded_results import HOSTILE, record, runs
@@ -114,16 +115,6 @@ def test_failures_come_newest_first_with_what_went_wrong(document: ProgressDocum
     assert (cell["done"], cell["episodes"]) == (4, 3)  # what infrastructure lost is in no rate
 
 
-def test_old_failures_are_counted_alone(
-    document: ProgressDocument, played: Played, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(results_document, "_FAILURES", 2)
-    for job in played.jobs[:4]:
-        played.play(job, False)
-    said = read(document)
-    assert (said["failed"], [one["episode"] for one in said["failures"]]) == (4, [3, 2])
-
-
 @pytest.mark.parametrize("state", ["complete", "interrupted", "out of time"])
 def test_it_says_how_the_evaluation_ended(document: ProgressDocument, played: Played, state: str) -> None:
     played.end(state)
@@ -194,32 +185,15 @@ def test_the_results_are_read_for_a_share_of_the_time_at_most(
 
 
 def test_calls_reach_the_terminal_too(tmp_path: Path) -> None:
-    told: list[str] = []
-
-    class Terminal(Progress):
-        def begin(self, *_: Any) -> None:
-            told.append("begin")
-
-        def episode(self, *_: Any) -> None:
-            told.append("episode")
-
-        def retry(self, *_: Any) -> None:
-            told.append("retry")
-
-        def stopped(self, *_: Any) -> None:
-            told.append("stopped")
-
-        def end(self) -> None:
-            told.append("end")
-
-    document = ProgressDocument(tmp_path, Terminal())
+    terminal = Mock(Progress)
+    document = ProgressDocument(tmp_path, terminal)
     one = Played(tmp_path, document)
     one.play(one.jobs[0], True)
     document.retry(one.jobs[1], Failure("worker", "env_failed", "it exploded"))
     document.stopped(one.jobs[1].cell, 1, 3)
     one.end("complete")
     one.store.close()
-    assert told == ["begin", "episode", "retry", "stopped", "end"]
+    assert [call[0] for call in terminal.method_calls] == ["begin", "episode", "retry", "stopped", "end"]
 
 
 def test_cells_that_may_stop_early_have_a_confidence_sequence(tmp_path: Path) -> None:

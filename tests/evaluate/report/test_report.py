@@ -12,7 +12,6 @@ from recorded_results import HOSTILE, better_later, record, runs
 
 from vlagents_ray.evaluate import EvalConfig, Results
 from vlagents_ray.evaluate.report import success
-from vlagents_ray.evaluate.report.charts import MINUS
 from vlagents_ray.evaluate.report.episodes import Gallery
 from vlagents_ray.evaluate.report.page import write_report
 from vlagents_ray.evaluate.results.store import Store
@@ -187,12 +186,6 @@ def test_a_run_without_an_episode_has_a_page(tmp_path: Path) -> None:
     assert "Not complete: interrupted" in page.words
 
 
-def test_many_checkpoints_are_compared_with_the_best_first(tmp_path: Path) -> None:
-    results = record(runs(tmp_path, steps=list(range(200, 2001, 200)), episodes=6), better_later)
-    words = Read(write_report(results, tmp_path / "report.html")).words
-    assert "45 further pairs" in words  # 11 contenders: 55 pairs, 10 of them with the best
-
-
 def test_of_very_many_checkpoints_only_the_pairs_that_are_asked_for_most_are_compared(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -294,13 +287,3 @@ def test_an_env_of_two_suites_is_named_with_its_suite_in_errors_and_protocol(tmp
     assert f"one {LINE}" in errors
     assert f"<h3>one {LINE}</h3>" in rest
     assert f"<h3>two {LINE}</h3>" in rest
-
-
-def test_the_gap_to_the_synchronous_score_is_shown(tmp_path: Path) -> None:
-    suites = [
-        {"name": "live", "envs": [LINE], "episodes": 4, "clock": {"latency": 0.1, "meanwhile": "hold"}},
-        {"name": "waiting", "envs": [LINE], "episodes": 4},
-    ]
-    results = record(runs(tmp_path, steps=[], suites=suites), lambda _cell, _seed: 5)
-    words = Read(write_report(results, tmp_path / "report.html")).words
-    assert f"learner, live in real time learner, waiting 0.0 {MINUS}50.0 to +50.0 1.00 1.00 4 4 0 0 0 " in words

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -64,6 +63,10 @@ def test_what_tells_the_policy_is_nowhere_until_all_are_judged(
         summary = evaluate_on_robot(config, person, agent_factory=Policies(Talkative))
     assert looks == 3 * 8, "ready, verdict and note of each trial"
     assert (tmp_path / "out" / "recordings" / "trial0008-1" / "meta" / "info.json").is_file()
+    lines = [json.loads(line) for line in (tmp_path / "out" / "trials.jsonl").read_text().splitlines()]
+    assert len({len(line["sealed"]) for line in lines if "sealed" in line}) == 1
+    shown = {"trial", "attempt", "at", "outcome", "earned", "note", "score", "ending", "sealed"}
+    assert [set(line) for line in lines if "outcome" in line] == [shown] * 8
     found = summary.results
     assert found.contenders == list(NAMES), "and then it is told"
     assert b"step-4711" in (tmp_path / "out" / "results.db").read_bytes()
@@ -79,26 +82,6 @@ class Talkative(Reaching):
         return super().act(obs)
 
 
-def test_sealed_lines_have_one_length_whatever_the_policy_says_of_itself(tmp_path: Path) -> None:
-    config = plan(tmp_path / "out", suite={"episodes": 2, "envs": ["drawer"]})
-    evaluate_on_robot(config, ScriptedPerson(judged("s")), agent_factory=Policies())
-    lines = [json.loads(line) for line in (tmp_path / "out" / "trials.jsonl").read_text().splitlines()]
-    assert len({len(line["sealed"]) for line in lines if "sealed" in line}) == 1
-    judged_lines = [line for line in lines if "outcome" in line]
-    assert [set(line) for line in judged_lines] == [SHOWN] * 4
-
-
-SHOWN = {"trial", "attempt", "at", "outcome", "earned", "note", "score", "ending", "sealed"}
-
-
-def test_the_policies_play_in_the_drawn_order(tmp_path: Path) -> None:
-    config, policies = plan(tmp_path / "out"), Policies()
-    evaluate_on_robot(config, ScriptedPerson(judged("s")), agent_factory=policies)
-    assert policies.made[:2] == sorted(NAMES), "each is rehearsed, in an order that tells nothing"
-    assert policies.made[2:] == names_by_trial(config)
-    assert Counter(policies.made[2:]) == dict.fromkeys(NAMES, 8)
-
-
 def test_without_a_key_one_is_drawn_that_this_user_alone_can_read(tmp_path: Path) -> None:
     orders = set()
     for number in range(2):
@@ -108,6 +91,7 @@ def test_without_a_key_one_is_drawn_that_this_user_alone_can_read(tmp_path: Path
         key = tmp_path / str(number) / "trials.key"
         assert key.stat().st_mode & 0o777 == 0o600
         drawn = [trial.job.cell.contender for trial in schedule(cells(config), key.read_bytes())]
+        assert policies.made[:2] == sorted(NAMES), "each is rehearsed, in an order that tells nothing"
         assert policies.made[2:] == drawn, "who has the key draws the same"
         orders.add(key.read_bytes())
     assert len(orders) == 2
