@@ -249,16 +249,6 @@ def test_a_baseline_is_a_level_line_in_the_learning_curve(tmp_path: Path) -> Non
     assert re.search(r"base \(no steps\) \N{EN DASH} \d", words)  # in the numbers, with no step
 
 
-def test_consecutive_checkpoints_are_compared_first_and_the_later_one_is_a(tmp_path: Path) -> None:
-    results = record(runs(tmp_path, steps=[1000, 2000, 3000]), better_later)
-    words = section_of(Read(write_report(results, tmp_path / "report.html")), "Comparison")
-    first = [words.index(pair) for pair in ("learner@2000 learner@1000", "learner@3000 learner@2000")]
-    others = [words.index(pair) for pair in ("learner@3000 base", "learner@2000 base", "learner@3000 learner@1000")]
-    assert first == sorted(first)
-    assert max(first) < min(others)
-    assert others[0] == min(others)  # the best against the baseline
-
-
 def test_with_an_expert_the_checkpoints_before_and_after_are_not_folded_away(tmp_path: Path) -> None:
     config = runs(tmp_path, steps=list(range(200, 2001, 200)), episodes=6)
     expert = record(config, lambda cell, seed: 5 if cell.step is None else better_later(cell, seed))
