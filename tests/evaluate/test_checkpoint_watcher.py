@@ -13,7 +13,6 @@ import pytest
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.checkpoint_watcher import FINISHED, CheckpointWatcher, rounds
-from vlagents_ray.policies.base.checkpoint_files import unfinished
 
 Write = Callable[[Path], Iterator[None]]
 
@@ -91,16 +90,6 @@ def test_a_trainer_that_stops_for_long_is_not_mistaken_for_one_that_is_done(writ
     for moment, _ in enumerate(write(tmp_path / "100"), 1):
         found = [step for look in range(3) for step in watcher.scan(100 * moment + 10 * look)]
         assert found == ([100] if moment == moments else [])
-
-
-@pytest.mark.parametrize("write", [one_file, shards, zipped])
-def test_what_is_cut_short_is_told(write: Write, tmp_path: Path) -> None:
-    steps = write(tmp_path / "100")
-    for _ in range(4):
-        next(steps)
-    assert unfinished(tmp_path / "100") is not None
-    list(steps)
-    assert unfinished(tmp_path / "100") is None
 
 
 def test_a_marker_says_that_it_is_done_and_no_waiting_is_needed(tmp_path: Path) -> None:

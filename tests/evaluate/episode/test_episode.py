@@ -324,21 +324,6 @@ def test_images_may_be_left_out_where_nobody_looks(images: bool, looked_at: list
         run_episode(Stated(after=(replace(GOOD, cameras={}), 0.0, False, False, SOLVED)), Chunks(CHUNK), KEY)
 
 
-def test_every_call_is_announced_to_the_watch() -> None:
-    phases: list[tuple[str, int]] = []
-    run_episode(
-        Script(terminates_at=2), Chunks(ROW, ROW), KEY, watch=lambda phase, steps: phases.append((phase, steps))
-    )
-    assert phases == [
-        ("env reset", 0),
-        ("policy reset", 0),
-        ("policy act", 0),
-        ("env step", 0),
-        ("policy act", 1),
-        ("env step", 1),
-    ]
-
-
 def test_the_policys_options_reach_its_reset_and_the_result_says_what_checkpoint_played() -> None:
     class Named(Chunks):
         def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:

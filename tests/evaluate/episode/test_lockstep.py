@@ -183,29 +183,6 @@ def test_each_episode_has_a_clock_of_its_own() -> None:
     assert all(result.ticks_waited > 0 for result in results)
 
 
-class Sparing(Line):
-    """Ends after as many steps as its seed says, and renders only if somebody looks."""
-
-    def __init__(self) -> None:
-        super().__init__(camera=(4, 4))
-        self.rendered: list[bool] = []
-
-    def step(self, act: Act) -> Any:
-        obs, reward, _, truncated, info = super().step(act)
-        self.rendered.append(self.looked_at)
-        over = self._steps == self._seed % 7 + 2
-        return (obs if self.looked_at else replace(obs, cameras={})), reward, over, truncated, info
-
-
-def test_images_between_two_requests_are_left_out_of_a_batch_too() -> None:
-    wanted = keys("line", 3)  # with 4 steps each
-    wanted[1] = replace(wanted[1], seed=98)  # 2 steps, of which nobody looks at the last
-    envs = [Sparing() for _ in wanted]
-    results = together(SequentialBatch(envs), ToZero(chunk=3), wanted, images=False)
-    assert [result.steps for result in untimed(results)] == [4, 2, 4]
-    assert [env.rendered for env in envs] == [[False, False, True, False], [False, False], [False, False, True, False]]
-
-
 def test_a_missing_image_is_never_anothers() -> None:
     class Blind(Line):
         def step(self, act: Act) -> Any:

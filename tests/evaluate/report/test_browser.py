@@ -131,18 +131,6 @@ def test_videos_of_the_table_play_one_after_another(page: Page, report: Path) ->
     assert page.asked[0] == report.as_uri()
 
 
-def test_charts_and_their_numbers_use_the_width(page: Page, report: Path) -> None:
-    page.open(report, width=1400, scheme="light")
-    text = page.value("document.querySelector('main').clientWidth")
-    used = page.value(
-        "[...document.querySelectorAll('.beside, .bars')].map((box) => {"
-        "const edges = [...box.querySelectorAll('*')].map((one) => one.getBoundingClientRect().right);"
-        "return Math.max(...edges) - box.getBoundingClientRect().left; })"
-    )
-    assert len(used) >= 3
-    assert min(used) >= 0.95 * text
-
-
 def test_it_prints_with_its_settings_unfolded(page: Page, report: Path) -> None:
     page.open(report, width=1400, scheme="dark")
     pages = len(re.findall(rb"/Type\s*/Page\b", page.pdf()))

@@ -1,11 +1,9 @@
 from __future__ import annotations
 
 import sqlite3
-import sys
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
-from subprocess import PIPE, Popen
 
 import pytest
 from eval_fakes import LINE, OTHER_LINE
@@ -175,36 +173,6 @@ def test_a_results_file_of_another_version_is_refused(config: Config) -> None:
         db.execute("PRAGMA user_version = 99")
     with pytest.raises(ConfigError, match="got version 99"):
         Store(config(resume=True))
-
-
-WRITER = """
-import sys
-from vlagents_ray.evaluate import EvalConfig
-from vlagents_ray.evaluate.episode.records import EpisodeResult
-from vlagents_ray.evaluate.plan.cases import cells
-from vlagents_ray.evaluate.plan.jobs import plan
-from vlagents_ray.evaluate.results.store import Store
-
-config = EvalConfig.model_validate_json(sys.argv[1])
-with Store(config) as store:
-    store.begin_run(config, {})
-    for job in plan(store.cells):
-        store.record(EpisodeResult(job.key, "done", True, True), 1)
-        print(job.key, flush=True)
-"""
-
-
-def test_a_killed_writer_loses_nothing_that_it_recorded(config: Config) -> None:
-    settings = config(envs=["tabletop"], episodes=50_000)
-    with Popen([sys.executable, "-c", WRITER, settings.model_dump_json()], stdout=PIPE, text=True) as writer:
-        assert writer.stdout is not None
-        told = [writer.stdout.readline().strip() for _ in range(200)]
-        writer.kill()
-        told += [line.strip() for line in writer.stdout if line.endswith("\n")]
-    with Store(config(envs=["tabletop"], episodes=50_000, resume=True)) as store:
-        finished = store.finished()
-    assert set(told) <= finished
-    assert len(finished) <= len(told) + 1
 
 
 def test_an_env_that_has_changed_between_runs_is_noticed(config: Config) -> None:

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any
 
 import pytest
 from eval_fakes import LINE, OTHER_LINE, SPARING_LINE, Line, SparingLine, ToZero
@@ -57,18 +57,6 @@ def test_the_env_is_made_once_and_closed_when_another_is_needed(
     assert closed == ["Line", "OtherLine"]
     worker.close()
     assert closed == ["Line", "OtherLine", "Line"]
-
-
-def test_a_worker_reports_what_it_found_out_about_env_and_policy(config: Config) -> None:
-    class Remote(ToZero):
-        metadata: ClassVar[dict[str, Any]] = {"policy": "to-zero", "checkpoint": "a"}
-
-    worker = rollout_of(config, Remote)
-    first, second = played(worker, job(0)), played(worker, job(1))
-    assert first.policy == {"policy": "to-zero", "checkpoint": "a"}
-    assert first.env is not None
-    assert first.env.described == {"simulator": "line", "version": 1}
-    assert (second.policy, second.env) == (None, None)
 
 
 def test_after_a_lost_connection_the_next_attempt_has_a_new_agent(
@@ -152,18 +140,6 @@ def test_only_failed_episodes_are_rendered_wholly_and_show_what_a_video_of_all_s
     assert second.result is not None
     assert shown.result is not None
     assert second.result.outcome == shown.result.outcome
-
-
-def test_a_policy_that_gets_every_image_needs_no_second_pass(config: Config) -> None:
-    failed = seeds_by_outcome(config, chunk=1)[False][0]
-    images, [report] = rendered(Rollout(config(video="failures"), lambda _policy: ToZero(3)), failed)
-    assert images == [4 + 11]
-    worker = Rollout(config(video="failures"), lambda _policy: ToZero())
-    single = job(failed, SPARING_LINE, env_options={"camera": [32, 32]}, execute=1)
-    before = SparingLine.rendered
-    report = played(worker, single)
-    assert SparingLine.rendered - before == 11
-    assert list(report.artifacts.footage.shown) == ["front"]
 
 
 def test_a_worker_whose_episodes_mostly_fail_renders_them_as_it_plays(config: Config) -> None:
