@@ -46,6 +46,11 @@ os._exit(9)
 """
 
 
+@pytest.fixture(scope="module", autouse=True)
+def commits_reach_the_disk() -> None:
+    """As they do outside of tests."""
+
+
 def begun(config: EvalConfig) -> Store:
     """A store with an episode in it."""
     store = Store(config)
