@@ -105,10 +105,7 @@ def test_a_run_without_an_episode_leaves_nothing_to_resume(config: Config, begun
     ("change", "differing"),
     [
         ({"seed": 100}, "seeds"),
-        ({"seeds": [100, 0]}, "seeds"),
         ({"checkpoint": "b"}, "checkpoint"),
-        ({"execute": 2}, "execute"),
-        ({"policy_config": {"a": 1}}, "policy_config"),
         ({"env_options": {"camera": [8, 8]}}, "env_options"),
     ],
 )
@@ -124,10 +121,8 @@ def test_results_of_other_settings_are_not_resumed(config: Config, change: dict[
     [
         {"episodes": 50},
         {"seeds": [0, 100]},
-        {"workers": 7},
         {"video": "all"},
         {"envs": [LINE, OTHER_LINE]},
-        {"steps": [1, 2]},
     ],
 )
 def test_more_of_the_same_is_resumed(config: Config, change: dict[str, object]) -> None:

@@ -25,12 +25,8 @@ from robot_trials import (
 )
 
 from vlagents_ray.errors import ConfigError, ConnectionLost, MissingState, PolicyFailed
-from vlagents_ray.evaluate import EvalConfig, Results, compare, evaluate
-from vlagents_ray.evaluate.episode.records import EpisodeResult
+from vlagents_ray.evaluate import EvalConfig, evaluate
 from vlagents_ray.evaluate.plan.cases import cells
-from vlagents_ray.evaluate.plan.jobs import plan as jobs
-from vlagents_ray.evaluate.results.store import Store
-from vlagents_ray.evaluate.results.summary import summarize
 from vlagents_ray.evaluate.robot import TrialsInterrupted, Verdict, evaluate_on_robot, schedule, unblind
 from vlagents_ray.images.jpeg_png import decode
 from vlagents_ray.interface import Act, Obs
@@ -95,30 +91,6 @@ def test_without_a_key_one_is_drawn_that_this_user_alone_can_read(tmp_path: Path
         assert policies.made[2:] == drawn, "who has the key draws the same"
         orders.add(key.read_bytes())
     assert len(orders) == 2
-
-
-def test_the_report_is_that_of_a_simulation_with_the_same_outcomes(tmp_path: Path) -> None:
-    """Intervals, paired test and table: only where and how long it was played differs."""
-    config = plan(tmp_path / "robot")
-    outcomes = dict(
-        zip(map(str, (trial.job.key for trial in schedule(cells(config), KEY))), "ssfsffsfsfsssfss", strict=True)
-    )
-    real = evaluate_on_robot(config, ScriptedPerson(judged("".join(outcomes.values()))), agent_factory=Policies())
-    with Store(config.model_copy(update={"out": tmp_path / "simulated"})) as store:
-        store.begin_run(config, {})
-        for job in jobs(store.cells):
-            success = outcomes[str(job.key)] == "s"
-            store.record(EpisodeResult(job.key, "done", success, success, steps=1), 1)
-        store.end_run("complete")
-    simulated = summarize(Results.load(tmp_path / "simulated"))
-    for mine, other in zip((*real.cells, *real.totals), (*simulated.cells, *simulated.totals), strict=True):
-        assert (mine.contender, mine.env, mine.planned) == (other.contender, other.env, other.planned)
-        assert mine.success_once == other.success_once
-        assert mine.success_at_end == other.success_at_end
-    assert compare(real.results, *NAMES).to_json() == compare(simulated.results, *NAMES).to_json()
-    assert real.state == "complete"
-    report = (tmp_path / "robot" / "report.html").read_text()
-    assert all(name in report for name in NAMES)
 
 
 def test_a_partial_success_is_none_and_its_score_is_the_share_of_the_rubrics_points(tmp_path: Path) -> None:
