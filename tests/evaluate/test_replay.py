@@ -102,16 +102,23 @@ def test_a_replay_that_infrastructure_kept_from_ending_is_no_difference(config: 
         compare(recorded, Results.load(settings.out))
 
 
-def test_an_episode_beyond_the_point_at_which_its_cell_stopped_was_played_and_is_found(config: Config) -> None:
-    results = play(config(episodes=30, stop={"target": 0.3}))
-    assert not (last := results.cells[0].episodes[-1]).counts
-    assert find(results, f"{LINE}#29").episode == last
-
-
-def test_an_episode_is_found_by_its_key_and_by_env_and_number(config: Config) -> None:
+def test_an_episode_is_found_by_its_key_and_by_env_and_number_if_it_is_the_only_one(config: Config) -> None:
     results = play(config(envs=[LINE, OTHER_LINE], episodes=2))
     key = results.cells[1].episodes[1].result.key
     assert find(results, str(key)).episode == find(results, f"{OTHER_LINE}#1").episode == results.cells[1].episodes[1]
+    for name in (LINE, f"{LINE}#7", "tabletop#0", f"{LINE}#0@0"):
+        with pytest.raises(ConfigError, match="has no episode"):
+            find(results, name)
+
+
+def test_seeds_are_not_guessed_and_episodes_beyond_the_point_of_stopping_are_found(
+    config: Config, tmp_path: Path
+) -> None:
+    with pytest.raises(ConfigError, match=r"stands for 2 episodes; want one of the keys .*@0.*@10"):
+        find(play(config(episodes=1, seeds=[0, 10], out=tmp_path / "seeds")), f"{LINE}#0")
+    results = play(config(episodes=30, stop={"target": 0.3}))
+    assert not (last := results.cells[0].episodes[-1]).counts
+    assert find(results, f"{LINE}#29").episode == last
 
 
 def with_weights(results: Results, weights: str) -> Results:
@@ -134,18 +141,6 @@ def test_a_replay_that_differs_says_that_the_weights_are_others(config: Config, 
     assert compare(recorded, with_weights(play(recorded.config(tmp_path / "same")), "b")) == []
     found = compare(recorded, with_weights(play(recorded.config(tmp_path / "other"), Noisy), "b"))
     assert found[-1] == "weights: a played it, now it is b: another checkpoint, or other files in it"
-
-
-@pytest.mark.parametrize("name", [LINE, f"{LINE}#7", "tabletop#0", f"{LINE}#0@0"])
-def test_an_unknown_episode_is_said_to_be_unknown(config: Config, name: str) -> None:
-    with pytest.raises(ConfigError, match="has no episode"):
-        find(play(config(episodes=1)), name)
-
-
-def test_a_number_that_several_seeds_have_is_not_guessed(config: Config) -> None:
-    results = play(config(episodes=1, seeds=[0, 10]))
-    with pytest.raises(ConfigError, match=r"stands for 2 episodes; want one of the keys .*@0.*@10"):
-        find(results, f"{LINE}#0")
 
 
 def test_the_settings_are_those_of_the_run_and_of_that_cell_alone(config: Config, tmp_path: Path) -> None:

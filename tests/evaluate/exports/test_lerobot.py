@@ -15,6 +15,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from eval_fakes import LINE, OTHER_LINE, ToZero
+from flat_config import flat_config
 from in_process_evaluation import play
 from scipy.spatial.transform import Rotation
 from wrist_roll_env import ROLLER, TILTED_ROLLER, Roller, Turner
@@ -22,7 +23,7 @@ from wrist_roll_env import ROLLER, TILTED_ROLLER, Roller, Turner
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.dataset_contract import BYTES, INFO, STATISTICS, DatasetContract
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.evaluate import EvalConfig
+from vlagents_ray.evaluate import EvalConfig, Results
 from vlagents_ray.evaluate.artifacts.trajectory import Trajectory
 from vlagents_ray.evaluate.exports import to_lerobot
 from vlagents_ray.interface import Act, Obs
@@ -31,6 +32,13 @@ from vlagents_ray.robot.episode import Finished
 
 Config = Callable[..., EvalConfig]
 CAMERA = {"camera": [32, 48]}
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Results:
+    """Two episodes of a hand that rolls, of which the first is solved."""
+    out = tmp_path_factory.mktemp("rolled") / "out"
+    return play(flat_config(envs=[ROLLER], episodes=2, record="all", out=out, video="none"), Turner)
 
 
 def test_frames_states_actions_rewards_and_success_are_those_of_the_episodes(config: Config, tmp_path: Path) -> None:
@@ -137,8 +145,7 @@ def rows(root: Path, number: int) -> dict[str, Any]:
     return dict(pq.read_table(root / f"data/chunk-000/file-{number:03d}.parquet").to_pydict())
 
 
-def test_cameras_and_parts_of_the_state_are_chosen_in_that_order(config: Config, tmp_path: Path) -> None:
-    results = play(config(envs=[ROLLER], episodes=1, record="all"), Turner)
+def test_cameras_and_parts_of_the_state_are_chosen_in_that_order(results: Results, tmp_path: Path) -> None:
     to_lerobot(results, tmp_path / "d", cameras=["wrist"], state=["gripper", "joints"])
     features = info(tmp_path / "d")["features"]
     assert [key for key in features if "images" in key] == ["observation.images.wrist"]
@@ -150,9 +157,8 @@ def test_cameras_and_parts_of_the_state_are_chosen_in_that_order(config: Config,
 
 @pytest.mark.parametrize("both", [False, True])
 def test_parts_of_the_environments_state_are_apart_and_need_no_camera(
-    config: Config, tmp_path: Path, both: bool
+    results: Results, tmp_path: Path, both: bool
 ) -> None:
-    results = play(config(envs=[ROLLER], episodes=1, record="all"), Turner)
     (tmp_path / "d").mkdir()  # may be there if it is empty
     chosen = ["joints", "gripper"] if both else None
     to_lerobot(results, tmp_path / "d", cameras=[], state=chosen, environment_state=["joints"])
@@ -185,9 +191,8 @@ def test_parts_of_the_environments_state_are_apart_and_need_no_camera(
     ],
 )
 def test_what_the_episodes_do_not_have_cannot_be_chosen(
-    config: Config, tmp_path: Path, chosen: dict[str, Any], text: str
+    results: Results, tmp_path: Path, chosen: dict[str, Any], text: str
 ) -> None:
-    results = play(config(envs=[ROLLER], episodes=1, record="all"), Turner)
     with pytest.raises(ConfigError, match=text):
         to_lerobot(results, tmp_path / "d", **chosen)
     assert not (tmp_path / "d").exists()
@@ -203,8 +208,7 @@ def test_only_what_was_solved_goes_into_it(config: Config, tmp_path: Path) -> No
         to_lerobot(unsolved, tmp_path / "none", successes=True)
 
 
-def test_an_episode_ends_where_nothing_moves_any_more_after_it_was_solved(config: Config, tmp_path: Path) -> None:
-    results = play(config(envs=[ROLLER], episodes=2, record="all"), Turner)
+def test_an_episode_ends_where_nothing_moves_any_more_after_it_was_solved(results: Results, tmp_path: Path) -> None:
     to_lerobot(results, tmp_path / "d", cut_idle=True)
     first, second = rows(tmp_path / "d", 0), rows(tmp_path / "d", 1)
     assert [action[0] for action in first["action"]] == pytest.approx([Roller.TURN] * 6 + [0.0])
@@ -233,8 +237,7 @@ def test_a_frame_names_the_weights_that_chose_its_action(config: Config, tmp_pat
     assert "policy_version" not in info(tmp_path / "none")["features"]
 
 
-def test_angles_are_written_without_jumps_and_info_says_about_what(config: Config, tmp_path: Path) -> None:
-    results = play(config(envs=[ROLLER], episodes=2, record="all"), Turner)
+def test_angles_are_written_without_jumps_and_info_says_about_what(results: Results, tmp_path: Path) -> None:
     recorded = Trajectory.load(results.out / str(results.cells[0].episodes[0].trajectory)).state["xyzrpy"][:-1]
     assert np.abs(np.diff(recorded[:, 3])).max() > np.pi
     to_lerobot(results, tmp_path / "d")
@@ -270,8 +273,7 @@ def test_rotation_vectors_are_written_without_jumps_and_are_the_same_rotations(c
     np.testing.assert_array_equal(alone, np.array(written["observation.state"])[:, 2:8])
 
 
-def test_the_contract_of_a_policy_goes_along_in_info_and_in_the_statistics(config: Config, tmp_path: Path) -> None:
-    results = play(config(envs=[ROLLER], episodes=2, record="all"), Turner)
+def test_the_contract_of_a_policy_goes_along_in_info_and_in_the_statistics(results: Results, tmp_path: Path) -> None:
     to_lerobot(results, tmp_path / "d", cameras=["wrist"], state=["joints", "gripper"])
     features = info(tmp_path / "d")["features"]
     assert features["action"]["spec"]["space"] == "joint"
