@@ -176,6 +176,7 @@ with make_env("gymnasium/Hopper-v5") as env:
 """
 
 
+@pytest.mark.sim
 @pytest.mark.skipif(importlib.util.find_spec("mujoco") is None, reason="mujoco is not installed")
 def test_mujoco_without_a_gpu_really_draws_in_software() -> None:
     child = subprocess.run(

@@ -29,6 +29,7 @@ def test_a_frame_is_rendered_and_the_device_named() -> None:
     assert 0.0 < found.seconds < render_probe.TIMEOUT_S
 
 
+@pytest.mark.sim
 @pytest.mark.skipif(importlib.util.find_spec("mujoco") is None, reason="mujoco is not installed")
 def test_mujoco_renders_through_egl() -> None:
     found = render_probe.egl_probe()

@@ -61,7 +61,7 @@ def test_following_the_instruction_succeeds_and_another_one_does_not(task: str) 
 def test_the_expert_sees_at_every_image_size(width: int, height: int) -> None:
     env = Tabletop(width=width, height=height)
     assert env.reset(seed=0)[0].cameras["front"].shape == (height, width, 3)
-    assert np.mean([play(env, seed) for seed in range(20)]) >= 0.95
+    assert np.mean([play(env, seed) for seed in range(many(20))]) >= 0.95
 
 
 @pytest.mark.parametrize("subsampling", ["444", "420"])
@@ -70,7 +70,7 @@ def test_the_expert_sees_through_jpeg(subsampling: str) -> None:
         return replace(obs, cameras={"front": decode(encode_jpeg(obs.cameras["front"], 85, subsampling))})
 
     env = Tabletop()
-    assert np.mean([play(env, seed, seen=seen) for seed in range(20)]) >= 0.95
+    assert np.mean([play(env, seed, seen=seen) for seed in range(many(20))]) >= 0.95
 
 
 def test_mixed_draws_every_task() -> None:
@@ -133,7 +133,7 @@ def test_one_puck_is_the_only_one_that_is_named(task: str) -> None:
     env = Tabletop(task, pucks=1)
     _, info = env.reset(seed=0)
     assert len({text.split(" puck ")[0] for text in [f"{text} " for text in info["instructions"]]}) == 1
-    assert np.mean([play(env, seed) for seed in range(20)]) >= 0.95
+    assert np.mean([play(env, seed) for seed in range(many(20))]) >= 0.95
 
 
 @pytest.mark.parametrize("task", ["pick_place", "slide", "stack", "lift"])

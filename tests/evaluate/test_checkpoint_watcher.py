@@ -92,22 +92,18 @@ def test_a_trainer_that_stops_for_long_is_not_mistaken_for_one_that_is_done(writ
         assert found == ([100] if moment == moments else [])
 
 
-def test_a_marker_says_that_it_is_done_and_no_waiting_is_needed(tmp_path: Path) -> None:
+def test_a_marker_says_that_it_is_done_and_no_waiting_is_needed_unless_it_is_not_whole(tmp_path: Path) -> None:
     watcher = CheckpointWatcher(str(tmp_path / "{step}"), settle_s=1e9, marker=".complete")
     list(one_file(tmp_path / "5"))
     assert watcher.scan(0) == []
     assert watcher.waiting() == {5: "has no .complete"}
     (tmp_path / "5" / ".complete").touch()
     assert watcher.scan(0) == [5]
-
-
-def test_a_marker_does_not_make_half_a_file_whole(tmp_path: Path) -> None:
-    watcher = CheckpointWatcher(str(tmp_path / "{step}"), marker=".complete")
-    (tmp_path / "5").mkdir()
-    (tmp_path / "5" / "model.safetensors").write_bytes(safetensors()[:-1])
-    (tmp_path / "5" / ".complete").touch()
+    (tmp_path / "6").mkdir()
+    (tmp_path / "6" / "model.safetensors").write_bytes(safetensors()[:-1])
+    (tmp_path / "6" / ".complete").touch()
     assert watcher.scan(0) == []
-    assert "its header says" in watcher.waiting()[5]
+    assert "its header says" in watcher.waiting()[6]
 
 
 def test_steps_are_found_in_any_part_of_the_path_with_and_without_leading_zeros(tmp_path: Path) -> None:
@@ -124,12 +120,9 @@ def test_what_the_policy_loads_has_to_be_there(tmp_path: Path) -> None:
     assert watcher.waiting() == {1: "model: no file is there"}
 
 
-def test_a_file_can_be_a_checkpoint(tmp_path: Path) -> None:
+def test_a_file_can_be_a_checkpoint_and_a_pattern_has_a_place_for_the_step(tmp_path: Path) -> None:
     (tmp_path / "epoch=7.ckpt").write_bytes(bytes(10))
     assert CheckpointWatcher(str(tmp_path / "epoch={step}.ckpt"), settle_s=0).scan(0) == [7]
-
-
-def test_a_pattern_has_a_place_for_the_step() -> None:
     with pytest.raises(ConfigError, match="write one where the step stands"):
         CheckpointWatcher("/runs/a")
 
