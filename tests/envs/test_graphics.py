@@ -11,14 +11,7 @@ from pathlib import Path
 import pytest
 
 from vlagents_ray.envs import graphics
-from vlagents_ray.envs.graphics import (
-    EGL_DEVICE,
-    GPUS,
-    EglDevice,
-    Renderer,
-    fitting,
-    require_own,
-)
+from vlagents_ray.envs.graphics import EGL_DEVICE, GPUS, EglDevice, Renderer, fitting, require_own
 from vlagents_ray.envs.render_probe import usable_devices
 from vlagents_ray.envs.robosuite import importing_robosuite
 from vlagents_ray.errors import ConfigError, EnvFailed
@@ -141,10 +134,7 @@ def test_drawing_on_anything_but_what_was_given_is_an_error_with_its_cure(
 
 
 def test_sapiens_devices_are_read_from_its_summary() -> None:
-    assert usable_devices(SUMMARY) == [
-        ("NVIDIA H200", 0),
-        ("llvmpipe (LLVM 15.0.6, 256 bits)", None),
-    ]
+    assert usable_devices(SUMMARY) == [("NVIDIA H200", 0), ("llvmpipe (LLVM 15.0.6, 256 bits)", None)]
 
 
 def test_robosuite_sees_the_number_that_egl_has_for_the_gpu_while_it_is_imported(

@@ -153,10 +153,7 @@ def test_success_comes_from_where_the_option_says(options: dict[str, str], solve
 
 @pytest.mark.parametrize(
     ("options", "error", "message"),
-    [
-        ({"success": "solved"}, ConfigError, "'solved'"),
-        ({"kwargs": {"broken": True}}, EnvFailed, "joint limit"),
-    ],
+    [({"success": "solved"}, ConfigError, "'solved'"), ({"kwargs": {"broken": True}}, EnvFailed, "joint limit")],
 )
 def test_what_a_simulator_does_not_give_is_no_failure_of_the_policy(
     options: dict[str, Any], error: type[Exception], message: str

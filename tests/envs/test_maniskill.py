@@ -228,8 +228,7 @@ def test_missing_assets_fail_with_the_command_that_gets_them(monkeypatch: pytest
 
 
 @pytest.mark.parametrize(
-    ("task", "words"),
-    [("PickSingleYCB-v1", "pick single ycb"), ("OpenCabinetDrawer-v1", "open cabinet drawer")],
+    ("task", "words"), [("PickSingleYCB-v1", "pick single ycb"), ("OpenCabinetDrawer-v1", "open cabinet drawer")]
 )
 def test_a_task_without_an_instruction_is_named_in_words(task: str, words: str) -> None:
     assert instruction_for(task) == words

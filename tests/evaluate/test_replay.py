@@ -65,8 +65,7 @@ def test_a_noisy_policy_is_told_with_the_step_at_which_it_differs(config: Config
 
 
 @pytest.mark.parametrize(
-    ("record", "why"),
-    [("none", r".*--record all"), ("all", r", as .*\.npz, the recorded trajectory, is gone$")],
+    ("record", "why"), [("none", r".*--record all"), ("all", r", as .*\.npz, the recorded trajectory, is gone$")]
 )
 def test_without_a_trajectory_it_is_said_that_the_actions_differ(
     config: Config, tmp_path: Path, record: str, why: str

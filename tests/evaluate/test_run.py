@@ -15,15 +15,7 @@ import pytest
 from eval_fakes import CLINGING, EVERY, LINE, Silent, Teller, ToZero, wait_for
 
 from vlagents_ray.errors import ConfigError, ConnectionLost, ContractMismatch, UnknownEnv
-from vlagents_ray.evaluate import (
-    EvalConfig,
-    EvaluationInterrupted,
-    Progress,
-    SuiteConfig,
-    Summary,
-    check,
-    evaluate,
-)
+from vlagents_ray.evaluate import EvalConfig, EvaluationInterrupted, Progress, SuiteConfig, Summary, check, evaluate
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.evaluate.results.store import Store

@@ -17,11 +17,7 @@ from faulty_disks import FULL, READ_ONLY, python_on
 from in_process_pool import without_ray
 
 from vlagents_ray.errors import ConfigError, ConnectionLost, DeadlineExceeded, StorageFailed
-from vlagents_ray.evaluate import (
-    EvalConfig,
-    evaluate,
-    run,
-)
+from vlagents_ray.evaluate import EvalConfig, evaluate, run
 from vlagents_ray.evaluate.artifacts import storage
 from vlagents_ray.evaluate.artifacts.storage import policy_code, save_diffs, storing, whole
 from vlagents_ray.evaluate.results.store import Store

@@ -11,14 +11,7 @@ from in_process_episode import run_episode
 
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.envs import EvalEnv
-from vlagents_ray.errors import (
-    ConnectionLost,
-    ContractMismatch,
-    EnvFailed,
-    InvalidAction,
-    PolicyFailed,
-    UnknownSession,
-)
+from vlagents_ray.errors import ConnectionLost, ContractMismatch, EnvFailed, InvalidAction, PolicyFailed, UnknownSession
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
 from vlagents_ray.interface import Act, Agent, Obs
 

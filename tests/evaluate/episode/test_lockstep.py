@@ -50,14 +50,7 @@ def untimed(results: Sequence[EpisodeResult | VLAgentsError]) -> list[EpisodeRes
     return timeless
 
 
-def together(
-    env: BatchEnv,
-    agent: Agent,
-    wanted: Sequence[EpisodeKey],
-    *,
-    images: bool = True,
-    **settings: Any,
-) -> Any:
+def together(env: BatchEnv, agent: Agent, wanted: Sequence[EpisodeKey], *, images: bool = True, **settings: Any) -> Any:
     sessions = [copy.deepcopy(agent) for _ in wanted]
     return run_episodes(env, agent, sessions, wanted, EpisodeSettings(**settings), images=images)
 

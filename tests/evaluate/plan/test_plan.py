@@ -17,12 +17,7 @@ from vlagents_ray.errors import ConfigError, UnknownEnv
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig
 from vlagents_ray.evaluate.plan.cases import cells, expand
 from vlagents_ray.evaluate.plan.config import ClockConfig, SuiteConfig, canonical, fingerprint
-from vlagents_ray.evaluate.plan.jobs import (
-    EpisodeKey,
-    Job,
-    JobQueue,
-    plan,
-)
+from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job, JobQueue, plan
 
 Config = Callable[..., EvalConfig]
 

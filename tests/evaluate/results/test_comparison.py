@@ -12,12 +12,7 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import Results
 from vlagents_ray.evaluate.merge import combined
 from vlagents_ray.evaluate.report.provenance import configuration
-from vlagents_ray.evaluate.results.comparison import (
-    clock_gaps,
-    comparable,
-    compare,
-    comparisons,
-)
+from vlagents_ray.evaluate.results.comparison import clock_gaps, comparable, compare, comparisons
 from vlagents_ray.evaluate.results.statistics import Pairs
 
 

@@ -8,24 +8,14 @@ from scipy.stats import binomtest
 
 from vlagents_ray.errors import InvalidInput
 from vlagents_ray.evaluate import Rate, wilson
-from vlagents_ray.evaluate.results.statistics import (
-    Pairs,
-    difference_interval,
-    holm,
-    mcnemar,
-)
+from vlagents_ray.evaluate.results.statistics import Pairs, difference_interval, holm, mcnemar
 
 
 # From R. G. Newcombe, "Two-sided confidence intervals for the single proportion: comparison of seven
 # methods", Statistics in Medicine 17 (1998), table I, method 3.
 @pytest.mark.parametrize(
     ("successes", "trials", "low", "high"),
-    [
-        (81, 263, 0.2553, 0.3662),
-        (15, 148, 0.0624, 0.1605),
-        (0, 20, 0.0, 0.1611),
-        (1, 29, 0.0061, 0.1718),
-    ],
+    [(81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605), (0, 20, 0.0, 0.1611), (1, 29, 0.0061, 0.1718)],
 )
 def test_wilson_agrees_with_published_values(successes: int, trials: int, low: float, high: float) -> None:
     assert wilson(successes, trials) == pytest.approx((low, high), abs=5e-5)

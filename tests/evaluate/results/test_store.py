@@ -117,13 +117,7 @@ def test_results_of_other_settings_are_not_resumed(config: Config, change: dict[
 
 
 @pytest.mark.parametrize(
-    "change",
-    [
-        {"episodes": 50},
-        {"seeds": [0, 100]},
-        {"video": "all"},
-        {"envs": [LINE, OTHER_LINE]},
-    ],
+    "change", [{"episodes": 50}, {"seeds": [0, 100]}, {"video": "all"}, {"envs": [LINE, OTHER_LINE]}]
 )
 def test_more_of_the_same_is_resumed(config: Config, change: dict[str, object]) -> None:
     with Store(config()) as store:
