@@ -241,7 +241,7 @@ def test_the_arm_stays_still_while_nobody_is_there(tmp_path: Path) -> None:
         raise EOFError
 
     config = plan(tmp_path / "out")
-    with pytest.raises(TrialsInterrupted, match="after 0 of 16 trials; go on with --resume"):
+    with pytest.raises(TrialsInterrupted, match="after 0 of 8 trials; go on with --resume"):
         evaluate_on_robot(config, ScriptedPerson(nobody), robot=arm, agent_factory=Policies())
     assert applied == [0]
     assert arm.applied == 0
@@ -250,7 +250,7 @@ def test_the_arm_stays_still_while_nobody_is_there(tmp_path: Path) -> None:
 def test_it_goes_on_with_the_next_trial(tmp_path: Path) -> None:
     config, policies = plan(tmp_path / "out"), Policies()
     lines = ["", "s", "", "", "s", "", ""]  # the third trial is played, and never judged
-    with pytest.raises(TrialsInterrupted, match="after 2 of 16"):
+    with pytest.raises(TrialsInterrupted, match="after 2 of 8"):
         evaluate_on_robot(config, ScriptedPerson(typed(lines)), agent_factory=policies)
     assert not (tmp_path / "out" / "results.db").exists()
     with pytest.raises(ConfigError, match="already has trials; resume them"):
@@ -261,8 +261,8 @@ def test_it_goes_on_with_the_next_trial(tmp_path: Path) -> None:
     summary = evaluate_on_robot(again, person, agent_factory=later)
     assert later.made[2:] == names_by_trial(config)[2:]
     assert any("played again: the evaluation ended before the verdict" in line for line in person.printed)
-    assert (summary.total.episodes, summary.total.success_once.successes, summary.total.retries) == (16, 2, 1)
-    assert evaluate_on_robot(again, ScriptedPerson(typed([])), agent_factory=Policies()).total.episodes == 16
+    assert (summary.total.episodes, summary.total.success_once.successes, summary.total.retries) == (8, 2, 1)
+    assert evaluate_on_robot(again, ScriptedPerson(typed([])), agent_factory=Policies()).total.episodes == 8
 
 
 def test_a_line_that_a_killed_process_left_half_written_is_dropped(tmp_path: Path) -> None:
@@ -273,7 +273,7 @@ def test_a_line_that_a_killed_process_left_half_written_is_dropped(tmp_path: Pat
     whole = log.read_bytes()
     log.write_bytes(whole[:-40])
     again = config.model_copy(update={"resume": True})
-    with pytest.raises(TrialsInterrupted, match="after 1 of 16"):
+    with pytest.raises(TrialsInterrupted, match="after 1 of 8"):
         evaluate_on_robot(again, ScriptedPerson(typed([])), agent_factory=Policies())
     last = json.loads(log.read_text().splitlines()[-1])
     assert (last["trial"], last["again"]) == (2, "the evaluation ended before the verdict")
@@ -331,7 +331,7 @@ def test_results_can_be_told_before_the_end_which_the_log_says(tmp_path: Path) -
         unblind(tmp_path)
     again = config.model_copy(update={"resume": True})
     whole = evaluate_on_robot(again, ScriptedPerson(judged("s")), agent_factory=Policies())
-    assert whole.total.episodes == 16
+    assert whole.total.episodes == 8
 
 
 def test_the_first_start_of_a_scene_is_what_later_trials_of_it_are_set_to(tmp_path: Path) -> None:
