@@ -145,21 +145,18 @@ def test_success_once_and_at_the_end_are_told_apart(solved: tuple[int, ...], onc
     assert (result.success_once, result.success_at_end) == (once, at_end)
 
 
-def test_the_key_decides_both_resets() -> None:
-    env, agent = Script(), Chunks(*[ROW] * 6)
-    run_episode(env, agent, KEY, reset_options={"layout": 2})
-    assert env.resets == [(11, {"layout": 2})]
-    assert agent.began == {"instruction": "do it", "seed": 11, "env": "script"}
-
-
-def test_a_remote_policy_is_told_the_contract_of_the_env() -> None:
+def test_the_key_decides_both_resets_and_a_remote_policy_is_told_the_contract() -> None:
     class Remote(Chunks):
         metadata: ClassVar[dict[str, Any]] = {}
         transport = "websocket"
 
-    agent = Remote(*[ROW] * 6)
-    result = run_episode(Script(), agent, KEY)
-    assert Contract.from_json(agent.began["contract"]) == Script().contract
+    for make in (Chunks, Remote):
+        env, agent = Script(), make(*[ROW] * 6)
+        result = run_episode(env, agent, KEY, reset_options={"layout": 2})
+        assert env.resets == [(11, {"layout": 2})]
+        told = agent.began.pop("contract", None)
+        assert agent.began == {"instruction": "do it", "seed": 11, "env": "script"}
+    assert Contract.from_json(told) == Script().contract
     assert result.transport == "websocket"
 
 
@@ -317,32 +314,34 @@ def test_images_may_be_left_out_where_nobody_looks(images: bool, looked_at: list
         run_episode(Stated(after=(replace(GOOD, cameras={}), 0.0, False, False, SOLVED)), Chunks(CHUNK), KEY)
 
 
-def test_the_policys_options_reach_its_reset_and_the_result_says_what_checkpoint_played() -> None:
-    class Named(Chunks):
+def test_the_result_says_which_checkpoint_and_weights_played_and_how_long_each_side_was_busy() -> None:
+    """A server says how long a batch took, of which each answer has its part."""
+
+    class Served(Chunks):
+        version = 4
+
         def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
             super().reset(obs, instruction, **kwargs)
             return {"checkpoint": f"runs/{kwargs['checkpoint_step']}"}
 
-    agent = Named(*[np.zeros(2)] * 6)
-    result = run_episode(Script(), agent, KEY, policy_options={"checkpoint_step": 20})
-    assert agent.began["checkpoint_step"] == 20
-    assert result.checkpoint == "runs/20"
-    assert run_episode(Script(), Chunks(*[np.zeros(2)] * 6), KEY).checkpoint is None
-
-
-def test_the_result_says_how_long_each_side_was_busy() -> None:
-    """A server says how long a batch took, of which each answer has its part."""
-
-    class Served(Chunks):
         def act(self, obs: Obs) -> Act:
             act = super().act(obs)
             act.info["timing"] = {"inference_ms": 40.0, "batch_size": 4}
+            act.info["policy"] = {"version": self.version, "fingerprint": f"digest {self.version}"}
+            self.version += 1
             return act
 
-    result = run_episode(Script(), Served(*[np.zeros(2)] * 6), KEY)
+    agent = Served(*[ROW] * 6)
+    result = run_episode(Script(), agent, KEY, policy_options={"checkpoint_step": 20})
+    assert (agent.began["checkpoint_step"], result.checkpoint) == (20, "runs/20")
+    versions = result.first_policy_version, result.policy_version, result.policy_fingerprint
+    assert versions == (4, 3 + result.acts, f"digest {3 + result.acts}")
     assert result.policy_seconds == pytest.approx(6 * 0.040 / 4)
     assert result.env_seconds is not None
     assert 0 < result.env_seconds < result.seconds
+    unserved = run_episode(Script(), Chunks(*[ROW] * 6), KEY)
+    versions = unserved.first_policy_version, unserved.policy_version, unserved.policy_fingerprint
+    assert (unserved.checkpoint, *versions) == (None,) * 4
 
 
 def test_a_policy_in_this_process_is_busy_while_it_is_waited_for() -> None:
@@ -354,20 +353,3 @@ def test_a_policy_in_this_process_is_busy_while_it_is_waited_for() -> None:
     result = run_episode(Script(), Slow(*[np.zeros(2)] * 6), KEY)
     assert result.policy_seconds is not None
     assert 6 * 0.005 <= result.policy_seconds < result.seconds
-
-
-def test_the_result_says_which_versions_of_the_weights_played() -> None:
-    class Trained(Chunks):
-        version = 4
-
-        def act(self, obs: Obs) -> Act:
-            act = super().act(obs)
-            act.info["policy"] = {"version": self.version, "fingerprint": f"digest {self.version}"}
-            self.version += 1
-            return act
-
-    result = run_episode(Script(), Trained(*[np.zeros(2)] * 6), KEY)
-    versions = result.first_policy_version, result.policy_version, result.policy_fingerprint
-    assert versions == (4, 3 + result.acts, f"digest {3 + result.acts}")
-    unserved = run_episode(Script(), Chunks(*[np.zeros(2)] * 6), KEY)
-    assert (unserved.first_policy_version, unserved.policy_version, unserved.policy_fingerprint) == (None,) * 3

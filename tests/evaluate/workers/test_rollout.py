@@ -91,19 +91,26 @@ def test_a_policy_that_cannot_start_stops_the_evaluation(config: Config) -> None
     assert "no such checkpoint" in failure.message
 
 
-def test_an_env_that_cannot_be_made_is_an_infrastructure_failure(config: Config) -> None:
+@pytest.mark.parametrize(
+    ("missing", "cause", "code", "said"),
+    [
+        (None, "worker", EnvFailed.code, "GPU lost"),
+        (
+            "no Vulkan device; install mesa-vulkan-drivers",
+            "user",
+            MissingDependency.code,
+            "install mesa-vulkan-drivers",
+        ),
+    ],
+)
+def test_an_env_that_cannot_be_made_is_an_infrastructure_failure_unless_it_says_what_it_misses(
+    config: Config, monkeypatch: pytest.MonkeyPatch, missing: str | None, cause: str, code: str, said: str
+) -> None:
+    monkeypatch.setattr(Line, "missing", classmethod(lambda _cls: missing))
     failure = played(rollout_of(config, ToZero), job(env_options={"broken": "GPU lost"})).failure
     assert failure is not None
-    assert (failure.cause, failure.code) == ("worker", EnvFailed.code)
-    assert "GPU lost" in failure.message
-
-
-def test_an_env_that_says_what_it_misses_stops_the_evaluation(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Line, "missing", classmethod(lambda _cls: "no Vulkan device; install mesa-vulkan-drivers"))
-    failure = played(rollout_of(config, ToZero), job(env_options={"broken": "no device"})).failure
-    assert failure is not None
-    assert (failure.cause, failure.code) == ("user", MissingDependency.code)
-    assert "install mesa-vulkan-drivers" in failure.message
+    assert (failure.cause, failure.code) == (cause, code)
+    assert said in failure.message
 
 
 def seeds_by_outcome(config: Config, chunk: int) -> dict[bool, list[int]]:
