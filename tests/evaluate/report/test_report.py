@@ -237,19 +237,21 @@ def test_an_episode_that_does_not_count_is_marked(tmp_path: Path) -> None:
     assert "In brackets: beyond the point" in page.words
 
 
-def test_baselines_stand_before_checkpoints_and_these_in_the_order_of_their_steps(tmp_path: Path) -> None:
+def test_baselines_stand_before_checkpoints_and_are_a_level_line_in_the_learning_curve(tmp_path: Path) -> None:
     results = record(runs(tmp_path, steps=[3000, 1000, 2000]), better_later)
     assert results.contenders == ["base", "learner@1000", "learner@2000", "learner@3000"]
-    words = page_of(results).section("Success")
-    places = [words.index(f"{name} 12") for name in results.contenders]
+    page = page_of(results)
+    places = [page.section("Success").index(f"{name} 12") for name in results.contenders]
     assert places == sorted(places)
-
-
-def test_a_baseline_is_a_level_line_in_the_learning_curve(tmp_path: Path) -> None:
-    page = page_of(record(runs(tmp_path)))
     words = page.section("Learning curve")
     assert "base (no steps)" in words
     assert re.search(r"base \(no steps\) \N{EN DASH} \d", words)  # in the numbers, with no step
+    words = page.section("Comparison")
+    first = [words.index(pair) for pair in ("learner@2000 learner@1000", "learner@3000 learner@2000")]
+    others = [words.index(pair) for pair in ("learner@3000 base", "learner@2000 base", "learner@3000 learner@1000")]
+    assert first == sorted(first), "consecutive checkpoints, and the later one is A"
+    assert max(first) < min(others)
+    assert others[0] == min(others), "the best against the baseline"
 
 
 def test_with_an_expert_the_checkpoints_before_and_after_are_not_folded_away(tmp_path: Path) -> None:
