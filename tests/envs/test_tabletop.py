@@ -17,7 +17,7 @@ from many import many
 from vlagents_ray import Act
 from vlagents_ray.envs import make_env
 from vlagents_ray.envs.tabletop import Tabletop
-from vlagents_ray.errors import ConfigError, UnknownEnv
+from vlagents_ray.errors import ConfigError, NotReset, UnknownEnv
 from vlagents_ray.images.jpeg_png import decode, encode_jpeg
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.scripted import Scripted
@@ -118,6 +118,8 @@ def test_what_there_is_not_is_refused() -> None:
             Tabletop().reset(seed=0, options={option: value})
     with pytest.raises(UnknownEnv, match="pick_place"):
         make_env("tabletop/juggle")
+    with pytest.raises(NotReset):
+        Tabletop().step(Act(np.zeros(4, np.float32)))
     for task, option, value, text in (
         ("lift", "width", 3, "want at least 32"),
         ("lift", "pucks", 0, "want 1 to 4 in 'lift'"),

@@ -12,6 +12,7 @@ from recorded_results import HOSTILE, better_later, record, runs
 
 from vlagents_ray.evaluate import EvalConfig, Results
 from vlagents_ray.evaluate.report import success
+from vlagents_ray.evaluate.report.charts import MINUS
 from vlagents_ray.evaluate.report.episodes import Gallery
 from vlagents_ray.evaluate.report.page import write_report
 from vlagents_ray.evaluate.results.store import Store
@@ -282,3 +283,14 @@ def test_an_env_of_two_suites_is_named_with_its_suite_in_errors_and_protocol(tmp
     assert f"one {LINE}" in errors
     assert f"<h3>one {LINE}</h3>" in rest
     assert f"<h3>two {LINE}</h3>" in rest
+
+
+def test_real_time_and_synchronous_scores_are_compared_apart_and_their_gap_is_shown(tmp_path: Path) -> None:
+    suites = [
+        {"name": "live", "envs": [LINE], "episodes": 4, "clock": {"latency": 0.1, "meanwhile": "hold"}},
+        {"name": "waiting", "envs": [LINE], "episodes": 4},
+    ]
+    page = page_of(record(runs(tmp_path, steps=[], suites=suites), lambda _cell, _seed: 5))
+    row = f"learner, live in real time learner, waiting 0.0 {MINUS}50.0 to +50.0 1.00 1.00 4 4 0 0 0 "
+    assert row in page.words
+    assert len(page.all("h3")) >= 2
