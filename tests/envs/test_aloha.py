@@ -10,7 +10,7 @@ from in_process_episode import Always, play
 from vlagents_ray.contract import CameraSpec
 from vlagents_ray.envs.aloha import Aloha
 from vlagents_ray.envs.base import known_contract, make_env
-from vlagents_ray.errors import ConfigError, ContractMismatch, EnvFailed, InvalidObservation, NotReset, UnknownEnv
+from vlagents_ray.errors import ConfigError, ContractMismatch, InvalidObservation, NotReset, UnknownEnv
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.testing import check_env
 
@@ -54,20 +54,6 @@ def test_observations_rewards_and_actions_are_gym_alohas_to_the_bit() -> None:
     theirs._env.physics.free()
 
 
-def test_images_are_left_out_where_nobody_looks_which_changes_nothing_else() -> None:
-    def elbow(looked_at: bool) -> tuple[float, int]:
-        with Aloha(width=32, height=24) as env:
-            env.reset(seed=1)
-            env.looked_at = looked_at
-            for _ in range(5):
-                obs, *_ = env.step(Act(np.full(14, 0.5, np.float32)))
-            return float(obs.state["left/joints"][2]), len(obs.cameras)
-
-    seen, unseen = elbow(True), elbow(False)
-    assert seen[0] == unseen[0]
-    assert (seen[1], unseen[1]) == (1, 0)
-
-
 def test_the_contract_is_known_before_the_simulator_is_made() -> None:
     with Aloha("insertion", width=40, height=32, cameras=("top", "angle")) as env:
         assert (
@@ -78,9 +64,6 @@ def test_the_contract_is_known_before_the_simulator_is_made() -> None:
         assert obs.cameras["angle"].shape == (32, 40, 3)
         assert env.instruction == "insert the peg into the socket"
         assert env.describe()["protocol"]["deviations"] == []
-        env.close()
-        with pytest.raises(EnvFailed, match="closed"):
-            env.reset(seed=0)
 
 
 def test_a_deviation_from_the_protocol_is_recorded() -> None:
@@ -89,23 +72,13 @@ def test_a_deviation_from_the_protocol_is_recorded() -> None:
             "max_steps: 300, the protocol says 400",
             "ends_on_success: False, the protocol says True",
         ]
-        with pytest.raises(NotReset):
-            env.step(STILL)
-        with pytest.raises(ConfigError, match="level"):
-            env.reset(seed=0, options={"level": 1})
 
 
-@pytest.mark.parametrize(
-    ("options", "error", "message"),
-    [
-        ({"width": 0}, ConfigError, "width is 0"),
-        ({"cameras": ("wrist",)}, ConfigError, r"no camera \['wrist'\].*top"),
-        ({"task": "insert"}, UnknownEnv, "did you mean 'insertion'"),
-    ],
-)
-def test_a_wrong_option_is_named(options: dict[str, object], error: type[Exception], message: str) -> None:
-    with pytest.raises(error, match=message):
-        make_env("aloha", **options)
+def test_a_wrong_option_is_named() -> None:
+    with pytest.raises(ConfigError, match=r"no camera \['wrist'\].*top"):
+        make_env("aloha", cameras=("wrist",))
+    with pytest.raises(UnknownEnv, match="did you mean 'insertion'"):
+        make_env("aloha/insert")
 
 
 def test_the_expert_says_what_it_wants() -> None:

@@ -11,14 +11,7 @@ from pathlib import Path
 import pytest
 
 from vlagents_ray.envs import graphics
-from vlagents_ray.envs.graphics import (
-    EGL_DEVICE,
-    GPUS,
-    EglDevice,
-    Renderer,
-    fitting,
-    require_own,
-)
+from vlagents_ray.envs.graphics import EGL_DEVICE, GPUS, EglDevice, Renderer, fitting, require_own
 from vlagents_ray.envs.render_probe import usable_devices
 from vlagents_ray.envs.robosuite import importing_robosuite
 from vlagents_ray.errors import ConfigError, EnvFailed
@@ -48,7 +41,7 @@ GPU: llvmpipe (LLVM 15.0.6, 256 bits)
 
 @pytest.fixture(autouse=True)
 def _nothing_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in (GPUS, EGL_DEVICE, "MUJOCO_GL", *graphics.VULKAN_DRIVERS):
+    for name in (GPUS, EGL_DEVICE, "MUJOCO_GL", "DISPLAY", "LP_NUM_THREADS", *graphics.VULKAN_DRIVERS):
         monkeypatch.setenv(name, "")  # so that what the test sets is undone
         monkeypatch.delenv(name)
     monkeypatch.setattr(graphics, "devices", lambda: TWO_GPUS)
@@ -60,14 +53,30 @@ def chosen(monkeypatch: pytest.MonkeyPatch, visible: str) -> str | None:
     return os.environ.get(EGL_DEVICE)
 
 
-@pytest.mark.parametrize("visible", ["1", "GPU-8c9a", "0,1"])
-def test_a_worker_with_a_gpu_draws_on_what_egl_calls_that_gpu(monkeypatch: pytest.MonkeyPatch, visible: str) -> None:
-    assert chosen(monkeypatch, visible) == "1"
+@pytest.mark.parametrize(
+    ("given", "egl", "want"),
+    [
+        ({}, True, ("egl", "1")),
+        ({}, False, (None, "1")),  # with the variable, `import mujoco` would fail
+        ({"DISPLAY": ":0"}, True, (None, "1")),
+        ({"MUJOCO_GL": "osmesa", "LP_NUM_THREADS": "4"}, True, ("osmesa", "4")),
+    ],
+)
+def test_without_a_display_mujoco_renders_through_egl_and_in_software_on_one_core(
+    monkeypatch: pytest.MonkeyPatch, given: dict[str, str], egl: bool, want: tuple[str | None, str]
+) -> None:
+    monkeypatch.setattr(graphics, "_has_egl", lambda: egl)
+    for name, value in given.items():
+        monkeypatch.setenv(name, value)
+    graphics.prepare_rendering()
+    assert (os.environ.get("MUJOCO_GL"), os.environ.get("LP_NUM_THREADS")) == want
 
 
-@pytest.mark.parametrize("visible", ["", "-1"])
-def test_a_worker_without_a_gpu_draws_in_software(monkeypatch: pytest.MonkeyPatch, visible: str) -> None:
-    assert chosen(monkeypatch, visible) == "3"
+@pytest.mark.parametrize(("visible", "device"), [("1", "1"), ("GPU-8c9a", "1"), ("0,1", "1"), ("", "3"), ("-1", "3")])
+def test_a_worker_draws_on_what_egl_calls_its_gpu_or_in_software(
+    monkeypatch: pytest.MonkeyPatch, visible: str, device: str
+) -> None:
+    assert chosen(monkeypatch, visible) == device
 
 
 def test_a_process_that_nobody_gave_or_forbade_gpus_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -107,29 +116,25 @@ def test_where_no_device_fits_none_is_named(monkeypatch: pytest.MonkeyPatch) -> 
     assert fitting([EglDevice(0, software=True, cuda=None)], gpu=True) is None
 
 
-def test_drawing_on_a_gpu_that_a_policy_may_use_is_an_error_with_its_cure(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(GPUS, "")
-    require_own(LLVMPIPE)
-    for gpu in (NVIDIA, OTHERS):
-        with pytest.raises(ConfigError, match=r"given no GPU .* renders on 'NVIDIA H200.*worker: \{gpus: 0.25\}"):
-            require_own(gpu)
-
-
-def test_drawing_on_anything_but_the_gpu_that_was_given_is_an_error_with_its_cure(
-    monkeypatch: pytest.MonkeyPatch,
+@pytest.mark.parametrize(
+    ("visible", "good", "bad", "said"),
+    [
+        ("", LLVMPIPE, [NVIDIA, OTHERS], r"given no GPU .* renders on 'NVIDIA H200.*worker: \{gpus: 0.25\}"),
+        ("3", NVIDIA, [LLVMPIPE, OTHERS], r"given the GPU 3, but its env renders on .*libnvidia-gl"),
+    ],
+)
+def test_drawing_on_anything_but_what_was_given_is_an_error_with_its_cure(
+    monkeypatch: pytest.MonkeyPatch, visible: str, good: Renderer, bad: list[Renderer], said: str
 ) -> None:
-    monkeypatch.setenv(GPUS, "3")
-    require_own(NVIDIA)
-    for other in (LLVMPIPE, OTHERS):
-        with pytest.raises(ConfigError, match=r"given the GPU 3, but its env renders on .*libnvidia-gl"):
+    monkeypatch.setenv(GPUS, visible)
+    require_own(good)
+    for other in bad:
+        with pytest.raises(ConfigError, match=said):
             require_own(other)
 
 
 def test_sapiens_devices_are_read_from_its_summary() -> None:
-    assert usable_devices(SUMMARY) == [
-        ("NVIDIA H200", 0),
-        ("llvmpipe (LLVM 15.0.6, 256 bits)", None),
-    ]
+    assert usable_devices(SUMMARY) == [("NVIDIA H200", 0), ("llvmpipe (LLVM 15.0.6, 256 bits)", None)]
 
 
 def test_robosuite_sees_the_number_that_egl_has_for_the_gpu_while_it_is_imported(
@@ -161,6 +166,7 @@ with make_env("gymnasium/Hopper-v5") as env:
 """
 
 
+@pytest.mark.sim
 @pytest.mark.skipif(importlib.util.find_spec("mujoco") is None, reason="mujoco is not installed")
 def test_mujoco_without_a_gpu_really_draws_in_software() -> None:
     child = subprocess.run(

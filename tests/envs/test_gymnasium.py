@@ -93,19 +93,6 @@ def test_keeps_the_contract(name: str, options: dict[str, Any]) -> None:
     check_env(make_env(name, **options), step_limit="Pendulum" not in name)
 
 
-def test_pusht_works_with_its_id_alone() -> None:
-    with make_env(PUSHT) as env:
-        obs, _ = env.reset(seed=0)
-        assert obs.cameras["front"].shape == (96, 96, 3)
-        assert obs.state["agent_pos"].shape == (2,)
-        assert env.instruction
-        assert env.max_steps == 300
-        assert (env.contract.action.low, env.contract.action.high) == (0.0, 512.0)
-        *_, info = env.step(Act(np.full(2, 256, np.float32)))
-        assert info["success"] is False
-        assert 0.0 <= info["coverage"] <= 1.0
-
-
 def test_a_seed_gives_what_gymnasium_gives_for_it() -> None:
     plain_env = gymnasium.make("Pendulum-v1")
     with make_env("gymnasium/Pendulum-v1") as env:
@@ -120,10 +107,9 @@ def test_a_seed_gives_what_gymnasium_gives_for_it() -> None:
 
 def test_images_and_vectors_of_the_observation_are_found() -> None:
     with make_env("gymnasium/VlaArm-v0") as env:
-        assert env.contract.cameras is not None
-        assert env.contract.state is not None
-        assert list(env.contract.cameras) == ["images/top"]
-        assert list(env.contract.state) == ["robot/qpos"]
+        assert list(env.contract.cameras or {}) == ["images/top"]
+        assert list(env.contract.state or {}) == ["robot/qpos"]
+        assert (env.contract.action.low, env.contract.action.high) == (None, None), "they differ by component"
 
 
 def test_cameras_and_states_are_renamed_cut_and_rendered() -> None:
@@ -145,12 +131,6 @@ def test_cameras_and_states_are_renamed_cut_and_rendered() -> None:
         assert env.contract.control_hz == 5.0
 
 
-def test_images_are_stretched_to_the_size_asked_for() -> None:
-    with make_env("gymnasium/VlaArm-v0", width=32, height=16) as env:
-        obs, _ = env.reset(seed=0)
-        assert obs.cameras["images/top"].shape == (16, 32, 3)
-
-
 def test_unit_actions_are_scaled_to_the_box_and_clipped() -> None:
     with make_env("gymnasium/VlaArm-v0", unit_actions=True) as env:
         env.reset(seed=0)
@@ -162,40 +142,26 @@ def test_unit_actions_are_scaled_to_the_box_and_clipped() -> None:
         assert inner.received.dtype == np.float64
 
 
-def test_bounds_that_differ_by_component_are_not_stated_as_one() -> None:
-    with make_env("gymnasium/VlaArm-v0") as env:
-        assert env.contract.action.low is None
-        assert env.contract.action.high is None
-
-
-def test_success_comes_from_where_the_option_says() -> None:
-    def last_success(**options: Any) -> bool:
-        with make_env("gymnasium/VlaArm-v0", **options) as env:
-            env.reset(seed=0)
-            return [env.step(Act(np.zeros(2, np.float32)))[-1]["success"] for _ in range(3)][-1]
-
-    assert last_success(success="task/solved") is True
-    assert last_success(success="terminated") is True
-    assert last_success() is False
-
-
-def test_a_success_key_that_the_info_lacks_is_an_error_not_a_failure_of_the_policy() -> None:
-    with make_env("gymnasium/VlaArm-v0", success="solved") as env:
+@pytest.mark.parametrize(
+    ("options", "solved"), [({"success": "task/solved"}, True), ({"success": "terminated"}, True), ({}, False)]
+)
+def test_success_comes_from_where_the_option_says(options: dict[str, str], solved: bool) -> None:
+    with make_env("gymnasium/VlaArm-v0", **options) as env:
         env.reset(seed=0)
-        with pytest.raises(ConfigError, match="'solved'"):
-            env.step(Act(np.zeros(2, np.float32)))
+        assert [env.step(Act(np.zeros(2, np.float32)))[-1]["success"] for _ in range(3)][-1] is solved
 
 
-def test_a_breaking_simulator_is_an_infrastructure_failure() -> None:
-    with make_env("gymnasium/VlaArm-v0", kwargs={"broken": True}) as env:
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [({"success": "solved"}, ConfigError, "'solved'"), ({"kwargs": {"broken": True}}, EnvFailed, "joint limit")],
+)
+def test_what_a_simulator_does_not_give_is_no_failure_of_the_policy(
+    options: dict[str, Any], error: type[Exception], message: str
+) -> None:
+    with make_env("gymnasium/VlaArm-v0", **options) as env:
         env.reset(seed=0)
-        with pytest.raises(EnvFailed, match="joint limit"):
+        with pytest.raises(error, match=message):
             env.step(Act(np.zeros(2, np.float32)))
-
-
-def test_discrete_actions_are_refused() -> None:
-    with pytest.raises(ConfigError, match="Discrete"):
-        make_env("gymnasium/VlaSwitch-v0")
 
 
 def test_an_env_without_step_limit_asks_for_one() -> None:
@@ -210,6 +176,7 @@ def test_an_env_without_step_limit_asks_for_one() -> None:
     [
         ("NoSuchEnv-v0", {}, UnknownEnv, "NoSuchEnv"),
         (None, {}, UnknownEnv, "Pendulum"),
+        ("VlaSwitch-v0", {}, ConfigError, "Discrete"),
         ("no_such_module/Env-v0", {}, MissingDependency, "no_such_module"),
         ("VlaArm-v0", {"kwargs": {"colour": 1}}, ConfigError, "colour"),
         ("VlaArm-v0", {"state": {"joints": "robot/joints"}}, ConfigError, "qpos"),
@@ -227,22 +194,18 @@ def test_a_wrong_mapping_is_named_when_the_env_is_made(
         Gymnasium(task, **options)
 
 
-def test_a_step_before_reset_and_after_close_is_refused() -> None:
+def test_a_step_before_reset_a_chunk_a_negative_seed_and_a_closed_env_are_refused() -> None:
     env = make_env("gymnasium/VlaArm-v0")
     with pytest.raises(NotReset):
         env.step(Act(np.zeros(2, np.float32)))
+    with pytest.raises(ConfigError, match="seed"):
+        env.reset(seed=-1)
+    env.reset(seed=0)
+    with pytest.raises(InvalidAction, match="row by row"):
+        env.step(Act(np.zeros((2, 2), np.float32)))
     env.close()
     with pytest.raises(NotReset):
         env.reset(seed=0)
-
-
-def test_a_chunk_and_a_negative_seed_are_refused() -> None:
-    with make_env("gymnasium/VlaArm-v0") as env:
-        with pytest.raises(ConfigError, match="seed"):
-            env.reset(seed=-1)
-        env.reset(seed=0)
-        with pytest.raises(InvalidAction, match="row by row"):
-            env.step(Act(np.zeros((2, 2), np.float32)))
 
 
 def test_what_a_reset_leaves_behind_is_found_by_the_suite_and_cured_by_remake() -> None:
@@ -275,13 +238,6 @@ def test_a_pick_of_a_scalar_is_a_vector_of_one() -> None:
     assert Pick.parse("").vector(np.arange(3)).tolist() == [0.0, 1.0, 2.0]
     with pytest.raises(ConfigError, match="shape"):
         Pick.parse("").vector(np.zeros((2, 2)))
-
-
-def test_an_image_is_a_copy() -> None:
-    buffer = np.zeros((4, 4, 3), np.uint8)
-    image = as_image(buffer, "front")
-    buffer[:] = 9
-    assert image.max() == 0
 
 
 def test_images_are_stretched_and_there_is_no_more_info_than_the_envs() -> None:

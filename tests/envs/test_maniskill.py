@@ -13,7 +13,7 @@ from vlagents_ray.contract import CameraSpec
 from vlagents_ray.envs import make_env
 from vlagents_ray.envs.maniskill import ManiSkill, simulator
 from vlagents_ray.envs.maniskill.simulator import INSTRUCTIONS, instruction_for
-from vlagents_ray.errors import ConfigError, EnvFailed, InvalidAction, NotReset, UnknownEnv
+from vlagents_ray.errors import ConfigError, EnvFailed, UnknownEnv
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.testing import check_env
 from vlagents_ray.validation import check_observation
@@ -59,34 +59,23 @@ def push() -> Iterator[ManiSkill]:
 
 @pytest.mark.parametrize("task", ManiSkill.tasks())
 def test_each_task_gives_what_its_contract_states(task: str) -> None:
-    env = make_env(f"maniskill/{task}", width=40, height=32)
-    with env:
+    with make_env(f"maniskill/{task}", width=40, height=32) as env:
         contract = env.contract
         obs, _ = env.reset(seed=3)
-        check_observation(obs, contract)
-        assert (
-            set(obs.cameras)
-            == set(contract.cameras or {})
-            == {"base_camera"} | ({"hand_camera"} if task in TWO_CAMERAS else set())
-        )
-        assert env.max_steps == STEP_LIMITS.get(task, 50)
-        assert env.instruction == INSTRUCTIONS[task]
-        assert contract.control_hz == 20.0
-        assert contract.action.space == "ee_pose"
+        cameras = {"base_camera"} | ({"hand_camera"} if task in TWO_CAMERAS else set())
+        assert set(obs.cameras) == set(contract.cameras or {}) == cameras
+        assert (env.max_steps, env.instruction) == (STEP_LIMITS.get(task, 50), INSTRUCTIONS[task])
         has_gripper = task != "PushT-v1"  # its robot holds a stick
-        assert contract.gripper is has_gripper
+        assert (contract.control_hz, contract.action.space, contract.gripper) == (20.0, "ee_pose", has_gripper)
         assert contract.action.dim == (7 if has_gripper else 6)
         action = np.full(contract.action.dim or 0, 0.1, dtype=np.float32)
         for _ in range(3):
             obs, reward, terminated, truncated, info = env.step(Act(action))
             check_observation(obs, contract)
             assert set(obs.state) == set(contract.state or {}) == {"joints", "tquat", "xyzrpy"}
-            assert all(part.dtype == np.float32 for part in obs.state.values())
             assert (obs.gripper is not None) is has_gripper
-            assert np.isfinite(obs.info["sim_state"]).all()
-            assert np.isfinite(reward)
-            assert (terminated, truncated) == (False, False)
-            assert type(info["success"]) is bool
+            assert np.isfinite([reward, *obs.info["sim_state"]]).all()
+            assert (terminated, truncated, type(info["success"])) == (False, False, bool)
 
 
 def test_it_keeps_the_promises_of_an_env() -> None:
@@ -105,12 +94,6 @@ def test_an_episode_does_not_depend_on_what_was_played_before(task: str) -> None
     with ManiSkill(task, width=16, height=16, cameras=["base_camera"]) as another:
         play(another, 2, actions[:5])
         assert_same(play(another, 3, actions), fresh)
-
-
-def test_seeds_give_different_episodes(push: ManiSkill) -> None:
-    states = [push.reset(seed=seed)[0].info["sim_state"] for seed in (0, 1, 2**32 + 1)]
-    assert not np.array_equal(states[0], states[1])
-    np.testing.assert_array_equal(states[1], states[2])  # modulo 2^32
 
 
 def test_images_have_the_size_asked_for_and_stand_upright() -> None:
@@ -178,38 +161,13 @@ def test_only_the_cameras_asked_for_are_given_and_rendered() -> None:
         assert set(env._env.env.scene.sensors) == {"hand_camera"}
 
 
-def test_a_read_only_action_is_executed_and_left_alone(push: ManiSkill) -> None:
-    push.reset(seed=0)
-    action = np.full(7, 0.5, dtype=np.float32)
-    action.flags.writeable = False
-    push.step(Act(action))
-    assert (action == 0.5).all()
-
-
-@pytest.mark.parametrize("action", [np.zeros(6), np.zeros((2, 7)), np.full(7, np.nan)])
-def test_an_unusable_action_is_refused(push: ManiSkill, action: np.ndarray) -> None:
-    push.reset(seed=0)
-    with pytest.raises(InvalidAction):
-        push.step(Act(action.astype(np.float32)))
-
-
-def test_a_description_names_versions_and_backends(push: ManiSkill) -> None:
-    facts = push.describe()
-    assert facts["mani_skill"] == "3.0.1"
-    assert facts["sapien"] == "3.0.3"
-    assert facts["control_mode"] == "pd_ee_delta_pose"
-    assert facts["sim_backend"] == "physx_cpu"
-    assert facts["render_backend"] in ("sapien_cpu", "sapien_cuda")
-    assert facts["render_device"]
-    assert facts["shaders"] == {"base_camera": "minimal"}
-    assert facts["reconfigure"] is True
-
-
 def test_other_control_modes_state_themselves() -> None:
     with ManiSkill("PushCube-v1", width=16, height=16, control_mode="pd_joint_delta_pos") as env:
         action = env.contract.action
         assert (action.dim, action.space, action.delta, action.rotation) == (8, "joint", True, "none")
-        assert env.describe()["control_mode"] == "pd_joint_delta_pos"
+        facts = env.describe()
+        assert (facts["control_mode"], facts["sim_backend"]) == ("pd_joint_delta_pos", "physx_cpu")
+        assert facts["render_backend"] in ("sapien_cpu", "sapien_cuda")
 
 
 def test_a_robot_without_the_default_control_mode_uses_its_own() -> None:
@@ -233,10 +191,6 @@ def test_a_step_limit_of_ones_own_is_kept() -> None:
     with ManiSkill("PushCube-v1", width=16, height=16, max_steps=2) as env:
         env.reset(seed=0)
         assert [env.step(command())[3] for _ in range(2)] == [False, True]
-        env.reset(seed=0)
-        assert env.step(command())[3] is False
-    with pytest.raises(UnknownEnv):
-        ManiSkill("PushCub-v1", max_steps=2)
     with pytest.raises(ConfigError, match="max_steps is 0"):
         ManiSkill("PushCube-v1", max_steps=0)
 
@@ -273,30 +227,16 @@ def test_missing_assets_fail_with_the_command_that_gets_them(monkeypatch: pytest
     assert sys.stdin is keyboard
 
 
-def test_a_simulator_error_is_an_infrastructure_failure(push: ManiSkill, monkeypatch: pytest.MonkeyPatch) -> None:
-    push.reset(seed=0)
-
-    def broken(action: object) -> None:
-        raise RuntimeError("the physics exploded")
-
-    monkeypatch.setattr(push._env.env, "step", broken)
-    with pytest.raises(EnvFailed, match=r"PushCube-v1 failed to step: RuntimeError: the physics exploded"):
-        push.step(command())
-
-
-def test_a_closed_env_says_so() -> None:
-    env = ManiSkill("PushCube-v1", width=16, height=16)
-    with pytest.raises(NotReset, match="reset"):
-        env.step(command())
-    env.close()
-    env.close()
-    with pytest.raises(EnvFailed, match="closed"):
-        env.reset(seed=0)
-
-
 @pytest.mark.parametrize(
-    ("task", "words"),
-    [("PickSingleYCB-v1", "pick single ycb"), ("OpenCabinetDrawer-v1", "open cabinet drawer")],
+    ("task", "words"), [("PickSingleYCB-v1", "pick single ycb"), ("OpenCabinetDrawer-v1", "open cabinet drawer")]
 )
 def test_a_task_without_an_instruction_is_named_in_words(task: str, words: str) -> None:
     assert instruction_for(task) == words
+
+
+def test_a_read_only_action_is_executed_and_left_alone(push: ManiSkill) -> None:
+    push.reset(seed=0)
+    action = np.full(7, 0.5, dtype=np.float32)
+    action.flags.writeable = False
+    push.step(Act(action))
+    assert (action == 0.5).all()

@@ -53,11 +53,6 @@ def test_a_block_pushed_onto_the_target_is_a_success_and_ends_the_episode(pusht:
     assert result.steps < 20
 
 
-def test_the_same_push_from_elsewhere_is_none_within_300_steps(pusht: EvalEnv) -> None:
-    result = play(pusht, NAME, PUSHING, seed=0)
-    assert (result.success_once, result.ending, result.steps) == (False, "truncated", 300)
-
-
 def test_success_wants_more_than_95_percent_of_the_target_covered(pusht: EvalEnv) -> None:
     pusht.reset(seed=0, options={"reset_to_state": BESIDE})
     covered = []
@@ -68,12 +63,6 @@ def test_success_wants_more_than_95_percent_of_the_target_covered(pusht: EvalEnv
             break
     assert (False, False, False) in covered
     assert covered[-1] == (True, True, True)
-
-
-def test_each_seed_begins_elsewhere_and_always_there(pusht: EvalEnv) -> None:
-    begins = [pusht.reset(seed=seed)[0].state["agent_pos"] for seed in (0, 1, 0)]
-    assert np.array_equal(begins[0], begins[2])
-    assert not np.array_equal(begins[0], begins[1])
 
 
 def test_the_expert_solves_random_beginnings_and_holding_still_does_not() -> None:

@@ -1,112 +1,154 @@
-"""What every environment of a simulator inherits: resets, steps, its end and its errors, without a simulator."""
+"""What all simulators share, shown with one that simulates nothing; protocols, as results record them."""
 
 from __future__ import annotations
 
-from typing import Any
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 
 from vlagents_ray.contract import ActionSpec, Contract
-from vlagents_ray.envs.simulator import SimulatorEnv
+from vlagents_ray.envs.simulator import BenchmarkProtocol, SimulatorEnv
 from vlagents_ray.errors import ConfigError, EnvFailed, InvalidAction, NotReset
 from vlagents_ray.interface import Act, Obs
+from vlagents_ray.registry import ENVS
+from vlagents_ray.testing.comparing import require_wireable
 
-STILL = Act(np.zeros(2, np.float32))
+PAGES = Path(__file__).parents[2] / "docs" / "benchmarks"
+ANY_PROTOCOL = {"tabletop", "gymnasium"}  # our own example, and environments of others by their ids
+
+PROTOCOL = BenchmarkProtocol(
+    name="Shelf",
+    source="a paper",
+    max_steps=200,
+    control_hz=20.0,
+    control="joints",
+    success="it is on the shelf",
+    begins="the seed's",
+    ends_on_success=True,
+)
+
+
+def test_what_was_played_by_the_protocol_deviates_in_nothing() -> None:
+    assert PROTOCOL.describe(max_steps=200, control_hz=20)["deviations"] == []
+
+
+def test_each_deviation_is_told_with_what_the_protocol_says() -> None:
+    told = PROTOCOL.describe(max_steps=50, control_hz=20.0, ends_on_success=False)["deviations"]
+    assert told == ["max_steps: 50, the protocol says 200", "ends_on_success: False, the protocol says True"]
+
+
+def test_a_description_travels_in_a_result() -> None:
+    described = replace(PROTOCOL, episodes=50).describe(max_steps=1)
+    require_wireable(described, "describe()")
+    assert (described["name"], described["episodes"]) == ("Shelf", 50)
+
+
+def test_what_a_protocol_does_not_settle_cannot_deviate_from_it() -> None:
+    with pytest.raises(AttributeError, match="colour"):
+        PROTOCOL.describe(colour="red")
+
+
+@pytest.mark.parametrize("suite", sorted(set(ENVS) - ANY_PROTOCOL))
+def test_the_page_of_a_benchmark_states_its_protocol(suite: str) -> None:
+    page = (PAGES / f"{'rcs' if suite == 'duobench' else suite}.md").read_text()
+    section = re.search(r"^## Protocol\n(.*?)(?=^## |\Z)", page, re.DOTALL | re.MULTILINE)
+    assert section is not None
+    for stated in ("step", "success"):
+        assert stated in section[1].lower()
 
 
 class Shelf(SimulatorEnv):
-    """Notes the seeds and the initial states with which episodes begin, and fails on request."""
+    """Is solved by its third step, and breaks where it is told to."""
 
-    suite, max_steps = "shelf", 3
-    _contract = Contract(action=ActionSpec(dim=2))
+    suite, title, packages, cure = "shelf", "Shelf", (), ""
+    distributions: ClassVar = ()
+    max_steps = 5
 
-    def __init__(self, states: int | None = None, broken: str = "") -> None:
-        super().__init__("shelf/tidy")
-        self.init_states, self.broken, self.begun, self.closed = states, broken, list[tuple[int, int]](), 0
+    def __init__(self, *, states: int | None = None, ends_on_success: bool = True, breaks: str = "") -> None:
+        super().__init__("shelf/top", width=8)
+        self.init_states, self._ends_on_success = states, ends_on_success
+        self._contract, self._protocol = Contract(action=ActionSpec(dim=2)), PROTOCOL
+        self.breaks, self.closed = breaks, 0
         with self._making():
             self._resources.callback(self._count)
-            self._fail("make")
+            self._break("make")
             self._env = object()
-
-    def _begin(self, seed: int, state: int) -> tuple[Obs, dict[str, Any]]:
-        self._fail("reset")
-        self.begun.append((seed, state))
-        return Obs(), {}
-
-    def _advance(self, action: np.ndarray) -> tuple[Obs, float, bool, dict[str, Any]]:
-        self._fail("step")
-        return Obs(), 0.0, False, {"success": False}
-
-    def _fail(self, when: str) -> None:
-        if self.broken == when:
-            raise RuntimeError("mj_step: unstable")
 
     def _count(self) -> None:
         self.closed += 1
 
+    def _break(self, when: str) -> None:
+        if self.breaks == when:
+            raise RuntimeError("unstable")
 
-def test_an_episode_begins_by_its_seed_and_ends_at_the_limit() -> None:
-    env = Shelf()
-    assert env.reset(seed=2**32 + 1)[1] == {"success": False}
-    assert env.begun == [(1, 0)]
-    for _ in range(2):
-        assert [env.step(STILL)[3] for _ in range(3)] == [False, False, True]
-        env.reset(seed=1)
+    def _begin(self, seed: int, state: int) -> tuple[Obs, dict[str, Any]]:
+        self._break("reset")
+        return Obs(info={"begun": [seed, state]}), {}
 
-
-def test_a_fixed_initial_state_is_that_of_the_options_or_of_the_seed() -> None:
-    env = Shelf(states=50)
-    assert [env.reset(seed=107)[1]["init_state"], env.reset(seed=0, options={"init_state": 3})[1]["init_state"]] == [
-        7,
-        3,
-    ]
-    assert env.begun == [(107, 7), (0, 3)]
+    def _advance(self, action: np.ndarray) -> tuple[Obs, float, bool, dict[str, Any]]:
+        self._break("step")
+        return Obs(), 0.0, *self._solved(self._steps == 2)
 
 
-@pytest.mark.parametrize(
-    ("states", "options", "says"),
-    [
-        (50, {"init_state": 50}, "init_state is 50, want 0 to 49"),
-        (50, {"init_state": "first"}, "init_state is 'first', want 0 to 49"),
-        (50, {"goal": 1}, r"unknown reset options \['goal'\], want init_state or none"),
-        (None, {"init_state": 0}, r"unknown reset options \['init_state'\], want none"),
-    ],
-)
-def test_unknown_reset_options_are_refused(states: int | None, options: dict[str, object], says: str) -> None:
-    env = Shelf(states)
-    with pytest.raises(ConfigError, match=f"shelf/tidy: {says}"):
-        env.reset(seed=0, options=options)
-    assert env.begun == []
+def step(env: Shelf, *action: Any) -> tuple[bool, bool, bool]:
+    _, _, terminated, truncated, info = env.step(Act(np.array(action or (0, 0), np.float32)))
+    return terminated, truncated, info["success"]
 
 
-@pytest.mark.parametrize("action", [np.zeros(3), np.zeros((2, 2)), np.full(2, np.nan)])
-def test_an_unusable_action_is_refused(action: np.ndarray) -> None:
-    env = Shelf()
+@pytest.mark.parametrize("ends", [True, False])
+def test_success_ends_an_episode_unless_told_otherwise_and_the_limit_truncates(ends: bool) -> None:
+    env = Shelf(ends_on_success=ends)
     env.reset(seed=0)
-    with pytest.raises(InvalidAction):
-        env.step(Act(action.astype(np.float32)))
+    assert [step(env) for _ in range(5)] == [(False, False, False)] * 2 + [
+        (ends, False, True), (False, False, False), (False, True, False)
+    ]  # fmt: skip
+    assert len(env.describe()["protocol"]["deviations"]) == (1 if ends else 2)
+    env.reset(seed=0)
+    assert not step(env)[1], "the count begins again"
+
+
+def test_initial_states_go_by_the_option_or_the_seed() -> None:
+    env = Shelf(states=3)
+    for seed, options, begun in ((7, None, [7, 1]), (7, {"init_state": 2}, [7, 2]), (2**32 + 3, None, [3, 1])):
+        obs, info = env.reset(seed=seed, options=options)
+        assert (obs.info["begun"], info["init_state"]) == (begun, begun[1])
+    for state in (3, -1, "1", True):
+        with pytest.raises(ConfigError, match="want 0 to 2"):
+            env.reset(seed=0, options={"init_state": state})
+    for odd, options in ((env, {"goal": 1}), (Shelf(), {"init_state": 0})):
+        with pytest.raises(ConfigError, match=r"unknown reset options \['(goal|init_state)'\]"):
+            odd.reset(seed=0, options=options)
 
 
 @pytest.mark.parametrize("when", ["make", "reset", "step"])
-def test_an_error_of_the_simulator_is_the_envs(when: str) -> None:
+def test_a_simulator_that_breaks_is_an_infrastructure_failure(when: str) -> None:
     def play() -> None:
-        env = Shelf(broken=when)
+        env = Shelf(breaks=when)
         env.reset(seed=0)
-        env.step(STILL)
+        step(env)
 
-    with pytest.raises(EnvFailed, match=f"shelf/tidy failed to {when}: RuntimeError: mj_step: unstable"):
+    with pytest.raises(EnvFailed, match=f"shelf/top failed to {when}: RuntimeError: unstable"):
         play()
 
 
-def test_one_that_was_not_reset_or_is_closed_says_so() -> None:
+def test_a_bad_action_is_an_error_of_the_policy() -> None:
     env = Shelf()
-    with pytest.raises(NotReset, match="shelf/tidy: step before reset"):
-        env.step(STILL)
     env.reset(seed=0)
+    for action in ((0, 0, 0), (np.nan, 0), ((0, 0), (0, 0))):
+        with pytest.raises(InvalidAction):
+            step(env, *action)
+
+
+def test_an_env_that_is_not_reset_or_closed_says_so() -> None:
+    env = Shelf()
+    with pytest.raises(NotReset, match="reset"):
+        step(env)
     env.close()
     env.close()
     assert env.closed == 1
-    for call in (lambda: env.step(STILL), lambda: env.reset(seed=0)):
-        with pytest.raises(EnvFailed, match="shelf/tidy is closed; make a new one"):
-            call()
+    with pytest.raises(EnvFailed, match="closed"):
+        env.reset(seed=0)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import subprocess
 import sys
-import time
+from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,26 +17,14 @@ from many import many
 from vlagents_ray import Act
 from vlagents_ray.envs import make_env
 from vlagents_ray.envs.tabletop import Tabletop
-from vlagents_ray.errors import ConfigError, InvalidAction, NotReset, UnknownEnv
+from vlagents_ray.errors import ConfigError, NotReset, UnknownEnv
 from vlagents_ray.images.jpeg_png import decode, encode_jpeg
+from vlagents_ray.interface import Obs
 from vlagents_ray.policies.scripted import Scripted
 from vlagents_ray.testing import check_env
 
-HASH_OF_EPISODE = """
-import hashlib, sys, numpy as np
-from vlagents_ray import Act
-from vlagents_ray.envs import make_env
-env = make_env("tabletop")
-obs, _ = env.reset(seed=int(sys.argv[1]))
-rng, digest = np.random.default_rng(0), hashlib.sha256(env.instruction.encode())
-for _ in range(20):
-    obs, *_ = env.step(Act(rng.uniform(-1, 1, 4).astype(np.float32)))
-    digest.update(obs.cameras["front"].tobytes() + obs.state["xyzrpy"].tobytes())
-print(digest.hexdigest())
-"""
 
-
-def play(env: Tabletop, seed: int, *, wrong: bool = False) -> bool:
+def play(env: Tabletop, seed: int, *, wrong: bool = False, seen: Callable[[Obs], Obs] = lambda obs: obs) -> bool:
     """Does the expert succeed, following the episode's instruction or another of the same scene?"""
     obs, info = env.reset(seed=seed)
     followed = env.instruction
@@ -42,7 +32,7 @@ def play(env: Tabletop, seed: int, *, wrong: bool = False) -> bool:
         others = [text for text in info["instructions"] if text != followed]
         followed = others[np.random.default_rng(seed).integers(len(others))]
     agent = Scripted()
-    agent.reset(obs, followed, env="tabletop", seed=seed)
+    agent.reset(seen(obs), followed, env="tabletop", seed=seed)
     success = truncated = False
     while not truncated:
         act = agent.act(obs)
@@ -67,28 +57,20 @@ def test_following_the_instruction_succeeds_and_another_one_does_not(task: str) 
     assert np.mean(wrong) <= 0.20
 
 
-@pytest.mark.parametrize(("width", "height"), [(96, 96), (320, 240), (240, 320), (512, 512)])
+@pytest.mark.parametrize(("width", "height"), [(96, 96), (320, 240), (240, 320)])
 def test_the_expert_sees_at_every_image_size(width: int, height: int) -> None:
     env = Tabletop(width=width, height=height)
     assert env.reset(seed=0)[0].cameras["front"].shape == (height, width, 3)
-    assert np.mean([play(env, seed) for seed in range(20)]) >= 0.95
+    assert np.mean([play(env, seed) for seed in range(many(20))]) >= 0.95
 
 
 @pytest.mark.parametrize("subsampling", ["444", "420"])
 def test_the_expert_sees_through_jpeg(subsampling: str) -> None:
+    def seen(obs: Obs) -> Obs:
+        return replace(obs, cameras={"front": decode(encode_jpeg(obs.cameras["front"], 85, subsampling))})
+
     env = Tabletop()
-    successes = []
-    for seed in range(20):
-        obs, _ = env.reset(seed=seed)
-        agent = Scripted()
-        image = decode(encode_jpeg(obs.cameras["front"], 85, subsampling))
-        agent.reset(replace(obs, cameras={"front": image}), env.instruction, env="tabletop")
-        success = truncated = False
-        while not truncated and not success:
-            obs, _, _, truncated, info = env.step(agent.act(obs))
-            success = info["success"]
-        successes.append(success)
-    assert np.mean(successes) >= 0.95
+    assert np.mean([play(env, seed, seen=seen) for seed in range(many(20))]) >= 0.95
 
 
 def test_mixed_draws_every_task() -> None:
@@ -100,27 +82,24 @@ def test_mixed_draws_every_task() -> None:
     assert verbs == {"put", "slide", "stack", "lift"}
 
 
+def digest_of_episode(env: Tabletop, seed: int) -> str:
+    obs, _ = env.reset(seed=seed)
+    rng, digest = np.random.default_rng(0), hashlib.sha256(env.instruction.encode())
+    for _ in range(20):
+        obs, *_ = env.step(Act(rng.uniform(-1, 1, 4).astype(np.float32)))
+        digest.update(obs.cameras["front"].tobytes() + obs.state["xyzrpy"].tobytes())
+    return digest.hexdigest()
+
+
 def test_an_episode_is_the_same_in_another_process_and_after_other_episodes() -> None:
-    results = {
-        subprocess.run(
-            [sys.executable, "-c", HASH_OF_EPISODE, "11"], capture_output=True, text=True, check=True
-        ).stdout.strip()
-    }
+    code = "from test_tabletop import *; print(digest_of_episode(Tabletop(), 11))"
+    path = os.pathsep.join([str(Path(__file__).parent), *filter(None, sys.path)])
+    elsewhere = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, env=os.environ | {"PYTHONPATH": path}
+    )
     env = Tabletop()
-    for seed in (3, 11):
-        obs, _ = env.reset(seed=seed)
-        rng, digest = np.random.default_rng(0), hashlib.sha256(env.instruction.encode())
-        for _ in range(20):
-            obs, *_ = env.step(Act(rng.uniform(-1, 1, 4).astype(np.float32)))
-            digest.update(obs.cameras["front"].tobytes() + obs.state["xyzrpy"].tobytes())
-    results.add(digest.hexdigest())
-    assert len(results) == 1
-
-
-def test_different_seeds_give_different_scenes() -> None:
-    env = Tabletop()
-    pictures = {env.reset(seed=seed)[0].cameras["front"].tobytes() for seed in range(10)}
-    assert len(pictures) == 10
+    other = digest_of_episode(env, 3)
+    assert digest_of_episode(env, 11) == elsewhere.stdout.strip() != other
 
 
 def test_a_chosen_instruction_leaves_the_scene_as_it_is() -> None:
@@ -132,34 +111,23 @@ def test_a_chosen_instruction_leaves_the_scene_as_it_is() -> None:
     assert np.array_equal(before.cameras["front"], after.cameras["front"])
 
 
-def test_an_instruction_about_what_is_not_there_is_refused() -> None:
-    with pytest.raises(ConfigError, match="put the orange puck on the blue pad"):
-        Tabletop().reset(seed=0, options={"instruction": "put the orange puck on the blue pad"})
-
-
-def test_an_unknown_reset_option_is_refused() -> None:
-    with pytest.raises(ConfigError, match="init_state"):
-        Tabletop().reset(seed=0, options={"init_state": 3})
-
-
-def test_an_unknown_task_is_refused_with_the_known_ones() -> None:
+def test_what_there_is_not_is_refused() -> None:
+    elsewhere = "put the orange puck on the blue pad"
+    for option, value in (("instruction", elsewhere), ("init_state", "3")):
+        with pytest.raises(ConfigError, match=value if option == "instruction" else option):
+            Tabletop().reset(seed=0, options={option: value})
     with pytest.raises(UnknownEnv, match="pick_place"):
         make_env("tabletop/juggle")
-
-
-@pytest.mark.parametrize(
-    ("task", "options", "text"),
-    [
-        ("lift", {"width": 3}, "width is 3, want at least 32"),
-        ("lift", {"pucks": 0}, "pucks is 0, want 1 to 4 in 'lift'"),
-        ("lift", {"pucks": 5}, "pucks is 5, want 1 to 4 in 'lift'"),
-        ("stack", {"pucks": 1}, "pucks is 1, want 2 to 4 in 'stack'"),
-        (None, {"pucks": 1}, "pucks is 1, want 2 to 4 in 'mixed'"),
-    ],
-)
-def test_an_option_out_of_range_is_refused(task: str | None, options: dict[str, int], text: str) -> None:
-    with pytest.raises(ConfigError, match=text):
-        Tabletop(task, **options)
+    with pytest.raises(NotReset):
+        Tabletop().step(Act(np.zeros(4, np.float32)))
+    for task, option, value, text in (
+        ("lift", "width", 3, "want at least 32"),
+        ("lift", "pucks", 0, "want 1 to 4 in 'lift'"),
+        ("lift", "pucks", 5, "want 1 to 4 in 'lift'"),
+        (None, "pucks", 1, "want 2 to 4 in 'mixed'"),
+    ):
+        with pytest.raises(ConfigError, match=f"{option} is {value}, {text}"):
+            Tabletop(task, **{option: value})
 
 
 @pytest.mark.parametrize("task", ["pick_place", "slide", "lift"])
@@ -167,7 +135,7 @@ def test_one_puck_is_the_only_one_that_is_named(task: str) -> None:
     env = Tabletop(task, pucks=1)
     _, info = env.reset(seed=0)
     assert len({text.split(" puck ")[0] for text in [f"{text} " for text in info["instructions"]]}) == 1
-    assert np.mean([play(env, seed) for seed in range(20)]) >= 0.95
+    assert np.mean([play(env, seed) for seed in range(many(20))]) >= 0.95
 
 
 @pytest.mark.parametrize("task", ["pick_place", "slide", "stack", "lift"])
@@ -191,18 +159,6 @@ def test_the_state_of_the_objects_says_where_the_puck_is_and_where_it_is_to_be(t
     assert off[-1] < 0.06, "within the pad, on the other puck, or somewhat higher than it had to be lifted"
 
 
-def test_a_step_before_reset_is_refused() -> None:
-    with pytest.raises(NotReset):
-        Tabletop().step(Act(np.zeros(4, np.float32)))
-
-
-def test_a_chunk_is_refused() -> None:
-    env = Tabletop()
-    env.reset(seed=0)
-    with pytest.raises(InvalidAction, match="row by row"):
-        env.step(Act(np.zeros((2, 4), np.float32)))
-
-
 def test_a_full_action_moves_three_centimetres_and_more_is_clipped() -> None:
     env = Tabletop()
     start, _ = env.reset(seed=0)
@@ -214,11 +170,9 @@ def test_a_full_action_moves_three_centimetres_and_more_is_clipped() -> None:
 def test_the_gripper_reports_one_when_open_and_zero_when_closed() -> None:
     env = Tabletop()
     start, _ = env.reset(seed=0)
-    closed = start
     for _ in range(3):
         closed, *_ = env.step(Act(np.array([0, 0, 0, -1], np.float32)))
-    assert start.gripper == 1.0
-    assert closed.gripper == pytest.approx(0.0, abs=1e-9)
+    assert (start.gripper, closed.gripper) == (1.0, pytest.approx(0.0, abs=1e-9))
 
 
 def test_the_image_shows_the_gripper_where_the_calibration_says() -> None:
@@ -232,20 +186,3 @@ def test_the_image_shows_the_gripper_where_the_calibration_says() -> None:
     u, v = 112 + scale * x, 112 - scale * (y * np.sin(np.radians(70)) + z * np.cos(np.radians(70)))
     assert columns.min() < u < columns.max()
     assert rows.min() < v < rows.max()
-
-
-def test_a_step_with_its_image_costs_no_more_than_one_jpeg_of_it() -> None:
-    """About 0.05 ms against 0.3 ms: several thousand steps a second on any machine of today."""
-    env = Tabletop()
-    obs, _ = env.reset(seed=0)
-    acts = [Act(a) for a in np.random.default_rng(0).uniform(-1, 1, (80, 4)).astype(np.float32)]
-    step_s, jpeg_s = [], []
-    for act in acts:
-        begin = time.perf_counter()
-        obs, *_ = env.step(act)
-        stepped = time.perf_counter()
-        encode_jpeg(obs.cameras["front"])
-        step_s.append(stepped - begin)
-        jpeg_s.append(time.perf_counter() - stepped)
-    assert obs.cameras["front"].shape == (224, 224, 3)
-    assert np.median(step_s) < np.median(jpeg_s)

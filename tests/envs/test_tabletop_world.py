@@ -40,35 +40,6 @@ def test_closing_around_a_puck_holds_it_and_it_follows() -> None:
     assert red.lifted
 
 
-def test_fingers_centre_a_puck_between_them() -> None:
-    red = Puck("red", 0.0, 0.0)
-    scene = world(red)
-    go(scene, 0.01, 0.0, 0.1, OPEN)
-    go(scene, 0.01, 0.0, 0.005, OPEN)
-    go(scene, 0.01, 0.0, 0.005, CLOSED)
-    assert scene.held is red
-    assert red.x == pytest.approx(0.01, abs=1e-6)
-
-
-def test_closing_beside_a_puck_holds_nothing() -> None:
-    red = Puck("red", 0.0, 0.0)
-    scene = world(red)
-    go(scene, 0.0, 0.06, 0.005, OPEN)
-    go(scene, 0.0, 0.06, 0.005, CLOSED)
-    assert scene.held is None
-    assert scene.opening == pytest.approx(0.0, abs=1e-9)
-
-
-def test_a_released_puck_falls_to_the_table() -> None:
-    red = Puck("red", 0.0, 0.0)
-    scene = world(red)
-    grasp(scene, red)
-    go(scene, 0.0, 0.0, 0.15, CLOSED)
-    go(scene, 0.0, 0.0, 0.15, OPEN)
-    assert scene.held is None
-    assert red.z == 0.0
-
-
 def test_a_puck_released_over_another_stands_on_it_and_falls_when_that_is_taken_away() -> None:
     red, blue = Puck("red", 0.0, 0.0), Puck("blue", 0.15, 0.0)
     scene = world(red, blue)
@@ -94,17 +65,6 @@ def test_what_stands_on_the_held_puck_is_carried_with_it() -> None:
     go(scene, 0.1, 0.05, 0.05, CLOSED)
     assert (above.x, above.y) == pytest.approx((below.x, below.y), abs=1e-6)
     assert above.z == pytest.approx(below.z + PUCK_HEIGHT)
-
-
-def test_a_closed_gripper_pushes_a_puck_ahead_of_it() -> None:
-    red = Puck("red", 0.0, 0.0)
-    scene = world(red)
-    go(scene, 0.0, 0.1, 0.1, CLOSED)
-    go(scene, 0.0, 0.1, 0.005, CLOSED)
-    go(scene, 0.0, -0.05, 0.005, CLOSED)
-    assert red.y < -0.05 - PUCK_RADIUS
-    assert red.x == pytest.approx(0.0, abs=1e-3)
-    assert not red.lifted
 
 
 def test_a_pushed_puck_pushes_the_next_and_they_never_overlap() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import time
 from collections.abc import Callable
@@ -19,13 +20,10 @@ from vlagents_ray.evaluate.run import CLOSING_S, MARGIN, Deadline
 JOBS = plan(cells(flat_config(envs=["tabletop"], episodes=3, out="out")))
 
 
-def test_without_a_deadline_there_is_always_room() -> None:
-    deadline = Deadline(None, [1e9])
-    assert deadline.leaves_room
-    assert not deadline.is_over
-
-
 def test_no_episode_is_begun_that_would_not_end_if_it_were_as_long_as_the_longest() -> None:
+    assert (Deadline(None, [1e9]).leaves_room, Deadline(None).is_over) == (True, False)
+    for longest, leaves_room in ((90.0, False), (70.0, True)):  # of earlier runs
+        assert Deadline(100 + CLOSING_S, [20.0, longest], Clock()).leaves_room is leaves_room
     clock = Clock()
     deadline = Deadline(1000 + CLOSING_S, now=clock)
     deadline.begin(JOBS[:2])
@@ -42,11 +40,6 @@ def test_no_episode_is_begun_that_would_not_end_if_it_were_as_long_as_the_longes
     assert deadline.is_over
 
 
-def test_episodes_of_earlier_runs_tell_how_long_they_take() -> None:
-    assert not Deadline(100 + CLOSING_S, [20.0, 90.0], Clock()).leaves_room
-    assert Deadline(100 + CLOSING_S, [20.0, 70.0], Clock()).leaves_room
-
-
 class SlowAfterTwo(Progress):
     """Once two episodes are recorded, there is no time for another one."""
 
@@ -59,21 +52,17 @@ class SlowAfterTwo(Progress):
             self._monkeypatch.setattr(Deadline, "leaves_room", False)
 
 
-@pytest.mark.usefixtures("shared_ray")
 def test_out_of_time_keeps_what_is_finished_and_resume_plays_the_rest(
     config: Callable[..., EvalConfig], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with monkeypatch.context() as patch, pytest.raises(OutOfTime, match=r"out of time after .* --resume") as stopped:
-        evaluate(config(), agent_factory=ToZero, progress=SlowAfterTwo(patch), end_at=time.time() + 1000)
-    played = stopped.value.summary.total.episodes
-    assert 2 <= played <= 3, "the other worker's episode went on to its end"
-    assert json.loads((config().out / "summary.json").read_text())["state"] == "out of time"
-    summary = evaluate(config(resume=True), agent_factory=ToZero, end_at=time.time() + 1000)
-    assert (summary.state, summary.total.episodes) == ("complete", 6)
-
-
-@pytest.mark.usefixtures("shared_ray")
-def test_an_end_that_is_past_plays_nothing(config: Callable[..., EvalConfig]) -> None:
+    play = functools.partial(evaluate, agent_factory=ToZero, in_process=True)
     with pytest.raises(OutOfTime) as stopped:
-        evaluate(config(), agent_factory=ToZero, end_at=time.time() - 1)
+        play(config(), end_at=time.time() - 1)
     assert stopped.value.summary.total.episodes == 0
+    again = config(resume=True)
+    with monkeypatch.context() as patch, pytest.raises(OutOfTime, match=r"out of time after .* --resume") as stopped:
+        play(again, progress=SlowAfterTwo(patch), end_at=time.time() + 1000)
+    assert stopped.value.summary.total.episodes == 2
+    assert json.loads((config().out / "summary.json").read_text())["state"] == "out of time"
+    summary = play(again, end_at=time.time() + 1000)
+    assert (summary.state, summary.total.episodes) == ("complete", 6)

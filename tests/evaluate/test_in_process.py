@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import sqlite3
+import subprocess
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import closing
@@ -42,6 +45,10 @@ def test_it_is_one_worker_without_ray_whatever_the_plan_says(config: Config) -> 
     summary = evaluate(config(workers=4), agent_factory=ToZero, in_process=True)
     assert (summary.state, summary.total.episodes) == ("complete", 6)
     assert [worker.pid for worker in summary.results.workers] == [os.getpid()]
+    assert json.loads((summary.out / "summary.json").read_text()) == json.loads(json.dumps(summary.to_json()))
+    rate = summary.total.success_once.successes / 6
+    assert 0 < rate < 1
+    assert f"{100 * rate:.1f} %" in (summary.out / "report.html").read_text()
 
 
 def test_a_simulator_that_does_not_repeat_itself_leaves_one_failure_without_a_video_and_a_warning(
@@ -73,7 +80,7 @@ def test_a_simulator_that_breaks_is_made_again_and_its_episode_repeated(config: 
         assert db.execute("SELECT episode FROM episodes WHERE attempts = 2").fetchall() == [(2,)]
     assert len(summary.results.workers) == 2, "one for each simulator"
     whole = evaluate(config(out=tmp_path / "whole"), agent_factory=ToZero, in_process=True)
-    assert [one["actions_sha256"] for one in outcomes(summary)] == [one["actions_sha256"] for one in outcomes(whole)]
+    assert [one | {"key": 0} for one in outcomes(summary)] == [one | {"key": 0} for one in outcomes(whole)]
 
 
 def test_suites_whose_workers_differ_have_their_turns(config: Config) -> None:
@@ -129,3 +136,21 @@ def test_failures_that_come_together_wait_for_a_signal_once(config: Config, monk
     with closing(sqlite3.connect(summary.out / "results.db")) as db:
         assert db.execute("SELECT count(*) FROM attempts").fetchone() == (3,)
     assert limits.count(0.0123) == 1
+
+
+READ = """
+import sys
+for name in ("jinja2", "ray", "rich", "torch"):
+    sys.modules[name] = None  # as if it were not installed
+from vlagents_ray.evaluate import Results, compare
+results = Results.load(sys.argv[1])
+print(sum(len(cell.episodes) for cell in results.cells))
+"""
+
+
+def test_results_are_read_without_ray(config: Callable[..., EvalConfig]) -> None:
+    summary = evaluate(config(), agent_factory=ToZero, in_process=True)
+    command = [sys.executable, "-W", "error", "-c", READ, str(summary.out)]
+    told = subprocess.run(command, check=False, capture_output=True, text=True, timeout=60)
+    assert told.returncode == 0, told.stderr
+    assert told.stdout.strip() == str(summary.total.episodes)

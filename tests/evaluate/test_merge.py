@@ -17,6 +17,7 @@ from in_process_evaluation import play
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig, Results
+from vlagents_ray.evaluate.artifacts.storage import require_below
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.merge import combined, merge
 from vlagents_ray.evaluate.plan.jobs import plan
@@ -49,29 +50,21 @@ def outcomes(results: Results) -> dict[str, object]:
     return {str(one.result.key): one.result.outcome for cell in results.cells for one in cell.episodes}
 
 
-def test_parts_that_overlap_make_the_whole(part: Callable[..., Path], tmp_path: Path) -> None:
+def test_parts_that_overlap_make_the_whole_each_episode_as_the_first_has_it(
+    part: Callable[..., Path], tmp_path: Path
+) -> None:
     whole, a, b = part("whole"), part("a", 3, 4, 5), part("b", 0, 1)
     summary = merge(tmp_path / "out", [a, b])
-    assert outcomes(Results.load(tmp_path / "out")) == outcomes(Results.load(whole))
+    found = Results.load(tmp_path / "out")
+    assert outcomes(found) == outcomes(Results.load(whole))
+    assert [one.run for one in found.cells[0].episodes] == [1, 1, 1, 2, 2, 2]
     assert (summary.total.episodes, summary.total.planned) == (6, 6)
     assert (tmp_path / "out" / "summary.json").is_file()
-
-
-def test_the_workers_of_each_part_are_known_with_its_runs(part: Callable[..., Path], tmp_path: Path) -> None:
-    merge(tmp_path / "merged", [part("a", 3, 4, 5), part("b", 0, 1)])
-    found = Results.load(tmp_path / "merged").workers
-    assert [(one.run, one.pid, one.transport) for one in found] == [
-        (1, os.getpid(), "local"),
-        (2, os.getpid(), "local"),
+    assert [(one.run, one.pid, one.transport) for one in found.workers] == [
+        (run, os.getpid(), "local") for run in (1, 2)
     ]
-
-
-def test_an_episode_of_both_is_as_the_first_has_it(part: Callable[..., Path], tmp_path: Path) -> None:
-    a, b = part("a"), part("b")
-    merge(tmp_path / "out", [a, b])
-    [cell] = Results.load(tmp_path / "out").cells
-    assert [one.finished for one in cell.episodes] == [one.finished for one in Results.load(a).cells[0].episodes]
-    assert {one.run for one in cell.episodes} == {1}
+    with pytest.raises(ConfigError, match="merge into a new folder"):
+        merge(a, [a, b])
 
 
 def test_a_merged_folder_is_resumed_like_any_other(part: Callable[..., Path], config: Config, tmp_path: Path) -> None:
@@ -83,27 +76,29 @@ def test_a_merged_folder_is_resumed_like_any_other(part: Callable[..., Path], co
     ]  # fmt: skip
 
 
-def test_other_envs_and_seeds_join_the_table(part: Callable[..., Path], tmp_path: Path) -> None:
-    a, b, c = part("a"), part("b", seed=100), part("c", envs=[OTHER_LINE])
-    merge(tmp_path / "out", [a, b, c])
+def test_other_envs_and_seeds_join_the_table_also_of_a_suite_that_was_renamed(
+    part: Callable[..., Path], config: Config, tmp_path: Path
+) -> None:
+    renamed = config(out=tmp_path / "b", seed=100)
+    suite = renamed.suites[0].model_copy(update={"name": "b"})
+    play(renamed.model_copy(update={"suites": [suite]}))
+    merge(tmp_path / "out", [part("a"), tmp_path / "b", part("c", envs=[OTHER_LINE])])
     cells = Results.load(tmp_path / "out").cells
-    assert [(cell.env, cell.planned, len(cell.episodes)) for cell in cells] == [(LINE, 12, 12), (OTHER_LINE, 6, 6)]
+    assert [(cell.env, cell.planned, len(cell.counted)) for cell in cells] == [(LINE, 12, 12), (OTHER_LINE, 6, 6)]
 
 
-def test_a_suite_that_was_renamed_is_still_the_same_cell(config: Config, tmp_path: Path) -> None:
-    for name, seed in (("a", 0), ("b", 100)):
-        settings = config(out=tmp_path / name, seed=seed)
-        suite = settings.suites[0].model_copy(update={"name": name})
-        play(settings.model_copy(update={"suites": [suite]}))
-    merge(tmp_path / "out", [tmp_path / "a", tmp_path / "b"])
-    [cell] = Results.load(tmp_path / "out").cells
-    assert (cell.suite, cell.planned, len(cell.counted)) == ("a", 12, 12)
-
-
-def test_seeds_that_would_play_an_episode_twice_are_refused(part: Callable[..., Path], tmp_path: Path) -> None:
-    a, b = part("a"), part("b", seed=3)
-    with pytest.raises(ConfigError, match=r"seeds \[3\]; together they are \[0, 3\].*6 or more apart"):
-        merge(tmp_path / "out", [a, b])
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"seed": 3}, r"seeds \[3\]; together they are \[0, 3\].*6 or more apart"),
+        ({"execute": 2}, r"Line has other settings: execute: None and 2"),
+    ],
+)
+def test_seeds_that_play_an_episode_twice_and_other_settings_are_refused(
+    part: Callable[..., Path], tmp_path: Path, changes: dict[str, int], said: str
+) -> None:
+    with pytest.raises(ConfigError, match=said):
+        merge(tmp_path / "out", [part("a"), part("b", **changes)])
 
 
 def test_different_outcomes_are_listed_and_nothing_is_written(part: Callable[..., Path], tmp_path: Path) -> None:
@@ -132,17 +127,25 @@ def test_a_lost_episode_gives_way_to_one_that_was_played(
         assert [one.result.status for one in Results.load(out).cells[0].episodes] == ["done"] * 6
 
 
-def test_other_settings_are_named(part: Callable[..., Path], tmp_path: Path) -> None:
-    a, b = part("a"), part("b", execute=2)
-    with pytest.raises(ConfigError, match=r"Line has other settings: execute: None and 2"):
-        merge(tmp_path / "out", [a, b])
-
-
-def test_a_policy_with_another_checkpoint_is_named(tmp_path: Path, config: Config) -> None:
-    folders = [tmp_path / checkpoint for checkpoint in ("x", "y")]
+@pytest.mark.parametrize(
+    ("said", "told"),
+    [
+        (lambda name: {"checkpoint": name}, r"policy 'policy' has checkpoint 'y'.*before it 'x'"),
+        (
+            lambda name: {"checkpoint": "a", "weights": {"digest": name, "revision": None}},
+            r"policy policy: weights was x, is y",
+        ),
+    ],
+)
+def test_a_policy_with_another_checkpoint_or_other_weights_is_named(
+    tmp_path: Path, config: Config, said: Callable[[str], dict[str, object]], told: str
+) -> None:
+    folders = [tmp_path / name for name in ("x", "y")]
     for folder in folders:
-        play(config(out=folder), functools.partial(Served, folder.name))
-    with pytest.raises(ConfigError, match=r"policy 'policy' has checkpoint 'y'.*before it 'x'"):
+        with Store(config(out=folder)) as store:
+            store.begin_run(config(out=folder), {})
+            store.note_policy("policy", {"policy": "act", **said(folder.name)})
+    with pytest.raises(ConfigError, match=told):
         merge(tmp_path / "out", folders)
 
 
@@ -186,18 +189,23 @@ def named(folder: Path, column: str, path: str) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("column", ["videos", "trajectory"])
 @pytest.mark.parametrize(
     "path", ["/etc/hostname", "../secret/key.mp4", "videos/../../secret/key.mp4", "..", "", "videos/\0.mp4"]
 )
+def test_a_path_out_of_a_folder_of_results_is_refused(path: str) -> None:
+    with pytest.raises(ConfigError, match="as a file of an episode, want a path below the folder of results"):
+        require_below(path)
+
+
+@pytest.mark.parametrize("column", ["videos", "trajectory"])
 def test_paths_out_of_a_folder_of_results_are_refused_by_all_that_read_it(
-    part: Callable[..., Path], tmp_path: Path, column: str, path: str
+    part: Callable[..., Path], tmp_path: Path, column: str
 ) -> None:
     (tmp_path / "secret").mkdir()
     (tmp_path / "secret" / "key.mp4").write_text("secret")
-    theirs = named(part("theirs"), column, path)
+    theirs = named(part("theirs"), column, "videos/../../secret/key.mp4")
     for read in (Results.load, lambda folder: merge(tmp_path / "out", [folder])):
-        with pytest.raises(ConfigError, match="as a file of an episode, want a path below the folder of results"):
+        with pytest.raises(ConfigError, match="want a path below the folder of results"):
             read(theirs)
     assert not list((tmp_path / "out").rglob("*.mp4"))
 
@@ -221,11 +229,16 @@ def test_symbolic_links_lead_no_further_than_their_folder(
         [path] = [video for cell in results.cells for one in cell.episodes for video in one.videos]
         with pytest.raises(ConfigError, match="symbolic link out of the folder"):
             results.file(path)
-        assert base64.b64encode(b"secret").decode() not in report_of(results, tmp_path)
+        page = write_report(results, tmp_path / "page.html", inline=True).read_text()
+        assert base64.b64encode(b"secret").decode() not in page
 
 
-def report_of(results: Results, folder: Path) -> str:
-    return write_report(results, folder / "page.html", inline=True).read_text()
+def test_a_difference_from_a_commit_that_is_a_link_is_not_copied(part: Callable[..., Path], tmp_path: Path) -> None:
+    theirs = part("theirs")
+    (theirs / "provenance").mkdir(exist_ok=True)
+    (theirs / "provenance" / "x.diff").symlink_to("/etc/hostname")
+    with pytest.raises(ConfigError, match=r"x\.diff: is a symbolic link out of"):
+        merge(tmp_path / "out", [theirs])
 
 
 def test_links_within_a_folder_and_to_it_are_followed(part: Callable[..., Path], tmp_path: Path) -> None:
@@ -239,20 +252,6 @@ def test_links_within_a_folder_and_to_it_are_followed(part: Callable[..., Path],
     assert not (tmp_path / "out" / "v").is_symlink()
 
 
-def test_a_difference_from_a_commit_that_is_a_link_is_not_copied(part: Callable[..., Path], tmp_path: Path) -> None:
-    theirs = part("theirs")
-    (theirs / "provenance").mkdir(exist_ok=True)
-    (theirs / "provenance" / "x.diff").symlink_to("/etc/hostname")
-    with pytest.raises(ConfigError, match=r"x\.diff: is a symbolic link out of"):
-        merge(tmp_path / "out", [theirs])
-
-
-def test_results_are_not_merged_into_results(part: Callable[..., Path]) -> None:
-    a, b = part("a"), part("b")
-    with pytest.raises(ConfigError, match="merge into a new folder"):
-        merge(a, [a, b])
-
-
 def with_weights(folder: Path, weights: str) -> Path:
     """All its episodes as if these weights had played them."""
     with closing(sqlite3.connect(folder / "results.db")) as db:
@@ -263,30 +262,11 @@ def with_weights(folder: Path, weights: str) -> Path:
 
 def test_other_weights_under_the_same_name_are_not_merged(part: Callable[..., Path], tmp_path: Path) -> None:
     a, b = with_weights(part("a", 3, 4, 5), "x"), with_weights(part("b", 0, 1, 2), "y")
-    with pytest.raises(ConfigError, match=r"played by several weights under one name: .*'x'.*'y'.*merge those apart"):
-        merge(tmp_path / "out", [a, b])
+    elsewhere = with_weights(part("c", envs=[OTHER_LINE]), "y")
+    for other in (b, elsewhere):
+        with pytest.raises(ConfigError, match=r"was played by several weights under one name: .*'x'.*'y'.*merge those"):
+            merge(tmp_path / "out", [a, other])
     with_weights(b, "x")
     merge(tmp_path / "same", [a, b])
     found = {one.result.weights for cell in Results.load(tmp_path / "same").cells for one in cell.episodes}
     assert found == {"x"}
-
-
-def test_servers_that_tell_other_weights_are_named(tmp_path: Path, config: Config) -> None:
-    folders = [tmp_path / digest for digest in ("x", "y")]
-    for folder in folders:
-        said = {"policy": "act", "checkpoint": "a", "weights": {"digest": folder.name, "revision": None}}
-        with Store(config(out=folder)) as store:
-            store.begin_run(config(out=folder), {})
-            store.note_policy("policy", said)
-    with pytest.raises(ConfigError, match=r"policy policy: weights was x, is y"):
-        merge(tmp_path / "out", folders)
-
-
-def test_a_checkpoint_with_other_weights_in_another_task_is_not_merged(tmp_path: Path, config: Config) -> None:
-    folders = []
-    for env, weights in ((LINE, "x"), (OTHER_LINE, "y")):
-        settings = config(envs=[env], episodes=2, out=tmp_path / weights)
-        play(settings)
-        folders.append(with_weights(settings.out, weights))
-    with pytest.raises(ConfigError, match=r"policy .*: was played by several weights under one name: .*'x'.*'y'"):
-        merge(tmp_path / "out", folders)

@@ -3,34 +3,25 @@ from __future__ import annotations
 import contextlib
 import functools
 import json
-import os
 import signal
 import socket
 import sqlite3
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-import av
 import pytest
-from eval_fakes import CLINGING, EVERY, LINE, OTHER_LINE, Silent, Teller, ToZero, wait_for
+from eval_fakes import CLINGING, EVERY, LINE, Silent, Teller, ToZero, wait_for
 
 from vlagents_ray.errors import ConfigError, ConnectionLost, ContractMismatch, UnknownEnv
-from vlagents_ray.evaluate import (
-    EvalConfig,
-    EvaluationInterrupted,
-    Progress,
-    SuiteConfig,
-    check,
-    evaluate,
-)
+from vlagents_ray.evaluate import EvalConfig, EvaluationInterrupted, Progress, SuiteConfig, Summary, check, evaluate
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.evaluate.results.store import Store
-from vlagents_ray.evaluate.workers import pool, worker
+from vlagents_ray.evaluate.workers import pool, rollout, worker
 from vlagents_ray.evaluate.workers.cluster import ray_cluster
+from vlagents_ray.interface import Agent
 
 Config = Callable[..., EvalConfig]
 
@@ -53,27 +44,16 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(worker, "GRACE_S", 0.2)
 
 
+def here(settings: EvalConfig, make: Callable[[], Agent] = ToZero) -> Summary:
+    """Evaluate in this process."""
+    return evaluate(settings, agent_factory=make, in_process=True)
+
+
 @pytest.mark.usefixtures("shared_ray")
 class TestOnACluster:
-    def test_results_do_not_depend_on_the_number_of_workers(self, config: Config, tmp_path: Path) -> None:
-        one = config(envs=[LINE, OTHER_LINE], episodes=8, workers=1, out=tmp_path / "one")
-        two = config(envs=[LINE, OTHER_LINE], episodes=8, workers=2, out=tmp_path / "two")
-        summary = evaluate(one, agent_factory=ToZero)
-        evaluate(two, agent_factory=ToZero)
-        assert outcomes(one) == outcomes(two)
-        assert len(outcomes(one)) == 16
-        assert {row[4] for row in outcomes(one)} == {0, 1}, "both outcomes occur, or the test shows nothing"
-        assert (summary.state, summary.total.episodes, summary.total.steps) == ("complete", 16, 160)
-        assert json.loads((one.out / "summary.json").read_text()) == json.loads(json.dumps(summary.to_json()))
-        assert (
-            f"{summary.total.success_once.successes / 16:.1%}".replace("%", " %")
-            in (one.out / "report.html").read_text()
-        )
-
     @pytest.mark.parametrize(
         ("kind", "error"),
-        [
-            ("raise", "the simulator exploded"),
+        [  # in this process, test_in_process.py shows one that raises
             ("exit", f"the worker on {socket.gethostname()} died"),
             ("hang", "env step after 3 steps took longer than 8 s"),
             ("freeze", "no sign of life"),
@@ -87,7 +67,7 @@ class TestOnACluster:
         settings = config(env_options=trouble, env_timeout_s=8, make_timeout_s=120)
         summary = evaluate(settings, agent_factory=ToZero)
         undisturbed = config(out=tmp_path / "undisturbed")
-        evaluate(undisturbed, agent_factory=ToZero)
+        here(undisturbed)
         assert outcomes(settings) == outcomes(undisturbed)
         assert (summary.total.retries, summary.total.infra_failures) == (1, 0)
         ((attempt, cause, text, stack, log),) = query(
@@ -96,22 +76,7 @@ class TestOnACluster:
         assert (attempt, cause) == (1, "worker")
         assert error in text
         assert f"misbehaving: {kind}" in log
-        assert "_misbehave" in stack or kind in ("exit", "freeze"), "a hang shows where"
-
-    def test_a_worker_killed_in_an_episode_costs_a_retry_and_no_failure(self, config: Config, tmp_path: Path) -> None:
-        settings = config(env_options={"folder": str(tmp_path), "trouble": {"gate": [3]}})
-        mark = tmp_path / "gate-3"
-
-        def kill() -> None:
-            wait_for(mark.exists)
-            os.kill(int(mark.read_text()), signal.SIGKILL)
-
-        killer = threading.Thread(target=kill)
-        killer.start()
-        summary = evaluate(settings, agent_factory=ToZero)
-        killer.join()
-        assert (summary.total.episodes, summary.total.retries, summary.total.infra_failures) == (6, 1, 0)
-        assert query(settings, "SELECT episode, attempts FROM episodes WHERE attempts > 1") == [(3, 2)]
+        assert "_misbehave" in stack or kind != "hang", "a hang shows where"
 
     def test_a_policy_that_never_answers_is_an_infrastructure_failure(
         self, config: Config, monkeypatch: pytest.MonkeyPatch
@@ -123,32 +88,8 @@ class TestOnACluster:
         ((text,),) = query(settings, "SELECT error FROM episodes")
         assert "policy act after 0 steps took longer than 4 s" in text
 
-    def test_lost_episodes_have_no_success_and_are_played_on_resume(self, config: Config) -> None:
-        summary = evaluate(config(retries=1), agent_factory=functools.partial(ToZero, lost_on=4))
-        assert (summary.total.episodes, summary.total.infra_failures, summary.total.retries) == (5, 1, 1)
-        row = query(config(), "SELECT status, success_once, success_at_end, attempts FROM episodes WHERE episode = 4")
-        assert row == [("infra_failed", None, None, 2)]
-        summary = evaluate(config(resume=True), agent_factory=ToZero)
-        assert (summary.total.episodes, summary.total.infra_failures) == (6, 0)
-        assert query(config(), "SELECT run, COUNT(*) FROM episodes GROUP BY run") == [(1, 5), (2, 1)]
-
-    def test_many_lost_episodes_in_a_row_stop_the_evaluation(self, config: Config) -> None:
-        settings = config(episodes=50, retries=0, abort_after=3, workers=1)
-        with pytest.raises(ConnectionLost, match="3 episodes in a row lost to infrastructure"):
-            evaluate(settings, agent_factory=functools.partial(ToZero, lost_on=EVERY))
-        assert len(outcomes(settings)) == 3
-        assert json.loads((settings.out / "summary.json").read_text())["state"] == "stopped"
-        assert "Not complete: stopped" in (settings.out / "report.html").read_text()
-
-    def test_a_contract_mismatch_stops_the_evaluation_before_any_step(self, config: Config) -> None:
-        settings = config(env_options={"state_dim": 3})
-        with pytest.raises(ContractMismatch, match="the policy needs 2 numbers, the env gives 3"):
-            evaluate(settings, agent_factory=functools.partial(ToZero, state_dim=2))
-        assert outcomes(settings) == []
-
-    @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
     def test_a_signal_keeps_what_is_finished_and_leaves_no_worker(
-        self, config: Config, tmp_path: Path, number: signal.Signals, monkeypatch: pytest.MonkeyPatch
+        self, config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         found: list[str] = []  # when Ray is left, which takes long if it is being stopped as well
 
@@ -167,7 +108,7 @@ class TestOnACluster:
                 self.seen += 1
                 if self.seen == 2:
                     wait_for((tmp_path / "gate-0").exists)  # the other worker may start later
-                    signal.raise_signal(number)
+                    signal.raise_signal(signal.SIGTERM)
 
         options = {"folder": str(tmp_path), "trouble": {"gate": [0]}}
         handlers = [signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM)]
@@ -182,25 +123,6 @@ class TestOnACluster:
         summary = evaluate(config(env_options=options, resume=True), agent_factory=ToZero)
         assert summary.total.episodes == 6
         assert [row[1] for row in outcomes(config())] == list(range(6))
-
-    def test_a_finished_evaluation_is_resumed_without_starting_anything(self, config: Config) -> None:
-        evaluate(config(), agent_factory=ToZero)
-        before = outcomes(config())
-        assert evaluate(config(resume=True), agent_factory=Silent).total.episodes == 6
-        assert outcomes(config()) == before
-
-    def test_videos_of_failed_episodes_are_kept(self, config: Config) -> None:
-        settings = config(video="failures", env_options={"camera": [32, 48]})
-        evaluate(settings, agent_factory=ToZero)
-        rows = query(settings, "SELECT success_once, steps, videos FROM episodes")
-        assert {row[0] for row in rows} == {0, 1}
-        for success, steps, videos in rows:
-            paths = json.loads(videos)
-            assert len(paths) == (0 if success else 1)
-            for path in paths:
-                assert path.endswith("_failure_front.mp4")
-                with av.open(settings.out / path) as container:
-                    assert sum(1 for _ in container.decode(video=0)) == steps + 1
 
     def test_workers_start_with_pinned_threads_and_the_users_variables(self, config: Config) -> None:
         runtime_env = config().worker.runtime_env
@@ -227,16 +149,12 @@ class TestOnACluster:
         assert (summary.state, summary.total.episodes) == ("complete", 3)
 
 
-def test_an_unknown_env_is_refused_before_anything_starts(config: Config) -> None:
-    with pytest.raises(UnknownEnv, match="'nowhere' is not registered"):
-        evaluate(config(envs=["nowhere"]), agent_factory=ToZero)
-    assert not config().out.exists()
-
-
 def test_settings_can_be_checked_before_anything_is_served(config: Config) -> None:
+    for refuse in (here, check):
+        with pytest.raises(UnknownEnv, match="'nowhere' is not registered"):
+            refuse(config(envs=["nowhere"]))
+        assert not config().out.exists()
     check(config())
-    with pytest.raises(UnknownEnv):
-        check(config(envs=["nowhere"]))
     with Store(config()) as store:
         store.begin_run(config(), {})
     with pytest.raises(ConfigError, match="--resume"):
@@ -246,3 +164,36 @@ def test_settings_can_be_checked_before_anything_is_served(config: Config) -> No
 def test_a_policy_must_be_somewhere(config: Config) -> None:
     with pytest.raises(ConfigError, match="policy 'policy': got no url"):
         evaluate(config())
+
+
+def test_lost_episodes_have_no_success_and_are_played_on_resume_and_a_finished_evaluation_plays_nothing(
+    config: Config, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rollout, "FIRST_WAIT_S", 0.001)
+    summary = here(config(retries=1), functools.partial(ToZero, lost_on=4))
+    assert (summary.total.episodes, summary.total.infra_failures, summary.total.retries) == (5, 1, 1)
+    row = query(config(), "SELECT status, success_once, success_at_end, attempts FROM episodes WHERE episode = 4")
+    assert row == [("infra_failed", None, None, 2)]
+    summary = here(config(resume=True))
+    assert (summary.total.episodes, summary.total.infra_failures) == (6, 0)
+    assert query(config(), "SELECT run, COUNT(*) FROM episodes GROUP BY run") == [(1, 5), (2, 1)]
+    before = outcomes(config())
+    assert here(config(resume=True), Silent).total.episodes == 6
+    assert outcomes(config()) == before
+
+
+def test_many_lost_episodes_in_a_row_stop_the_evaluation(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rollout, "FIRST_WAIT_S", 0.001)
+    settings = config(episodes=50, retries=0, abort_after=3)
+    with pytest.raises(ConnectionLost, match="3 episodes in a row lost to infrastructure"):
+        here(settings, functools.partial(ToZero, lost_on=EVERY))
+    assert len(outcomes(settings)) == 3
+    assert json.loads((settings.out / "summary.json").read_text())["state"] == "stopped"
+    assert "Not complete: stopped" in (settings.out / "report.html").read_text()
+
+
+def test_a_contract_mismatch_stops_the_evaluation_before_any_step(config: Config) -> None:
+    settings = config(env_options={"state_dim": 3})
+    with pytest.raises(ContractMismatch, match="the policy needs 2 numbers, the env gives 3"):
+        here(settings, functools.partial(ToZero, state_dim=2))
+    assert outcomes(settings) == []

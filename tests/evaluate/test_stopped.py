@@ -64,7 +64,7 @@ def episodes(config: EvalConfig) -> list[tuple[int, int, int]]:
         return db.execute("SELECT run, episode, attempts FROM episodes ORDER BY episode").fetchall()
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGKILL, -9), (signal.SIGINT, 130), (signal.SIGTERM, 130)])
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGKILL, -9), (signal.SIGINT, 130)])
 def test_a_stopped_and_resumed_evaluation_has_each_episode_exactly_once(
     config: Callable[..., EvalConfig], tmp_path: Path, ray_folder: Path, number: signal.Signals, code: int
 ) -> None:

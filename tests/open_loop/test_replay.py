@@ -80,12 +80,6 @@ def test_the_same_checkpoint_makes_no_error(tmp_path: Path) -> None:
     assert result["against"] == "answers"
 
 
-def test_small_pictures_make_an_error(tmp_path: Path) -> None:
-    record(tmp_path, pictures="small")
-    with loaded(Brightness()) as sessions:
-        assert replay(tmp_path, sessions, ReplayPlan()).to_json()["mae"] > 0
-
-
 def test_another_checkpoint_makes_an_error_by_joint_and_by_step(tmp_path: Path) -> None:
     record(tmp_path)
     with loaded(Brightness(gain=1.5, chunk=3)) as sessions:

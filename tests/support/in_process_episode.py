@@ -10,7 +10,7 @@ import numpy as np
 from vlagents_ray.envs import EvalEnv
 from vlagents_ray.envs.base import SequentialBatch
 from vlagents_ray.errors import VLAgentsError
-from vlagents_ray.evaluate.episode.episode import EpisodeSettings, Watch, run_episodes
+from vlagents_ray.evaluate.episode.episode import EpisodeSettings, run_episodes
 from vlagents_ray.evaluate.episode.records import EpisodeObserver, EpisodeResult
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
 from vlagents_ray.interface import Act, Agent, Obs
@@ -27,31 +27,12 @@ class Always(Agent):
         return Act(self.action.copy())
 
 
-class Watched(EpisodeObserver):
-    """Calls functions with what happens."""
-
-    def __init__(
-        self,
-        record: Callable[[Obs], None] = lambda _obs: None,
-        executed: Callable[[np.ndarray, float, bool], None] = lambda _action, _reward, _success: None,
-    ) -> None:
-        self.record, self.executed = record, executed
-
-    def add_observation(self, obs: Obs) -> None:
-        self.record(obs)
-
-    def add_action(self, action: np.ndarray, reward: float, success: bool) -> None:
-        self.executed(action, reward, success)
-
-
 def run_episode(
     env: EvalEnv,
     agent: Agent,
     key: EpisodeKey,
     *,
-    record: Callable[[Obs], None] = lambda _obs: None,
     executed: Callable[[np.ndarray, float, bool], None] = lambda _action, _reward, _success: None,
-    watch: Watch = lambda _phase, _steps: None,
     images: bool = True,
     **settings: Any,
 ) -> EpisodeResult:
@@ -60,15 +41,10 @@ def run_episode(
     Raises:
         VLAgentsError: An error that is not the policy's.
     """
+    observer, batch = EpisodeObserver(), SequentialBatch([env])
+    observer.add_action = executed  # type: ignore[method-assign]
     [outcome] = run_episodes(
-        SequentialBatch([env]),
-        agent,
-        [agent],
-        [key],
-        EpisodeSettings(**settings),
-        observers=[Watched(record, executed)],
-        watch=watch,
-        images=images,
+        batch, agent, [agent], [key], EpisodeSettings(**settings), observers=[observer], images=images
     )
     if isinstance(outcome, VLAgentsError):
         raise outcome

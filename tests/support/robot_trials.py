@@ -70,7 +70,7 @@ class Reaching(Agent):
 def plan(out: Path, **changes: Any) -> EvalConfig:
     """Two policies, two tasks, short trials."""
     robot = {"arm": "robot_trials:Arm", "hz": 200, "key": "a key of the plan", "tasks": tasks(), "mode": "open_loop"}
-    suite = {"envs": ["cups", "drawer"], "episodes": 4, "seeds": [3]}
+    suite = {"envs": ["cups", "drawer"], "episodes": 2, "seeds": [3]}
     settings = {
         "policies": [{"name": name, "url": URLS[name]} for name in NAMES],
         "suites": [suite | changes.pop("suite", {})],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import os
 from collections.abc import Callable
 from dataclasses import replace
@@ -11,15 +12,18 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
-from eval_fakes import LINE, ToZero
+from eval_fakes import ToZero
 from in_process_evaluation import play
 
 from vlagents_ray.errors import ConfigError, EnvFailed
-from vlagents_ray.evaluate import ClockConfig, EvalConfig
+from vlagents_ray.evaluate import ClockConfig, EvalConfig, PolicyConfig, SuiteConfig, WorkerConfig
 from vlagents_ray.evaluate.artifacts.recorder import Recording
 from vlagents_ray.evaluate.artifacts.trajectory import NO_VERSION, Trajectory, TrajectoryRecorder, videos_of
-from vlagents_ray.evaluate.artifacts.video import VideoRecorder
+from vlagents_ray.evaluate.artifacts.video import VideoRecorder, save_videos
+from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.episode.second_pass import PlayedEpisode
+from vlagents_ray.evaluate.plan.cases import EvalCase
+from vlagents_ray.evaluate.plan.jobs import EpisodeKey
 from vlagents_ray.interface import Act, Agent, Obs
 
 Config = Callable[..., EvalConfig]
@@ -144,11 +148,6 @@ def test_states_of_several_arms_and_a_gripper_survive_the_file(tmp_path: Path) -
     assert found.cameras == ()
 
 
-def test_a_trajectory_that_is_gone_is_said_to_be(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"a\.npz: got no file, want the one that results\.db names"):
-        Trajectory.load(tmp_path / "a.npz")
-
-
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04", b"{}"])
 def test_a_file_that_is_no_trajectory_is_said_to_be_none(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "a.npz"
@@ -157,11 +156,94 @@ def test_a_file_that_is_no_trajectory_is_said_to_be_none(tmp_path: Path, content
         Trajectory.load(path)
 
 
-def test_a_repeated_episode_replaces_its_trajectory(config: Config) -> None:
-    settings = config(episodes=1, record="all", envs=[LINE], env_options=CAMERA)
-    folder = settings.out / "trajectories" / "policy" / "eval_fakes_Line"
-    folder.mkdir(parents=True)
-    for left in ("ep0000_seed0_side.mp4", "ep0000_seed0.npz.part"):
-        (folder / left).write_bytes(b"of an attempt that died")
-    play(settings)
-    assert sorted(path.name for path in folder.iterdir()) == ["ep0000_seed0.npz", "ep0000_seed0_front.mp4"]
+ENV = "maniskill/PushCube-v1"
+COLOURS = [(200, 40, 40), (40, 200, 40), (40, 40, 200), (220, 220, 220), (20, 20, 20)]
+
+
+def record(frames: list[np.ndarray], fps: float | None = None) -> dict[str, bytes]:
+    with VideoRecorder(fps) as recorder:
+        for frame in frames:
+            recorder.add(Obs(cameras={"front": frame}))
+        return recorder.finish()
+
+
+def plain(colour: tuple[int, int, int], height: int = 64, width: int = 96) -> np.ndarray:
+    return np.full((height, width, 3), colour, np.uint8)
+
+
+def test_a_video_holds_every_frame_in_its_colours() -> None:
+    video = record([plain(colour) for colour in COLOURS * 3])["front"]
+    with av.open(io.BytesIO(video)) as container:
+        stream = container.streams.video[0]
+        assert (stream.codec_context.name, stream.codec_context.pix_fmt) == ("h264", "yuv420p")
+        decoded = [frame.to_ndarray(format="rgb24") for frame in container.decode(stream)]
+    assert len(decoded) == 15
+    for image, colour in zip(decoded, COLOURS * 3, strict=True):
+        assert image.shape == (64, 96, 3)
+        assert np.abs(image.reshape(-1, 3).mean(axis=0) - colour).max() < 8
+
+
+@pytest.mark.parametrize("fps", [10.0, 12.5, None])
+def test_a_video_plays_at_the_control_rate(fps: float | None) -> None:
+    with av.open(io.BytesIO(record([plain(COLOURS[0])] * 10, fps)["front"])) as container:
+        assert float(container.streams.video[0].average_rate or 0) == pytest.approx(fps or 20.0)
+
+
+def test_odd_sizes_are_made_even() -> None:
+    video = record([plain(COLOURS[1], 65, 97)] * 2)["front"]
+    with av.open(io.BytesIO(video)) as container:
+        image = next(container.decode(video=0)).to_ndarray(format="rgb24")
+    assert image.shape == (66, 98, 3)
+    assert np.abs(image.astype(int) - COLOURS[1]).max() < 12
+
+
+def test_every_camera_has_its_video() -> None:
+    with VideoRecorder() as recorder:
+        recorder.add(Obs(cameras={"front": plain(COLOURS[0], 128, 128), "wrist": plain(COLOURS[1])}))
+        videos = recorder.finish()
+    sizes = {}
+    for camera, video in videos.items():
+        with av.open(io.BytesIO(video)) as container:
+            sizes[camera] = (container.streams.video[0].height, container.streams.video[0].width)
+    assert sizes == {"front": (128, 128), "wrist": (64, 96)}
+
+
+def test_a_camera_that_changes_its_size_is_an_env_failure() -> None:
+    with pytest.raises(EnvFailed, match=r"want \(64, 96, 3\)"):
+        record([plain(COLOURS[0]), plain(COLOURS[0], 32, 32)])
+
+
+CELL = EvalCase(PolicyConfig(name="act", steps=[20]), 20, SuiteConfig(name="unseen", envs=[ENV]), ENV, WorkerConfig())
+
+
+def result(success: bool, status: str = "done") -> EpisodeResult:
+    key = EpisodeKey(ENV, 3, 3, "0")
+    return EpisodeResult(key, status, success_once=success)  # type: ignore[arg-type]
+
+
+def test_a_video_is_named_by_env_episode_outcome_and_camera(tmp_path: Path) -> None:
+    paths = save_videos(tmp_path, CELL, result(True), {"base_camera": b"1", "left/wrist": b"2"})
+    assert paths == [
+        "videos/act@20/unseen/maniskill_PushCube-v1/ep0003_seed3_success_base_camera.mp4",
+        "videos/act@20/unseen/maniskill_PushCube-v1/ep0003_seed3_success_left_wrist.mp4",
+    ]
+    assert (tmp_path / paths[0]).read_bytes() == b"1"
+
+
+def test_two_cameras_never_share_a_video(tmp_path: Path) -> None:
+    videos = {"left/wrist": b"1", "left_wrist": b"2", "left wrist": b"3"}
+    paths = save_videos(tmp_path, CELL, result(True), videos)
+    assert [(tmp_path / path).read_bytes() for path in paths] == [b"1", b"2", b"3"]
+    assert paths[1].endswith("success_left_wrist.mp4")
+
+
+def test_a_repeated_episode_replaces_its_videos(tmp_path: Path) -> None:
+    save_videos(tmp_path, CELL, result(True), {"front": b"old", "wrist": b"old"})
+    folder = tmp_path / "videos" / "act@20" / "unseen" / "maniskill_PushCube-v1"
+    (folder / "ep0003_seed3_success_side.part").write_bytes(b"cut off by a crash")
+    (folder / "ep0003_seed33_success_front.mp4").write_bytes(b"another episode")
+    save_videos(tmp_path, CELL, result(False), {"front": b"new"})
+    assert sorted(path.name for path in folder.iterdir()) == [
+        "ep0003_seed33_success_front.mp4",
+        "ep0003_seed3_failure_front.mp4",
+    ]

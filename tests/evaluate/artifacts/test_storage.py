@@ -1,4 +1,4 @@
-"""Disks that take no more: one sentence with the cure, and nothing recorded is lost."""
+"""Disks that take no more: one sentence with the cure, and nothing recorded is lost; the code beside the results."""
 
 from __future__ import annotations
 
@@ -17,14 +17,11 @@ from faulty_disks import FULL, READ_ONLY, python_on
 from in_process_evaluation import without_ray
 
 from vlagents_ray.errors import ConfigError, ConnectionLost, DeadlineExceeded, StorageFailed
-from vlagents_ray.evaluate import (
-    EvalConfig,
-    Results,
-    evaluate,
-    run,
-)
-from vlagents_ray.evaluate.artifacts.storage import storing, whole
+from vlagents_ray.evaluate import EvalConfig, evaluate, run
+from vlagents_ray.evaluate.artifacts import storage
+from vlagents_ray.evaluate.artifacts.storage import policy_code, save_diffs, storing, whole
 from vlagents_ray.evaluate.results.store import Store
+from vlagents_ray.ray_tools.git_state import GitState
 
 Config = Callable[..., EvalConfig]
 COMMANDS = """
@@ -39,7 +36,7 @@ def play(**changes):
     with without_ray():
         return evaluate(config.model_copy(update=changes), agent_factory=ToZero)
 """
-FAIL = (
+UNTIL_FULL = (
     COMMANDS
     + """
 import subprocess, typer
@@ -49,11 +46,6 @@ except typer.Exit as ended:
     assert ended.exit_code == 1, ended
 else:
     raise AssertionError("it was written")
-"""
-)
-UNTIL_FULL = (
-    FAIL
-    + """
 subprocess.run(["mount", "-o", "remount,size=64m", sys.argv[1]], check=True)
 summary = play(resume=True)
 videos = [path for cell in summary.results.cells for one in cell.episodes for path in one.videos]
@@ -182,16 +174,6 @@ def test_a_full_disk_costs_nothing_that_was_recorded(size: str, config: Config, 
 
 
 @pytest.mark.hosts
-def test_a_read_only_folder_is_one_sentence(config: Config, tmp_path: Path) -> None:
-    with without_ray():
-        evaluate(config(), agent_factory=ToZero)
-    for settings in (config(resume=True, episodes=9), config(out=tmp_path / "out" / "new")):
-        done = python_on(READ_ONLY, config().out, FAIL, settings.model_dump_json())
-        assert re.search(r"StorageFailed: .*read-only file system .*choose another folder", one_sentence(done))
-    assert len(Results.load(config().out).cells[0].episodes) == 6
-
-
-@pytest.mark.hosts
 def test_reports_merges_and_exports_tell_a_read_only_folder_alike(config: Config, tmp_path: Path) -> None:
     with without_ray():
         evaluate(config(), agent_factory=ToZero)
@@ -205,3 +187,22 @@ def test_reports_merges_and_exports_tell_a_read_only_folder_alike(config: Config
         done = python_on(READ_ONLY, target, WRITE, *words)
         assert done.stdout.startswith("1 SystemExit(1)"), done.stdout + done.stderr
         assert "is on a read-only file system" in " ".join(done.stdout.split())
+
+
+DIRTY = GitState("c" * 40, "d" * 64, b"-a\n+b\n")
+CLEAN = GitState("c" * 40, None, b"")
+
+
+def test_each_difference_is_stored_once_under_its_digest(tmp_path: Path) -> None:
+    save_diffs(tmp_path, [DIRTY, None, CLEAN, DIRTY])
+    save_diffs(tmp_path, [DIRTY])
+    [path] = (tmp_path / "provenance").iterdir()
+    assert (path.name, path.read_bytes()) == (f"{'d' * 64}.diff", DIRTY.diff)
+
+
+def test_the_difference_of_a_policy_is_known_only_if_its_server_has_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(storage, "code_of", lambda _target: DIRTY)
+    assert policy_code({"policy": "noop", "code": DIRTY.to_json()}) is DIRTY
+    assert policy_code({"policy": "noop", "code": CLEAN.to_json()}) is None
+    assert policy_code({"policy": "noop"}) is None
+    assert policy_code({}) is None

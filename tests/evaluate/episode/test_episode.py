@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -8,22 +7,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
-from eval_fakes import Line, ToZero
 from in_process_episode import run_episode
 
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.envs import EvalEnv
-from vlagents_ray.errors import (
-    ConnectionLost,
-    ContractMismatch,
-    EnvFailed,
-    InvalidAction,
-    NotReset,
-    PolicyFailed,
-    PolicyUnavailable,
-    UnknownSession,
-    VLAgentsError,
-)
+from vlagents_ray.errors import ConnectionLost, ContractMismatch, EnvFailed, InvalidAction, PolicyFailed, UnknownSession
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
 from vlagents_ray.interface import Act, Agent, Obs
 
@@ -86,42 +74,38 @@ ROW = [1.0, 2.0]
 CHUNK = [[1.0, 0.0], [2.0, 0.0], [3.0, 0.0]]
 
 
-def test_a_chunk_is_executed_row_by_row_without_asking_again() -> None:
-    env, agent = Script(), Chunks(CHUNK, CHUNK)
-    result = run_episode(env, agent, KEY)
-    assert env.actions == [[1, 0], [2, 0], [3, 0]] * 2
-    assert (result.steps, result.acts) == (6, 2)
-
-
-def test_only_the_first_rows_of_a_chunk_are_executed_when_so_set() -> None:
+@pytest.mark.parametrize(("execute", "rows", "acts"), [(None, [1, 2, 3] * 2, 2), (2, [1, 2] * 3, 3)])
+def test_a_chunk_or_its_first_rows_are_executed_without_asking_again(
+    execute: int | None, rows: list[int], acts: int
+) -> None:
     env = Script()
-    result = run_episode(env, Chunks(CHUNK, CHUNK, CHUNK), KEY, execute=2)
-    assert env.actions == [[1, 0], [2, 0]] * 3
-    assert (result.steps, result.acts) == (6, 3)
+    result = run_episode(env, Chunks(CHUNK, CHUNK, CHUNK), KEY, execute=execute)
+    assert env.actions == [[row, 0] for row in rows]
+    assert (result.steps, result.acts) == (6, acts)
 
 
-def test_a_finished_policy_ends_the_episode_after_its_rows() -> None:
-    env = Script(solved=(4,))
-    result = run_episode(env, Chunks(ROW, Act(np.asarray(CHUNK, np.float32), done=True)), KEY)
-    assert (result.steps, result.ending, result.success_at_end) == (4, "policy_done", True)
+class Endless(Script):
+    """Forgets its step limit."""
+
+    def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
+        return (*super().step(act)[:3], False, {"success": False})
 
 
-def test_a_terminated_env_ends_the_episode_within_a_chunk() -> None:
-    result = run_episode(Script(terminates_at=2), Chunks(CHUNK), KEY)
-    assert (result.steps, result.ending) == (2, "terminated")
-
-
-def test_the_step_limit_truncates() -> None:
-    result = run_episode(Script(), Chunks(*[ROW] * 6), KEY)
-    assert (result.steps, result.ending, result.episode_return) == (6, "truncated", 3.0)
-
-
-def test_the_step_limit_holds_for_an_env_that_forgets_it() -> None:
-    class Endless(Script):
-        def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
-            return (*super().step(act)[:3], False, {"success": False})
-
-    assert run_episode(Endless(), Chunks(*[ROW] * 9), KEY).steps == 6
+@pytest.mark.parametrize(
+    ("env", "answers", "steps", "ending"),
+    [
+        (Script(), [ROW, Act(np.asarray(CHUNK, np.float32), done=True)], 4, "policy_done"),  # after its rows
+        (Script(terminates_at=2), [CHUNK], 2, "terminated"),  # within a chunk
+        (Script(), [ROW] * 6, 6, "truncated"),
+        (Endless(), [ROW] * 9, 6, "truncated"),
+    ],
+    ids=["policy", "env", "limit", "forgotten limit"],
+)
+def test_an_episode_ends_with_the_policy_the_env_or_the_step_limit(
+    env: Script, answers: list[Any], steps: int, ending: str
+) -> None:
+    result = run_episode(env, Chunks(*answers), KEY)
+    assert (result.steps, result.ending, result.episode_return) == (steps, ending, 0.5 * steps)
 
 
 def test_a_further_task_begins_the_policy_anew_in_the_middle_of_a_chunk() -> None:
@@ -161,21 +145,18 @@ def test_success_once_and_at_the_end_are_told_apart(solved: tuple[int, ...], onc
     assert (result.success_once, result.success_at_end) == (once, at_end)
 
 
-def test_the_key_decides_both_resets() -> None:
-    env, agent = Script(), Chunks(*[ROW] * 6)
-    run_episode(env, agent, KEY, reset_options={"layout": 2})
-    assert env.resets == [(11, {"layout": 2})]
-    assert agent.began == {"instruction": "do it", "seed": 11, "env": "script"}
-
-
-def test_a_remote_policy_is_told_the_contract_of_the_env() -> None:
+def test_the_key_decides_both_resets_and_a_remote_policy_is_told_the_contract() -> None:
     class Remote(Chunks):
         metadata: ClassVar[dict[str, Any]] = {}
         transport = "websocket"
 
-    agent = Remote(*[ROW] * 6)
-    result = run_episode(Script(), agent, KEY)
-    assert Contract.from_json(agent.began["contract"]) == Script().contract
+    for make in (Chunks, Remote):
+        env, agent = Script(), make(*[ROW] * 6)
+        result = run_episode(env, agent, KEY, reset_options={"layout": 2})
+        assert env.resets == [(11, {"layout": 2})]
+        told = agent.began.pop("contract", None)
+        assert agent.began == {"instruction": "do it", "seed": 11, "env": "script"}
+    assert Contract.from_json(told) == Script().contract
     assert result.transport == "websocket"
 
 
@@ -196,19 +177,25 @@ def test_a_policy_that_fails_ends_its_episode_without_success(answer: Any, code:
     assert result.error.startswith(code)
 
 
+@pytest.mark.parametrize("where", ["step", "contract"])
+@pytest.mark.parametrize(
+    "error",
+    [RuntimeError("physics exploded"), SystemExit("an asset is missing"), PolicyFailed("mine"), UnknownSession("who")],
+)
+def test_whatever_a_simulator_raises_is_an_env_failure(
+    error: BaseException, where: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr(Script, where, property(fail) if where == "contract" else fail)
+    with pytest.raises(EnvFailed, match=str(error)):
+        run_episode(Script(), Chunks(ROW), KEY)
+
+
 def test_a_lost_connection_is_no_failure_of_the_policy() -> None:
     with pytest.raises(ConnectionLost):
         run_episode(Script(), Chunks(ROW, ConnectionLost("gone")), KEY)
-
-
-@pytest.mark.parametrize("error", [RuntimeError("physics exploded"), SystemExit("an asset is missing")])
-def test_whatever_a_simulator_raises_is_an_env_failure(error: BaseException) -> None:
-    class Broken(Script):
-        def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
-            raise error
-
-    with pytest.raises(EnvFailed, match=str(error)):
-        run_episode(Broken(), Chunks(ROW), KEY)
 
 
 def test_an_action_that_the_env_refuses_counts_against_the_policy() -> None:
@@ -217,26 +204,6 @@ def test_an_action_that_the_env_refuses_counts_against_the_policy() -> None:
             raise InvalidAction("got 2 numbers, want 7")
 
     assert run_episode(Narrow(), Chunks(ROW), KEY).status == "policy_error"
-
-
-def test_an_env_that_does_not_say_whether_it_is_solved_is_an_env_failure() -> None:
-    class Silent(Script):
-        def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
-            return (*super().step(act)[:4], {})
-
-    with pytest.raises(EnvFailed, match="want 'success'"):
-        run_episode(Silent(), Chunks(ROW), KEY)
-
-
-@pytest.mark.parametrize("reward", [math.nan, math.inf])
-def test_a_reward_that_is_no_number_is_an_env_failure(reward: float) -> None:
-    class Diverged(Script):
-        def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
-            obs, _, *rest = super().step(act)
-            return obs, reward, *rest
-
-    with pytest.raises(EnvFailed, match=f"got the reward {reward}, want a finite number"):
-        run_episode(Diverged(), Chunks(ROW), KEY)
 
 
 JOINTS = {"joints": np.zeros(6, np.float32)}
@@ -303,6 +270,9 @@ def test_an_observation_that_is_none_is_the_envs_failure_and_never_the_policys(o
         ((GOOD, 0.0, False, False, {"success": None}), "got None as info"),
         ((GOOD, 0.0, False, False, {"success": 0.7}), "got 0.7 as info"),
         ((GOOD, 0.0, False, False, None), "got NoneType as info, want 'success' among it"),
+        ((GOOD, 0.0, False, False, {}), ".*want 'success'"),
+        ((GOOD, np.nan, False, False, SOLVED), "got the reward nan, want a finite number"),
+        ((GOOD, np.inf, False, False, SOLVED), "got the reward inf, want a finite number"),
         ((GOOD, 0.0, "no", False, SOLVED), "got 'no' as terminated"),
         ((GOOD, 0.0, False, [False], SOLVED), ".*as truncated"),
         ((GOOD, None, False, False, SOLVED), "got the reward None"),
@@ -314,12 +284,9 @@ def test_an_observation_that_is_none_is_the_envs_failure_and_never_the_policys(o
 def test_what_a_step_returns_is_never_guessed(answer: Any, said: str) -> None:
     with pytest.raises(EnvFailed, match=f"env step: {said}"):
         run_episode(Stated(after=answer), Chunks(*[ROW] * 6), KEY)
-
-
-@pytest.mark.parametrize("words", [None, 3])
-def test_an_instruction_that_is_no_text_is_an_env_failure(words: Any) -> None:
-    with pytest.raises(EnvFailed, match=f"got the instruction {words}"):
-        run_episode(Stated(words=words), Chunks(ROW), KEY)
+    for words in (None, 3):
+        with pytest.raises(EnvFailed, match=f"got the instruction {words}"):
+            run_episode(Stated(words=words), Chunks(ROW), KEY)
 
 
 @pytest.mark.parametrize("success", [np.True_, 1, 1.0, np.float32(1)])
@@ -329,88 +296,52 @@ def test_a_number_that_is_a_bool_is_one(success: Any) -> None:
     assert (result.status, result.success_at_end, result.episode_return) == ("done", True, 3.0)
 
 
-def test_images_may_be_left_out_where_nobody_looks() -> None:
+@pytest.mark.parametrize(
+    ("images", "looked_at"), [(True, [True] * 6), (False, [False, False, True, False, False, False])]
+)
+def test_images_may_be_left_out_where_nobody_looks(images: bool, looked_at: list[bool]) -> None:
+    told: list[bool] = []
+
     class Sparing(Stated):
         def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
+            told.append(self.looked_at)
             obs, *rest = super().step(act)
             return (obs if self.looked_at else replace(obs, cameras={})), *rest
 
-    assert run_episode(Sparing(), Chunks(CHUNK, CHUNK), KEY, images=False).status == "done"
+    assert run_episode(Sparing(), Chunks(CHUNK, CHUNK), KEY, images=images).status == "done"
+    assert told == looked_at
     with pytest.raises(EnvFailed, match="camera 'front' is missing"):
         run_episode(Stated(after=(replace(GOOD, cameras={}), 0.0, False, False, SOLVED)), Chunks(CHUNK), KEY)
 
 
-@pytest.mark.parametrize(
-    "error", [PolicyFailed("mine"), PolicyUnavailable("gone"), UnknownSession("who"), NotReset("")]
-)
-def test_no_error_of_this_package_that_an_env_raises_is_anothers(error: VLAgentsError) -> None:
-    class Relayed(Script):
-        def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
-            raise error
+def test_the_result_says_which_checkpoint_and_weights_played_and_how_long_each_side_was_busy() -> None:
+    """A server says how long a batch took, of which each answer has its part."""
 
-    with pytest.raises(EnvFailed, match=type(error).__name__):
-        run_episode(Relayed(), Chunks(ROW), KEY)
+    class Served(Chunks):
+        version = 4
 
-
-def test_a_contract_that_cannot_be_made_is_an_env_failure() -> None:
-    class Broken(Script):
-        @property
-        def contract(self) -> Contract:
-            raise RuntimeError("no robot")
-
-    with pytest.raises(EnvFailed, match="no robot"):
-        run_episode(Broken(), Chunks(ROW), KEY)
-
-
-def test_every_call_is_announced_to_the_watch() -> None:
-    phases: list[tuple[str, int]] = []
-    run_episode(
-        Script(terminates_at=2), Chunks(ROW, ROW), KEY, watch=lambda phase, steps: phases.append((phase, steps))
-    )
-    assert phases == [
-        ("env reset", 0),
-        ("policy reset", 0),
-        ("policy act", 0),
-        ("env step", 0),
-        ("policy act", 1),
-        ("env step", 1),
-    ]
-
-
-def test_two_runs_of_one_key_are_the_same_episode() -> None:
-    def outcome() -> tuple[Any, ...]:
-        result = run_episode(Line(), ToZero(chunk=2), EpisodeKey("line", 0, 5, "0"))
-        return result.steps, result.episode_return, result.success_once, result.instruction
-
-    assert outcome() == outcome()
-
-
-def test_the_policys_options_reach_its_reset_and_the_result_says_what_checkpoint_played() -> None:
-    class Named(Chunks):
         def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
             super().reset(obs, instruction, **kwargs)
             return {"checkpoint": f"runs/{kwargs['checkpoint_step']}"}
 
-    agent = Named(*[np.zeros(2)] * 6)
-    result = run_episode(Script(), agent, KEY, policy_options={"checkpoint_step": 20})
-    assert agent.began["checkpoint_step"] == 20
-    assert result.checkpoint == "runs/20"
-    assert run_episode(Script(), Chunks(*[np.zeros(2)] * 6), KEY).checkpoint is None
-
-
-def test_the_result_says_how_long_each_side_was_busy() -> None:
-    """A server says how long a batch took, of which each answer has its part."""
-
-    class Served(Chunks):
         def act(self, obs: Obs) -> Act:
             act = super().act(obs)
             act.info["timing"] = {"inference_ms": 40.0, "batch_size": 4}
+            act.info["policy"] = {"version": self.version, "fingerprint": f"digest {self.version}"}
+            self.version += 1
             return act
 
-    result = run_episode(Script(), Served(*[np.zeros(2)] * 6), KEY)
+    agent = Served(*[ROW] * 6)
+    result = run_episode(Script(), agent, KEY, policy_options={"checkpoint_step": 20})
+    assert (agent.began["checkpoint_step"], result.checkpoint) == (20, "runs/20")
+    versions = result.first_policy_version, result.policy_version, result.policy_fingerprint
+    assert versions == (4, 3 + result.acts, f"digest {3 + result.acts}")
     assert result.policy_seconds == pytest.approx(6 * 0.040 / 4)
     assert result.env_seconds is not None
     assert 0 < result.env_seconds < result.seconds
+    unserved = run_episode(Script(), Chunks(*[ROW] * 6), KEY)
+    versions = unserved.first_policy_version, unserved.policy_version, unserved.policy_fingerprint
+    assert (unserved.checkpoint, *versions) == (None,) * 4
 
 
 def test_a_policy_in_this_process_is_busy_while_it_is_waited_for() -> None:
@@ -422,36 +353,3 @@ def test_a_policy_in_this_process_is_busy_while_it_is_waited_for() -> None:
     result = run_episode(Script(), Slow(*[np.zeros(2)] * 6), KEY)
     assert result.policy_seconds is not None
     assert 6 * 0.005 <= result.policy_seconds < result.seconds
-
-
-def test_the_result_says_which_versions_of_the_weights_played() -> None:
-    class Trained(Chunks):
-        version = 4
-
-        def act(self, obs: Obs) -> Act:
-            act = super().act(obs)
-            act.info["policy"] = {"version": self.version, "fingerprint": f"digest {self.version}"}
-            self.version += 1
-            return act
-
-    result = run_episode(Script(), Trained(*[np.zeros(2)] * 6), KEY)
-    versions = result.first_policy_version, result.policy_version, result.policy_fingerprint
-    assert versions == (4, 3 + result.acts, f"digest {3 + result.acts}")
-    unserved = run_episode(Script(), Chunks(*[np.zeros(2)] * 6), KEY)
-    assert (unserved.first_policy_version, unserved.policy_version, unserved.policy_fingerprint) == (None,) * 3
-
-
-@pytest.mark.parametrize(
-    ("images", "looked_at"), [(True, [True] * 6), (False, [False, False, True, False, False, False])]
-)
-def test_an_env_is_told_whether_anybody_looks(images: bool, looked_at: list[bool]) -> None:
-    class Told(Script):
-        def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
-            told.append(self.looked_at)
-            return super().step(act)
-
-    told: list[bool] = []
-    chunk = np.zeros((3, 2), np.float32)
-    result = run_episode(Told(), Chunks(chunk, chunk), KEY, images=images)
-    assert result.steps == 6
-    assert told == looked_at

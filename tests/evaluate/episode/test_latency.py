@@ -13,31 +13,17 @@ from hypothesis import strategies as st
 from in_process_episode import run_episode
 from pydantic import ValidationError
 
-from vlagents_ray.chunking.fallback import neutral
 from vlagents_ray.contract import ActionSpec, Contract
-from vlagents_ray.envs.tabletop import Tabletop
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.episode.latency import ChunkExecutor
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.config import ClockConfig
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
-from vlagents_ray.interface import DELAY, LEFTOVER, Act, Agent, Obs
-from vlagents_ray.policies.experts.tabletop import TabletopExpert
+from vlagents_ray.interface import DELAY, LEFTOVER, Act, Obs
 
 RELATIVE = Contract(action=ActionSpec(dim=2, delta=True, gripper_open=1.0), control_hz=10.0)
 ABSOLUTE = Contract(action=ActionSpec(dim=2, delta=False), control_hz=10.0)
 CHUNK = np.array([[i, -1.0] for i in range(1, 7)], np.float32)  # rows 1 to 6, the gripper closed
-TIMES = (
-    "seconds",
-    "reset_ms",
-    "env_step_ms",
-    "policy_ms",
-    "policy_p95_ms",
-    "timing_ms",
-    "latency_ms",
-    "env_seconds",
-    "policy_seconds",
-)
 
 
 def played(player: ChunkExecutor, latency_s: float, rows: np.ndarray = CHUNK) -> list[float]:
@@ -49,11 +35,31 @@ def clock(**settings: Any) -> ClockConfig:
     return ClockConfig(**{"latency": 0.2} | settings)
 
 
-def test_rows_that_the_rest_of_the_last_chunk_was_executed_in_place_of_are_dropped() -> None:
-    player = ChunkExecutor(4, clock(), RELATIVE)
-    assert played(player, 0.0) == [1, 2, 3, 4]
-    assert played(player, 0.1) == [5, 2, 3, 4]
-    assert played(player, 0.2) == [5, 6, 3, 4]
+@pytest.mark.parametrize(
+    ("execute", "settings", "env", "answers"),
+    [
+        # Rows in place of which the rest of the last chunk was executed are dropped.
+        (4, {}, RELATIVE, [(0.0, [1, 2, 3, 4]), (0.1, [5, 2, 3, 4]), (0.2, [5, 6, 3, 4])]),
+        # Without alignment the answer begins with its first row.
+        (4, {"align": False}, RELATIVE, [(0.0, [1, 2, 3, 4]), (0.2, [5, 6, 1, 2, 3, 4])]),
+        # The rest is executed while the policy thinks; where it ends, relative actions stop.
+        (4, {}, RELATIVE, [(0.2, [0, 0, 1, 2, 3, 4]), (0.2, [5, 6, 3, 4]), (0.3, [5, 6, 0, 3, 4])]),
+        # Where actions are absolute, the last one is held.
+        (4, {"neutral": [9, 9]}, ABSOLUTE, [(0.2, [9, 9, 1, 2, 3, 4]), (0.4, [5, 6, 6, 6, 3, 4])]),
+        # Where holding goes on moving, it is in place of the rows; before the first answer nothing moves.
+        (
+            None,
+            {"meanwhile": "hold"},
+            RELATIVE,
+            [(0.2, [0, 0, 1, 2, 3, 4, 5, 6]), (0.2, [6, 6, 3, 4, 5, 6]), (0.9, [6] * 9 + [6])],
+        ),
+    ],
+)
+def test_what_is_executed_until_an_answer_comes_and_of_it(
+    execute: int | None, settings: dict[str, Any], env: Contract, answers: list[tuple[float, list[int]]]
+) -> None:
+    player = ChunkExecutor(execute, clock(**settings), env)
+    assert [played(player, latency_s) for latency_s, _ in answers] == [executed for _, executed in answers]
 
 
 @pytest.mark.parametrize(
@@ -63,32 +69,6 @@ def test_no_row_is_dropped_for_ticks_at_which_the_robot_held(meanwhile: str, env
     player = ChunkExecutor(None, clock(meanwhile=meanwhile, neutral=[0, 0]), env)
     for latency_s in (0.2, 30.0):
         assert played(player, latency_s)[-6:] == [1, 2, 3, 4, 5, 6]
-
-
-def test_where_holding_goes_on_moving_it_is_in_place_of_the_rows() -> None:
-    player = ChunkExecutor(None, clock(meanwhile="hold"), RELATIVE)
-    assert played(player, 0.2) == [0, 0, 1, 2, 3, 4, 5, 6]  # before the first answer nothing moves
-    assert played(player, 0.2) == [6, 6, 3, 4, 5, 6]
-    assert played(player, 0.9) == [6] * 9 + [6]
-
-
-def test_without_alignment_the_answer_begins_with_its_first_row() -> None:
-    player = ChunkExecutor(4, clock(align=False), RELATIVE)
-    assert played(player, 0.0) == [1, 2, 3, 4]
-    assert played(player, 0.2) == [5, 6, 1, 2, 3, 4]
-
-
-def test_the_rest_of_the_last_chunk_is_executed_while_the_policy_thinks() -> None:
-    player = ChunkExecutor(4, clock(meanwhile="chunk"), RELATIVE)
-    assert played(player, 0.2) == [0, 0, 1, 2, 3, 4]
-    assert played(player, 0.2) == [5, 6, 3, 4], "no tick is lost"
-    assert played(player, 0.3) == [5, 6, 0, 3, 4], "where it ends, relative actions stop"
-
-
-def test_the_last_action_is_held_where_actions_are_absolute() -> None:
-    player = ChunkExecutor(4, clock(meanwhile="chunk", neutral=[9, 9]), ABSOLUTE)
-    assert played(player, 0.2) == [9, 9, 1, 2, 3, 4]
-    assert played(player, 0.4) == [5, 6, 6, 6, 3, 4]
 
 
 def test_holding_repeats_the_last_action_and_zero_keeps_only_the_gripper() -> None:
@@ -113,27 +93,17 @@ def test_an_answer_later_than_all_its_rows_is_good_for_its_last_one() -> None:
     assert played(player, 0.3, CHUNK[:3]) == [3, 4, 5, 3]
 
 
-def test_before_the_first_answer_the_gripper_is_open_and_nothing_moves() -> None:
-    assert neutral(RELATIVE.action).tolist() == [0, 1]
-
-
 def test_a_started_tick_is_over_and_rounding_starts_none() -> None:
     assert len(played(ChunkExecutor(None, clock(), RELATIVE), 1.1, CHUNK[:1])) == 11 + 1
     assert len(played(ChunkExecutor(None, clock(), RELATIVE), 1.1001, CHUNK[:1])) == 12 + 1
 
 
-def test_absolute_actions_need_one_to_begin_with() -> None:
+def test_what_a_clock_lacks_is_named() -> None:
     with pytest.raises(ConfigError, match=r"give clock\.neutral"):
         ChunkExecutor(None, clock(), ABSOLUTE)
     ChunkExecutor(None, clock(latency=0), ABSOLUTE)
-
-
-def test_a_neutral_action_is_as_long_as_the_others() -> None:
     with pytest.raises(ConfigError, match="got 3 numbers, the policy's actions have 2"):
         played(ChunkExecutor(None, clock(neutral=[0, 0, 0]), ABSOLUTE), 0.1)
-
-
-def test_a_clock_has_a_rate() -> None:
     bare = Contract(action=RELATIVE.action)
     with pytest.raises(ConfigError, match=r"give clock\.hz"):
         ChunkExecutor(None, clock(), bare)
@@ -168,52 +138,27 @@ def test_a_policy_that_chunks_in_real_time_is_told_what_is_left_and_for_how_long
     assert told() == [((), None)] * 2
 
 
-class Chunked(Agent):
-    """The tabletop's expert, which plans `rows` actions from one look, as if each took it where it should."""
-
-    def __init__(self, rows: int) -> None:
-        self._rows = rows
-        self._expert = TabletopExpert("tabletop")
-
-    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
-        self._expert.reset(obs, instruction or "")
-        return {}
-
-    def act(self, obs: Obs) -> Act:
-        xyzrpy, rows = obs.state["xyzrpy"].copy(), []
-        for _ in range(self._rows):
-            act = self._expert.act(Obs(cameras=obs.cameras, state={"xyzrpy": xyzrpy}, gripper=obs.gripper))
-            rows.append(act.action)
-            if act.done:
-                break
-            xyzrpy[:3] += 0.03 * act.action[:3]
-        return Act(np.stack(rows), done=act.done)
-
-
-def tabletop(seed: int, timing: ClockConfig | None, execute: int | None = None) -> EpisodeResult:
-    env = Tabletop("pick_place", width=96, height=96)
-    return run_episode(env, Chunked(6), EpisodeKey("tabletop", 0, seed, "0"), clock=timing, execute=execute)
+def episode(seed: int, timing: ClockConfig | None, execute: int | None = None) -> EpisodeResult:
+    return run_episode(Line(), ToZero(chunk=6), EpisodeKey("line", 0, seed, "0"), clock=timing, execute=execute)
 
 
 def outcome(result: EpisodeResult) -> dict[str, Any]:
-    return {name: getattr(result, name) for name in EpisodeResult.__slots__ if name not in TIMES}
+    return result.outcome | {"latency_ms": 0}
 
 
 @pytest.mark.parametrize("execute", [None, 1, 3])
 @pytest.mark.parametrize("meanwhile", ["chunk", "hold", "zero"])
-def test_without_latency_it_is_the_synchronous_episode(meanwhile: str, execute: int | None) -> None:
-    timing = ClockConfig(latency=0, meanwhile=meanwhile)  # type: ignore[arg-type]
-    assert outcome(tabletop(3, timing, execute)) == outcome(tabletop(3, None, execute))
+def test_without_latency_it_is_the_synchronous_episode(meanwhile: Any, execute: int | None) -> None:
+    timing = ClockConfig(latency=0, meanwhile=meanwhile, neutral=[0])
+    assert outcome(episode(3, timing, execute)) == outcome(episode(3, None, execute))
 
 
 def test_latency_lowers_success_and_repeats_exactly() -> None:
-    timing = ClockConfig(latency=0.3, meanwhile="hold")
-    synchronous = [tabletop(seed, None) for seed in range(8)]
-    late = [tabletop(seed, timing) for seed in range(8)]
-    assert sum(bool(one.success_once) for one in synchronous) == 8
-    assert sum(bool(one.success_once) for one in late) <= 4
-    assert all(one.latency_ms == pytest.approx(300) and one.ticks_waited >= 3 * (one.acts - 1) for one in late)
-    assert [outcome(tabletop(seed, timing)) for seed in range(8)] == [outcome(one) for one in late]
+    timing = ClockConfig(latency=0.5, meanwhile="hold", neutral=[0])
+    synchronous, late, again = ([episode(seed, clock, 1) for seed in range(40)] for clock in (None, timing, timing))
+    assert sum(bool(one.success_once) for one in synchronous) > 2 * sum(bool(one.success_once) for one in late)
+    assert all(one.latency_ms == pytest.approx(500) and one.ticks_waited >= 5 * (one.acts - 1) for one in late)
+    assert [outcome(one) for one in again] == [outcome(one) for one in late]
 
 
 def test_measured_latency_is_what_the_policy_took() -> None:

@@ -15,23 +15,29 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from eval_fakes import LINE, OTHER_LINE, ToZero
-from in_process_evaluation import play
+from in_process_evaluation import flat_config, play
 from scipy.spatial.transform import Rotation
 from wrist_roll_env import ROLLER, TILTED_ROLLER, Roller, Turner
 
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.dataset_contract import BYTES, INFO, STATISTICS, DatasetContract
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.evaluate import EvalConfig
+from vlagents_ray.evaluate import EvalConfig, Results
 from vlagents_ray.evaluate.artifacts.trajectory import Trajectory
 from vlagents_ray.evaluate.exports import to_lerobot
 from vlagents_ray.interface import Act, Obs
-from vlagents_ray.policies.scripted import Scripted
 from vlagents_ray.robot.dataset import Dataset
 from vlagents_ray.robot.episode import Finished
 
 Config = Callable[..., EvalConfig]
 CAMERA = {"camera": [32, 48]}
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Results:
+    """Two episodes of a hand that rolls, of which the first is solved."""
+    out = tmp_path_factory.mktemp("rolled") / "out"
+    return play(flat_config(envs=[ROLLER], episodes=2, record="all", out=out, video="none"), Turner)
 
 
 def test_frames_states_actions_rewards_and_success_are_those_of_the_episodes(config: Config, tmp_path: Path) -> None:
@@ -54,15 +60,6 @@ def test_frames_states_actions_rewards_and_success_are_those_of_the_episodes(con
     assert tasks == [episode.result.instruction for episode in results.cells[0].episodes]
 
 
-def test_units_and_the_meaning_of_actions_go_along(config: Config, tmp_path: Path) -> None:
-    to_lerobot(play(config(envs=["tabletop"], episodes=1, record="all"), Scripted), tmp_path / "dataset")
-    features = json.loads((tmp_path / "dataset/meta/info.json").read_text())["features"]
-    assert features["action"]["spec"]["space"] == "ee_position"
-    units = {key: one["unit"] for key, one in features.items() if key.startswith("observation.state.")}
-    assert units
-    assert all(units.values())
-
-
 def test_the_trajectories_stay_as_they_are(config: Config, tmp_path: Path) -> None:
     results = play(config(episodes=1, record="all", video="all", env_options=CAMERA))
     before = {path: path.read_bytes() for path in sorted(results.out.rglob("*.mp4"))}
@@ -78,11 +75,6 @@ def test_envs_that_differ_are_exported_one_by_one(config: Config, tmp_path: Path
         to_lerobot(results, tmp_path / "both")
     assert list(tmp_path.glob("both*")) == [], "the first env was written, and is no dataset of both"
     assert to_lerobot(results.only(env=OTHER_LINE), tmp_path / "one") == 1
-
-
-def test_without_trajectories_the_cure_is_said(config: Config, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"--record all \(`record: all`"):
-        to_lerobot(play(config(episodes=1)), tmp_path / "dataset")
 
 
 @pytest.mark.parametrize("end", ["npz", "mp4"])
@@ -115,12 +107,6 @@ def test_after_an_export_that_failed_the_same_command_works(
     assert to_lerobot(results, tmp_path / "new" / "dataset") == 2
 
 
-def test_an_empty_folder_may_be_there_already(config: Config, tmp_path: Path) -> None:
-    (tmp_path / "dataset").mkdir()
-    assert to_lerobot(play(config(episodes=1, record="all")), tmp_path / "dataset") == 1
-    assert info(tmp_path / "dataset")["total_episodes"] == 1
-
-
 def test_trajectories_are_in_memory_one_at_a_time(
     config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -141,10 +127,13 @@ def test_trajectories_are_in_memory_one_at_a_time(
     assert max(alive) <= 2  # the last one, until the next one is read
 
 
-def test_nothing_is_written_into_a_folder_that_holds_something(config: Config, tmp_path: Path) -> None:
-    results = play(config(episodes=1, record="all"))
+def test_a_folder_that_holds_something_and_results_without_trajectories_are_refused(
+    config: Config, tmp_path: Path
+) -> None:
     with pytest.raises(ConfigError, match="not empty"):
-        to_lerobot(results, tmp_path)
+        to_lerobot(play(config(episodes=1, record="all")), tmp_path)
+    with pytest.raises(ConfigError, match=r"--record all \(`record: all`"):
+        to_lerobot(play(config(episodes=1, out=tmp_path / "without")), tmp_path / "dataset")
 
 
 def info(root: Path) -> dict[str, Any]:
@@ -155,8 +144,7 @@ def rows(root: Path, number: int) -> dict[str, Any]:
     return dict(pq.read_table(root / f"data/chunk-000/file-{number:03d}.parquet").to_pydict())
 
 
-def test_cameras_and_parts_of_the_state_are_chosen_in_that_order(config: Config, tmp_path: Path) -> None:
-    results = play(config(envs=[ROLLER], episodes=1, record="all"), Turner)
+def test_cameras_and_parts_of_the_state_are_chosen_in_that_order(results: Results, tmp_path: Path) -> None:
     to_lerobot(results, tmp_path / "d", cameras=["wrist"], state=["gripper", "joints"])
     features = info(tmp_path / "d")["features"]
     assert [key for key in features if "images" in key] == ["observation.images.wrist"]
@@ -166,31 +154,24 @@ def test_cameras_and_parts_of_the_state_are_chosen_in_that_order(config: Config,
     assert not (tmp_path / "d/videos/observation.images.base").exists()
 
 
-def test_parts_of_the_environments_state_are_apart_and_need_no_camera(config: Config, tmp_path: Path) -> None:
-    results = play(config(envs=[ROLLER], episodes=1, record="all"), Turner)
-    to_lerobot(results, tmp_path / "d", cameras=[], environment_state=["joints"])
+@pytest.mark.parametrize("both", [False, True])
+def test_parts_of_the_environments_state_are_apart_and_need_no_camera(
+    results: Results, tmp_path: Path, both: bool
+) -> None:
+    (tmp_path / "d").mkdir()  # may be there if it is empty
+    chosen = ["joints", "gripper"] if both else None
+    to_lerobot(results, tmp_path / "d", cameras=[], state=chosen, environment_state=["joints"])
     features = info(tmp_path / "d")["features"]
     assert [key for key in features if "images" in key] == []
     assert features["observation.environment_state"]["names"] == ["joints_0", "joints_1"]
-    assert features["observation.state"]["names"] == [*(f"xyzrpy_{i}" for i in range(6)), "gripper"]
-    assert rows(tmp_path / "d", 0)["observation.environment_state"][0] == pytest.approx([0.1, 0.0])
+    others = [f"joints_{i}" for i in range(2)] if both else [f"xyzrpy_{i}" for i in range(6)]
+    assert features["observation.state"]["names"] == [*others, "gripper"]
+    first = {key: values[0] for key, values in rows(tmp_path / "d", 0).items()}
+    assert first["observation.environment_state"] == pytest.approx([0.1, 0.0])
     about = DatasetContract.from_json(info(tmp_path / "d")[INFO])
     assert about.environment == ("joints",)
-    assert set(about.contract.state or {}) == {"joints", "xyzrpy"}
+    assert set(about.contract.state or {}) == ({"joints"} if both else {"joints", "xyzrpy"})
     assert sorted(path.name for path in (tmp_path / "d").iterdir()) == ["data", "meta"]
-
-
-def test_a_part_may_be_in_both_states(config: Config, tmp_path: Path) -> None:
-    results = play(config(envs=[ROLLER], episodes=1, record="all"), Turner)
-    to_lerobot(results, tmp_path / "d", state=["joints", "gripper"], environment_state=["joints"])
-    first = {key: values[0] for key, values in rows(tmp_path / "d", 0).items()}
-    assert first["observation.state"] == pytest.approx([0.1, 0.0, 1.0])
-    assert first["observation.environment_state"] == first["observation.state.joints"]
-
-
-def test_a_finished_dataset_has_no_folder_of_an_unfinished_episode(config: Config, tmp_path: Path) -> None:
-    to_lerobot(play(config(envs=[ROLLER], episodes=2, record="all"), Turner), tmp_path / "d")
-    assert sorted(path.name for path in (tmp_path / "d").iterdir()) == ["data", "meta", "videos"]
 
 
 @pytest.mark.parametrize(
@@ -209,9 +190,8 @@ def test_a_finished_dataset_has_no_folder_of_an_unfinished_episode(config: Confi
     ],
 )
 def test_what_the_episodes_do_not_have_cannot_be_chosen(
-    config: Config, tmp_path: Path, chosen: dict[str, Any], text: str
+    results: Results, tmp_path: Path, chosen: dict[str, Any], text: str
 ) -> None:
-    results = play(config(envs=[ROLLER], episodes=1, record="all"), Turner)
     with pytest.raises(ConfigError, match=text):
         to_lerobot(results, tmp_path / "d", **chosen)
     assert not (tmp_path / "d").exists()
@@ -227,8 +207,7 @@ def test_only_what_was_solved_goes_into_it(config: Config, tmp_path: Path) -> No
         to_lerobot(unsolved, tmp_path / "none", successes=True)
 
 
-def test_an_episode_ends_where_nothing_moves_any_more_after_it_was_solved(config: Config, tmp_path: Path) -> None:
-    results = play(config(envs=[ROLLER], episodes=2, record="all"), Turner)
+def test_an_episode_ends_where_nothing_moves_any_more_after_it_was_solved(results: Results, tmp_path: Path) -> None:
     to_lerobot(results, tmp_path / "d", cut_idle=True)
     first, second = rows(tmp_path / "d", 0), rows(tmp_path / "d", 1)
     assert [action[0] for action in first["action"]] == pytest.approx([Roller.TURN] * 6 + [0.0])
@@ -257,8 +236,7 @@ def test_a_frame_names_the_weights_that_chose_its_action(config: Config, tmp_pat
     assert "policy_version" not in info(tmp_path / "none")["features"]
 
 
-def test_angles_are_written_without_jumps_and_info_says_about_what(config: Config, tmp_path: Path) -> None:
-    results = play(config(envs=[ROLLER], episodes=2, record="all"), Turner)
+def test_angles_are_written_without_jumps_and_info_says_about_what(results: Results, tmp_path: Path) -> None:
     recorded = Trajectory.load(results.out / str(results.cells[0].episodes[0].trajectory)).state["xyzrpy"][:-1]
     assert np.abs(np.diff(recorded[:, 3])).max() > np.pi
     to_lerobot(results, tmp_path / "d")
@@ -294,9 +272,11 @@ def test_rotation_vectors_are_written_without_jumps_and_are_the_same_rotations(c
     np.testing.assert_array_equal(alone, np.array(written["observation.state"])[:, 2:8])
 
 
-def test_the_contract_of_a_policy_goes_along_in_info_and_in_the_statistics(config: Config, tmp_path: Path) -> None:
-    results = play(config(envs=[ROLLER], episodes=2, record="all"), Turner)
+def test_the_contract_of_a_policy_goes_along_in_info_and_in_the_statistics(results: Results, tmp_path: Path) -> None:
     to_lerobot(results, tmp_path / "d", cameras=["wrist"], state=["joints", "gripper"])
+    features = info(tmp_path / "d")["features"]
+    assert features["action"]["spec"]["space"] == "joint"
+    assert features["observation.state.joints"]["unit"] == "rad"
     about = DatasetContract.from_json(info(tmp_path / "d")[INFO])
     assert about.state == ("joints", "gripper")
     assert about.cameras == {"observation.images.wrist": "wrist"}

@@ -60,17 +60,6 @@ def test_its_videos_play(page: Page, report: Path) -> None:
     assert page.value(play) == 48
 
 
-def test_the_gallery_shows_what_is_chosen(page: Page, report: Path) -> None:
-    page.open(report, width=1400, scheme="light")
-    visible = "[...document.querySelectorAll('.gallery figure')].filter((card) => card.checkVisibility()).length"
-    before = page.value(visible)
-    page.value(
-        "(() => { const select = document.querySelectorAll('.choices select')[1]; select.value = 'base';"
-        "select.dispatchEvent(new Event('change', { bubbles: true })); })()"
-    )
-    assert 0 < page.value(visible) < before
-
-
 EPISODES = "[...document.querySelectorAll('.episodes tbody tr')].filter((row) => row.checkVisibility())"
 
 
@@ -140,32 +129,6 @@ def test_videos_of_the_table_play_one_after_another(page: Page, report: Path) ->
     page.value("document.querySelectorAll('.viewer button')[2].click()")
     assert page.value("document.querySelector('.viewer').open") is False
     assert page.asked[0] == report.as_uri()
-
-
-@pytest.mark.parametrize("width", [360, 1400])
-def test_controls_cover_nothing_of_a_tile(page: Page, report: Path, width: int) -> None:
-    page.open(report, width=width, scheme="light")
-    boxes = (
-        "[...document.querySelectorAll('.gallery video')].map((video) => [video.clientHeight, video.clientWidth,"
-        "Number(getComputedStyle(video).getPropertyValue('--tall'))])"
-    )
-    found = page.value(boxes)
-    assert found
-    for high, wide, tall in found:
-        assert tall == pytest.approx(32 / 48, abs=0.01)
-        assert high - wide * tall >= 50  # px
-
-
-def test_charts_and_their_numbers_use_the_width(page: Page, report: Path) -> None:
-    page.open(report, width=1400, scheme="light")
-    text = page.value("document.querySelector('main').clientWidth")
-    used = page.value(
-        "[...document.querySelectorAll('.beside, .bars')].map((box) => {"
-        "const edges = [...box.querySelectorAll('*')].map((one) => one.getBoundingClientRect().right);"
-        "return Math.max(...edges) - box.getBoundingClientRect().left; })"
-    )
-    assert len(used) >= 3
-    assert min(used) >= 0.95 * text
 
 
 def test_it_prints_with_its_settings_unfolded(page: Page, report: Path) -> None:

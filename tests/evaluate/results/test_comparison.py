@@ -12,12 +12,7 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import Results
 from vlagents_ray.evaluate.merge import combined
 from vlagents_ray.evaluate.report.provenance import configuration
-from vlagents_ray.evaluate.results.comparison import (
-    clock_gaps,
-    comparable,
-    compare,
-    comparisons,
-)
+from vlagents_ray.evaluate.results.comparison import clock_gaps, comparable, compare, comparisons
 from vlagents_ray.evaluate.results.statistics import Pairs
 
 
@@ -62,11 +57,6 @@ def test_a_comparison_as_json_has_every_line(tmp_path: Path) -> None:
     assert {"pairs", "both", "difference", "interval_95", "p_value", "p_holm"} <= found["lines"][0].keys()
 
 
-def test_unknown_contenders_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"got \['best'\], want two of the contenders"):
-        compare(record(runs(tmp_path)), "best", "base")
-
-
 def folder(out: Path, name: str, **suite: Any) -> Results:
     """One policy in one env."""
     settings = {
@@ -83,10 +73,12 @@ def test_other_settings_of_an_env_are_no_pair(tmp_path: Path) -> None:
     assert comparable(results)[0] == []
 
 
-def test_no_shared_episode_is_no_comparison(tmp_path: Path) -> None:
+def test_no_shared_episode_and_unknown_contenders_are_no_comparison(tmp_path: Path) -> None:
     results = combined([folder(tmp_path / "a", "a"), folder(tmp_path / "b", "b", envs=[OTHER_LINE])])
     with pytest.raises(ConfigError, match="share no finished episode"):
         compare(results, "a", "b")
+    with pytest.raises(ConfigError, match=r"got \['best'\], want two of the contenders"):
+        compare(results, "best", "b")
 
 
 def test_folders_are_read_as_one(tmp_path: Path) -> None:

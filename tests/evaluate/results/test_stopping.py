@@ -125,17 +125,16 @@ def test_a_rule_has_an_end() -> None:
         StopConfig()
 
 
+STOP = {"target": 0.3, "at_least": 3}
+
+
 @pytest.mark.usefixtures("shared_ray")
 class TestOnACluster:
-    STOP = {"target": 0.3, "at_least": 3}  # noqa: RUF012 - never changed
-
     def test_the_result_does_not_depend_on_the_number_of_workers(self, config: Config) -> None:
         out = config().out
         found = []
-        for workers in (1, 2, 4):
-            settings = config(
-                envs=[LINE, OTHER_LINE], episodes=40, workers=workers, stop=self.STOP, out=out / str(workers)
-            )
+        for workers in (1, 4):
+            settings = config(envs=[LINE, OTHER_LINE], episodes=40, workers=workers, stop=STOP, out=out / str(workers))
             summary = evaluate(settings, agent_factory=ToZero)
             assert summary.state == "complete"
             found.append([(cell.stopped_at, [outcome(one) for one in cell.counted]) for cell in summary.results.cells])
@@ -145,24 +144,25 @@ class TestOnACluster:
             assert at == len(counted) < 40
             assert len(cell.episodes) >= at, "what was played beyond is kept"
 
-    def test_what_a_stopped_cell_says_holds_and_resuming_plays_nothing(self, config: Config) -> None:
-        settings = config(episodes=40, stop=self.STOP)
-        summary = evaluate(settings, agent_factory=ToZero)
-        [cell] = summary.results.cells
-        rate = rate_of([cell], "success_once")
-        assert rate.interval == confidence_sequence(rate.successes, rate.episodes)
-        assert rate.interval[0] > 0.3
-        [written] = json.loads((settings.out / "summary.json").read_text())["cells"]
-        assert written["stopped_at"] == cell.stopped_at == written["success_once"]["episodes"]
-        assert written["success_once"]["error_rate"] == 0.05
-        assert "wilson_95" not in written["success_once"]
-        assert summary.total.infra_failures == 0
-        evaluate(config(episodes=40, stop=self.STOP, resume=True), agent_factory=ToZero)
-        [again] = Results.load(settings.out).cells
-        assert again.episodes == cell.episodes
-        whole = evaluate(config(episodes=40, resume=True), agent_factory=ToZero)
-        assert whole.total.episodes == 40
-        assert whole.total.success_once.error_rate is None
+
+def test_what_a_stopped_cell_says_holds_and_resuming_plays_nothing(config: Config) -> None:
+    settings = config(episodes=40, stop=STOP)
+    summary = evaluate(settings, agent_factory=ToZero, in_process=True)
+    [cell] = summary.results.cells
+    rate = rate_of([cell], "success_once")
+    assert rate.interval == confidence_sequence(rate.successes, rate.episodes)
+    assert rate.interval[0] > 0.3
+    [written] = json.loads((settings.out / "summary.json").read_text())["cells"]
+    assert written["stopped_at"] == cell.stopped_at == written["success_once"]["episodes"]
+    assert written["success_once"]["error_rate"] == 0.05
+    assert "wilson_95" not in written["success_once"]
+    assert summary.total.infra_failures == 0
+    evaluate(config(episodes=40, stop=STOP, resume=True), agent_factory=ToZero, in_process=True)
+    [again] = Results.load(settings.out).cells
+    assert again.episodes == cell.episodes
+    whole = evaluate(config(episodes=40, resume=True), agent_factory=ToZero, in_process=True)
+    assert whole.total.episodes == 40
+    assert whole.total.success_once.error_rate is None
 
 
 def outcome(one: EpisodeResult) -> tuple[object, ...]:

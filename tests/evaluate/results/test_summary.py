@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from io import StringIO
 from pathlib import Path
@@ -72,6 +72,7 @@ def test_the_total_counts_all_envs(summary: Summary) -> None:
     assert total.policy_ms == 3.0
     assert summary.transports == ["http", "websocket"]
     assert summary.steps_per_second == pytest.approx(18 / summary.wall_seconds)
+    assert (summary.env_busy, summary.policy_busy) == (None, None), "no episode says it"
 
 
 def test_a_summary_is_plain_json_with_all_that_made_it(summary: Summary) -> None:
@@ -87,22 +88,16 @@ def test_a_summary_is_plain_json_with_all_that_made_it(summary: Summary) -> None
     assert {"python", "ray", "numpy", "vlagents-ray", "code"} <= set(written["versions"])
 
 
-def test_a_summary_replaces_the_one_before_whole(summary: Summary) -> None:
-    write_summary(summary)
-    write_summary(summary)
-    assert not list(Path(summary.out).glob("*.part"))
-
-
 def test_the_report_shows_rates_and_what_was_not_the_policys_fault(summary: Summary) -> None:
-    console = Console(file=StringIO(), width=100)
-    print_summary(console, summary)
-    text = console.file.getvalue()  # type: ignore[attr-defined]
+    text = printed(summary)
     assert "50% [9, 91]" in text
     assert "67% [21, 94]" in text
     assert "1 attempts lost to infrastructure and repeated" in text
     assert "1 episodes lost to infrastructure" in text
     assert "--resume" in text
-    assert "report:" not in text  # there is none
+    assert not any(word in text for word in ("report:", "busy")), "there is none"
+    page = write_report(summary.results, Path(summary.out) / "report.html")
+    assert f"report: {page}" in printed(summary)
 
 
 def test_a_summary_says_how_busy_envs_and_policy_were(config: Config) -> None:
@@ -119,18 +114,6 @@ def test_a_summary_says_how_busy_envs_and_policy_were(config: Config) -> None:
     assert summary.to_json()["env_busy"] == summary.env_busy
     of_replica = f"{summary.policy_busy:.0%}"
     assert f"envs busy for 75% of the workers' time, the policy for {of_replica} of one replica's" in printed(summary)
-
-
-def test_results_that_do_not_say_it_show_no_busy_share(summary: Summary) -> None:
-    assert (summary.env_busy, summary.policy_busy) == (None, None)
-    assert "busy" not in printed(summary)
-
-
-def test_the_page_is_named_where_there_is_one(summary: Summary) -> None:
-    page = write_report(summary.results, Path(summary.out) / "report.html")
-    console = Console(file=StringIO(), width=100)
-    print_summary(console, summary)
-    assert f"report: {page}" in console.file.getvalue()  # type: ignore[attr-defined]
 
 
 def recorded(settings: EvalConfig, outcomes: dict[str, list[bool]], **fields: int) -> Summary:
@@ -152,62 +135,56 @@ def printed(summary: Summary) -> str:
     return str(console.file.getvalue())  # type: ignore[attr-defined]
 
 
-def test_a_cell_in_real_time_tells_its_gap_to_the_synchronous_one(tmp_path: Path) -> None:
+def in_real_time(
+    out: Path, outcomes: dict[str, list[bool]], envs: Sequence[str] = (LINE,), **fields: int
+) -> tuple[Summary, str]:
+    """The summary of suites of which only "waits" is synchronous, and what is printed of it."""
     suites = [
-        {"name": "waits", "envs": [LINE], "episodes": 4},
-        {"name": "moves on", "envs": [LINE], "episodes": 4, "clock": {"latency": 0.2}},
-        {"name": "smaller", "envs": [LINE], "episodes": 4, "env_options": {"state_dim": 2}, "clock": {"latency": 0.2}},
+        {"name": name, "envs": list(envs), "episodes": len(solved)}
+        | ({} if name == "waits" else {"clock": {"latency": 0.2}})
+        | ({"env_options": {"state_dim": 2}} if name == "smaller" else {})
+        for name, solved in outcomes.items()
     ]
-    settings = EvalConfig.model_validate({"policies": [{}], "suites": suites, "out": tmp_path / "out"})
+    settings = EvalConfig.model_validate({"policies": [{}], "suites": suites, "out": out / "out"})
+    summary = recorded(settings, outcomes, **fields)
+    return summary, printed(summary)
+
+
+def test_a_cell_in_real_time_tells_its_gap_to_the_synchronous_one(tmp_path: Path) -> None:
     outcomes = {"waits": [True] * 4, "moves on": [True] + [False] * 3, "smaller": [True] * 4}
-    summary = recorded(settings, outcomes, ticks_waited=5, ticks_held=2)
+    summary, text = in_real_time(tmp_path, outcomes, ticks_waited=5, ticks_held=2)
     waits, moves, smaller = summary.results.cells
     assert synchronous_twin(summary.results, moves) is waits
     assert synchronous_twin(summary.results, waits) is None
     assert synchronous_twin(summary.results, smaller) is None, "it differs in more than its clock"
     assert [cell["gap_to_synchronous"] for cell in summary.to_json()["cells"]] == [None, -0.75, None]
-    text = printed(summary)
     assert "policy, moves on in real time: -75.0 points to the synchronous score (" in text
     assert ", 4 pairs); 50% of its ticks waited for an answer, 20% with nothing to execute" in text
 
 
 def test_a_cell_in_real_time_without_a_single_step_has_no_ticks_that_waited(tmp_path: Path) -> None:
-    suites = [
-        {"name": "waits", "envs": [LINE], "episodes": 2},
-        {"name": "moves on", "envs": [LINE], "episodes": 2, "clock": {"latency": 0.2}},
-    ]
-    settings = EvalConfig.model_validate({"policies": [{}], "suites": suites, "out": tmp_path / "out"})
-    summary = recorded(settings, {"waits": [True] * 2, "moves on": [False] * 2}, steps=0)
-    assert "in real time: -100.0 points to the synchronous score (" in printed(summary)
-    assert "; 0% of its ticks" in printed(summary)
+    _, text = in_real_time(tmp_path, {"waits": [True] * 2, "moves on": [False] * 2}, steps=0)
+    assert "in real time: -100.0 points to the synchronous score (" in text
+    assert "; 0% of its ticks" in text
 
 
 def test_console_report_and_summary_tell_the_same_gap(tmp_path: Path) -> None:
-    suites = [
-        {"name": "waits", "envs": [LINE, OTHER_LINE], "episodes": 6},
-        {"name": "moves on", "envs": [LINE, OTHER_LINE], "episodes": 4, "clock": {"latency": 0.2}},
-    ]  # of the six episodes that wait, two have no pair: rates differ by -60 points, pairs by -50
-    settings = EvalConfig.model_validate({"policies": [{}], "suites": suites, "out": tmp_path / "out"})
+    # of the six episodes that wait, two have no pair: rates differ by -60 points, pairs by -50
     outcomes = {"waits": [True] * 3 + [False] + [True] * 2, "moves on": [True] + [False] * 3}
-    summary = recorded(settings, outcomes)
+    summary, text = in_real_time(tmp_path, outcomes, [LINE, OTHER_LINE])
     assert [cell["gap_to_synchronous"] for cell in summary.to_json()["cells"]] == [None, None, -0.5, -0.5]
-    assert "moves on in real time: -50.0 points to the synchronous score (" in printed(summary)
-    assert ", 8 pairs)" in printed(summary)
+    assert "moves on in real time: -50.0 points to the synchronous score (" in text
+    assert ", 8 pairs)" in text
     page = write_report(summary.results, tmp_path / "report.html").read_text()
     assert "<strong>\N{MINUS SIGN}50.0</strong>" in page
 
 
 def test_real_time_and_synchronous_episodes_are_in_no_rate_together(tmp_path: Path) -> None:
-    suites = [
-        {"name": "waits", "envs": [LINE], "episodes": 4},
-        {"name": "moves on", "envs": [LINE], "episodes": 4, "clock": {"latency": 0.2}},
-    ]
-    settings = EvalConfig.model_validate({"policies": [{}], "suites": suites, "out": tmp_path / "out"})
-    summary = recorded(settings, {"waits": [True] * 4, "moves on": [False] * 4})
+    summary, text = in_real_time(tmp_path, {"waits": [True] * 4, "moves on": [False] * 4})
     [total] = summary.to_json()["totals"]
     assert (total["success_once"]["rate"], total["episodes"]) == (None, 8)
-    assert "50%" not in printed(summary)
-    assert "total synchronous" in printed(summary)
+    assert "50%" not in text
+    assert "total synchronous" in text
     page = write_report(summary.results, tmp_path / "report.html").read_text()
     assert ">50.0" not in page
     assert "solved, synchronous" in page
@@ -217,6 +194,9 @@ def test_real_time_and_synchronous_episodes_are_in_no_rate_together(tmp_path: Pa
 
 def test_cells_that_stopped_after_different_numbers_have_no_rate_in_common(config: Config, tmp_path: Path) -> None:
     settings = config(envs=[LINE, OTHER_LINE], episodes=40, stop={"target": 0.5, "at_least": 5})
+    alike = recorded(settings.model_copy(update={"out": tmp_path / "alike"}), {"": [True] * 12})
+    assert {cell.stopped_at for cell in alike.results.cells} != {None}
+    assert alike.totals[0].success_once.rate == 1.0
     with Store(settings) as store:
         store.begin_run(settings, {})
         for job in plan(store.cells):  # one task is solved at once, the other every second time
@@ -236,13 +216,6 @@ def test_cells_that_stopped_after_different_numbers_have_no_rate_in_common(confi
     assert "50.0 to 100.0 %" in page  # from task to task, as the headline
     pooled = 100 * (first.stopped_at + 20) / (first.stopped_at + 40)
     assert f"{pooled:.1f}" not in page
-
-
-def test_cells_that_stopped_alike_have_one(config: Config) -> None:
-    settings = config(envs=[LINE, OTHER_LINE], episodes=40, stop={"target": 0.5, "at_least": 5})
-    summary = recorded(settings, {"": [True] * 12})
-    assert {cell.stopped_at for cell in summary.results.cells} != {None}
-    assert summary.totals[0].success_once.rate == 1.0
 
 
 def test_a_cell_that_stopped_early_says_after_how_many_and_at_which_error_rate(config: Config) -> None:

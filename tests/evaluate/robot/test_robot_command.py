@@ -127,29 +127,29 @@ def test_what_was_judged_can_be_told_before_the_end(tmp_path: Path) -> None:
     assert "1/4" in answer.stdout
 
 
+ROBOT = ["--robot", "robot_trials:Arm"]
+
+
 @pytest.mark.parametrize(
     ("options", "said"),
     [
         (["--operator", "terminal"], "got ['--operator'] without --robot"),
         (["--unblind"], "got ['--unblind'] without --robot"),
-        (["--robot", "robot_trials:Arm", "--dry-run"], "--robot and ['--dry-run'] exclude each other"),
-        (["--robot", "robot_trials:Arm", "--operator", "owl"], "--operator: got 'owl', want page or terminal"),
-        (["--robot", "robot_trials:Arm", "--unblind"], "want the folder of an evaluation on a robot"),
-        (["--robot", "robot_trials:Arm", "--track", "wandb"], "['--track'] exclude each other"),
+        ([*ROBOT, "--dry-run"], "--robot and ['--dry-run'] exclude each other"),
+        ([*ROBOT, "--operator", "owl"], "--operator: got 'owl', want page or terminal"),
+        ([*ROBOT, "--unblind"], "want the folder of an evaluation on a robot"),
+        ([*ROBOT, "--track", "wandb"], "['--track'] exclude each other"),
+        (["simulation.yaml", *ROBOT], "robot.tasks"),
     ],
 )
-def test_options_that_do_not_go_together_are_refused(tmp_path: Path, options: list[str], said: str) -> None:
+def test_options_that_do_not_go_together_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: list[str], said: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
     write_plan(tmp_path / "plan.yaml")
-    answer = CliRunner().invoke(app, ["eval", str(tmp_path / "plan.yaml"), "--out", str(tmp_path / "out"), *options])
+    simulation = {"policies": [{"source": "noop"}], "suites": [{"envs": ["tabletop"]}]}
+    (tmp_path / "simulation.yaml").write_text(json.dumps(simulation))
+    plan = [] if options[0].endswith("yaml") else ["plan.yaml"]
+    answer = CliRunner().invoke(app, ["eval", *plan, *options, "--out", "out"])
     assert answer.exit_code == 2
     assert said in answer.stderr
-
-
-def test_a_file_without_tasks_has_no_robot(tmp_path: Path) -> None:
-    (tmp_path / "plan.yaml").write_text(
-        json.dumps({"policies": [{"source": "noop"}], "suites": [{"envs": ["tabletop"]}]})
-    )
-    command = ["eval", str(tmp_path / "plan.yaml"), "--robot", "robot_trials:Arm", "--out", str(tmp_path / "out")]
-    answer = CliRunner().invoke(app, command)
-    assert answer.exit_code == 2
-    assert "robot.tasks" in answer.stderr

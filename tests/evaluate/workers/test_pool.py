@@ -1,4 +1,4 @@
-"""What the pool of workers makes of nodes that are lost."""
+"""The pool of workers: nodes that are lost, fewer workers than it wants, and reports that come together."""
 
 from __future__ import annotations
 
@@ -9,14 +9,16 @@ from typing import Any
 
 import pytest
 import ray
-from eval_fakes import LINE, ToZero, wait_for
+from eval_fakes import LINE, Clock, ToZero, wait_for
 from ray.exceptions import RaySystemError
 
-from vlagents_ray.errors import EnvFailed
-from vlagents_ray.evaluate import EvalConfig
+from vlagents_ray.errors import ConfigError, EnvFailed
+from vlagents_ray.evaluate import EvalConfig, WorkerConfig
 from vlagents_ray.evaluate.episode.failures import Failure
-from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job
+from vlagents_ray.evaluate.plan.cases import cells
+from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job, plan
 from vlagents_ray.evaluate.workers import pool
+from vlagents_ray.evaluate.workers.cluster import CapacityMonitor
 from vlagents_ray.evaluate.workers.pool import WorkerPool
 from vlagents_ray.evaluate.workers.rollout import Report
 from vlagents_ray.evaluate.workers.worker import WorkerHandle
@@ -104,3 +106,62 @@ def test_who_kills_workers_of_a_ray_that_was_left_meanwhile_starts_no_other_ray(
     monkeypatch.setattr(ray, "kill", asked.append)
     pool._kill(["one"])
     assert asked == []
+
+
+WANTED = WorkerConfig(cpus=64)
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def capacity(config: Config, clock: Clock) -> CapacityMonitor:
+    return CapacityMonitor(config(workers=3, place_timeout_s=100), clock)
+
+
+def test_a_worker_may_wait_for_as_long_as_the_settings_say(capacity: CapacityMonitor, clock: Clock) -> None:
+    clock.now = 110.0
+    assert not capacity.timed_out(since=10.0)
+    assert capacity.timed_out(since=9.0)
+
+
+def test_that_it_goes_on_with_fewer_is_said_once_until_another_comes_up(
+    capacity: CapacityMonitor, clock: Clock, caplog: pytest.LogCaptureFixture
+) -> None:
+    clock.now = 1000.0
+    capacity.note_playing()
+    for _ in range(3):
+        capacity.report_shortage(WANTED, running=2)
+    assert caplog.text.count("going on with 2 of 3 workers: the cluster found no room") == 1
+    capacity.note_started()
+    capacity.report_shortage(WANTED, running=2)
+    assert caplog.text.count("going on with") == 2
+
+
+def test_between_two_episodes_nobody_gives_up_but_where_nothing_is_played_for_as_long(
+    capacity: CapacityMonitor, clock: Clock
+) -> None:
+    clock.now = 1000.0
+    capacity.note_playing()
+    clock.now = 1100.0
+    capacity.report_shortage(WANTED, running=1)
+    clock.now = 1101.0
+    with pytest.raises(ConfigError, match=r"no room for a worker in 100 s: each needs .*64.* lower `workers`"):
+        capacity.report_shortage(WANTED, running=1)
+
+
+def test_reports_that_have_come_are_taken_in_one_turn(config: Config) -> None:
+    settings = config(workers=2)
+    jobs = plan(cells(settings))
+    with WorkerPool(settings, lambda _: ToZero()) as pool:
+        for job in jobs[:2]:
+            pool.start(job.cell)
+        wait_for(lambda: not list(pool.wait(0.1)) and len(pool.idle()) == 2)
+        busy = pool.idle()
+        for worker, job in zip(busy, jobs, strict=False):
+            pool.dispatch(worker, (job,))
+        done, _ = ray.wait([worker.running for worker in busy], num_returns=2, timeout=60)
+        assert len(done) == 2
+        assert {job.key for job, _ in pool.wait(10)} == {job.key for job in jobs[:2]}

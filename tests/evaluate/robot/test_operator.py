@@ -1,9 +1,11 @@
-"""The operator's page: what it answers, to whom, and a whole evaluation over it."""
+"""The operator's page: what it answers, to whom, and a whole evaluation over it; and the operator at a terminal."""
 
 from __future__ import annotations
 
 import contextlib
 import json
+import os
+import pty
 import threading
 import time
 import urllib.error
@@ -16,7 +18,7 @@ import pytest
 from eval_fakes import wait_for
 from robot_trials import NAMES, URLS, Arm, Evaluation, plan, tasks
 
-from vlagents_ray.evaluate.robot import PageOperator, TrialsInterrupted
+from vlagents_ray.evaluate.robot import PageOperator, TerminalOperator, TrialsInterrupted, VisibleTrial
 from vlagents_ray.images.jpeg_png import decode
 
 
@@ -189,3 +191,40 @@ def test_a_trial_is_stopped_by_the_button_or_when_the_page_is_gone(
     assert arm.applied == applied
     person.answer("end", again)
     run.join()
+
+
+@pytest.fixture
+def keyboard(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
+    """What is written there is typed at this process's terminal."""
+    main, terminal = pty.openpty()
+    with os.fdopen(terminal) as stdin:
+        monkeypatch.setattr("sys.stdin", stdin)
+        yield main
+    os.close(main)
+
+
+def test_enter_stops_a_trial_once(keyboard: int) -> None:
+    person = TerminalOperator()
+    assert not person.stops()
+    os.write(keyboard, b"stop")
+    assert not person.stops(), "the line has no end yet"
+    os.write(keyboard, b"\n")
+    assert person.stops()
+    assert not person.stops(), "it is read, and no answer to the next question"
+
+
+def test_lines_of_a_pipe_are_left_for_the_questions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "answers").write_text("s\n")
+    with (tmp_path / "answers").open() as stdin:
+        monkeypatch.setattr("sys.stdin", stdin)
+        assert not TerminalOperator().stops()
+        assert stdin.read() == "s\n"
+
+
+def test_a_word_that_is_no_verdict_is_asked_again() -> None:
+    typed = iter(["maybe", "p", "", "S", "well done"])
+    trial = VisibleTrial(1, 2, "drawer", 1, 1, "open the drawer", "", 4.0, rubric={})
+    said: list[str] = []
+    verdict = TerminalOperator(lambda _: next(typed), said.append).judge(trial, "the trial is over")
+    assert (verdict.outcome, verdict.note) == ("success", "well done")
+    assert "want some of the rubric's" in said[-1], "a task without a rubric has no partial success"

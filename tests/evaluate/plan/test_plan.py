@@ -1,3 +1,5 @@
+"""Settings, cases and jobs: what is planned, under which keys, and in which order workers take it."""
+
 from __future__ import annotations
 
 from collections import Counter
@@ -8,17 +10,14 @@ from typing import Any
 import pytest
 from eval_fakes import LINE, OTHER_LINE
 from in_process_evaluation import flat_config
+from pydantic import ValidationError
 
 from vlagents_ray.envs.tabletop import Tabletop
 from vlagents_ray.errors import ConfigError, UnknownEnv
-from vlagents_ray.evaluate import EvalConfig, PolicyConfig, SuiteConfig
+from vlagents_ray.evaluate import EvalConfig, PolicyConfig
 from vlagents_ray.evaluate.plan.cases import cells, expand
-from vlagents_ray.evaluate.plan.jobs import (
-    EpisodeKey,
-    Job,
-    JobQueue,
-    plan,
-)
+from vlagents_ray.evaluate.plan.config import ClockConfig, SuiteConfig, canonical, fingerprint
+from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job, JobQueue, plan
 
 Config = Callable[..., EvalConfig]
 
@@ -32,21 +31,11 @@ def keys(config: EvalConfig) -> list[EpisodeKey]:
 
 
 def test_a_plan_numbers_and_seeds_every_episode_of_every_env(config: Config) -> None:
-    found = keys(config(envs=[LINE, OTHER_LINE], episodes=3, seed=7))
+    found = keys(config(envs=[LINE, OTHER_LINE], episodes=2, seeds=[7, 100]))
     assert [(key.env, key.episode, key.seed) for key in found] == [
-        (LINE, 0, 7),
-        (LINE, 1, 8),
-        (LINE, 2, 9),
-        (OTHER_LINE, 0, 7),
-        (OTHER_LINE, 1, 8),
-        (OTHER_LINE, 2, 9),
+        (env, episode, seed + episode) for env in (LINE, OTHER_LINE) for seed in (7, 100) for episode in (0, 1)
     ]
-    assert len(set(map(str, found))) == 6
-
-
-def test_a_further_seed_is_a_further_set_of_episodes(config: Config) -> None:
-    found = keys(config(episodes=2, seeds=[0, 100]))
-    assert [(key.episode, key.seed) for key in found] == [(0, 0), (1, 1), (0, 100), (1, 101)]
+    assert len(set(map(str, found))) == 8
 
 
 def test_pushed_weights_are_a_checkpoint_and_part_of_the_key(config: Config) -> None:
@@ -89,7 +78,7 @@ def test_a_sweep_plays_checkpoint_by_checkpoint(config: Config) -> None:
         {"codec": "jpeg"},
     ],
 )
-def test_what_changes_the_outcome_changes_the_key(config: Callable[..., EvalConfig], change: dict[str, Any]) -> None:
+def test_what_changes_the_outcome_changes_the_key(config: Config, change: dict[str, Any]) -> None:
     assert not set(map(str, keys(config()))) & set(map(str, keys(config(**change))))
 
 
@@ -106,39 +95,24 @@ def test_what_changes_the_outcome_changes_the_key(config: Callable[..., EvalConf
         {"codec": "lossless"},
     ],
 )
-def test_what_does_not_change_the_outcome_keeps_the_key(
-    config: Callable[..., EvalConfig], change: dict[str, Any]
-) -> None:
+def test_what_does_not_change_the_outcome_keeps_the_key(config: Config, change: dict[str, Any]) -> None:
     assert keys(config()) == keys(config(**change))
 
 
-def test_suites_have_options_of_their_own(config: Config) -> None:
-    plain, changed = (
-        keys(
-            EvalConfig(
-                policies=[PolicyConfig()],
-                suites=[SuiteConfig(envs=[LINE]), SuiteConfig(envs=[OTHER_LINE], env_options=options)],
-                out=Path("out"),
-            )
-        )
-        for options in ({}, {"width": 8})
-    )
-    assert {key.env for key in plain if key in changed} == {LINE}
-
-
-def test_an_env_in_two_suites_of_one_name_is_refused() -> None:
-    suites = [SuiteConfig(envs=[LINE]), SuiteConfig(envs=[LINE], env_options={"width": 8})]
-    with pytest.raises(ConfigError, match="are in two suites of one name"):
+@pytest.mark.parametrize(
+    ("second", "said"),
+    [
+        ({"envs": [LINE], "env_options": {"width": 8}}, "are in two suites of one name"),
+        ({"name": "all", "envs": [LINE, OTHER_LINE], "seeds": [100]}, "stand in two suites with the same settings"),
+    ],
+)
+def test_an_env_in_two_suites_of_one_name_or_that_do_not_differ_is_refused(second: dict[str, Any], said: str) -> None:
+    suites = [SuiteConfig(envs=[LINE]), SuiteConfig.model_validate(second)]
+    with pytest.raises(ConfigError, match=said):
         cells(EvalConfig(policies=[PolicyConfig()], suites=suites, out=Path("out")))
 
 
-def test_an_env_in_two_suites_that_do_not_differ_is_refused() -> None:
-    suites = [SuiteConfig(name="few", envs=[LINE]), SuiteConfig(name="all", envs=[LINE, OTHER_LINE], seeds=[100])]
-    with pytest.raises(ConfigError, match=r"\['eval_fakes:Line'\] stand in two suites with the same settings"):
-        cells(EvalConfig(policies=[PolicyConfig()], suites=suites, out=Path("out")))
-
-
-def test_policies_whose_episodes_would_share_their_files_are_refused(config: Callable[..., EvalConfig]) -> None:
+def test_policies_whose_episodes_would_share_their_files_are_refused(config: Config) -> None:
     [policy] = config().policies
     policies = [policy.model_copy(update={"name": name}) for name in ("pi0/fast", "pi0_fast")]
     with pytest.raises(ConfigError, match="would share files"):
@@ -216,3 +190,45 @@ def test_episodes_side_by_side_are_of_one_cell() -> None:
     assert queue.needs_worker({}, {kind: 4}) is None
     taken = [queue.take(kind, None, Counter()) for _ in range(4)]
     assert [[job.cell.step for job in some] for some in taken] == [[1, 1, 1], [1, 1], [2, 2, 2], [2, 2]]
+
+
+def test_a_range_of_steps_includes_the_last(config: Config) -> None:
+    [policy] = config(steps={"first": 1000, "last": 3000, "every": 1000}).policies
+    assert policy.steps == [1000, 2000, 3000]
+
+
+def test_seeds_that_would_play_an_episode_twice_are_refused(config: Config) -> None:
+    assert config(episodes=5, seeds=[10, 0, 5]).suites[0].seeds == [10, 0, 5]
+    with pytest.raises(ValidationError, match="would play some twice; want them 5 or more apart"):
+        config(episodes=5, seeds=[0, 4])
+
+
+def test_a_fingerprint_ignores_order_and_nothing_else() -> None:
+    assert fingerprint({"a": 1, "b": [1, 2]}) == fingerprint({"b": [1, 2], "a": 1})
+    assert fingerprint({"a": 1, "b": [1, 2]}) != fingerprint({"a": 1, "b": [2, 1]})
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_numbers_that_json_lacks_are_refused(value: Any) -> None:
+    with pytest.raises(ValueError, match="Out of range"):
+        canonical({"a": value})
+
+
+def test_a_batch_has_no_latency_to_measure() -> None:
+    assert SuiteConfig(envs=["line"], num_envs=2, clock=ClockConfig(latency=0.1)).clock is not None
+    with pytest.raises(ValidationError, match="of the whole batch; want 1, or a latency in seconds"):
+        SuiteConfig(envs=["line"], num_envs=2, clock=ClockConfig())
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"wokers": 3}, "wokers"),
+        ({"envs": ["a", "b", "a"]}, "named twice"),
+        ({"policies": [{"name": "a", "url": "http://x"}, {"name": "a", "url": "http://y"}]}, "two policies are named"),
+        ({"policy_options": {"seed": 3, "checkpoint_step": 20}}, r"\['seed'\] are set episode by episode"),
+    ],
+)
+def test_settings_that_cannot_be_are_refused(config: Config, wrong: dict[str, Any], said: str) -> None:
+    with pytest.raises(ValidationError, match=said):
+        config(**wrong)

@@ -7,12 +7,49 @@ from hypothesis import strategies as st
 from scipy.stats import binomtest
 
 from vlagents_ray.errors import InvalidInput
-from vlagents_ray.evaluate.results.statistics import (
-    Pairs,
-    difference_interval,
-    holm,
-    mcnemar,
+from vlagents_ray.evaluate import Rate, wilson
+from vlagents_ray.evaluate.results.statistics import Pairs, difference_interval, holm, mcnemar
+
+
+# From R. G. Newcombe, "Two-sided confidence intervals for the single proportion: comparison of seven
+# methods", Statistics in Medicine 17 (1998), table I, method 3.
+@pytest.mark.parametrize(
+    ("successes", "trials", "low", "high"),
+    [(81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605), (0, 20, 0.0, 0.1611), (1, 29, 0.0061, 0.1718)],
 )
+def test_wilson_agrees_with_published_values(successes: int, trials: int, low: float, high: float) -> None:
+    assert wilson(successes, trials) == pytest.approx((low, high), abs=5e-5)
+
+
+@given(st.integers(1, 10_000).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))))
+def test_wilson_encloses_the_rate_within_zero_and_one(counts: tuple[int, int]) -> None:
+    successes, trials = counts
+    low, high = wilson(successes, trials)
+    assert 0.0 <= low <= successes / trials <= high <= 1.0
+
+
+@given(st.integers(0, 50), st.integers(1, 50))
+def test_wilson_narrows_with_more_of_the_same(successes: int, failures: int) -> None:
+    few = wilson(successes, successes + failures)
+    many = wilson(4 * successes, 4 * (successes + failures))
+    assert many[1] - many[0] < few[1] - few[0]
+
+
+def test_nothing_is_known_without_episodes() -> None:
+    assert wilson(0, 0) == (0.0, 1.0)
+    assert Rate(0, 0).rate is None
+    assert Rate(0, 0).to_json()["wilson_95"] == [0.0, 1.0]
+    assert difference_interval([]) == difference_interval([Pairs()]) == (-1.0, 1.0)
+
+
+def test_impossible_counts_are_refused() -> None:
+    for counts in ((3, 2), (-1, 5)):
+        with pytest.raises(InvalidInput, match="want 0 <= successes <= trials"):
+            wilson(*counts)
+    for refuse in (lambda: mcnemar(-1, 2), lambda: Pairs(both=-1)):
+        with pytest.raises(InvalidInput, match="no count below 0"):
+            refuse()
+
 
 COUNTS = st.integers(0, 60)
 
@@ -99,10 +136,6 @@ def test_thousands_of_episodes_narrow_the_interval() -> None:
     assert few[0] < many[0] < 0.1 < many[1] < few[1]
 
 
-def test_nothing_is_known_of_the_difference_without_episodes() -> None:
-    assert difference_interval([]) == difference_interval([Pairs()]) == (-1.0, 1.0)
-
-
 def test_holm_agrees_with_a_worked_example() -> None:
     # Sorted 0.005, 0.01, 0.03, 0.04 times 4, 3, 2, 1, and never less than the one before.
     assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
@@ -119,10 +152,3 @@ def test_holm_keeps_the_chance_of_any_error_below_five_percent() -> None:
     drawn = np.random.default_rng(2).uniform(size=(4000, 10))  # ten true hypotheses
     wrong = np.mean([min(holm(list(p_values))) < 0.05 for p_values in drawn])
     assert 0.03 < wrong < 0.06
-
-
-def test_impossible_counts_are_refused() -> None:
-    with pytest.raises(InvalidInput, match="no count below 0"):
-        mcnemar(-1, 2)
-    with pytest.raises(InvalidInput, match="no count below 0"):
-        Pairs(both=-1)
