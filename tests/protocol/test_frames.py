@@ -10,12 +10,12 @@ import tracemalloc
 import golden
 import numpy as np
 import pytest
+from hostile_messages import mutated
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from in_flight import read_requests
 from many import many
-from mutated_messages import mutated
 
 from vlagents_ray.errors import (
     InvalidInput,
