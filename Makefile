@@ -40,9 +40,9 @@ CONSTRAINTS := $(VENV)/constraints.txt
 STAMP := $(VENV)/.installed
 # `make check`, `lint`, `type` and `fmt` do with a smaller environment where the whole one is not installed.
 TOOLS := $(if $(wildcard $(STAMP)),$(VENV),$(VENV)-check)
-# On two cores: tests wait for a third of their time.
+# On two cores: tests wait for a third of their time, those of `make check` for half of it.
 TEST_PROCESSES ?= 3
-CHECK_PROCESSES ?= 3
+CHECK_PROCESSES ?= 4
 # Marked so: what wants more than Python, takes long, or wants the machine for itself (pyproject.toml, tests/support/needs.py).
 NOT_QUICK := ray or server or hosts or sim or vulkan or torch or gpu or browser or node or compiler or alone or slow or integration
 # Environments of model families: requirements/NAME.txt, in $(VENV)-NAME. What is tested in each is in tests/families,
