@@ -1,1 +1,1 @@
-"""The wire protocol of this project: it turns bytes into Obs and Act and back, without threads, sockets or Ray."""
+"""The project's wire protocol: conversion between bytes and Obs and Act, without threads, sockets or Ray."""

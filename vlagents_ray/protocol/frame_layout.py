@@ -23,22 +23,22 @@ from vlagents_ray.protocol.messages import PROTOCOL_VERSION, Budget, Limits
 Buffer = bytes | memoryview
 _PREFIX = struct.Struct("<3sBI")
 _ALIGN = 8
-HEADER_BYTES = 2**20  # most bytes of the JSON of a request; the limits of a body hold for that of a reply
-VALUES = 20_000  # most values in the JSON of a request, which parses in about 2 ms
+HEADER_BYTES = 2**20  # maximum size of a request's JSON; only the size of the body limits a reply's
+VALUES = 20_000  # maximum number of values in a request's JSON; parsing as many takes about 2 ms
 _INLINE_BYTES = 64 * 1024  # longer JSON is parsed within a budget, which may move it to a decoding thread
 _LONG_VALUES = 1_000_000
 _PLAIN = re.compile(r"[<|][biuf][1248]")
-dump = json.JSONEncoder(separators=(",", ":")).encode  # created once, as `json.dumps` creates an encoder for each call
+dump = json.JSONEncoder(separators=(",", ":")).encode  # created once, as `json.dumps` creates an encoder per call
 
 
 def pack(header: dict[str, Any], blobs: list[Buffer]) -> list[Buffer]:
-    """Return the pieces of a frame, in order; sets "blobs" in `header`; blobs are not copied."""
+    """Return the pieces of a frame in order, and set "blobs" in `header`; the blobs are not copied."""
     header["blobs"] = [len(blob) for blob in blobs]
     return assemble(dump(header), blobs)
 
 
 def assemble(header: str, blobs: list[Buffer]) -> list[Buffer]:
-    """Return the pieces of a frame whose header is JSON text already, with "blobs"."""
+    """Return the pieces of a frame whose header is JSON text that already contains "blobs"."""
     head = header.encode()
     parts: list[Buffer] = [_PREFIX.pack(b"VLA", PROTOCOL_VERSION, len(head)), head]
     at = _PREFIX.size + len(head)
@@ -50,7 +50,12 @@ def assemble(header: str, blobs: list[Buffer]) -> list[Buffer]:
 
 
 def unpack(data: Buffer, limits: Limits, budget: Budget | None = None) -> tuple[dict[str, Any], list[Buffer]]:
-    """Return the header of a frame and views of its blobs; the header of a request has the limits of its `budget`.
+    """Return the header of a frame, and views of its blobs.
+
+    Args:
+        data: The frame.
+        limits: The limits of the frame.
+        budget: The budget that a request's header is charged to; None for a reply, whose header may be longer.
 
     Raises:
         MalformedMessage: The data are not a frame.
@@ -93,18 +98,18 @@ def parse_json(
     budget: Budget | None = None,
     long: bool = False,
 ) -> Any:
-    """Return the value of a JSON text of the network.
+    """Parse JSON text from the network.
 
     Args:
         text: The text; bytes are UTF-8.
         what: The beginning of the error message, such as "obs:".
-        pairs: Makes the value of an object from its keys and values; a `ValueError` of it is a `MalformedMessage`.
-        budget: Is charged before a long text is parsed.
-        long: Whether it may be longer than a request: the reply of a server, or a file.
+        pairs: Converts the keys and values of each object; its `ValueError`s become `MalformedMessage`.
+        budget: The budget to charge before a long text is parsed.
+        long: Whether the text may be longer than a request, as a server's reply or a file may be.
 
     Raises:
-        MalformedMessage: It is not JSON, or has characters that no text can have: halves of surrogate pairs.
-        MessageTooLarge: It is too long, or has too many values.
+        MalformedMessage: The text is not valid JSON, or contains unpaired surrogates.
+        MessageTooLarge: The text is too long, or has too many values.
     """
     if len(text) > HEADER_BYTES and not long:
         raise MessageTooLarge(
@@ -114,30 +119,30 @@ def parse_json(
         budget.parse(len(text))
     data = text if isinstance(text, str) else bytes(text)
     most = _LONG_VALUES if long else VALUES
-    if len(data) > 2 * most:  # each value takes two characters at least
+    if len(data) > 2 * most:  # each value takes at least two characters
         marks: tuple[Any, ...] = (",", "[", "{") if isinstance(data, str) else (b",", b"[", b"{")
-        if sum(map(data.count, marks)) > most:  # it would need far more memory and time than its length suggests
+        if sum(map(data.count, marks)) > most:  # parsing would need far more memory and time than the length suggests
             raise MessageTooLarge(f"message: more than {most} values in its JSON; send arrays instead of lists")
     try:
         decoded = data if isinstance(data, str) else data.decode("utf-8-sig")
         value = json.loads(decoded, object_pairs_hook=pairs)
         if "\\u" in decoded:
-            json.dumps(value, ensure_ascii=False).encode()  # raises an error for half of a pair
+            json.dumps(value, ensure_ascii=False).encode()  # raises an error for an unpaired surrogate
     except (ValueError, RecursionError) as error:
         raise MalformedMessage(f"{what} not JSON ({error})") from error
     return value
 
 
-# Arrays from the bytes of any message: only bools, integers and floats, and only with all their bytes.
+# Arrays in messages: only booleans, integers and floats, and only if the number of bytes matches.
 
 
 def is_plain(dtype: Any) -> bool:
-    """Return whether `dtype`, as numpy writes it, names bools, integers or floats."""
+    """Return whether `dtype`, as numpy writes it, names booleans, integers or floats."""
     return isinstance(dtype, str) and _PLAIN.fullmatch(dtype) is not None
 
 
 def plain_dtype(dtype: Any) -> np.dtype[Any]:
-    """Return numpy's type of that name; raises `MalformedMessage` unless it is plain."""
+    """Return the numpy dtype named `dtype`; raise `MalformedMessage` if it is not plain."""
     if not is_plain(dtype):
         raise MalformedMessage(f"array: got dtype {shown(dtype, 20)}, want one like '<f4' or '|u1'")
     try:
@@ -148,7 +153,7 @@ def plain_dtype(dtype: Any) -> np.dtype[Any]:
 
 
 def read_array(data: Buffer, dtype: Any, shape: Any) -> np.ndarray:
-    """Return a read-only view of `data` as an array; raises `MalformedMessage` unless data, type and shape match."""
+    """Return a read-only array over `data`; raise `MalformedMessage` unless data, dtype and shape match."""
     kind = plain_dtype(dtype)
     if not isinstance(data, (bytes, memoryview)):
         raise MalformedMessage(f"array: got {type(data).__name__} for its data, want bytes")
@@ -158,5 +163,5 @@ def read_array(data: Buffer, dtype: Any, shape: Any) -> np.ndarray:
         raise MalformedMessage(f"array: got {len(data)} bytes, want {shown(shape)} of {dtype}")
     try:
         return np.frombuffer(data, kind).reshape(shape)
-    except (ValueError, OverflowError) as error:  # an axis too long for numpy beside an empty one
+    except (ValueError, OverflowError) as error:  # numpy cannot represent such a long axis, even beside an empty one
         raise MalformedMessage(f"array: got shape {shown(shape)}, which numpy does not know") from error

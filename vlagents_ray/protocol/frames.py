@@ -1,6 +1,6 @@
 """The binary frame: a complete message, with its images and arrays as aligned raw bytes.
 
-The same frame travels in an HTTP body, in a WebSocket message and through shared memory. Its header (see
+HTTP bodies, WebSocket messages and shared memory contain the same frame. Its header (see
 `vlagents_ray.protocol.frame_layout`) is one request or reply, or a list of them under "requests" or "replies", as a
 vector of environments sends them.
 """
@@ -47,7 +47,7 @@ _REQUEST_KEYS = {"op", "obs", "instruction", "kwargs", "contract", "history", "b
 
 
 def encode_request(request: Request, codec: ImageCodec = RAW) -> bytes:
-    """Encode a request as one frame. `request.obs` is not changed."""
+    """Encode a request as one frame, without changing `request.obs`."""
     return b"".join(request_parts([request], codec))
 
 
@@ -84,17 +84,25 @@ def _write_request(request: Request, writer: ValueWriter, codec: ImageCodec) -> 
 
 
 class Decoded(NamedTuple):
-    """The requests of a frame, and the answers to those that could not be read, by their places among all."""
+    """The requests decoded from a frame, and the error replies to unreadable ones by their index in the frame."""
 
     requests: list[Request]
     refused: dict[int, Reply]
 
 
 def decode_requests(data: Buffer, budget: Budget, ops: Sequence[Op] = OPS) -> Decoded:
-    """Return the requests in a frame, each one of `ops`.
+    """Decode the requests in a frame.
 
-    `budget` is charged for the message before any of it is parsed, and for each further request before its images are
-    decoded. Raises `MalformedMessage` for other data, `MessageTooLarge` over a limit, and `TooManyRequests`.
+    Args:
+        data: The frame.
+        budget: The budget to charge for the message before any of it is parsed, and for each further request before its
+            images are decoded.
+        ops: The accepted operations.
+
+    Raises:
+        MalformedMessage: The data are not a frame of requests.
+        MessageTooLarge: The frame, or its number of requests, exceeds a limit.
+        TooManyRequests: The sender's key is over its rate.
     """
     budget.begin_message()
     limits = budget.limits
@@ -123,7 +131,7 @@ def _read_request(node: dict[str, Any], reader: ValueReader, limits: Limits, ops
         raise MalformedMessage(f"request: unknown keys {shown(sorted(unknown))}, want some of {sorted(_REQUEST_KEYS)}")
     if node.get("op") not in ops:
         raise MalformedMessage(f"op: got {shown(node.get('op'))}, want one of {list(ops)}")
-    if node["op"] == "close":  # costs nothing, and carries nothing
+    if node["op"] == "close":  # a close has no payload and costs nothing
         node = {name: value for name, value in node.items() if name in _OF_CLOSE}
     obs, history = node.get("obs"), node.get("history") or []
     if not isinstance(history, list):
@@ -146,7 +154,7 @@ def _read_request(node: dict[str, Any], reader: ValueReader, limits: Limits, ops
 
 
 def _step(node: dict[str, Any]) -> Any:
-    """Return the step of a request or reply, which is text, since some parsers of JSON round numbers over 2**53."""
+    """Return the `step` of a request or reply. It is sent as text: some JSON parsers round numbers above 2**53."""
     step = node.get("step")
     if step is None:
         return None
@@ -156,7 +164,7 @@ def _step(node: dict[str, Any]) -> Any:
 
 
 def check_request(request: Request, limits: Limits) -> Request:
-    """Check the types and sizes that JSON does not fix, for requests of any format; returns the request."""
+    """Check the types and sizes that JSON itself does not enforce, for a request of any format; return the request."""
     if request.op in ("act", "close") and (of_reset := [name for name in _OF_RESET if getattr(request, name)]):
         raise MalformedMessage(f"{request.op}: got {of_reset}, which a reset states for its whole episode")
     if request.obs is None and request.op in _WITH_OBS:
@@ -187,10 +195,13 @@ def check_request(request: Request, limits: Limits) -> Request:
 
 
 def encode_replies(replies: Sequence[Reply], *, arrived: float | None = None) -> bytes:
-    """Encode the replies to one frame of requests, in the requests' order, as one frame.
+    """Encode the replies to one frame of requests as one frame, in the order of the requests.
 
-    With `arrived`, the `time.perf_counter()` at which the requests arrived, the timing of replies without an error also
-    gets `encode_ms` and `total_ms`, which include all but joining the parts of the frame.
+    Args:
+        replies: The replies.
+        arrived: The time at which the requests arrived, s, of `time.perf_counter()`. If it is given, the `timing` of
+            replies without an error also gets `encode_ms` and `total_ms`, which exclude only the final joining of the
+            frame.
     """
     begun = time.perf_counter()
     writer = ValueWriter()
@@ -204,8 +215,8 @@ def encode_replies(replies: Sequence[Reply], *, arrived: float | None = None) ->
         for reply in replies:
             if reply.error is None:
                 reply.timing |= both
-    for i, reply in enumerate(replies):  # last and separately, so that it includes the time of the rest
-        if reply.timing:  # to 0.1 us: the last digits would take a third of the time of an encoder
+    for i, reply in enumerate(replies):  # last, in a separate loop, so that `timing` covers the encoding of the rest
+        if reply.timing:  # 4 decimals (0.1 us): all digits would take a third of the encoding time
             times = ",".join([f'"{k}":{v:.4f}' if type(v) is float else f'"{k}":{v}' for k, v in reply.timing.items()])
             nodes[i] = f'{nodes[i][:-1]},"timing":{{{times}}}}}'
     blobs = dump([len(blob) for blob in writer.blobs])
@@ -233,12 +244,12 @@ def _write_reply(reply: Reply, writer: ValueWriter) -> dict[str, Any]:
 
 
 def decode_reply(data: Buffer, limits: Limits = DEFAULT_LIMITS) -> Reply:
-    """Return the reply in a frame; a server's error has the class that the server raised."""
+    """Decode the reply in a frame; a server's error has the class that the server raised."""
     return decode_replies(data, limits)[0]
 
 
 def decode_replies(data: Buffer, limits: Limits = DEFAULT_LIMITS) -> list[Reply]:
-    """Return the replies in a frame, at least one."""
+    """Decode the replies in a frame, at least one."""
     header, blobs = unpack(data, limits)
     nodes = header.get("replies", [header])
     if not isinstance(nodes, list) or not nodes or not all(isinstance(node, dict) for node in nodes):

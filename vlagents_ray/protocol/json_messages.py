@@ -25,9 +25,9 @@ _KEYS = {"instruction", "gripper", "state", "info", "kwargs", "contract", "reque
 
 
 def request_from_parts(op: Op, text: str | bytes, images: Mapping[str, bytes], budget: Budget) -> Request:
-    """Return a request from its JSON document and its images by camera name, each a JPEG or PNG file.
+    """Build a request from its JSON document and its images by camera name, each a JPEG or PNG file.
 
-    `budget` is charged before any of it is decoded.
+    The `budget` is charged before anything is decoded.
     """
     limits = budget.limits
     budget.begin(op)
@@ -42,7 +42,7 @@ def request_from_parts(op: Op, text: str | bytes, images: Mapping[str, bytes], b
         )
     if unknown:
         raise MalformedMessage(f"obs: unknown keys {shown(sorted(unknown))}, want some of {sorted(_KEYS)}")
-    names = [] if op == "close" else list(images)  # costs nothing, and carries nothing
+    names = [] if op == "close" else list(images)  # a close has no payload and costs nothing
     reader = ValueReader([images[name] for name in names], budget)
     obs = {key: document[key] for key in ("gripper", "state", "info") if key in document}
     obs["cameras"] = {name: {"$": ["img", index]} for index, name in enumerate(names)}
@@ -61,7 +61,7 @@ def request_from_parts(op: Op, text: str | bytes, images: Mapping[str, bytes], b
 
 
 def _distinct(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Return a JSON object; raises an error for a key that occurs twice, since it is unclear which value counts."""
+    """Return a JSON object; raise an error if a key occurs twice, since either value could be meant."""
     found = dict(pairs)
     if len(found) < len(pairs):
         keys = [key for key, _ in pairs]
@@ -71,7 +71,7 @@ def _distinct(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def reply_to_json(reply: Reply) -> dict[str, Any]:
-    """Return a reply without an error as plain JSON values."""
+    """Convert a reply without an error to plain JSON values."""
     document: dict[str, Any] = {"request_id": reply.request_id}
     if reply.act is not None:
         document |= {"action": reply.act.action.tolist(), "done": reply.act.done, "info": plain_values(reply.act.info)}
@@ -81,7 +81,7 @@ def reply_to_json(reply: Reply) -> dict[str, Any]:
 
 
 def problem(error: VLAgentsError, request_id: str = "") -> dict[str, Any]:
-    """Return the problem+json document (RFC 9457) of an error; `code` is the stable name to test for."""
+    """Return the problem+json document (RFC 9457) of an error; clients should test `code`, which is stable."""
     return {
         "type": "about:blank",
         "title": type(error).__name__,
@@ -92,8 +92,9 @@ def problem(error: VLAgentsError, request_id: str = "") -> dict[str, Any]:
 
 
 def plain_values(value: Any) -> Any:
-    """Convert a value to JSON's types, without any of numpy: arrays become lists, bytes become base64, and NaN and
-    infinity, which JSON does not have, become None.
+    """Convert a value to JSON types.
+
+    Arrays become lists, bytes become base64, and NaN and infinity, which JSON cannot represent, become None.
     """
     if isinstance(value, Mapping):
         return {key: plain_values(item) for key, item in value.items()}

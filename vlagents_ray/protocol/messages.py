@@ -16,28 +16,28 @@ from vlagents_ray.interface import Act, Obs
 PROTOCOL_VERSION = 1
 SESSION_HEADER = "x-session-id"
 REQUEST_ID_HEADER = "x-request-id"
-MACHINE_HEADER = "x-boot-id"  # of GET /v1/metadata: the caller's machine (see `boot_id`), or
-SERVERS_MACHINE = "server"  # for the machine of the process that answers
+MACHINE_HEADER = "x-boot-id"  # header of GET /v1/metadata: the caller's machine (see `boot_id`), or
+SERVERS_MACHINE = "server"  # the machine of the process that replies
 DEADLINE_HEADER = "x-deadline-ms"
-# of a reply: the session's step; a request with it is refused if the session is at any other step
+# header of a reply: the session's step. A request with it is refused if the session is at any other step.
 STEP_HEADER = "x-step"
 RANK_HEADER = "x-rank"
 MOST_DEADLINE_MS = 1e9  # 11 days
-NAME_CHARACTERS = 128  # most characters of a session's or a request's id
-STREAM_PATH = "/v1/stream/"  # on a replica's own port; an unguessable part follows
-STREAM_BYTES = 16 * 2**20  # most bytes of one WebSocket message: uvicorn's limit, which Serve does not let us change
+NAME_CHARACTERS = 128  # maximum length of a session's or a request's id
+STREAM_PATH = "/v1/stream/"  # path on a replica's own port, followed by an unguessable part
+STREAM_BYTES = 16 * 2**20  # maximum size of a WebSocket message: uvicorn's limit, which Serve does not let us change
 
 
 def is_name(text: str) -> bool:
-    """Whether a text may be the id of a session or a request: visible ASCII, which cannot forge a line in a log."""
+    """Return whether a text is a valid session or request id: visible ASCII, which cannot forge a line in a log."""
     return text.isascii() and text.isprintable() and " " not in text and len(text) <= NAME_CHARACTERS
 
 
 Op = Literal["reset", "act", "close", "observe", "export", "adopt", "release"]
 OPS: tuple[Op, ...] = ("reset", "act", "close")
-# Only a replica may send these to the process that runs its policy; "export" and "adopt" carry pickles.
+# Only a replica may send these, to the process that runs its policy; "export" and "adopt" contain pickles.
 INNER_OPS: tuple[Op, ...] = (*OPS, "observe", "export", "adopt")
-RankName = Literal["robot", "simulation"]  # the class of a request; robots go first
+RankName = Literal["robot", "simulation"]  # the class of a request; robots are scheduled first
 RANKS: tuple[RankName, ...] = ("robot", "simulation")
 
 
@@ -45,26 +45,26 @@ RANKS: tuple[RankName, ...] = ("robot", "simulation")
 class Request:
     """One call of `Agent.reset`, `Agent.act` or `Agent.close` on a remote policy, or one of `INNER_OPS`.
 
-    Once it was decoded, nothing of it is changed, and only `drop_observations` takes something away. It is not frozen,
-    since a frozen one takes three times as long to make (2.2 instead of 0.7 us).
+    A decoded request is not modified, except by `drop_observations`. The class is not frozen, since creating a frozen
+    instance takes three times as long (2.2 instead of 0.7 us).
     """
 
     op: Op
-    obs: Obs | None = None  # of reset, act and observe
+    obs: Obs | None = None  # for reset, act and observe
     instruction: str | None = None  # reset only
-    kwargs: dict[str, Any] = field(default_factory=dict)  # of reset: `seed`, ...; of adopt: the reply to export
-    # reset only: the contract of the robot or the environment, which the server compares
+    kwargs: dict[str, Any] = field(default_factory=dict)  # for reset: `seed`, ...; for adopt: the reply to export
+    # reset only: the contract of the robot or the environment, which the server checks against the policy's
     contract: dict[str, Any] | None = None
-    history: list[Obs] = field(default_factory=list)  # reset only: observations of the session since, oldest first
-    session: str = ""  # the id of the sender's session; empty: the only one of its connection
+    history: list[Obs] = field(default_factory=list)  # reset only: earlier observations of the session, oldest first
+    session: str = ""  # id of the sender's session; empty for the only session of its connection
     rank: RankName = "robot"
-    # of act and reset: the `step` of the last reply; an act is refused if the session is at another
+    # for act and reset: the `step` of the last reply; an act is refused if the session is at another step
     step: int | None = None
     request_id: str = ""
-    deadline_ms: float | None = None  # how long the reply is of use, counted from the arrival of the request
+    deadline_ms: float | None = None  # time from the request's arrival after which the reply is of no use
 
     def drop_observations(self) -> None:
-        """Drop the observations after use, as they may lie in memory that their sender needs back."""
+        """Drop the observations after use, since their memory may belong to the sender."""
         self.obs = None
         if self.history:
             self.history = []
@@ -76,19 +76,19 @@ class Reply:
 
     request_id: str = ""
     act: Act | None = None
-    info: dict[str, Any] | None = None  # the info that `Agent.reset` returned
+    info: dict[str, Any] | None = None  # the return value of `Agent.reset`
     error: VLAgentsError | None = None
-    step: int | None = None  # the session's step: one more with each act; at a reset, a random number above all before
-    draining: bool = False  # the replica stops or is overloaded: connect again, and the session is moved
+    step: int | None = None  # the session's step: each act adds 1; a reset draws a number above all earlier steps
+    draining: bool = False  # the replica stops or is overloaded: the client should reconnect, and its session is moved
     timing: dict[str, float] = field(default_factory=dict)  # ms, by stage
 
     def answers(self, request: Request) -> bool:
-        """Return whether this is the reply to that request, not to an earlier one. An unreadable frame has no id."""
+        """Return whether this is the reply to that request not to an earlier one; an unreadable frame has no id."""
         return self.request_id in ("", request.request_id)
 
     @property
     def identity(self) -> dict[str, Any]:
-        """The checkpoint, the digest of its weights and their commit, as far as the info of a reset names them."""
+        """Return the checkpoint, its digest and the commit of the weights, as far as the info of a reset names them."""
         info = self.info or {}
         return {name: info[name] for name in ("checkpoint", "weights", "revision") if name in info}
 
@@ -98,18 +98,18 @@ class Limits:
     """The limits of a decoder; anything larger raises `MessageTooLarge` before memory is allocated for it."""
 
     body_bytes: int = 64 * 2**20
-    pixels: int = 4096 * 2304  # of one image: 4K, of both television and cinema
+    pixels: int = 4096 * 2304  # per image: 4K, for both television and cinema
     cameras: int = 16
-    state_values: int = 4096  # of one part of the proprioception
-    depth: int = 8  # nesting of `info` and `kwargs`
+    state_values: int = 4096  # per part of the proprioception
+    depth: int = 8  # nesting depth of `info` and `kwargs`
     items: int = 10_000  # values in `info` and `kwargs` together
-    text: int = 16_384  # characters of an instruction
-    requests: int = 512  # in one frame
-    history: int = 256  # observations that come with a reset
-    reply_bytes: int = 16 * 2**20  # of the action and the info of one reply
-    # of the images and bytes of one request, each counted as often as it is referred to
+    text: int = 16_384  # length of an instruction
+    requests: int = 512  # requests in one frame
+    history: int = 256  # observations sent with a reset
+    reply_bytes: int = 16 * 2**20  # size of the action and the info of one reply
+    # Size of the images and bytes in one request, counted once for each reference to them.
     decoded_bytes: int = 128 * 2**20
-    in_flight_bytes: int = 512 * 2**20  # of all messages that a replica is processing, encoded and decoded
+    in_flight_bytes: int = 512 * 2**20  # size of all messages that a replica is processing, encoded and decoded
 
 
 DEFAULT_LIMITS = Limits()
@@ -117,20 +117,20 @@ DEFAULT_LIMITS = Limits()
 
 @dataclass(frozen=True, slots=True)
 class LocalAddress:
-    """The address for processes on the server's own machine: `local` in the metadata."""
+    """The address for processes on the server's machine: `local` in the metadata."""
 
     socket: str  # name of a Unix socket in the abstract namespace, not in a file system
-    boot_id: str  # of the machine, which Linux draws at random when it starts
-    keyed: bool = False  # whether the first message is the client's API key; only a refusal is replied to
+    boot_id: str  # random id of the machine, which Linux draws at each boot
+    keyed: bool = False  # whether the first message is the client's API key, which is replied to only if it is refused
 
-    # The data of a request lie in a memory file of the client, sent with the message that first names it: a frame or,
-    # with COMPACT, the arrays of the acts that follow the message's header (see `vlagents_ray.protocol.shm_layout`). A
-    # reply follows its header, or lies in a memory file that is sent with it.
-    REQUEST: ClassVar[struct.Struct] = struct.Struct("<IIQ")  # number of the memory file, flags, bytes in it
+    # The data of a request are in a memory file of the client, which is sent with the first message that names it: a
+    # frame or, with COMPACT, the arrays of the acts that follow the message's header (see
+    # `vlagents_ray.protocol.shm_layout`). A reply follows its header, or is in a memory file that is sent with it.
+    REQUEST: ClassVar[struct.Struct] = struct.Struct("<IIQ")  # number of the memory file, flags, number of bytes in it
     REPLY: ClassVar[struct.Struct] = struct.Struct("<QHxx")  # bit n: memory file n is free again; flags
-    IN_FILE: ClassVar[int] = 1  # flag: the frame of the reply lies in the memory file that comes with it
+    IN_FILE: ClassVar[int] = 1  # flag: the frame of the reply is in the memory file sent with the message
     COMPACT: ClassVar[int] = 2  # flag: no frame
-    # most memory files of a client, which needs more than one if the policy keeps observations
+    # Maximum number of a client's memory files; a policy that keeps observations needs more than one.
     FILES: ClassVar[int] = 16
 
 
@@ -139,7 +139,7 @@ class StreamAddress:
     """The replica's own port for WebSockets, on the host of the server's URL: `stream` in the metadata."""
 
     port: int
-    path: str  # unguessable: only clients that may read the metadata know it
+    path: str  # unguessable: known only to clients that may read the metadata
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,13 +149,13 @@ class PlasmaAddress:
     socket: str  # path of a Unix socket in Ray's folder
     node: str  # Ray's id of the node
 
-    # Ray's id of the channel that holds the frame or the arrays; flags as in `LocalAddress`.
+    # Ray's id of the channel that contains the frame or the arrays; flags as in `LocalAddress`.
     REQUEST: ClassVar[struct.Struct] = struct.Struct("<28sI")
     TAG: ClassVar[bytes] = b"VLA1"  # Ray's metadata of the channel's content: out-of-band buffers, to be joined
 
 
 def boot_id() -> str:
-    """Return an id that differs between machines and between their restarts; empty where there is no Linux."""
+    """Return an id that differs between machines and between their boots; empty on systems other than Linux."""
     try:
         return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
     except OSError:
@@ -177,17 +177,17 @@ def is_loopback(host: str) -> bool:
         return host == "localhost"
 
 
-# The cost of a message, which is checked before any of it is decoded.
+# The cost of a message, which is checked before any of the message is decoded.
 
 
-_JSON_FACTOR = 4  # bytes of Python's objects for each byte of JSON within the limits of `frame_layout`
+_JSON_FACTOR = 4  # size of the parsed Python objects per byte of JSON, within the limits of `frame_layout`
 
 
 class Budget:
-    """The budget of one message: before an image is decoded or bytes are copied, its declared size is checked here.
+    """The budget of one message: it checks declared sizes before an image is decoded or bytes are copied.
 
-    This class knows the limits only. A server's subclass also checks what the caller's key and the replica's memory
-    allow, and decides on which thread to decode: `vlagents_ray.serve.engine.admission.MessageAdmission`.
+    This class enforces the limits only. A server's subclass also enforces those of the caller's key and of the
+    replica's memory, and chooses the decoding thread: `vlagents_ray.serve.engine.admission.MessageAdmission`.
     """
 
     __slots__ = ("_left", "files", "limits", "serial")
@@ -200,22 +200,22 @@ class Budget:
 
     @property
     def pixels(self) -> int:
-        """The largest number of pixels of one image."""
+        """The maximum number of pixels of one image."""
         return self.limits.pixels
 
     def begin_message(self) -> None:
-        """Count the message for its sender, before any of it is parsed; raises the error that refuses it."""
+        """Count the message for its sender before any of it is parsed; raise an error if it is refused."""
 
     def parse(self, size: int) -> None:
-        """Count the memory for the values of `size` bytes of JSON before they are parsed; raises as `hold`."""
+        """Count the memory for the values of `size` bytes of JSON before they are parsed; raise as `hold`."""
         self.hold(_JSON_FACTOR * size)
 
     def begin(self, op: object, rank: object = "robot") -> None:
-        """Begin the next request of the message, whose header is parsed; raises the error that refuses it."""
+        """Begin the next request of the message after its header is parsed; raise an error if it is refused."""
         self._left = self.limits.decoded_bytes
 
     def count(self, size: int) -> None:
-        """Count `size` bytes of the request that are in memory already; raises `MessageTooLarge` if too many."""
+        """Count `size` bytes of the request that are in memory already; raise `MessageTooLarge` over the limit."""
         self._left -= size
         if self._left < 0:
             raise MessageTooLarge(
@@ -224,21 +224,21 @@ class Budget:
             )
 
     def hold(self, size: int) -> None:
-        """Count `size` bytes that are about to be allocated for the request; raises an error if they may not be."""
+        """Count `size` bytes before they are allocated for the request; raise an error if they exceed a limit."""
         self.count(size)
 
 
-# A probe is answered at once, to test the link; it reaches neither a session nor the policy. It is b"VLA?", a uint32
-# that is not read, and as many bytes as the link is to carry, in a WebSocket message, under the limits of a request.
-# The answer is b"VLA!" and the number of bytes that arrived, uint64 little-endian.
+# A probe tests the link. It is answered at once, without a session or the policy. It consists of b"VLA?", an unused
+# uint32, and as many bytes as the link should be tested with; it is one WebSocket message, under the limits of a
+# request. The answer is b"VLA!" and the number of bytes that arrived, uint64 little-endian.
 
-_HEAD_BYTES = 8  # of the tag and the uint32
+_HEAD_BYTES = 8  # size of the tag and the uint32
 _PROBE_TAG, _ANSWER_TAG = b"VLA?", b"VLA!"
 _ANSWER = struct.Struct("<4sQ")
 
 
 def is_probe(message: bytes | memoryview) -> bool:
-    """Return whether a message is a probe, to be answered with `probe_answer`."""
+    """Return whether a message is a probe, which `probe_answer` answers."""
     return message[: len(_PROBE_TAG)] == _PROBE_TAG
 
 

@@ -1,9 +1,9 @@
-"""Acts between two processes of one machine, without repeating what stays the same from step to step.
+"""A compact form of acts between two processes of one machine, which omits the fields that are the same at each step.
 
-An observation's layout (session, class, names and sizes of cameras and state) is sent once, as JSON, and referred to by
-its number from then on. The rest of a request is an `ITEM`, and its arrays, which lie one after the other in shared
-memory, each at a multiple of 64. The reply is an `ANSWER`, its action, and the `WEIGHTS` that acted. All other messages
-(a reset, `info`, an error) travel as frames; see `vlagents_ray.protocol.frames`.
+An observation's layout (session, class, names and sizes of cameras and state) is sent once, as JSON; later messages
+refer to it by its number. The rest of a request is an `ITEM`, and its arrays, which are stored one after the other in
+shared memory, each at a multiple of 64. A reply consists of an `ANSWER`, the action, and the `WEIGHTS` that acted. All
+other messages (a reset, `info`, an error) are sent as frames; see `vlagents_ray.protocol.frames`.
 """
 
 from __future__ import annotations
@@ -26,33 +26,37 @@ from vlagents_ray.protocol.frames import check_request
 from vlagents_ray.protocol.messages import Limits, RankName, Reply, Request, is_name
 
 _ALIGN = 64
-_ID_BYTES = 40  # of a request's id
-_MOST = 1024  # most layouts of one connection
+_ID_BYTES = 40  # maximum length of a request's id
+_MOST = 1024  # maximum number of layouts of one connection
 _NONE = float("nan")
 _UINT8, _FLOAT32 = np.dtype(np.uint8), np.dtype(np.float32)
 
 COUNT = struct.Struct("<I")
-ITEM = struct.Struct(f"<IIqdd{_ID_BYTES}s")  # layout, bytes of its JSON, step or -1, deadline ms, gripper, request id
+ITEM = struct.Struct(f"<IIqdd{_ID_BYTES}s")  # layout, size of its JSON, step or -1, deadline ms, gripper, request id
 ANSWER = struct.Struct(f"<{_ID_BYTES}sqBB2xIIIddddd")  # id, step, flags, dimensions, H, D, batch size, times in ms
 _DONE, _DRAINING, _POLICY = 1, 2, 4
-WEIGHTS = struct.Struct("<q16s")  # of each answer, after all actions, with the flag _POLICY: version, digest
+WEIGHTS = struct.Struct("<q16s")  # per answer, after all actions, if the flag _POLICY is set: version, digest
 
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """The constant part of a session's requests, and the places of their arrays."""
+    """The constant part of a session's requests, with the offsets of their arrays."""
 
     session: str
     rank: RankName
     cameras: tuple[tuple[str, tuple[int, ...], int], ...]  # name, (H, W, 3) uint8, offset in bytes
     state: tuple[tuple[str, tuple[int, ...], int], ...]  # name, (D,) float32, offset in bytes
-    size: int  # bytes of all arrays
+    size: int  # total size of the arrays, bytes
 
     @classmethod
     def of(cls, session: str, rank: RankName, cameras: Sequence[Any], state: Sequence[Any]) -> Layout:
-        """Return the layout with the offsets that follow from the shapes.
+        """Compute the layout of arrays with these shapes.
 
-        `cameras` and `state` are pairs of name and shape.
+        Args:
+            session: The session's id.
+            rank: The class of its requests.
+            cameras: Pairs of name and shape, (H, W, 3).
+            state: Pairs of name and shape, (D,).
         """
         at = 0
         placed: tuple[list[Any], list[Any]] = ([], [])
@@ -63,10 +67,9 @@ class Layout:
         return cls(session, rank, tuple(placed[0]), tuple(placed[1]), at)
 
     def placed(self, request: Request, at: int) -> list[tuple[int, np.ndarray]] | None:
-        """Return the offset of each array if the first one is at `at`; None for requests other than acts of this
-        layout.
+        """Return the offset of each array if the first one is at `at`; None if the request is no act of this layout.
 
-        Comparing each array is faster than computing its `_key`.
+        Comparing each array is faster than computing the request's `_key`.
         """
         obs = request.obs
         if obs is None or not _is_plain(request, obs) or request.rank != self.rank:
@@ -86,14 +89,14 @@ class Layout:
 
 
 class ShmWriter:
-    """Writes the acts of one connection; remembers which layouts the receiver knows."""
+    """Writes the acts of one connection, and remembers the layouts that the receiver has."""
 
     def __init__(self) -> None:
         self._known: dict[Any, tuple[int, Layout]] = {}
         self._latest: dict[str, tuple[int, Layout]] = {}  # by session; its next act probably has the same layout
 
     def write(self, requests: Sequence[Request]) -> Written | None:
-        """Return the message and the offsets of the arrays; None if the requests must travel as a frame."""
+        """Return the message and the offsets of the arrays; None if the requests must be sent as a frame."""
         items, texts = [COUNT.pack(len(requests))], []
         arrays: list[tuple[int, np.ndarray]] = []
         new: dict[Any, tuple[int, Layout]] = {}
@@ -130,14 +133,14 @@ class ShmWriter:
 
 @dataclass(slots=True)
 class Written:
-    """Acts, ready to be sent."""
+    """Encoded acts, ready to be sent."""
 
     message: bytes
-    size: int  # bytes of memory that the arrays take
+    size: int  # size of the memory for the arrays, bytes
     arrays: list[tuple[int, np.ndarray]]  # offset, array
 
     def parts(self) -> list[Buffer]:
-        """Return the memory in pieces, in order: the arrays, not copied where possible, and the gaps between them."""
+        """Return the content of the memory: the arrays, not copied where possible, and the gaps between them."""
         pieces: list[Buffer] = []
         end = 0
         for at, array in self.arrays:
@@ -156,9 +159,11 @@ class ShmReader:
         self._known: dict[int, Layout] = {}
 
     def read(self, message: memoryview, memory: np.ndarray) -> list[Request]:
-        """Return the requests, whose arrays are views of `memory`, (N,) uint8.
+        """Return the requests of a message; raise `InvalidInput` if it is malformed.
 
-        Raises `InvalidInput` if there are none.
+        Args:
+            message: The message, which names layouts and sizes.
+            memory: The memory with the arrays, (N,) uint8; the arrays of the requests are views of it.
         """
         try:
             (count,) = COUNT.unpack_from(message)
@@ -225,14 +230,14 @@ class ShmReader:
 
 
 def _is_plain(request: Request, obs: Obs) -> bool:
-    """Return whether a request may have a layout, apart from its arrays."""
+    """Return whether a request can be sent in compact form, apart from its arrays."""
     if request.op != "act" or obs.info or len(request.request_id) > _ID_BYTES:
         return False
-    return obs.gripper is None or 0.0 <= obs.gripper <= 1.0  # else an error, for which the act must travel as a frame
+    return obs.gripper is None or 0.0 <= obs.gripper <= 1.0  # an invalid value is sent as a frame, to get an error
 
 
 def _key(request: Request) -> tuple[Any, ...] | None:
-    """Return the key of the layout; None if the request must travel as a frame."""
+    """Return the key of the layout; None if the request must be sent as a frame."""
     obs = request.obs
     if obs is None or not _is_plain(request, obs):
         return None
@@ -251,7 +256,7 @@ def _key(request: Request) -> tuple[Any, ...] | None:
 
 
 def write_answers(replies: Sequence[Reply], *, arrived: float) -> bytes | None:
-    """Return the replies to acts, with `timing` as by `encode_replies`; None if they must travel as a frame."""
+    """Encode the replies to acts, with the `timing` of `encode_replies`; None if they must be sent as a frame."""
     begun = time.perf_counter()
     actions, weights = [], []
     for reply in replies:
@@ -265,7 +270,7 @@ def write_answers(replies: Sequence[Reply], *, arrived: float) -> bytes | None:
         if act.action.ndim not in (1, 2) or act.action.shape[0] > 0xFFFF or len(reply.request_id) > _ID_BYTES:
             return None
         actions.append(act.action.tobytes())
-    if weights and len(weights) != len(replies):  # all name them, or none does
+    if weights and len(weights) != len(replies):  # the compact form has weights for all replies or for none
         return None
     named = _POLICY if weights else 0
     ended = time.perf_counter()
@@ -297,13 +302,13 @@ def write_answers(replies: Sequence[Reply], *, arrived: float) -> bytes | None:
 
 
 def _packed(info: Mapping[str, Any]) -> bytes | None:
-    """Return the weights that the info of an act names; None if it holds anything else."""
+    """Encode the weights that the info of an act names; return None if the info contains anything else."""
     policy = info.get(POLICY)
     if len(info) != 1 or type(policy) is not dict or len(policy) != 2:
         return None
     try:
         return _pack(policy["version"], policy["fingerprint"])
-    except (KeyError, TypeError, AttributeError, ValueError, struct.error):  # the policy itself names something else
+    except (KeyError, TypeError, AttributeError, ValueError, struct.error):  # the policy uses this key for other data
         return None
 
 
@@ -318,10 +323,10 @@ def _text(digest: bytes) -> str:
 
 
 def read_answers(message: memoryview) -> list[Reply]:
-    """Return the replies in a message, the inverse of `write_answers`."""
+    """Decode the replies in a message, the inverse of `write_answers`."""
     (count,) = COUNT.unpack_from(message)
     at = COUNT.size + count * ANSWER.size
-    named = len(message) - count * WEIGHTS.size  # with the flag _POLICY
+    named = len(message) - count * WEIGHTS.size  # start of the weights, if the flag _POLICY is set
     replies = []
     for answer in ANSWER.iter_unpack(message[COUNT.size : at]):
         request_id, step, flags, dimensions, rows, columns, batch_size, queue, inference, decode, encode, total = answer

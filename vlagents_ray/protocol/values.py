@@ -1,9 +1,4 @@
-"""Nested values (None, bool, numbers, text, bytes, arrays, lists, dicts) <-> JSON plus binary blobs.
-
-Values that JSON cannot express become `{"$": [kind, blob index, ...]}`: `["nd", i, dtype, shape]` an array, `["img",
-i]` a JPEG or PNG file, `["bin", i]` bytes; `["float", "nan"]`, "inf" and "-inf" need no blob. An observation is an
-object of them.
-"""
+"""Conversion between nested values (None, bool, numbers, text, bytes, arrays, lists, dicts) and JSON with blobs."""
 
 from __future__ import annotations
 
@@ -31,7 +26,7 @@ class ValueWriter:
         self.blobs: list[Buffer] = []
 
     def array(self, value: np.ndarray) -> dict[str, Any]:
-        """Return the reference to an array, whose bytes become a blob, without a copy where possible."""
+        """Return a reference to an array, whose bytes become a blob, without a copy where possible."""
         dtype = value.dtype.newbyteorder("<").str
         if not is_plain(dtype):
             raise InvalidInput(f"array: got dtype {value.dtype}, want bool, integers or floats; convert it")
@@ -40,12 +35,12 @@ class ValueWriter:
         return {"$": ["nd", len(self.blobs) - 1, dtype, value.shape]}
 
     def image(self, file: bytes) -> dict[str, Any]:
-        """Return the reference to an encoded image."""
+        """Return a reference to an encoded image."""
         self.blobs.append(file)
         return {"$": ["img", len(self.blobs) - 1]}
 
     def value(self, value: Any) -> Any:
-        """Return the JSON of a supported value; raises `InvalidInput` with the type of an unsupported one."""
+        """Return the JSON form of a supported value; raise `InvalidInput` with the type of an unsupported one."""
         if value is None or isinstance(value, (bool, str, int)):
             return value
         if isinstance(value, float):
@@ -70,23 +65,23 @@ class ValueWriter:
 
 
 class ValueReader:
-    """Converts the JSON back to values, which are views of the blobs, not copies."""
+    """Converts JSON back to values, which are views of the blobs where possible."""
 
     def __init__(self, blobs: Sequence[Buffer], budget: Budget) -> None:
         self._blobs = blobs
         self._budget = budget
         self._limits = budget.limits
         self._items = 0
-        self._images: dict[int, np.ndarray] = {}  # by blob; each is decoded once, however often it is referred to
-        self._copies: dict[int, bytes] = {}  # by blob; each is copied once
-        self._fresh: set[int] = set()  # blobs that were decoded in advance and not referred to yet
+        self._images: dict[int, np.ndarray] = {}  # by blob: each image is decoded once, whatever its number of uses
+        self._copies: dict[int, bytes] = {}  # by blob: the bytes of each are copied once
+        self._fresh: set[int] = set()  # blobs that were decoded in advance and have no reference yet
 
     def begin(self) -> None:
         """Begin another request and reset its limits."""
         self._items = 0
 
     def decode_images(self, nodes: Mapping[str, Any]) -> None:
-        """Decode the images that `nodes` refer to, by camera, all at once; `blob` then returns them at once."""
+        """Decode the images of several cameras together, so that `blob` returns them without further decoding."""
         new: dict[int, str] = {}
         for name, node in nodes.items():
             reference = _reference(node)
@@ -99,7 +94,7 @@ class ValueReader:
             self._fresh.update(new)
 
     def value(self, node: Any, depth: int = 0) -> Any:
-        """Return the value of a JSON node; raises `MalformedMessage` or `MessageTooLarge` if it is invalid."""
+        """Return the value of a JSON node; raise `MalformedMessage` or `MessageTooLarge` if it is invalid."""
         self._items += 1
         if self._items > self._limits.items:
             raise MessageTooLarge(f"info: more than {self._limits.items} values; send arrays instead of lists")
@@ -137,9 +132,9 @@ class ValueReader:
         if image is None:
             [image] = decode_files([data], self._budget)
             self._images[index] = image
-        elif index in self._fresh:  # it was counted when it was decoded
+        elif index in self._fresh:  # the budget was charged when the image was decoded
             self._fresh.discard(index)
-        else:  # a further reference costs its readers as much again
+        else:  # a reader of the request may copy each reference
             self._budget.count(image.nbytes)
             image.flags.writeable = False  # several observations share it
         return image
@@ -171,7 +166,7 @@ def _reference(node: Any) -> list[Any]:
 
 
 def read_obs(node: Any, reader: ValueReader, limits: Limits) -> Obs:
-    """Return an observation from its JSON form, in which cameras and state parts may be references or lists."""
+    """Read an observation from its JSON form, in which cameras and state parts may be references or lists."""
     if not isinstance(node, dict):
         raise MalformedMessage(f"obs: got {type(node).__name__}, want an object")
     unknown = node.keys() - _OBS_KEYS
@@ -204,7 +199,7 @@ def read_obs(node: Any, reader: ValueReader, limits: Limits) -> Obs:
 
 
 def as_camera(name: str, image: Any, limits: Limits) -> np.ndarray:
-    """Return `image` unchanged if it is (H, W, 3) uint8 RGB within the limits; `name` is for the error."""
+    """Return `image` unchanged if it is (H, W, 3) uint8 RGB within the limits; errors mention `name`."""
     if not isinstance(image, np.ndarray) or image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
         got = f"{image.shape} {image.dtype}" if isinstance(image, np.ndarray) else type(image).__name__
         raise InvalidObservation(f"camera {name!r}: got {got}, want (H, W, 3) uint8 RGB")
@@ -217,7 +212,7 @@ def as_camera(name: str, image: Any, limits: Limits) -> np.ndarray:
 
 
 def as_state(name: str, part: Any, limits: Limits) -> np.ndarray:
-    """Return `part`, a list of numbers or an array, as (D,) float32 within the limits; `name` is for the error."""
+    """Convert `part`, a list of numbers or an array, to (D,) float32 within the limits; errors mention `name`."""
     if isinstance(part, list):
         if len(part) > limits.state_values:
             raise MessageTooLarge(f"state {name!r}: got {len(part)} values, the limit is {limits.state_values}")
@@ -241,7 +236,7 @@ def _single(name: str, part: np.ndarray) -> np.ndarray:
 
 
 def write_obs(obs: Obs, writer: ValueWriter, codec: ImageCodec) -> dict[str, Any]:
-    """Return the node of an observation, which is not changed; raw images and arrays are views, not copies."""
+    """Convert an observation, which is not changed, to its JSON form; raw images and arrays are views, not copies."""
     if codec.name == "raw":
         cameras = {name: writer.array(image) for name, image in obs.cameras.items()}
     else:
@@ -256,16 +251,14 @@ def write_obs(obs: Obs, writer: ValueWriter, codec: ImageCodec) -> dict[str, Any
 
 
 def is_number(value: object) -> bool:
-    """Return whether a value is a number that a float can hold; no bool is, since JSON tells the two apart."""
+    """Return whether a value is a number that a float can represent; a bool is not a number, as in JSON."""
     if isinstance(value, int):
         return not isinstance(value, bool) and value.bit_length() < 1024
     return isinstance(value, float)
 
 
 def require_plain(value: Any, depth: int) -> None:
-    """Raise unless `value`, from another protocol's message, has only types of the wire, text keys, and `depth`
-    levels.
-    """
+    """Raise an error unless a value of another protocol has only wire types, text keys and at most `depth` levels."""
     if isinstance(value, (dict, list)):
         if depth <= 0:
             raise MessageTooLarge("message: nested too deep; flatten it")
@@ -279,7 +272,7 @@ def require_plain(value: Any, depth: int) -> None:
 
 
 def to_text(value: Any) -> str:
-    """Return a supported value as JSON, with its arrays and bytes in base64; raises `InvalidInput` as `ValueWriter`."""
+    """Convert a supported value to JSON with arrays and bytes in base64; raise `InvalidInput` as `ValueWriter` does."""
     writer = ValueWriter()
     plain = writer.value(value)
     blobs = [base64.b64encode(blob).decode() for blob in writer.blobs]
@@ -287,7 +280,7 @@ def to_text(value: Any) -> str:
 
 
 def from_text(text: str, budget: Budget) -> Any:
-    """Return the value of which `to_text` made the text; raises `MalformedMessage` if there is none."""
+    """Return the value that `to_text` converted; raise `MalformedMessage` for other text."""
     document = parse_json(text, "value:", long=True)
     try:
         blobs = [base64.b64decode(blob, validate=True) for blob in document.get("blobs", ())]
