@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-MOST_BYTES = 1_000_000  # largest part of a diff that is kept
+MOST_BYTES = 1_000_000  # maximum number of bytes of a diff that are kept
 _TIMEOUT_S = 30.0
 
 
@@ -21,8 +21,8 @@ class GitState:
     """The state of a repository's tracked files; untracked files are not part of it."""
 
     commit: str  # 40 hexadecimal digits
-    diff_sha256: str | None  # of the complete difference from the commit; None if there is none
-    diff: bytes  # output of `git diff`, at most its first `MOST_BYTES`
+    diff_sha256: str | None  # hash of the complete difference from the commit; None if there is none
+    diff: bytes  # output of `git diff`, truncated to `MOST_BYTES`
 
     def to_json(self) -> dict[str, Any]:
         """Return the commit and the hash of the difference, without the difference itself."""

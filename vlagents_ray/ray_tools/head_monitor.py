@@ -1,8 +1,8 @@
-"""A monitor of the cluster's head and of Ray's daemon on this machine.
+"""Detects that the cluster's head, or Ray's daemon on this machine, has ended.
 
-Ray kills a process that has lost the cluster's head after a minute, without a chance to write anything. It does not
-notice the end of its daemon (the raylet) on the same machine. Most calls of Ray block meanwhile. So the driver checks
-both by itself, and ends in time.
+Ray kills a process a minute after it has lost the cluster's head, without a chance to write anything. It does not
+notice the end of its daemon (the raylet) on the same machine. Most calls of Ray block in the meantime. Therefore the
+driver checks both by itself, and exits in time.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from vlagents_ray.ray_tools.session import started_here
 
 log = logging.getLogger(__name__)
 
-PERIOD_S = 2.0  # between two checks
+PERIOD_S = 2.0  # interval of the checks
 ANSWER_S = 1.0  # timeout of a check, which blocks the driver
 _RAY_TIMEOUT = "RAY_gcs_rpc_server_reconnect_timeout_s"  # time after which Ray kills a process without a head
 _RAY_TIMEOUT_S = 60.0  # its default
-_SHARE = 0.4  # of Ray's timeout; the rest is for an orderly end
+_SHARE = 0.4  # share of Ray's timeout after which the head counts as lost; the rest is for an orderly end
 _SOCKETS = Path("/proc/net/unix")
 
 
@@ -33,16 +33,16 @@ class HeadMonitor:
     """Checks whether the cluster's head accepts connections, and whether the local daemon's socket exists."""
 
     def __init__(self, cure: str) -> None:
-        """Monitor the cluster to which this process is connected; `cure` ends the message when it is lost."""
+        """Monitor the cluster of this process; `cure` is the end of the error message when the cluster is lost."""
         self.node = node_of_this_process()
         self._address = host, port = _address()
         self._name = f"the head of the Ray cluster, {host}:{port},"
         self._cure = cure
         self._timeout_s = _SHARE * float(os.environ.get(_RAY_TIMEOUT) or _RAY_TIMEOUT_S)
         if started_here():
-            self._timeout_s = min(self._timeout_s, PERIOD_S)  # started by this process: it will not be replaced
+            self._timeout_s = min(self._timeout_s, PERIOD_S)  # nothing replaces a head of this process
         self._daemon = None if self.node is None else str(self.node.raylet_socket_name)
-        if self._daemon is not None and not _exists(self._daemon):  # the machine does not list its sockets
+        if self._daemon is not None and not _exists(self._daemon):  # the system does not list its sockets
             self._daemon = None
         self._looked = self._answered = monotonic()
 
@@ -76,12 +76,12 @@ class HeadMonitor:
 
 
 def head_is_gone() -> bool:
-    """Whether the head refuses connections, as it does after SIGTERM, though its process takes seconds to end."""
+    """Return whether the head refuses connections, as it does from SIGTERM until its process ends seconds later."""
     try:
         socket.create_connection(_address(), ANSWER_S).close()
     except ConnectionRefusedError:
         return True
-    except OSError:  # it may be busy
+    except OSError:  # no refusal: the head may be busy
         return False
     return False
 
@@ -95,5 +95,5 @@ def _exists(unix_socket: str) -> bool:
     """Return whether a Unix socket is open; its file may remain after the listener has ended."""
     try:
         return any(line.endswith(f" {unix_socket}") for line in _SOCKETS.read_text().splitlines())
-    except OSError:  # not Linux
+    except OSError:  # the system is not Linux
         return False

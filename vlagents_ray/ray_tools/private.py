@@ -1,9 +1,9 @@
 """The private names of Ray and of Ray Serve that this package uses, all in one place.
 
-They were read in Ray 2.60, and 2.59 has them as well; read them again before another version is allowed
-(`tests/support/ray_names.py` lists those that it lacks). Ray is imported inside the functions, as clients without Ray
-import this module. Only `vlagents_ray.serve.scaling.router` uses others, as its class overrides private methods of
-Serve's, and Serve sends that module by value to processes that need not have this package.
+They were checked in the sources of Ray 2.60 and 2.59; check them again before another version is allowed
+(`tests/support/ray_names.py` lists those that a version lacks). Ray is imported inside the functions, as clients
+without Ray import this module. Only `vlagents_ray.serve.scaling.router` uses further private names: its class overrides
+private methods of Serve, which sends that module by value to processes that may lack this package.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from typing import Any
 
 # The loggers of Ray and Serve in the process that started them.
 LOGGERS = ("ray.serve", "ray._private.worker", "ray._private.authentication.authentication_token_setup")
-START_LOGGER = "ray._private.services"  # of the start of Ray's processes
+START_LOGGER = "ray._private.services"  # logs the start of Ray's processes
 
 # The connection of this process.
 
 
 def node_of_this_process() -> Any:
-    """Return Ray's record of the local daemons; None if this process is not connected, or did not import Ray.
+    """Return Ray's record of the local daemons; None if this process is not connected, or has not imported Ray.
 
-    It has data without a public function: the daemons' sockets, the folder of their logs, whether this process started
-    them. The record exists before the connection does; a call of Ray from another thread would then start a second
-    cluster.
+    The record contains data that no public function returns: the daemons' sockets, their log folder, and whether this
+    process started them. It exists before the connection does; a call of Ray from another thread would then start a
+    second cluster.
     """
     worker: Any = sys.modules.get("ray._private.worker")
     if worker is None or not worker.global_worker.connected:
@@ -36,12 +36,12 @@ def node_of_this_process() -> Any:
 
 
 def use_loopback(on: bool) -> bool:
-    """Set whether Ray takes this machine for no part of a cluster, and uses loopback addresses as they are.
+    """Set whether Ray assumes a single-node cluster, and uses loopback addresses unchanged.
 
-    Ray reads this from `RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER` when it is imported.
+    Ray reads this setting from `RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER` when it is imported.
 
     Returns:
-        The setting before.
+        The previous setting.
     """
     from ray._private import ray_constants
 
@@ -51,7 +51,7 @@ def use_loopback(on: bool) -> bool:
 
 
 def reread_authentication_mode() -> None:
-    """Make Ray read `RAY_AUTH_MODE` again, as it does when it is imported."""
+    """Make Ray read `RAY_AUTH_MODE` again, which it otherwise reads only when it is imported."""
     import ray
 
     ray._raylet.Config.initialize("")
@@ -60,7 +60,7 @@ def reread_authentication_mode() -> None:
 def address_of_ray_start() -> str | None:
     """Return the address of the cluster that `ray start` started last on this machine; None if there is none.
 
-    With `ray.init("auto")` one would find out only after a wait of ten minutes.
+    `ray.init("auto")` would report a missing cluster only after ten minutes.
     """
     from ray._private.utils import read_ray_address
 
@@ -72,10 +72,10 @@ def address_of_ray_start() -> str | None:
 
 
 def start_head(temp_dir: str, dashboard_port: int, **params: Any) -> Any:
-    """Start the daemons of a cluster of one machine, with a token as its password, and return Ray's record of them.
+    """Start the daemons of a one-machine cluster that requires a token, and return Ray's record of them.
 
     `ray.init("local")` does the same, but always with an autoscaler and a log monitor, which one machine does not need
-    (90 MB, 1 s), and with an agent at a fixed port, whose start takes 3 s more while another Ray has that port.
+    (90 MB, 1 s), and with an agent at a fixed port, whose start takes 3 s longer while another Ray uses that port.
 
     Args:
         temp_dir: The folder of Ray's files.
@@ -95,7 +95,7 @@ def start_head(temp_dir: str, dashboard_port: int, **params: Any) -> Any:
         include_dashboard=False,
         dashboard_host="127.0.0.1",
         dashboard_port=dashboard_port,
-        dashboard_agent_listen_port=0,  # any that is free
+        dashboard_agent_listen_port=0,  # any free port
         include_log_monitor=False,
         no_monitor=True,
         **params,
@@ -107,7 +107,7 @@ def start_head(temp_dir: str, dashboard_port: int, **params: Any) -> Any:
 def node_that_failed(error: BaseException) -> Any:
     """Return the node that was being started when `error` was raised; None if there was none.
 
-    Its processes are left running, and the error does not say which they are.
+    The node's processes continue to run, and the error does not name them.
     """
     from ray._private.node import Node
 
@@ -116,7 +116,7 @@ def node_that_failed(error: BaseException) -> Any:
 
 
 def gpus_here() -> float:
-    """Count the GPUs that a Ray started on this machine would offer, without starting one and without torch."""
+    """Count the GPUs that Ray would offer on this machine, without starting Ray and without torch."""
     from ray._private.accelerators import get_accelerator_manager_for_resource
 
     manager = get_accelerator_manager_for_resource("GPU")
@@ -127,7 +127,7 @@ def gpus_here() -> float:
     return float(found if visible is None else min(found, len(visible)))
 
 
-# Channels: mutable objects in plasma, the memory under Ray's `Channel`.
+# Channels: mutable objects in plasma, on which Ray's `Channel` is built.
 
 
 def plasma_folder() -> Path:
@@ -138,7 +138,7 @@ def plasma_folder() -> Path:
 
 
 def create_channel(size: int) -> Any:
-    """Return the ref of a new channel of `size` bytes, which this process reads."""
+    """Create a channel of `size` bytes that this process reads, and return its ref."""
     import ray
 
     worker = ray._private.worker.global_worker
@@ -155,9 +155,9 @@ def register_writer(channel: Any) -> None:
 
 
 def write_channel(channel: Any, content: Any, wait_ms: int) -> str | None:
-    """Write the content to a channel; return the reason why it cannot be written, None if it was.
+    """Write the content to a channel; return the reason if that is impossible, otherwise None.
 
-    An error raised from here would keep the channel's memory as long as anything holds its traceback.
+    An exception raised here would retain the channel's memory for as long as its traceback is referenced.
     """
     import ray
 
@@ -170,9 +170,10 @@ def write_channel(channel: Any, content: Any, wait_ms: int) -> str | None:
 
 
 def read_channel(channel: Any) -> Any:
-    """Return the newest content, with `metadata` and `data`, in place: it is valid as long as the caller holds it.
+    """Return the newest content, with `metadata` and `data`, in place: it is valid while the caller holds it.
 
-    Raises `ray.exceptions.RayChannelTimeoutError` if nothing was written since.
+    Raises:
+        ray.exceptions.RayChannelTimeoutError: Nothing was written since the last call.
     """
     import ray
 
@@ -180,9 +181,9 @@ def read_channel(channel: Any) -> Any:
 
 
 def channel_content(tag: bytes, pieces: Iterable[memoryview]) -> Any:
-    """Return pieces of memory in a form that Ray copies straight into a channel, one after the other.
+    """Return pieces of memory in a form that Ray copies directly into a channel, one after the other.
 
-    This is Ray's writer of out-of-band buffers, with nothing pickled in band.
+    This is Ray's writer of out-of-band buffers, without any pickled data in band.
     """
     import ray
 
@@ -200,7 +201,7 @@ def plain_content(data: bytes) -> Any:
 
 
 def channel_pieces(data: Any) -> Any:
-    """Return the pieces in the data of a channel, in place; Ray's parser trusts the data. Nothing is unpickled."""
+    """Return the pieces in the data of a channel, in place, without unpickling; Ray's parser trusts the data."""
     import ray
 
     _, pieces = ray._raylet.unpack_pickle5_buffers(data)
@@ -211,9 +212,9 @@ def channel_pieces(data: Any) -> Any:
 
 
 def start_serve(http: dict[str, Any], location: str) -> tuple[Any, list[Any]]:
-    """Return Serve's client and the refs of its proxies, like `serve_start`, but without waiting for them.
+    """Return Serve's client and the refs of its proxies, like `serve_start`, but without waiting for the proxies.
 
-    The proxies start while a policy is built and loaded.
+    The proxies then start while a policy is built and loaded.
     """
     from ray.serve._private import api
     from ray.serve._private.client import ServeControllerClient
@@ -229,7 +230,7 @@ def start_serve(http: dict[str, Any], location: str) -> tuple[Any, list[Any]]:
 
 
 def proxies_now(client: Any) -> list[Any]:
-    """Return the refs of the proxies that Serve has now, in place of those that `start_serve` returned.
+    """Return the refs of Serve's current proxies, which may have replaced those from `start_serve`.
 
     `serve.status` reports that a proxy failed, but not the reason.
     """
@@ -240,9 +241,9 @@ def proxies_now(client: Any) -> list[Any]:
 
 
 def long_polls(client: Any) -> Iterator[Any]:
-    """Yield the long polls of the controller by the handles of Serve's client, each with `stop`.
+    """Yield the long polls that the handles of Serve's client have open at the controller, each with `stop`.
 
-    `serve.shutdown` leaves them open, and Ray reports them as failed tasks.
+    `serve.shutdown` leaves them open, and Ray would report them as failed tasks.
     """
     from ray.serve._private.router import SharedRouterLongPollClient
 
@@ -254,7 +255,7 @@ def long_polls(client: Any) -> Iterator[Any]:
 
 
 def end_controller(client: Any) -> Any:
-    """Begin the end of Serve; return the ref of the call, which fails because the controller ends during it."""
+    """Begin to shut Serve down; return the ref of the call, which fails because it ends the controller."""
     return client._controller.graceful_shutdown.options(max_task_retries=0).remote()
 
 
@@ -267,14 +268,14 @@ def forget_serve(client: Any) -> None:
 
 
 def http_options() -> Any:
-    """Return Serve's HTTP options: `host`, `port`, `ssl_certfile`, ... `serve.status` does not state them."""
+    """Return Serve's HTTP options: `host`, `port`, `ssl_certfile`, ... `serve.status` does not contain them."""
     from ray.serve.context import _get_global_client
 
     return _get_global_client().http_config
 
 
 def replica_is_ending() -> bool:
-    """Return whether Serve has begun to stop the replica that this process is; it has no hook for that."""
+    """Return whether Serve has begun to stop the replica in this process; Serve has no public hook for that."""
     import ray
 
     worker = ray._private.worker.global_worker

@@ -1,10 +1,10 @@
-"""Cleans up after a driver that was killed: `python reaper.py FOLDER`, with a pipe as its standard input.
+"""Cleans up after a killed driver: `python reaper.py FOLDER`, with a pipe as its standard input.
 
 A local cluster normally ends with its driver. After `kill -9` parts of it can remain: an HAProxy whose manager was
-killed first, agents that take a minute to notice, the folder. The end of the pipe shows this process that the driver
-has ended. A driver that ends in order, with its Ray alive, first writes a byte. Then only processes that use files of
-the folder can remain: an HAProxy that waits for the end of its last connection, and Ray's agents, which take a moment
-to notice.
+killed first, agents that take a minute to exit, the folder. The end of the pipe signals that the driver has ended. A
+driver that exits in order, while its Ray runs, first writes a byte. In that case only processes that use files of the
+folder can remain: an HAProxy that waits for its last connection to close, and Ray's agents, which take a moment to
+exit.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-MARK = "VLAGENTS_RAY_CLUSTER"  # in the environment of every process of the cluster
-_GRACE_S = 3.0  # for Ray to end by itself
+MARK = "VLAGENTS_RAY_CLUSTER"  # environment variable of every process of the cluster
+_GRACE_S = 3.0  # time for Ray to end by itself
 _ORDERLY = b"."
-_SWEEPS = 200  # 10 s at least: on a busy machine a process that is killed takes a while to end
-_QUIET_SWEEPS = 3  # consecutive sweeps without a find; a process has no environment while it starts a program
+_SWEEPS = 200  # at least 10 s: on a busy machine a killed process takes a while to end
+_QUIET_SWEEPS = 3  # consecutive sweeps that must find nothing; during exec a process has no environment
 
 
 @contextmanager
@@ -35,7 +35,7 @@ def reaped(folder: Path, lost: type[Exception]) -> Iterator[None]:
         lost: An exception of this type within the context has the same effect, as the cluster then does not end its
             remaining processes.
     """
-    # The reaper runs as a script, which starts quickly; so this module imports no other one of the package.
+    # The reaper runs as a script, which starts quickly; therefore this module imports no other module of the package.
     command = [sys.executable, "-I", __file__, str(folder)]
     reaper = subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True)  # noqa: S603 - our own module
     if reaper.stdin is None:
@@ -57,8 +57,8 @@ def reaped(folder: Path, lost: type[Exception]) -> Iterator[None]:
 def marked(folder: str) -> list[int]:
     """List this user's processes that were started for the cluster of `folder`.
 
-    The title that Ray gives its processes may overwrite the mark in their environment. These have their logs open in
-    the folder; so have drivers that joined the cluster and continue.
+    Ray may overwrite the mark in the environment of its processes with their titles. Those processes have their log
+    files in the folder open, as do drivers that joined the cluster and continue.
     """
     mark = f"{MARK}={folder}".encode()
     found = []
@@ -68,27 +68,31 @@ def marked(folder: str) -> list[int]:
             ours = ours or (is_titled(process) and has_open_files(process, folder))
             if ours and int(process.name) != os.getpid():
                 found.append(int(process.name))
-        except OSError:  # it has ended, or is another user's
+        except OSError:  # the process has ended, or belongs to another user
             continue
     return found
 
 
 def is_titled(process: Path) -> bool:
-    """Return whether a process, given as a folder of /proc, has a title of Ray's."""
+    """Return whether a process, given as a folder of /proc, has a title set by Ray."""
     return (process / "cmdline").read_bytes().startswith(b"ray::")
 
 
 def has_open_files(process: Path, folder: str) -> bool:
-    """Whether a process, given as a folder of /proc, has a file of `folder` open; `OSError` if it is another user's."""
+    """Return whether a process, given as a folder of /proc, has a file of `folder` open.
+
+    Raises:
+        OSError: The process has ended, or belongs to another user.
+    """
     for descriptor in (process / "fd").iterdir():
-        with suppress(OSError):  # closed meanwhile
+        with suppress(OSError):  # the file was closed in the meantime
             if os.readlink(descriptor).startswith(f"{folder}/"):
                 return True
     return False
 
 
 def about(folder: str) -> list[int]:
-    """List the marked processes that no user started: their command line names the folder, or is a title of Ray's."""
+    """List the marked processes that no user started: their command line names the folder, or is a title set by Ray."""
     found = []
     for pid in marked(folder):
         with suppress(OSError):
@@ -99,7 +103,7 @@ def about(folder: str) -> list[int]:
 
 
 def main() -> None:
-    """Wait for the end of the driver, and kill the processes that remain."""
+    """Wait for the end of the driver, and kill the remaining processes."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):  # systemd and Slurm signal every process of a service
         signal.signal(number, signal.SIG_IGN)
     folder = sys.argv[1]
@@ -116,7 +120,7 @@ def main() -> None:
             with suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
         time.sleep(0.05)
-    if not orderly:  # else the driver removes it
+    if not orderly:  # otherwise the driver removes it
         shutil.rmtree(folder, ignore_errors=True)
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from vlagents_ray.errors import ConfigError
 
-# Only the last word of a variable's name counts, so that TOKENIZERS_PARALLELISM, HF_TOKEN_PATH and MAX_TOKENS pass.
+# Only the last word of a variable's name is checked, so that TOKENIZERS_PARALLELISM, HF_TOKEN_PATH and MAX_TOKENS pass.
 _SECRET = re.compile(r"(^|_)(API|ACCESS)?KEY$|(TOKEN|SECRET|PASSWORD|PASSWD|PASSPHRASE|CREDENTIALS?)$", re.IGNORECASE)
 _PASSWORD_IN_URL = re.compile(r"://[^/@\s:]*:(?!\$\{)[^/@\s]+@")  # pip replaces ${NAME} later
 

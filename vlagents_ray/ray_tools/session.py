@@ -1,4 +1,4 @@
-"""The connection of this process to a Ray cluster: one that runs, or one that it starts."""
+"""The connection of this process to a Ray cluster, which is either running already or started here."""
 
 from __future__ import annotations
 
@@ -31,36 +31,36 @@ from vlagents_ray.ray_tools.signals import own_sigterm
 log = logging.getLogger(__name__)
 
 _ATTEMPTS = 3
-# A driver whose head has ended would wait for 5 s to send its last events, of which nothing here makes use.
+# Without this setting, a driver whose head has ended waits 5 s to send its last events, which are not used here.
 _CONFIG = {"task_events_shutdown_flush_timeout_ms": 300}
 _RESOURCES = ("num_cpus", "num_gpus", "resources", "object_store_memory")  # options of the cluster, not of its driver
-_FAILED = "Check failed: "  # in the log of a daemon that ended
+_FAILED = "Check failed: "  # prefix in the log of a daemon that aborted
 FILES = "ray"  # the folder of Ray's files in a `ray_folder`
 _SHORT = "/tmp"  # noqa: S108 - used if the names of Ray's sockets would be too long elsewhere
-_SOCKETS = (  # the longest names below such a folder: Ray's, and HAProxy's, whose folder has the name of the node
+_SOCKETS = (  # the longest socket names in such a folder: Ray's, and HAProxy's, whose folder is named after the node
     f"{FILES}/session_2026-01-31_12-00-00_123456_1234567/sockets/.vla12345678",
     f"{'0' * 56}/admin.1234567.tmp",
 )
 _LONGEST = 107 - len("/vlr-12345678/") - max(map(len, _SOCKETS))
 _REMOVALS = 100  # attempts, 0.05 s apart, as a process that is ending may still write to the folder
-_FILE = "server.json"  # written to the private folder of a server's Ray when the server is ready
+_FILE = "server.json"  # written into the private folder of a server's Ray when the server is ready
 _DAEMON = b"raylet"
 _ADDRESS = b"--gcs-address="
 MODE, _TOKENS = "RAY_AUTH_MODE", ("RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
-# If this variable is "0", Ray does not take this machine for a part of a cluster and uses the loopback address as the
-# node's own, so that all its ports are there. (Ray replaces the address given as `_node_ip_address` by another one.)
+# If this variable is "0", Ray assumes a single-node cluster and uses the loopback address as the node's, so that all
+# ports are bound there. (Ray replaces an address given as `_node_ip_address`.)
 ALONE = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
-_started: list[Any] = []  # Ray's record of the daemons that this process started, if it did
+_started: list[Any] = []  # Ray's record of the daemons started by this process, at most one
 
 
 @contextlib.contextmanager
 def joined(address: str | None = None, **options: Any) -> Iterator[None]:
-    """Connect this process to a Ray cluster within the context, or use the cluster to which it is connected already.
+    """Connect this process to a Ray cluster within the context, or use its existing connection.
 
     Args:
-        address: The address of the cluster. None is the cluster of RAY_ADDRESS, or of this machine. The URL of a server
-            on this machine stands for its Ray cluster. "auto" is the cluster of `ray start`; without one, a
-            server's. "local" starts a cluster that ends with the context.
+        address: The address of the cluster. None selects the cluster of RAY_ADDRESS, or of this machine. The URL of a
+            server on this machine selects that server's cluster. "auto" selects the cluster of `ray start` or, without
+            one, a server's. "local" starts a cluster that ends with the context.
         options: Further options of `ray.init`.
 
     Raises:
@@ -95,21 +95,21 @@ def joined(address: str | None = None, **options: Any) -> Iterator[None]:
 
 
 def _local_server(address: str | None) -> str | None:
-    """Return the URL of the server on this machine to join; "" for any; None if the address is one of Ray's."""
+    """Return the URL of the server on this machine to join; "" for any server; None if the address is Ray's."""
     if address is not None and urlsplit(address).scheme in ("http", "https"):
         return address
     if address != "auto":
         return None
-    # If `ray start` started none, Ray would try that of a server on this machine, and wait for ten minutes.
+    # If there is no cluster of `ray start`, Ray would try that of a server on this machine, and wait for ten minutes.
     return "" if address_of_ray_start() is None and local_servers() else None
 
 
 @contextlib.contextmanager
 def ray_folder() -> Iterator[Path]:
-    """Make a folder that no other user can enter, with a subfolder `FILES` for the Ray that this process starts.
+    """Create a folder that is private to this user, with a subfolder `FILES` for the Ray that this process starts.
 
-    Ray opens the folders of its sockets and logs to every user of the machine. At the end of the context, or when this
-    process is killed, the folder is removed and the processes that run there are ended.
+    Ray makes the folders of its sockets and logs accessible to every user. At the end of the context, or when this
+    process is killed, the folder is removed and the processes that use it are ended.
     """
     base = os.environ.get("RAY_TMPDIR") or tempfile.gettempdir()
     if len(os.fsencode(base)) > _LONGEST:
@@ -144,13 +144,14 @@ def variables(values: Mapping[str, str]) -> Iterator[None]:
 
 
 def start_ray(folder: Path, **options: Any) -> None:
-    """Start a Ray cluster of this machine and join it, with another attempt if its start takes too long.
+    """Start a Ray cluster of this machine and join it; try again if the start times out.
 
-    Ray's daemon waits at most 15 s for each of its helpers (ray issue 65983), which a busy machine or a slow disk with
-    Python's modules can exceed. The next attempt is faster, as the modules are cached by then. `leave_ray` ends it.
+    Ray's daemon waits at most 15 s for each of its helpers (ray issue 65983), which can be too short on a busy machine
+    or if Python's modules are on a slow disk. The next attempt is faster, as the modules are cached by then.
+    `leave_ray` ends the cluster.
 
     Args:
-        folder: A `ray_folder`, for the files of Ray. What its processes print is in log files there.
+        folder: A `ray_folder`, for the files of Ray. The output of its processes is in log files there.
         options: Further options of `ray.init`: resources, `logging_level`, `namespace`, ...
 
     Raises:
@@ -171,8 +172,8 @@ def start_ray(folder: Path, **options: Any) -> None:
             node = node or node_that_failed(error)
             if node is None or not node.all_processes:  # nothing was started, so time is not the cause
                 raise
-            node.kill_all_processes(check_alive=False, wait=True)  # Ray leaves them running
-            if isinstance(error, ValueError):  # a wrong option
+            node.kill_all_processes(check_alive=False, wait=True)  # Ray does not end them itself
+            if isinstance(error, ValueError):  # an invalid option
                 raise
             reason = f"{error} {_daemon_error(node)}".rstrip()
             if attempt == _ATTEMPTS:
@@ -197,16 +198,16 @@ def leave_ray() -> None:
 
 
 def started_here() -> bool:
-    """Whether this process is in a cluster that it started itself."""
+    """Return whether this process is in a cluster that it started itself."""
     return bool(_started) and node_of_this_process() is not None
 
 
 @contextlib.contextmanager
 def _taken_port() -> Iterator[int]:
-    """Yield a port on which nothing else can listen, as the port of the unused dashboard.
+    """Yield a port that no other process can listen on, as the port of the unused dashboard.
 
-    Even without a dashboard Ray starts its server, for usage statistics, and waits for it for 2 s, unless the port is
-    taken. Then it logs an error, which is dropped here.
+    Ray starts the dashboard's server even without a dashboard, for usage statistics, and waits 2 s for it unless the
+    port is taken. If it is, Ray logs an error, which is dropped here.
     """
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port: int = taken.getsockname()[1]
@@ -227,13 +228,13 @@ def _taken_port() -> Iterator[int]:
 def _kept_logs(node: Any) -> Path:
     """Copy a node's logs to a folder of this user, as the cluster's folder is about to be removed."""
     kept = Path(tempfile.mkdtemp(prefix="vlr-logs-"))
-    with contextlib.suppress(OSError):  # shutil.Error is one; the other files were copied
+    with contextlib.suppress(OSError):  # shutil.Error is an OSError; the other files have been copied
         shutil.copytree(node.get_logs_dir_path(), kept, dirs_exist_ok=True)
     return kept
 
 
 def _daemon_error(node: Any) -> str:
-    """Return the reason why a node's daemon ended, from its log; "" if it has none."""
+    """Return the reason why a node's daemon ended, from its log; "" if the log has none."""
     try:
         text = (Path(node.get_logs_dir_path()) / "raylet.err").read_text(errors="replace")
     except OSError:
@@ -243,7 +244,7 @@ def _daemon_error(node: Any) -> str:
 
 
 def unless_lost(leave: Callable[[], None]) -> Callable[..., None]:
-    """Make an exit callback for an `ExitStack` that skips `leave` if the head is lost, as `leave` would then block."""
+    """Make an exit callback for an `ExitStack` that skips `leave` if the head is lost, since `leave` would block."""
 
     def end(kind: type[BaseException] | None, *_: object) -> None:
         if kind is not ClusterLost:
@@ -257,15 +258,15 @@ class LocalServer:
     """A running server on this machine, started by `vlagents-ray serve`."""
 
     url: str  # http(s)://host:port
-    apps: tuple[str, ...]  # its applications, reached at serve://APP inside the cluster
+    apps: tuple[str, ...]  # names of its applications, reached at serve://APP inside the cluster
     ray_address: str  # host:port of its Ray cluster
 
 
 def join(server: str | None = None, **options: Any) -> LocalServer:
-    """Connect this process to the Ray cluster of a server on this machine, instead of `ray.init`.
+    """Connect this process to the Ray cluster of a server on this machine, in place of `ray.init`.
 
-    That Ray is on the loopback address, in a private folder, and requires a token: `ray.init("auto")` finds it, but
-    connects to another address of this machine, and waits there for minutes.
+    The server's Ray is on the loopback address, in a private folder, and requires a token: `ray.init("auto")` finds it,
+    but connects to another address of this machine, and times out after minutes.
 
     Actors and tasks of this process then run in that cluster, with the server's Python and with the modules of this
     process's script and working directory. `RemoteAgent("serve://APP")` reaches the policy from this process and from
@@ -279,8 +280,8 @@ def join(server: str | None = None, **options: Any) -> LocalServer:
         The URL of the server, its applications, and the address of its Ray cluster.
 
     Raises:
-        ConfigError: No server of this user is ready on this machine, several are and `server` is None, or this process
-            is in another Ray cluster.
+        ConfigError: No server of this user is ready on this machine, or several are ready and `server` is None, or this
+            process is in another Ray cluster.
     """
     import ray
 
@@ -297,19 +298,19 @@ def join(server: str | None = None, **options: Any) -> LocalServer:
     if os.environ.get(MODE, "token").lower() != "token":
         raise ConfigError(f"{MODE}={os.environ[MODE]}: the Ray of {chosen.url} needs its token; unset {MODE}")
     tokens = {one: environment[one] for one in _TOKENS if environment.get(one)}
-    if not tokens and environment.get("HOME"):  # where Ray keeps the token, which may not be this program's home
+    if not tokens and environment.get("HOME"):  # Ray stores the token there; this process may have another home
         tokens = {_TOKENS[1]: f"{environment['HOME']}/.ray/auth_token"}
     for one in _TOKENS:
         os.environ.pop(one, None)
     os.environ.update({MODE: "token", ALONE: "0"} | tokens)
-    use_loopback(True)  # Ray read the variables when it was imported
+    use_loopback(True)  # Ray has already read the variables, when it was imported
     reread_authentication_mode()
     ray.init(chosen.ray_address, **{"log_to_driver": True, "logging_level": "WARNING"} | options)
     return chosen
 
 
 def announce(url: str, apps: Mapping[str, str], ray_address: str) -> None:
-    """Write the file by which programs of this user find the server of this process's Ray, which is ready.
+    """Announce the server of this process's Ray, which is ready, in a file that other programs of this user can find.
 
     Args:
         url: The server's URL.
@@ -322,12 +323,12 @@ def announce(url: str, apps: Mapping[str, str], ray_address: str) -> None:
 
 
 def local_servers() -> list[LocalServer]:
-    """List the servers of this user on this machine that are ready, sorted by URL."""
+    """List the ready servers of this user on this machine, sorted by URL."""
     return sorted((server for server, _ in _found()), key=lambda server: server.url)
 
 
 def _chosen(wanted: str | None) -> tuple[LocalServer, dict[str, str]]:
-    """Return the server that `wanted` names, and the environment of its Ray's daemon."""
+    """Return the server whose URL or application is `wanted`, and the environment of its Ray's daemon."""
     found = list(_found())
     url = None if wanted is None else wanted.rstrip("/").replace("://localhost:", "://127.0.0.1:")
     fitting = [one for one in found if wanted is None or url == one[0].url or wanted in one[0].apps]
@@ -355,7 +356,7 @@ def _found() -> Iterator[tuple[LocalServer, dict[str, str]]]:
             environment = {os.fsdecode(key): os.fsdecode(value) for key, _, value in pairs}
             content = json.loads((Path(environment[MARK]) / _FILE).read_text())
             address = f"{_ADDRESS.decode()}{content['ray_address']}"
-        except (OSError, KeyError, ValueError, TypeError):  # it has ended, is another user's, or not announced
+        except (OSError, KeyError, ValueError, TypeError):  # it has ended, is another user's, or is not announced
             continue
         # A killed cluster may have left the folder, and another cluster may use it now.
         if any(address in os.fsdecode(word) for word in words):

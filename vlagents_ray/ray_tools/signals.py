@@ -1,4 +1,4 @@
-"""Handlers of signals: Ctrl-C and SIGTERM beside Ray, and a request to stop."""
+"""Signal handlers: Ctrl-C and SIGTERM in a process that uses Ray, and an event that requests a stop."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ _interrupted = threading.Event()
 
 @contextlib.contextmanager
 def interrupts() -> Iterator[None]:
-    """Raise `KeyboardInterrupt` at Ctrl-C and at SIGTERM within the context, and remember it.
+    """Raise `KeyboardInterrupt` on Ctrl-C and SIGTERM within the context, and record the signal.
 
-    Python drops an exception that a handler raises while a destructor or a callback of Ray's C code runs. Then
-    `raise_dropped_interrupt` raises it. Outside the main thread Python delivers no signals, and this does nothing.
+    Python drops an exception that a handler raises while a destructor or a callback of Ray's C code runs; in that case
+    `raise_dropped_interrupt` raises it later. Outside the main thread, where Python delivers no signals, this does
+    nothing.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -36,17 +37,17 @@ def interrupts() -> Iterator[None]:
 
 
 def raise_dropped_interrupt() -> None:
-    """Raise `KeyboardInterrupt` if one was raised in `interrupts`, and this process continues as before."""
+    """Raise `KeyboardInterrupt` if a signal arrived within `interrupts` and its exception was dropped."""
     if _interrupted.is_set():
         raise KeyboardInterrupt
 
 
 @contextlib.contextmanager
 def own_sigterm() -> Iterator[None]:
-    """Keep this process's handler of SIGTERM during `ray.init`.
+    """Preserve this process's SIGTERM handler during `ray.init`.
 
-    Ray installs a handler whose alarm aborts the process three seconds later, in the middle of an orderly end. If the
-    process had no handler, Ray's remains.
+    Ray installs a handler whose alarm aborts the process three seconds later, during an orderly exit. If the process
+    had no handler, Ray's remains.
     """
     before = signal.getsignal(signal.SIGTERM)
     if not callable(before) or threading.current_thread() is not threading.main_thread():
@@ -64,8 +65,8 @@ def own_sigterm() -> Iterator[None]:
 def stop_signals() -> Iterator[threading.Event]:
     """Yield an event that Ctrl-C and SIGTERM set; a second signal raises `KeyboardInterrupt`.
 
-    A handler that only sets a flag cannot interrupt a transaction. Outside the main thread Python delivers no signals,
-    and the event is never set.
+    A handler that only sets a flag cannot interrupt a transaction. Outside the main thread, where Python delivers no
+    signals, the event is never set.
     """
     raise_dropped_interrupt()
     stop = threading.Event()
