@@ -21,8 +21,8 @@ def build(args: Mapping[str, Any] | ServerArgs) -> Application:
     """Build the Serve application of one policy from the `args` of a deployment file.
 
     Raises:
-        RayServeException: A setting is wrong, or the policy's environment is missing. `serve status` shows the text of
-            this exception alone, and a traceback of forty lines for any other.
+        RayServeException: A setting is wrong, or the policy's environment is missing. `serve status` shows only the
+            text of this exception, but a traceback of forty lines for any other.
     """
     try:
         return app.build(ServerArgs.model_validate(args))

@@ -12,10 +12,10 @@ from typing import Any
 from vlagents_ray.errors import ConfigError
 
 LOOPBACK, EVERYWHERE = "127.0.0.1", "0.0.0.0"  # noqa: S104 - only compared, and bound for a moment
-HOST = "VLAGENTS_RAY_HOST"  # environment variable of a replica: its server's address, if not the one of Serve
+HOST = "VLAGENTS_RAY_HOST"  # environment variable of a replica: the address of its server, if it is not Serve's
 _BLOCKS = (20_000, 24_000)  # range of the ports for replicas
 _PORTS = (24_000, 32_700)  # range of the ports for HAProxy and others, below the system's ephemeral ports
-_CLAIMS = 256  # largest number of ports that this process claims at once, the latest ones
+_CLAIMS = 256  # maximum number of ports that this process claims at once, the latest ones
 _RELEASE_S = 2.0  # time limit for a server that is being replaced to close its port
 _claims: deque[int] = deque()  # descriptors of the claims; the kernel closes them with the process
 _kept: set[int] = set()  # ports that `free_port` never returns

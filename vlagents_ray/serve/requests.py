@@ -1,14 +1,14 @@
-"""Requests in flight: the message that brought them, and each of them from the endpoint to its answer.
+"""Requests in flight: the message that contained them, and each request from the endpoint to its answer.
 
-An endpoint makes a `Message` when its last byte is there, decodes it, and has a `Sender` turn its requests into
-`PendingRequest`s. The engine finishes each of these once; when the last one is finished, the endpoint writes all
-answers of the message. What was decoded, a `Request`, is not changed on the way: what the server decides stands in the
-`PendingRequest`. Only the observations are removed once they were used, since they may lie in the sender's memory.
+An endpoint creates a `Message` when the last byte has arrived, decodes it, and passes its requests to a `Sender`, which
+creates a `PendingRequest` for each. The engine finishes each of these once; when the last one is finished, the endpoint
+writes all answers of the message. The decoded `Request` is not modified on the way: the server's decisions are in the
+`PendingRequest`. Only the observations are removed after use, since their memory may belong to the sender.
 
-Requests come by the thread that reads the connections (the policy's own, or a reader while a batch runs) or by an event
-loop. The policy's thread runs batches and finishes their requests; answers to simulations may be sent by another one.
-Others finish what does not get that far: the event loop at a deadline or a hanging call, the thread that loads a
-checkpoint, the one that closes the engine.
+Requests arrive on the thread that reads the connections (the policy's own, or a reader while a batch runs) or on an
+event loop. The policy's thread runs batches and finishes their requests; another thread may send the answers to
+simulations. Requests that reach no batch are finished by other threads: the event loop at a deadline or if a call
+hangs, the thread that loads a checkpoint, or the one that closes the engine.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Rank(IntEnum):
     SIMULATION = 1
 
 
-RANKS: Mapping[str, Rank] = {"robot": Rank.ROBOT, "simulation": Rank.SIMULATION}  # by the names on the wire
+RANKS: Mapping[str, Rank] = {"robot": Rank.ROBOT, "simulation": Rank.SIMULATION}  # by their names in the protocol
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,12 +74,12 @@ DEFAULT = CheckpointChoice()
 class Origin:
     """The origin of one sender's requests."""
 
-    transport: str = ""  # for the metrics
-    owner: str = ""  # connection with which its sessions end; empty if it has none
-    connection: str = ""  # the sender, whose requests share one turn in the queue; empty: each session has a turn
+    transport: str = ""  # transport, for the metrics
+    owner: str = ""  # connection with which its sessions end; empty without one
+    connection: str = ""  # the sender, whose requests share one turn in the queue; if empty, each session has a turn
     caller: Caller | None = None  # None if no key is required
-    prefix: str = ""  # of the session ids of the caller's key
-    sessions: set[str] = field(default_factory=set)  # those of the owner, as the engine names them
+    prefix: str = ""  # prefix of the session ids of the caller's key
+    sessions: set[str] = field(default_factory=set)  # the owner's sessions, by their ids in the engine
 
 
 NOWHERE = Origin()
@@ -87,10 +87,10 @@ NOWHERE = Origin()
 
 @dataclass(slots=True)
 class Opening:
-    """The server's settings of the episode that a reset begins."""
+    """The server's settings for the episode that a reset begins."""
 
     choice: CheckpointChoice
-    kwargs: dict[str, Any]  # those of the request that are for the policy
+    kwargs: dict[str, Any]  # the options of the request that are for the policy
     follows: bool  # whether the episode takes the newest version of the weights
     first: int = 0  # step at which the episode begins
 
@@ -99,29 +99,29 @@ class Opening:
 class PendingRequest:
     """One request in flight, from its message to its answer.
 
-    `done` receives the answer, on any thread: the policy's, one that gives up on a hanging policy, the one that reads
-    the connection, or an event loop. Where two of these answer at once, `done` ignores the second answer.
+    `done` is called with the answer, on any thread: the policy's, one that detects a hanging policy, the one that reads
+    the connection, or an event loop. If two threads answer at once, `done` ignores the second answer.
     """
 
-    session_id: str  # as the engine names it
+    session_id: str  # the id in the engine
     request: Request
     done: Callable[[Reply], None]
     rank: Rank = Rank.ROBOT
-    arrived: float = field(default_factory=time.perf_counter)  # s of the engine's clock; by default that is this one
-    deadline: float = math.inf  # after which no answer is of use, s of the engine's clock
+    arrived: float = field(default_factory=time.perf_counter)  # s, of the engine's clock, by default this one
+    deadline: float = math.inf  # time after which an answer is of no use, s, of the engine's clock
     origin: Origin = NOWHERE
     over: bool = False  # whether it was answered, or its caller no longer waits
-    begun: bool = False  # whether a batch has taken it, so that the policy acts on it; set under the queue's lock
-    sought: bool = False  # whether its session was looked for at other replicas
+    begun: bool = False  # whether a batch has taken it for the policy; set under the queue's lock
+    sought: bool = False  # whether other replicas were searched for its session
     session: Any = None  # the `Session` of an act at its arrival
-    opening: Opening | None = None  # of a reset
-    # Time at which the checkpoint was loaded, s, if a reset had to wait for it. Such a reset is run even if it is over,
-    # to give the checkpoint back.
+    opening: Opening | None = None  # for a reset: the server's settings
+    # If a reset had to wait for its checkpoint: the time at which that was loaded, s. Such a reset runs even if it is
+    # over, to release the checkpoint.
     loaded: float | None = None
-    preparation: Preparation | None = None  # of its observation, on another thread
+    preparation: Preparation | None = None  # preparation of its observation, on another thread
     return_s: float | None = None  # recent time from an answer to the session's next request, s, if known
-    place: int = 0  # among the requests of its message
-    # Set for observers: the files of its message's images, and their data until the answer.
+    place: int = 0  # index among the requests of its message
+    # For observers: the image files of its message, and the observers' own data until the answer.
     files: DecodedFiles = None  # type: ignore[assignment]
     kept: dict[Any, Any] = None  # type: ignore[assignment]
 
@@ -154,12 +154,12 @@ class PendingRequest:
 class Message:
     """The requests of one message, from the arrival of its last byte until their answers are written.
 
-    It collects the answers, encodes them with their times, and records them for the metrics.
+    A message collects the answers, encodes them with their times, and records them for the metrics.
 
     Args:
         stats: Buffer for the metrics.
         transport: Name of the transport.
-        op: Operation of its one request, if it is known before decoding.
+        op: Operation of its only request, if that is known before decoding.
         rank: Class of that request.
     """
 
@@ -180,27 +180,27 @@ class Message:
         self.arrived = self._decoded = time.perf_counter()
 
     def decoded(self, decoded: Decoded) -> None:
-        """Record that the requests are decoded, and which they are."""
+        """Record that the requests are decoded, with their operations and classes."""
         self._decoded = time.perf_counter()
         self._asked = [(request.op, request.rank) for request in decoded.requests]
         for place in sorted(decoded.refused):
             self._asked.insert(place, ("unknown", "robot"))
 
     def decoded_alike(self, requests: int = 1) -> None:
-        """Record that the requests, all of the `op` and `rank` given before, are decoded."""
+        """Record that `requests` requests, all of the message's own `op` and `rank`, are decoded."""
         self._decoded = time.perf_counter()
         self._asked = [self._asked[0]] * requests
 
     def expect(self, requests: int, then: Answered) -> None:
-        """Expect an answer to each of so many requests by `put`, and call `then` once all are there."""
-        self.replies = [None] * requests  # type: ignore[list-item]  # until they are there
+        """Expect this number of answers from `put`, and call `then` when the last one has arrived."""
+        self.replies = [None] * requests  # type: ignore[list-item]  # replaced by `put`
         self._missing = requests
         self._then = then
 
     def put(self, place: int, reply: Reply) -> None:
-        """Take the answer to one of the requests; a second answer to it is ignored."""
+        """Store the answer to the request at that index; a second answer is ignored."""
         if reply.error is not None:
-            reply.error.__traceback__ = None  # its frames would keep this message and its bytes
+            reply.error.__traceback__ = None  # its frames would retain this message and its bytes
         with self._lock:
             if self.replies[place] is not None:
                 return
@@ -213,7 +213,7 @@ class Message:
             then(self)
 
     def refuse(self, error: VLAgentsError, request_id: str = "") -> None:
-        """Answer the message as a whole with an error, as it could not be read."""
+        """Answer an unreadable message with one error."""
         error.__traceback__ = None  # as in `put`
         self.replies = [Reply(request_id, error=error)]
 
@@ -247,7 +247,7 @@ class Message:
     def written(self, write: Callable[[], T]) -> T:
         """Encode the replies with `write` for a client of another system, and record them.
 
-        The `timing` of a reply is complete only afterwards.
+        The `timing` of a reply is complete only after this call.
         """
         begun = time.perf_counter()
         data = write()
@@ -255,7 +255,7 @@ class Message:
         return data
 
     def record_failure(self, code: str) -> None:
-        """Record all requests as failed with this error code, also if the caller no longer waits."""
+        """Record all requests as failed with this error code, even if the caller no longer waits."""
         total_ms = (time.perf_counter() - self.arrived) * 1e3
         for op, rank in self._asked:
             self._stats.handled((op, self.transport, rank, code), (total_ms, *_NOT_MEASURED))
@@ -275,7 +275,7 @@ class Message:
                 reply.timing["decode_ms"] = decode_ms
 
     def record(self) -> None:
-        """Record the requests; called after the replies are sent where possible, so that the client does not wait."""
+        """Record the requests for the metrics. Call this after sending if possible, so that no client waits."""
         if len(self.replies) != len(self._asked):  # the message was unreadable as a whole
             self._asked = self._asked[:1]
         for (op, rank), reply in zip(self._asked, self.replies, strict=True):
@@ -283,7 +283,7 @@ class Message:
                 timing = reply.timing
                 decode_ms, queue_ms = timing.get("decode_ms", 0.0), timing.get("queue_ms", 0.0)
                 inference_ms, encode_ms = timing.get("inference_ms", 0.0), timing.get("encode_ms", 0.0)
-                total_ms = timing.get("total_ms", 0.0)  # too many replies at once are sent as errors, without times
+                total_ms = timing.get("total_ms", 0.0)  # replies too large together are sent as errors, without times
                 times = (total_ms, decode_ms, queue_ms, inference_ms, encode_ms)  # in the order of `STAGES`
                 self._stats.handled((op, self.transport, rank, "ok"), times)
             else:

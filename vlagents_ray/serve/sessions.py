@@ -24,13 +24,13 @@ M = TypeVar("M")  # type of a loaded model
 logger = logging.getLogger(__name__)
 
 _REMEMBERED = 4096  # number of remembered sessions that left, whose older states are refused (some 500 bytes each)
-_ANY = 2**63  # number of moves with which a version is newer than any other state of its step
-_UNSEEN = 2**20  # largest number of acts at other replicas unknown to the client and this replica
-_MOST_STEP = 2**62  # steps from here on are ignored if a client reports them
+_ANY = 2**63  # number of moves that makes a version newer than any other state of its step
+_UNSEEN = 2**20  # maximum number of acts at other replicas that neither the client nor this replica has seen
+_MOST_STEP = 2**62  # steps reported by clients are ignored from here on
 
 
 class Outdated(UnknownSession):
-    """The replica has, or had, a state of the session that is at least as new as the arriving one."""
+    """Raised if the replica has, or had, a state of the session that is at least as new as the arriving one."""
 
 
 Version = tuple[int, int]
@@ -44,26 +44,26 @@ class Session(Generic[M]):
     id: str
     agent: Agent | None = None  # None until the first `reset` succeeded
     model: M | None = None  # model of which `agent` is a copy; only the model manager and its cache set it
-    weights: WeightsVersion | None = None  # version of the model's weights with which it acts
-    instruction: str = ""  # of its last reset
-    follows: bool = True  # whether it takes the newest version of the weights, otherwise the pinned one
+    weights: WeightsVersion | None = None  # version of the weights that it acts with
+    instruction: str = ""  # instruction of its last reset
+    follows: bool = True  # whether it uses the newest version of the weights, otherwise the pinned one
     over: bool = False  # whether the session has ended, so that no table contains it
     resetting: PendingRequest | None = None  # reset that waits for its checkpoint
-    origin: Origin = NOWHERE  # of its last request; without an owner it ends when it is closed or idle for long
+    origin: Origin = NOWHERE  # origin of its last request; without an owner it ends when closed or idle for long
     steps: int = 0  # step of its state: drawn at each reset, above all earlier steps, and incremented by each act
     first: int = 0  # step drawn at the last reset that was run
     expected: int = 0  # step drawn for the latest reset, which may still be queued
     moves: int = 0  # number of moves between replicas since the last reset
-    announced: bool = False  # whether the other replicas know that it is here, so that they keep no older state
+    announced: bool = False  # whether it was announced to the other replicas, which then keep no older state
     used: float = field(default_factory=time.monotonic)  # time of its last request, s
 
     @property
     def version(self) -> Version:
-        """Version of the session's state; a reset that is under way counts as completed."""
+        """Version of the session's state; a reset in progress counts as completed."""
         return max((self.steps, self.moves), (self.expected, 0))
 
     def wrong_step(self, step: int) -> UnknownSession:
-        """Return the error for an act of another step, which would act twice or leave one out."""
+        """Return the error for an act at another step, which would repeat or skip an act."""
         return UnknownSession(
             f"session {self.id!r}: is at step {self.steps} here, at {step} as its client knows; an answer was lost, "
             f"or this is another episode: reset it"
@@ -74,10 +74,19 @@ class SessionFinder(Protocol):
     """Fetches sessions from other replicas: `vlagents_ray.serve.scaling.session_migration.SessionMigrator`."""
 
     def fetch(self, session_id: str, then: Callable[[], None], caller: str = "") -> bool:
-        """Fetch a session, then call `then`, found or not; False without a call if `caller` has too many searches."""
+        """Fetch a session, then call `then`, found or not.
+
+        Args:
+            session_id: Id of the session.
+            then: Called when the search is over.
+            caller: Owner of the search.
+
+        Returns:
+            False, without a call of `then`, if the caller has too many searches.
+        """
 
     def announce(self, session_id: str, step: int) -> None:
-        """Announce to the other replicas that the session began an episode here at that step, so theirs are older."""
+        """Announce to the other replicas that the session began an episode here at `step`; their states are older."""
 
 
 class SessionTable(Generic[M]):
@@ -110,7 +119,7 @@ class SessionTable(Generic[M]):
         self._idle_s = idle_s
         self._clock = clock
         self._drawn = 0  # latest step drawn
-        self._left: OrderedDict[str, Version] = OrderedDict()  # version by session up to which states are refused
+        self._left: OrderedDict[str, Version] = OrderedDict()  # by session: version up to which its states are refused
         self._lock = threading.Lock()
 
     def __len__(self) -> int:
@@ -120,7 +129,7 @@ class SessionTable(Generic[M]):
         return session_id in self._sessions
 
     def get(self, session_id: str) -> Session[M]:
-        """Return the session, and mark it used; raises `UnknownSession` if it is not here."""
+        """Return the session, and mark it used; raise `UnknownSession` if it is not here."""
         session = self._sessions.get(session_id)
         if session is None:
             raise UnknownSession(
@@ -131,11 +140,11 @@ class SessionTable(Generic[M]):
         return session
 
     def open(self, session_id: str, origin: Origin = NOWHERE) -> Session[M]:
-        """Return the session, which is created if it is new, for a request from there.
+        """Return the session, which is created if it is new, for a request from `origin`.
 
         Raises:
-            PolicyUnavailable: The replica holds as many sessions as it may.
-            TooManyRequests: The key of the origin's caller holds as many sessions as it may.
+            PolicyUnavailable: The replica has reached its limit of sessions.
+            TooManyRequests: The key of the origin's caller has reached its limit of sessions.
         """
         with self._lock:
             session = self._sessions.get(session_id)
@@ -180,18 +189,18 @@ class SessionTable(Generic[M]):
             return self._left.get(session_id, (0, 0))[0] >= first or (session is not None and session.steps > first)
 
     def require_room(self, session_id: str) -> None:
-        """Raise `PolicyUnavailable` if the session is not here and the replica holds as many sessions as it may."""
+        """Raise `PolicyUnavailable` if the session is not here and the replica has reached its limit of sessions."""
         with self._lock:
             if session_id not in self._sessions and len(self._sessions) >= self.limit:
                 raise self.full()
 
     def full(self) -> PolicyUnavailable:
-        """Return the error for a client whose session has no room here."""
+        """Return the error for a client whose session exceeds the replica's limit."""
         cure = "close one, or raise sessions.limit or the number of replicas"
         return PolicyUnavailable(f"this replica holds {self.limit} sessions, its limit; {cure}")
 
     def enter(self, arriving: Session[M]) -> None:
-        """Add a session from another replica, in place of an older state of it.
+        """Add a session from another replica, in place of an older state of the session.
 
         Its old replica has already released it, so it is added even if the table has become full.
 
@@ -210,18 +219,18 @@ class SessionTable(Generic[M]):
             self._sessions[arriving.id] = arriving
 
     def held(self, session_ids: Iterable[str]) -> dict[str, Version]:
-        """Return the versions of those sessions that are here and have an episode."""
+        """Return the versions of the given sessions that are here and have an episode."""
         with self._lock:
             here = [self._sessions[session_id] for session_id in session_ids if session_id in self._sessions]
             return {session.id: session.version for session in here if session.agent is not None}
 
     def versions(self) -> dict[str, Version]:
-        """Return the versions of all sessions, including those whose first reset is under way."""
+        """Return the versions of all sessions, including those whose first reset is in progress."""
         with self._lock:
             return {session.id: session.version for session in self._sessions.values()}
 
     def drop_older(self, steps: Mapping[str, int]) -> None:
-        """Close sessions with states before these steps, at which other replicas began episodes; refuse such states."""
+        """Close sessions with states before `steps`, at which other replicas began episodes, and refuse such states."""
         with self._lock:
             for session_id, step in steps.items():
                 session = self._sessions.get(session_id)
@@ -252,12 +261,12 @@ class SessionTable(Generic[M]):
             return True
 
     def close_owned(self, connection: str, session_ids: Iterable[str]) -> None:
-        """Close the given sessions, except any that no longer end with the connection."""
+        """Close the given sessions, except those that no longer end with the connection."""
         with self._lock:
             for session_id in session_ids:
                 session = self._sessions.get(session_id)
                 if session is not None and session.origin.owner == connection:
-                    self._forget(session_id, (max(session.steps, session.expected), _ANY))  # a reset that waits is void
+                    self._forget(session_id, (max(session.steps, session.expected), _ANY))  # this voids a waiting reset
 
     def close_those_of(self, model: M) -> None:
         """Close all sessions of that model."""
@@ -266,7 +275,7 @@ class SessionTable(Generic[M]):
                 self._forget(session.id)
 
     def all(self) -> list[Session[M]]:
-        """Return all sessions. It takes no lock, so that callers may hold theirs."""
+        """Return all sessions, without a lock, so that callers may hold theirs."""
         return list(self._sessions.values())
 
     def by_transport(self) -> dict[str, int]:
@@ -309,9 +318,9 @@ class SessionTable(Generic[M]):
 
 
 class DrainList:
-    """The connections to move to another replica; the next reply of each requests that once. Thread-safe.
+    """The connections to move to another replica; each gets the request in its next reply, once. Thread-safe.
 
-    `vlagents_ray.serve.scaling.rebalancer` marks them.
+    `vlagents_ray.serve.scaling.rebalancer` selects them.
     """
 
     def __init__(self) -> None:
@@ -323,7 +332,7 @@ class DrainList:
         self._marked = connections
 
     def ask(self, connection: str) -> bool:
-        """Return whether the current reply requests a reconnection; if so, record the request."""
+        """Return whether the current reply must request a reconnection; if so, record that."""
         if not self._marked or connection not in self._marked:
             return False
         self._marked.discard(connection)

@@ -1,9 +1,9 @@
-"""The versions of one model's weights: which are held, which one its agent has now, and which one a session acts with.
+"""The versions of one model's weights: which are held, which one the agent has, and which one each session acts with.
 
-Version 0 is the checkpoint that was loaded. A learner stages a version, which is checked and held but does not act, and
-commits it later, once all replicas hold it. Nothing is copied or loaded at the commit: before a batch, a reset or an
-observation, the policy's thread makes the version of these sessions the agent's own (`ModelWeights.use`), which takes
-no time if it is that already. A version is freed when no session acts with it and it is neither the newest nor pinned.
+Version 0 is the loaded checkpoint. A learner stages a version, which is checked and held but not used, and commits it
+when all replicas hold it. A commit copies and loads nothing: before a batch, a reset or an observation, the policy's
+thread loads the sessions' version into the agent (`ModelWeights.use`), which takes no time if the agent has it already.
+A version is freed when no session acts with it and it is neither the newest nor the pinned one.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ from vlagents_ray.weights.safetensors import ValueSpec, read_header
 from vlagents_ray.weights.shared_values import SharedValues, gpu_of, opened
 from vlagents_ray.weights.trainable import fingerprint, fitted, is_copied, own_copy, portable, require_fit
 
-DIGITS = 16  # of a checkpoint's digest in place of a fingerprint, hexadecimal
+DIGITS = 16  # length of a checkpoint's digest that replaces a fingerprint, hexadecimal digits
 STAGED_S = 60.0  # time for which a staged version waits for its commit, s
 
 PushMode = Literal["keep", "next_episode"]
 """When a session changes to a new version: between two of its acts, or at its next reset."""
-OPTION = "weights"  # of a reset
-_COLLECTED = 1000  # most durations of pushes that wait to be collected
-_LARGEST = 2**53 - 1  # number of a version, which JSON carries exactly
+OPTION = "weights"  # option of a reset
+_COLLECTED = 1000  # maximum number of uncollected durations of pushes
+_LARGEST = 2**53 - 1  # largest version number, which JSON represents exactly
 _FOLLOW, _PINNED = "follow", "pinned"
 
 
@@ -49,10 +49,10 @@ class PushOptions:
     """The options of a push."""
 
     mode: PushMode = "next_episode"  # when sessions change
-    partial: bool = False  # whether names may be missing, whose values stay
+    partial: bool = False  # whether names may be missing, whose values are kept
     allow_same: bool = False  # whether all values may equal those of the newest version
-    pin: bool = False  # whether sessions that do not follow also get it, at their next reset
-    version: int | None = None  # its number, such as the step of training; None: the newest one's + 1
+    pin: bool = False  # whether sessions that do not follow the newest version also get it, at their next reset
+    version: int | None = None  # its number, such as the training step; by default the newest one's + 1
 
     def __post_init__(self) -> None:
         if self.version is not None and not 1 <= self.version <= _LARGEST:
@@ -73,27 +73,27 @@ class WeightsVersion:
         self.info = {POLICY: {"version": number, "fingerprint": digest}}  # for the info of each act
 
     def describe(self) -> dict[str, Any]:
-        """Return number and fingerprint, for the metadata."""
+        """Return the number and the fingerprint, for the metadata."""
         return dict(self.info[POLICY])
 
 
 class FollowingSession(Protocol):
-    """The interface of a session for versions."""
+    """The part of a session's interface that concerns weights."""
 
-    weights: WeightsVersion | None  # with which it acts; None without an episode
-    follows: bool  # whether it takes the newest version, otherwise the pinned one
+    weights: WeightsVersion | None  # version that it acts with; None without an episode
+    follows: bool  # whether it uses the newest version, otherwise the pinned one
 
 
 class ModelWeights:
     """The versions of one model. Thread-safe, except `use`, which runs on the policy's thread."""
 
     def __init__(self, agent: Agent, busy: threading.Lock, digest: str = "", model: tuple[str, str] = ("", "")) -> None:
-        """Take the weights of an initialized agent as version 0.
+        """Make the weights of an initialized agent version 0.
 
         Args:
             agent: The agent, which acts with one version at a time.
             busy: The lock that is held while the agent runs.
-            digest: The fingerprint for an agent that names no parameters, whose files may be known.
+            digest: The fingerprint of an agent that names no parameters.
             model: A value that is equal in replicas with the same checkpoint and settings.
         """
         self.model = model
@@ -106,54 +106,54 @@ class ModelWeights:
             first, self._in_place, self.gpu = WeightsVersion(0, digest, None), False, ""
         else:
             self._refusal = None
-            # An agent with its own `load_parameters` may also copy, so that references to old values do not last.
+            # An agent with its own `load_parameters` may copy values instead of keeping references to them.
             self._in_place = type(agent).load_parameters is not Agent.load_parameters or is_copied(values or {})
             first = WeightsVersion(0, fingerprint(values or {}), None if self._in_place else values)
             self.gpu = gpu_of(values or {})
         self.newest = self.pinned = first
         self._staged: WeightsVersion | None = None
         self._timer: threading.Timer | None = None
-        self._live: WeightsVersion | None = first  # which the agent has; None if it could not be loaded
+        self._live: WeightsVersion | None = first  # version in the agent; None if loading one has failed
         self._alive = WeakValueDictionary({0: first})
 
     def begin(self, session: FollowingSession, *, follows: bool) -> WeightsVersion:
-        """Choose the newest or the pinned version for the next episode of a session, and return it."""
+        """Choose the newest or the pinned version for the session's next episode, and return it."""
         with self._lock:
             session.follows = follows
             session.weights = version = self.newest if follows else self.pinned
             return version
 
     def find(self, number: int, digest: str) -> WeightsVersion:
-        """Return the version of a session from another replica; raises `UnknownSession` if it is not held here."""
+        """Return the version of a session from another replica; raise `UnknownSession` if it is not held here."""
         version = self._alive.get(number)
         if version is None or version.fingerprint != digest or version is self._staged:
             raise UnknownSession(f"version {number} of the weights ({digest}) is not held here; reset the session")
         return version
 
     def use(self, version: WeightsVersion) -> None:
-        """Make a version the agent's own. Called with `busy` held, on the policy's thread."""
+        """Load a version into the agent. Called with `busy` held, on the policy's thread."""
         if version is self._live:
             return
         live, self._live = self._live, None
         if self._in_place and live is not None and live.values is None:
             live.values = self._copies()
-        if version.values is not None:  # otherwise the agent still has them: a copy of them failed
+        if version.values is not None:  # otherwise the agent still has its own values
             self._agent.load_parameters(version.values)
         self._live = version
         if self._in_place:
             version.values = None
 
     def read_header(self, header: bytes, options: PushOptions) -> dict[str, ValueSpec]:
-        """Return types and shapes of values before they arrive, once they fit.
+        """Check the header of a push, and return the types and shapes of the announced values.
 
         Args:
             header: The header of a push, as `vlagents_ray.weights.safetensors.header_of` returns it.
-            options: Those of the push.
+            options: The options of the push.
 
         Raises:
             NotTrainable: The agent names no parameters.
             MessageTooLarge: The header is twice as long as one with the agent's own names would be. It is not parsed.
-            MalformedMessage: It is no header.
+            MalformedMessage: The header is invalid.
             InvalidWeights: The values do not fit.
         """
         if self._refusal is not None:
@@ -162,7 +162,7 @@ class ModelWeights:
         if held is None:
             with self._busy:
                 held = self._agent.parameters()
-        # An entry is its name, a type, numbers of up to 15 digits, and at most 60 characters of JSON around them.
+        # Each entry has its name, a type, numbers of up to 15 digits, and at most 60 further characters of JSON.
         most = 4096 + 2 * sum(len(name) + 90 + 16 * len(held[name].shape) for name in held)
         if len(header) > most:
             raise MessageTooLarge(
@@ -173,14 +173,14 @@ class ModelWeights:
         return announced
 
     def stage(self, number: int, pushed: Mapping[str, Any], options: PushOptions) -> str:
-        """Check a new version and hold it, without acting with it; return its fingerprint.
+        """Check a new version and hold it without using it; return its fingerprint.
 
         It is dropped unless it is committed within a minute, since its learner may have died.
 
         Args:
             number: The number of the version, above that of the newest one.
             pushed: Its values, by name.
-            options: Those of the push.
+            options: The options of the push.
 
         Raises:
             NotTrainable: The agent names no parameters.
@@ -219,15 +219,15 @@ class ModelWeights:
         return staged.fingerprint
 
     def commit(self, number: int, options: PushOptions, sessions: Callable[[], Iterable[FollowingSession]]) -> None:
-        """Act with a staged version from now on. A commit of the newest version does nothing, so it can be repeated.
+        """Use a staged version from now on. A repeated commit of the newest version does nothing.
 
         Args:
             number: The number of the version.
-            options: Those of the push.
+            options: The options of the push.
             sessions: Returns the sessions of the replica, without a lock.
 
         Raises:
-            WeightsNotStaged: It is neither staged nor the newest.
+            WeightsNotStaged: The version is neither staged nor the newest one.
         """
         with self._lock:
             if self.newest.number == number:
@@ -247,7 +247,7 @@ class ModelWeights:
                         session.weights = self.newest
 
     def drop(self, number: int) -> None:
-        """Drop a staged version; the last committed one stays."""
+        """Drop a staged version; the last committed one is kept."""
         with self._lock:
             if self._staged is not None and self._staged.number == number:
                 self._forget_staged()
@@ -275,11 +275,11 @@ class ModelWeights:
 
 @dataclass(frozen=True, slots=True)
 class PushResult:
-    """A push that succeeded."""
+    """The result of a successful push."""
 
     version: int
     fingerprint: str  # the same at all replicas
-    replicas: tuple[str, ...]  # names of those that act with it
+    replicas: tuple[str, ...]  # names of the replicas that act with the version
 
 
 @dataclass(frozen=True, slots=True)
@@ -293,24 +293,24 @@ class NewestVersion:
 
 @dataclass(frozen=True, slots=True)
 class HeldVersion:
-    """A pushed version, for a replica that lacks it."""
+    """A pushed version, sent to a replica that lacks it."""
 
     number: int
     pinned: bool
-    values: dict[str, np.ndarray]  # by name, as `portable` returns them
+    values: dict[str, np.ndarray]  # by name, as returned by `portable`
 
 
 class WeightUpdates:
     """Stages and commits new weights in one replica. Thread-safe."""
 
     def __init__(self, own: Callable[[], ModelWeights], sessions: Callable[[], Sequence[FollowingSession]]) -> None:
-        """Update the weights that `own` returns, with which these `sessions` of the replica act."""
+        """Update the weights that `own` returns, which the `sessions` of the replica act with."""
         self._own = own
         self._sessions = sessions
         self._pushes_ms: deque[float] = deque(maxlen=_COLLECTED)
 
     def pushed(self, took_ms: float) -> None:
-        """Note the duration of a push that this replica coordinated, for the metrics."""
+        """Record the duration of a push that this replica coordinated, for the metrics."""
         self._pushes_ms.append(took_ms)
 
     def collect_pushes_ms(self) -> list[float]:
@@ -318,20 +318,20 @@ class WeightUpdates:
         return [self._pushes_ms.popleft() for _ in range(len(self._pushes_ms))]
 
     def read_header(self, header: bytes, options: PushOptions) -> dict[str, ValueSpec]:
-        """Check values before they arrive; see `ModelWeights.read_header`."""
+        """Check the header of a push, as `ModelWeights.read_header` does."""
         return self._own().read_header(header, options)
 
     def stage(self, number: int, pushed: Mapping[str, Any] | SharedValues, options: PushOptions) -> str:
-        """Check and hold a new version, and return its fingerprint; see `ModelWeights.stage`."""
+        """Check and hold a new version, and return its fingerprint, as `ModelWeights.stage` does."""
         with opened(pushed) if isinstance(pushed, SharedValues) else nullcontext(pushed) as named:
             return self._own().stage(number, named, options)
 
     def commit(self, number: int, options: PushOptions) -> None:
-        """Act with the staged version; see `ModelWeights.commit`."""
+        """Use the staged version, as `ModelWeights.commit` does."""
         self._own().commit(number, options, self._sessions)
 
     def held(self) -> list[HeldVersion]:
-        """Return the pinned and the newest version, the older one first, unless that is the checkpoint itself."""
+        """Return the pinned and the newest version, the older one first, except for the checkpoint itself."""
         own = self._own()
         pinned, newest = own.pinned, own.newest
         pushed = dict.fromkeys(version for version in (pinned, newest) if version.number)
@@ -350,7 +350,7 @@ class WeightUpdates:
         return {"newest": own.newest.describe(), "pinned": own.pinned.describe()}
 
     def newest(self) -> NewestVersion:
-        """Return the newest version; raises `PolicyUnavailable` while the policy loads."""
+        """Return the newest version; raise `PolicyUnavailable` while the policy loads."""
         own = self._own()
         return NewestVersion(own.newest.number, own.model, own.gpu)
 
@@ -364,7 +364,7 @@ class WeightUpdates:
 
 
 def follows(options: dict[str, Any], *, by_default: bool) -> bool:
-    """Remove the option "weights" from those of a reset, and return whether the episode takes the newest version.
+    """Remove the option "weights" from the options of a reset, and return whether the episode uses the newest version.
 
     Raises:
         InvalidInput: The option has another value than "follow" or "pinned".

@@ -1,1 +1,1 @@
-"""Access control: API keys, their file, the check of origins, the audit log."""
+"""Access control: API keys and their file, the check of origins, and the audit log."""

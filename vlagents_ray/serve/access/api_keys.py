@@ -1,8 +1,8 @@
-"""API keys and the permissions of each; the module uses neither sockets nor Ray.
+"""API keys and their permissions, without sockets or Ray.
 
-A key is 256 random bits (`vlagents_ray.serve.access.key_store.new_key`); the server stores its SHA-256. That is as
-secure as a slow password hash, which is necessary only because people choose guessable passwords: these keys are
-random, and a slow hash at every request would take longer than the policy. Therefore users cannot choose keys.
+A key is 256 random bits (`vlagents_ray.serve.access.key_store.new_key`); the server stores its SHA-256. Slow password
+hashes are necessary only for passwords that people choose, since those can be guessed. These keys are random, and a
+slow hash at every request would take longer than the policy. Therefore users cannot choose keys.
 
 Limits apply per replica and per gateway: two replicas together allow a key twice its rate and sessions.
 """
@@ -32,17 +32,17 @@ from vlagents_ray.serve.access.key_store import Key, parse_keys, read_text
 logger = logging.getLogger(__name__)
 
 FILE_VARIABLE, TEXT_VARIABLE = "VLAGENTS_RAY_KEYS_FILE", "VLAGENTS_RAY_KEYS"
-_KEY_PROTOCOL = "vlagents.key."  # begins the subprotocol of a WebSocket that states a key
-_THROTTLED_S = (0.05, 1.0)  # minimum and maximum time for which the senders of a key over its rate are not read
+_KEY_PROTOCOL = "vlagents.key."  # prefix of the WebSocket subprotocol that contains a key
+_THROTTLED_S = (0.05, 1.0)  # minimum and maximum time for which senders with a key over its rate are not read
 _CHECK_S = 1.0  # minimum time between two checks of the file
-_WAIT_S = 0.25  # for a check: a network drive that hangs delays one request, which may be on the policy's thread
+_WAIT_S = 0.25  # for a check: a network drive that hangs delays one request, possibly on the policy's thread
 _CLOSE_S = 300.0  # time for which the keys stay valid while the file cannot be read
 _REMIND_S = 60.0  # time between two log lines about an unreadable file
 _UNREAD = object()  # the state of a file that could not be read: each check tries again
 
 
 class NoKey(enum.Enum):
-    """The reason why a request needs no API key, in place of a `Caller`."""
+    """The reason why a request needs no API key, used in place of a `Caller`."""
 
     OPEN = "the server has no keys"
     INSIDE = "it comes from the same Ray cluster, or from the replica itself"
@@ -51,13 +51,18 @@ class NoKey(enum.Enum):
 class Keys:
     """The keys of a server, read again when their file changes; thread-safe.
 
-    If the file is deleted, all keys are refused. If the file cannot be read or parsed, the keys stay valid for
-    `_CLOSE_S`, so that an editing mistake or a short failure of a network drive stops no robot; the log and a metric
-    report it at once. After that time all keys are refused, as some may have been revoked, until it can be read.
+    If the file is deleted, all keys are refused. If it cannot be read or parsed, the keys stay valid for `_CLOSE_S`, so
+    that an editing mistake or a short failure of a network drive stops no robot; the log and a metric report it at
+    once. After that time all keys are refused until the file can be read, as some may have been revoked.
     """
 
     def __init__(self, read: Callable[[], str], changed: Callable[[], object]) -> None:
-        """`read` returns the text of a key file; `changed` an object that differs when the text may have changed."""
+        """Read the keys.
+
+        Args:
+            read: Returns the text of the key file.
+            changed: Returns an object that differs when the text may have changed.
+        """
         self._read = read
         self._changed = changed
         self._keys: dict[bytes, Key] = {}
@@ -74,17 +79,17 @@ class Keys:
 
     @classmethod
     def from_file(cls, path: str | Path) -> Keys:
-        """Return the keys in a file, which is checked for changes; raise `ConfigError` if it is not a key file."""
+        """Read the keys from a file, which is then checked for changes; raise `ConfigError` if it is not a key file."""
         file = Path(path)
         return cls(lambda: read_text(file), lambda: _stamp(file))
 
     @classmethod
     def from_text(cls, text: str) -> Keys:
-        """Return the keys in the text of a key file; they cannot be revoked while this process lives."""
+        """Read the keys from the text of a key file; they cannot be revoked while this process runs."""
         return cls(lambda: text, lambda: None)
 
     def check(self, token: str | None, app: str) -> Caller:
-        """Return the caller that the key `token` belongs to, for the application `app`.
+        """Return the caller with the key `token`, for the application `app`.
 
         Raises:
             Unauthorized: The key is missing, unknown, revoked or expired.
@@ -100,7 +105,7 @@ class Keys:
         digest = hashlib.sha256(token.encode(errors="surrogateescape")).digest()
         found: bytes | None = None
         keys = self._keys  # another thread may replace the attribute
-        for known in keys:  # compares with all of them, so that the time reveals nothing
+        for known in keys:  # compares with all of them, so that the duration reveals nothing about the keys
             if hmac.compare_digest(known, digest):
                 found = known
         if found is None:
@@ -111,7 +116,7 @@ class Keys:
         return caller
 
     def key(self, digest: bytes) -> Key | None:
-        """Return the key with this SHA-256 in the present file, or None."""
+        """Return the key with this SHA-256 in the current file, or None."""
         self._refresh()
         return self._keys.get(digest)
 
@@ -149,7 +154,7 @@ class Keys:
 
     @property
     def unreadable_s(self) -> float:
-        """Time since which the file cannot be read, s; 0 if it can."""
+        """Time since which the file is unreadable, s; 0 if it is readable."""
         self._refresh()
         since = self._unreadable
         return 0.0 if since is None else time.monotonic() - since
@@ -173,13 +178,13 @@ class Keys:
                 self._hung = None
 
     def _read_again(self, now: float) -> None:
-        """Read the file if it has changed, on a separate thread, which a network drive may block."""
+        """Read the file if it has changed; runs on a separate thread, which a network drive may block."""
         try:
             state = self._changed()
             if state == self._state:
                 return
             self._load(None if state is None else self._read())
-        except Exception as error:  # noqa: BLE001 - no content of the file and no disk error may fail a request
+        except Exception as error:  # noqa: BLE001 - neither the file's content nor a disk error may fail a request
             self._handle_unreadable(error, now)
             return
         self._state = state
@@ -188,7 +193,7 @@ class Keys:
             self._unreadable = None
 
     def _handle_unreadable(self, error: Exception, now: float) -> None:
-        """Handle a failed reading of the file."""
+        """Handle a failed attempt to read the file."""
         first = self._unreadable is None
         since = self._unreadable = now if self._unreadable is None else self._unreadable
         self._state = _UNREAD
@@ -209,16 +214,16 @@ class Keys:
 
 @dataclass(frozen=True, slots=True)
 class Caller:
-    """The holder of a key, for one connection; the permissions of the key are looked up at each request."""
+    """The holder of a key, for one connection; each request looks up the key's permissions."""
 
     _keys: Keys
     _digest: bytes
-    name: str  # name of the key; keys of other names cannot use its sessions
+    name: str  # name of the key; keys with other names cannot use its sessions
     app: str
 
     @property
     def rank(self) -> RankName | None:
-        """The most urgent class that the caller's requests may have; None for any."""
+        """The most urgent class of the caller's requests; None for any class."""
         key = self._keys.key(self._digest)
         return None if key is None else key.rank
 
@@ -229,7 +234,7 @@ class Caller:
         return 0 if key is None else key.sessions
 
     def admit(self, *, free: bool = False, scope: str | None = None) -> None:
-        """Check the key, and its `scope` if one is stated, before each request, and count that unless it is `free`.
+        """Check the key, and its `scope` if one is given, before each request; count the request unless it is `free`.
 
         Raises:
             Unauthorized: The key is revoked or has expired.
@@ -243,7 +248,7 @@ class Caller:
             raise
 
     def refusal(self, scope: str | None = None) -> str | None:
-        """Return the reason if the key is no longer valid, or lacks the `scope`; None if it is valid."""
+        """Return the reason why the key is no longer valid or lacks the `scope`; None if it is valid."""
         try:
             self._admit(free=True, scope=scope)
         except VLAgentsError as error:
@@ -251,14 +256,15 @@ class Caller:
         return None
 
     def throttled_s(self) -> float:
-        """Return for how long no sender with this key is read, s; 0 if all of them kept within its rate.
+        """Return for how long no sender with this key is read, s; 0 if the key is within its rate.
 
-        Each message that is refused costs its own reception, so that the time concerns the key and not a connection.
+        Receiving a refused message costs time on any connection, so the pause applies to the key, not to one
+        connection.
         """
         return self._keys.throttled_s(self.name)
 
     def require_unthrottled(self) -> None:
-        """Raise `TooManyRequests` for a new connection while no sender with this key is read."""
+        """Raise `TooManyRequests` for a new connection while senders with this key are not read."""
         if (wait_s := self.throttled_s()) > 0:
             self._keys.audit.refused(self.name, TooManyRequests.code)
             error = TooManyRequests(f"key {self.name!r}: over its rate; connect again after {wait_s:.2g} s")
@@ -274,7 +280,7 @@ class Caller:
             raise
 
     def note(self, what: str, of: str) -> None:
-        """Write an action of the key into the audit log, see `vlagents_ray.serve.access.audit`."""
+        """Log an action of the key, see `vlagents_ray.serve.access.audit`."""
         self._keys.audit.did(self.name, what, of)
 
     def _admit(self, free: bool, scope: str | None = None) -> None:
@@ -298,10 +304,10 @@ class _Bucket:
         self.rate = rate  # requests/s
         self._tokens = self._capacity = max(1.0, rate)
         self._refilled = time.monotonic()
-        self.unread_until = 0.0  # senders with the key are not read before, s
+        self.unread_until = 0.0  # time before which senders with the key are not read, s
 
     def take(self, now: float) -> float:
-        """Take a token and return 0 if there is one; else return the time until there is one, s."""
+        """Take a token and return 0 if there is one; otherwise return the time until there is one, s."""
         self._tokens = min(self._capacity, self._tokens + (now - self._refilled) * self.rate)
         self._refilled = now
         if self._tokens < 1:
@@ -311,7 +317,7 @@ class _Bucket:
 
 
 def load_keys(file: str | None = None, environment: Mapping[str, str] = os.environ) -> Keys | None:
-    """Return the keys in `file`, or else those of the environment; None if neither names any.
+    """Load the keys in `file` or, if it is None, those that the environment names; return None without either.
 
     In the environment, `VLAGENTS_RAY_KEYS_FILE` is the path of a key file, `VLAGENTS_RAY_KEYS` its text.
     """
@@ -324,7 +330,7 @@ def load_keys(file: str | None = None, environment: Mapping[str, str] = os.envir
 def token_of(headers: Mapping[str, str]) -> str | None:
     """Return the key of a request: `Authorization: Bearer KEY`, `Authorization: Api-Key KEY` or `x-api-key: KEY`.
 
-    openpi's client sends the second form. A page in a browser, which can set no header of a WebSocket, states the key
+    openpi's client sends the second form. A page in a browser, which cannot set headers of a WebSocket, sends the key
     among its subprotocols, as `vlagents.key.KEY`. The names in `headers` must be in lower case.
     """
     kind, _, token = headers.get("authorization", "").strip().partition(" ")
@@ -342,13 +348,13 @@ _CALLER: ContextVar[Identity] = ContextVar("vlagents_ray_caller")
 
 
 def current_caller() -> Identity:
-    """Return the caller whose request this task processes; raise `LookupError` outside of `on_behalf_of`."""
+    """Return the caller of the request that this task processes; raise `LookupError` outside `on_behalf_of`."""
     return _CALLER.get()
 
 
 @contextmanager
 def on_behalf_of(caller: Identity) -> Iterator[None]:
-    """Make `caller` the current caller inside the context, and in tasks that are started there."""
+    """Make `caller` the current caller within the context, and in tasks that are started there."""
     token = _CALLER.set(caller)
     try:
         yield
@@ -385,15 +391,15 @@ def warn_of_plain_http(host: str) -> None:
         )
 
 
-# Checks that the caller of a request may do what needs a scope.
+# Checks of the scopes of a request's key.
 
 
 class ScopeCheck:
-    """The check of one endpoint.
+    """The check of the keys and scopes of requests to one endpoint.
 
     Args:
         subject: The subject of the endpoint, for the error message.
-        open_to_network: Whether other machines reach this server without a key; then it is refused.
+        open_to_network: Whether other machines reach this server without a key; requests are then refused.
     """
 
     def __init__(self, subject: str, *, open_to_network: bool) -> None:
@@ -401,11 +407,11 @@ class ScopeCheck:
         self._open_to_network = open_to_network
 
     def require(self, scope: str | None) -> None:
-        """Check the key of the current request, and its scope if one is stated.
+        """Check the key of the current request, and its scope if one is given.
 
         Raises:
             Unauthorized: The key is revoked or has expired.
-            Forbidden: It lacks the scope, or the server has no keys and other machines reach it.
+            Forbidden: The key lacks the scope, or the server has no keys and is open to other machines.
         """
         caller = current_caller()
         if isinstance(caller, Caller):
@@ -418,7 +424,7 @@ class ScopeCheck:
             )
 
     def may(self, scope: str) -> bool:
-        """Return whether `require` would raise nothing."""
+        """Return whether the current request has the scope, as `require` checks it."""
         caller = current_caller()
         return caller.refusal(scope) is None if isinstance(caller, Caller) else not self._open_to_network
 

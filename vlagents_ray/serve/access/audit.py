@@ -6,9 +6,9 @@
     key (none): refused: an unknown key
     key lab: pressed 'pause' for session 'arm-1/7f3a'
 
-A kind of event is logged at once, and again after `_EVERY_S` at the earliest, with the number of events left out; but
-each button that is pressed on the live page is logged, also on a server without keys. Only names of keys are written,
-never keys. Refusals have the level WARNING, all other events INFO.
+A kind of event is logged at once, and again after `_EVERY_S` at the earliest, with the number of omitted events. Only
+the buttons of the live page are always logged, also on a server without keys. The log contains names of keys, never
+keys. Refusals have the level WARNING, all other events INFO.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _EVERY_S = 10.0
 
 
 def write_audit() -> None:
-    """Write this log to stderr (which Ray stores per process), unless logging is configured already."""
+    """Write this log to stderr, which Ray stores per process, unless logging is already configured."""
     logger.setLevel(logging.INFO)
     if not logger.hasHandlers():
         handler = logging.StreamHandler()
@@ -34,18 +34,18 @@ def write_audit() -> None:
 
 
 def log_pressed(name: str, what: str) -> None:
-    """Log that the key `name` commanded a session, each time; an empty name means a server without keys."""
+    """Log every command of the key `name` to a session; an empty name means a server without keys."""
     logger.info("key %s: pressed %s", name or "(none)", what)
 
 
 @dataclass(slots=True)
 class _Kind:
-    logged: float  # s, monotonic
+    logged: float  # time of the last line, s, monotonic
     left_out: int = 0
 
 
 class Audit:
-    """Writes the audit log; thread-safe. Only names of known keys are passed, so that there are few kinds of events."""
+    """Writes the audit log; thread-safe. Only names of known keys are passed, which bounds the number of kinds."""
 
     def __init__(self) -> None:
         self._kinds: dict[tuple[str, str], _Kind] = {}

@@ -26,11 +26,10 @@ from vlagents_ray.protocol.messages import RANKS, RankName
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _SHA256 = re.compile(r"[0-9a-f]{64}")
-# Further rights of a key besides commanding the policy: push new weights, watch all sessions on the live page, and
-# press its
-# buttons, which pause, stop, mark or, where a robot offers that, move them.
+# Rights of a key in addition to using the policy: push new weights; watch all sessions on the live page; press its
+# buttons, which pause or stop a robot, or mark or save its episode.
 SCOPES = ("weights", "watch", "operate")
-_PREFIX = "vlr_"  # lets scanners of repositories and logs find leaked keys
+_PREFIX = "vlr_"  # allows scanners of repositories and logs to find leaked keys
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,11 +39,11 @@ class Key:
     name: str
     sha256: str  # SHA-256 of the key's UTF-8 text, 64 hexadecimal digits
     apps: tuple[str, ...] = ()  # the applications that the key is for; empty for all
-    rate: float | None = None  # maximum, requests/s
-    sessions: int | None = None  # maximum held at once
-    rank: RankName | None = None  # "simulation" applies to all requests of the key; else each request states its class
-    scopes: tuple[str, ...] = ()  # of `SCOPES`
-    expires: float | None = None  # s since 1970
+    rate: float | None = None  # maximum rate, requests/s
+    sessions: int | None = None  # maximum number of sessions at once
+    rank: RankName | None = None  # "simulation" for all requests of the key; otherwise each request states its class
+    scopes: tuple[str, ...] = ()  # some of `SCOPES`
+    expires: float | None = None  # time of expiry, s since 1970
     revoked: bool = False
 
     def __post_init__(self) -> None:
@@ -122,8 +121,8 @@ def new_key(file: Path, name: str, **allowed: Any) -> str:
     """Generate a key, add its hash to the file, and return the key, which is stored nowhere.
 
     Args:
-        file: The key file; a new one is readable by its owner alone.
-        name: The name of the key; that of a revoked key may be used again.
+        file: The key file; a new file is readable by its owner only.
+        name: The name of the key; the name of a revoked key may be used again.
         allowed: The other fields of `Key`.
 
     Raises:
@@ -153,10 +152,10 @@ def revoke(file: Path, name: str) -> None:
 
 
 def _change(file: Path, change: Callable[[list[Key]], list[Key]]) -> None:
-    """Read, change and replace the file as a whole, so that a server never reads half of it.
+    """Read, change and replace the file as a whole, so that a server never reads a partial file.
 
-    The new file keeps the owner of the old one, since a server that cannot read it would use the old keys for a while.
-    If the owner cannot be kept, nothing is changed and `ConfigError` is raised.
+    The new file has the owner of the old one; otherwise a server could not read it, and would accept the old keys for
+    some time. If the owner cannot be preserved, nothing is changed and `ConfigError` is raised.
     """
     with _locked(file):
         keys = change(read_keys(file))
@@ -176,7 +175,7 @@ def _change(file: Path, change: Callable[[list[Key]], list[Key]]) -> None:
 
 
 def _belong(descriptor: int, file: Path) -> None:
-    """Give the open file `descriptor` the owner, group and mode of `file`, which it will replace."""
+    """Give the open file `descriptor` the owner, group and mode of `file`, which it is about to replace."""
     try:
         old = file.stat()
     except FileNotFoundError:
@@ -209,7 +208,7 @@ def _document(key: Key) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def _locked(file: Path) -> Iterator[None]:
-    """Hold a lock on the folder of the file, so that of two simultaneous commands no change is lost."""
+    """Hold a lock on the file's folder, so that no change is lost when two commands run at once."""
     try:
         descriptor = os.open(file.parent, os.O_RDONLY)
     except OSError as error:

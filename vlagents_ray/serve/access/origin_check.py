@@ -2,11 +2,11 @@
 
 A server with API keys needs no such check, since the page also needs a key.
 
-A browser states the site of the requesting page in `origin`, and the host name of the server in `host`. Only pages at
-this server's address count as its own: another site can let its own name resolve to this machine once its page is
-loaded (DNS rebinding). Requests of such a page to that name carry no `origin`. Therefore a request is refused if its
-`host` is a name that others could own: accepted are addresses, names without a dot, names of private networks, this
-machine's own name and those in `access.hosts`. Programs that send no `host` are not browsers.
+A browser sends the site of the requesting page in `origin`, and the host name of the server in `host`. Only pages at
+this server's address are accepted: another site can let its own name resolve to this machine once its page is loaded
+(DNS rebinding), and requests of that page to that name have no `origin`. Therefore a request is refused if its `host`
+is a name that others could own. Accepted are addresses, names without a dot, names of private networks, this machine's
+own name and those in `access.hosts`. Programs that send no `host` are not browsers.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _LONGEST = 260  # maximum length of a DNS name (253 characters) and a port
 
 
 def require_own_page(headers: Mapping[str, str], hosts: Collection[str] = ()) -> None:
-    """Refuse requests of another site's page.
+    """Refuse requests from pages of other sites.
 
     Args:
         headers: The headers of the request, with names in lower case.
@@ -47,10 +47,10 @@ def require_own_page(headers: Mapping[str, str], hosts: Collection[str] = ()) ->
 
 
 def require_same_origin(headers: Mapping[str, str]) -> None:
-    """Refuse GETs of other sites' pages, also those that carry no `origin`, such as the loading of an image.
+    """Refuse GETs from other sites' pages, including those without `origin`, such as image requests.
 
     Raises:
-        Forbidden: A browser states that another site's page sent it.
+        Forbidden: The browser reports that another site's page sent the request.
     """
     site = headers.get("sec-fetch-site", "none")
     if site not in ("same-origin", "none"):
@@ -72,7 +72,7 @@ def _is_ours(host: str, hosts: Collection[str]) -> bool:
     return ours or name in hosts or name == _here()
 
 
-@lru_cache(maxsize=64)  # every request of a robot sends the same one
+@lru_cache(maxsize=64)  # every request of a robot has the same header
 def _name_of(host: str) -> tuple[str, bool]:
     """Return the name in a `host` header, without the port, and whether no other site can own it."""
     try:

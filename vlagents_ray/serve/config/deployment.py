@@ -25,7 +25,7 @@ AbsolutePath = Annotated[str, AfterValidator(lambda path: os.path.abspath(os.pat
 
 
 class _DeploymentModel(BaseModel):
-    model_config = ConfigDict(extra="forbid", hide_input_in_errors=True)  # errors are logged
+    model_config = ConfigDict(extra="forbid", hide_input_in_errors=True)  # errors are logged; inputs may be secret
 
 
 class LiveArgs(_DeploymentModel):
@@ -128,7 +128,12 @@ class CheckpointArgs(_DeploymentModel):
         return choices
 
     def of(self, make: Callable[[Mapping[str, Any]], Agent], config: Mapping[str, Any]) -> Checkpoints:
-        """Return the checkpoints of a policy, which `make` builds; `config` are the deployment's settings of it."""
+        """Return the checkpoints of a policy.
+
+        Args:
+            make: Builds the policy from its settings.
+            config: The deployment's own settings of the policy.
+        """
         return Checkpoints(make, config, self.choices, steps=self.steps, loaded=self.loaded)
 
 
@@ -261,7 +266,11 @@ class AccessArgs(_DeploymentModel):
         return self
 
     def keys(self) -> Keys | None:
-        """Return the API keys of the file or the environment, or raise `ConfigError`; None if requests need no key."""
+        """Return the API keys of the file or the environment; None if requests need no key.
+
+        Raises:
+            ConfigError: The keys cannot be read.
+        """
         return None if self.insecure else load_keys(self.keys_file)
 
 
@@ -294,7 +303,7 @@ class AutoscalingArgs(_DeploymentModel):
         return {
             **self.model_dump(exclude_none=True, exclude=chosen | {"look_back_s"}),
             "look_back_period_s": self.look_back_s,
-            # A replica reports as often as it measures; Serve's own default is every 10 s.
+            # A replica reports at each measurement; Serve's own default is every 10 s.
             "metrics_interval_s": min(2.0, self.look_back_s / 5),
             "policy": {
                 "policy_function": "vlagents_ray.serve.scaling.autoscaling:MeasuredLoad",

@@ -43,7 +43,7 @@ class DialectConfig(BaseModel):
         return value
 
     def keys(self) -> KeyMapping | None:
-        """Return the mapping; None if the client uses our names."""
+        """Return the mapping; None if the client uses this project's names."""
         return None if self.mapping is None else read_mapping(self.mapping)
 
 
@@ -92,7 +92,7 @@ class DialectArgs(BaseModel):
         return self
 
     def on(self) -> dict[str, DialectConfig]:
-        """Return the settings of all dialects that are on, by name, in the order of the registry."""
+        """Return the settings of the enabled dialects, by name, in the order of the registry."""
         return dict(self.model_extra or {})
 
     def gateways(self) -> dict[str, PortConfig]:
@@ -117,10 +117,10 @@ def _config_of(name: str) -> type[DialectConfig]:
 
 
 def read_mapping(value: str | Mapping[str, Any]) -> KeyMapping:
-    """Read a mapping, a preset's name or an object; the fields of an object with `preset` replace those of that preset.
+    """Read a mapping: a preset's name, or an object, whose fields replace those of its `preset` if it names one.
 
-    The presets are the mappings of known clients, which each dialect defines, with the units and orders of each
-    system's own examples.
+    The presets are the mappings of known clients. Each dialect defines its own, with the units and orders of its
+    system's examples.
 
     Raises:
         ConfigError: The preset is unknown, or the object is invalid.
