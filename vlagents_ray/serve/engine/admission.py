@@ -1,6 +1,6 @@
 """Admission of messages to a replica before they are decoded: rate limits, memory limits, and the decoding thread.
 
-A message has a `MessageAdmission` from its arrival until it is answered. A decoder uses that as its `Budget`, so that
+A message has a `MessageAdmission` from its arrival until it is answered. Decoders use it as their `Budget`, so that
 these limits apply before anything is decoded:
 
 - The message counts towards the rate limit of the caller's key before any of it is parsed, and each further request
@@ -40,7 +40,7 @@ class Admission:
         self._limit = in_flight_bytes
         self._held = 0
         self._lock = threading.Lock()
-        self._threads: dict[bool, ThreadPoolExecutor] = {}  # the pool for robots (True), and for all others (False)
+        self._threads: dict[bool, ThreadPoolExecutor] = {}  # the thread pools for robots and (False) for others
         self._closed = False
 
     @property
@@ -49,10 +49,10 @@ class Admission:
         return self._held
 
     def hold(self, size: int, robot: bool, message_bytes: int) -> None:
-        """Count `size` more bytes as in flight for a message that holds `message_bytes` bytes already.
+        """Count `size` more bytes as in flight for a message that already holds `message_bytes` bytes.
 
         Raises:
-            Overloaded: The bytes in flight leave no room for them at the moment.
+            Overloaded: The bytes in flight leave no room at the moment.
             MessageTooLarge: The message alone exceeds the limit.
         """
         most = self._limit if robot else int(self._limit * (1 - _ROBOTS_SHARE))
@@ -77,7 +77,7 @@ class Admission:
             self._held -= size
 
     def submit(self, call: Callable[[], T], robot: bool) -> Future[T]:
-        """Run `call` on a decoding thread; `PolicyUnavailable` after `close`."""
+        """Run `call` on a decoding thread; raise `PolicyUnavailable` after `close`."""
         with self._lock:
             if self._closed:
                 raise PolicyUnavailable("the replica is stopping; connect again")
@@ -89,7 +89,7 @@ class Admission:
             return threads.submit(call)
 
     def close(self) -> None:
-        """Cancel waiting decoding jobs, and accept no further ones."""
+        """Cancel waiting decoding jobs, and accept no more."""
         with self._lock:
             self._closed = True
             threads = list(self._threads.values())
@@ -118,13 +118,12 @@ class MessageAdmission(Budget):
         Args:
             admission: The replica's bytes in flight.
             limits: Limits for decoding the message.
-            admit: Counts a "message", or a further request of an op, for the sender's key, or raises; returns False if
-                the request is scheduled after those of robots. None if the sender has no key.
+            admit: Counts a "message", or a further request of an op, for the sender's key, or raises an error; returns
+                False if the request is scheduled after those of robots. None if the sender has no key.
             size: Bytes of the message itself, which the replica keeps while it works on the message.
             robot: Whether the message may use the bytes reserved for robots.
-            inline: Whether the first decoding thread has other work waiting for it, so that large messages are decoded
-                elsewhere.
-            keep_files: Whether `files` remembers the files of the message's images.
+            inline: Whether the first decoding thread also has other work, so that large messages are decoded elsewhere.
+            keep_files: Whether `files` keeps the files of the message's images.
         """
         super().__init__(limits)
         self.files = {} if keep_files else None
@@ -139,7 +138,7 @@ class MessageAdmission(Budget):
         self._inline = inline
 
     def begin_message(self) -> None:
-        """See `Budget`. A message that is decoded again, on another thread, counts once."""
+        """Count the message, as in `Budget`, but only once if it is decoded again on another thread."""
         if self._admit is not None:
             if not self._refusals:
                 self._refusals.append(self._refusal_of(self._admit, "message"))
@@ -147,13 +146,13 @@ class MessageAdmission(Budget):
                 raise refusal
 
     def parse(self, size: int) -> None:
-        """See `Budget`; raises `NeedsDecodingThread` on a thread with other work."""
+        """Count the memory for JSON, as in `Budget`; raise `NeedsDecodingThread` on a thread with other work."""
         if self._inline:
             raise NeedsDecodingThread
         super().parse(size)
 
     def begin(self, op: object, rank: object = "robot") -> None:
-        """See `Budget`. The first request is counted with its message."""
+        """Begin the next request, as in `Budget`; the first request is counted with its message."""
         self._left = self.limits.decoded_bytes
         if rank == "simulation":
             self._robot = False
@@ -169,17 +168,17 @@ class MessageAdmission(Budget):
             self.size = 0
 
     def receive(self, size: int) -> None:
-        """Count bytes of the message itself as in flight; raises the errors of `Admission.hold`."""
+        """Count bytes of the message itself as in flight; raise the errors of `Admission.hold`."""
         self._admission.hold(size, self._robot, self._held)
         self._held += size
 
     def grow(self, size: int) -> None:
-        """Count the message as in flight with `size` bytes, of which some may be counted; raises as `receive`."""
+        """Count the message as in flight with `size` bytes, including those counted before; raise as `receive`."""
         if size > self._held:
             self.receive(size - self._held)
 
     def hold(self, size: int) -> None:
-        """See `Budget`; raises `NeedsDecodingThread` if decoding the message would take too long on this thread."""
+        """Count bytes to be allocated, as in `Budget`; raise `NeedsDecodingThread` if that takes too long here."""
         self.count(size)
         if self._inline and self._decoded + size > INLINE_BYTES:
             raise NeedsDecodingThread
@@ -187,7 +186,7 @@ class MessageAdmission(Budget):
         self._decoded += size
 
     def decode_on_thread(self, read: Callable[[Budget], T]) -> Future[T]:
-        """Return a future of the result of `read` on a decoding thread; `PolicyUnavailable` if the replica stops."""
+        """Decode with `read` on a decoding thread, and return the future; raise `PolicyUnavailable` after `close`."""
         self._admission.release(self._decoded)
         self._held -= self._decoded
         self._decoded = 0
@@ -197,7 +196,7 @@ class MessageAdmission(Budget):
         return self._admission.submit(lambda: read(self), self._robot)
 
     async def decoded(self, read: Callable[[Budget], T], *, long: bool = False) -> T:
-        """Return the result of `read`, on another thread if `long` or if the images are large."""
+        """Decode with `read` and return the result; if it is `long` or the images are large, use another thread."""
         if not long:
             try:
                 return read(self)
@@ -211,7 +210,7 @@ class MessageAdmission(Budget):
         return self._held > 0
 
     def release(self) -> None:
-        """Release the bytes of the message, which is answered or never will be."""
+        """Release the bytes of a message that is answered or dropped."""
         held, self._held, self._decoded = self._held, 0, 0
         if held:
             self._admission.release(held)

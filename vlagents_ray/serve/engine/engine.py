@@ -1,7 +1,7 @@
 """The core of a replica, without Ray: one policy, its sessions and its batch queue.
 
 Every endpoint (HTTP, WebSocket, a Serve handle, …) decodes a message, and its `Sender` submits the requests to the
-engine. The engine has the policy's thread: it takes batches from the queue, runs them, and finishes their requests.
+engine. The engine runs the policy's thread, which takes batches from the queue, runs them, and finishes their requests.
 """
 
 from __future__ import annotations
@@ -70,13 +70,25 @@ class Engine:
         poller: Poller | None = None,
         finder: SessionFinder | None = None,
     ) -> None:
-        """With `batch_sizes`, batches are padded to the next of these sizes; the largest is `max_batch_size`.
-        Without, a compiled policy that names no sizes is compiled for 1, 2, 4, … `max_batch_size`.
+        """Create the engine, without loading the policy.
 
-        `version` is the policy's version: sessions only move between replicas of equal version and settings. `check`
-        raises an error if a policy with that contract cannot be served. A call over its `limits` makes the engine
-        unhealthy. Larger replies than `reply_bytes` are not sent; messages in flight take at most `in_flight_bytes`. A
-        simulated engine gets simulated clocks (s and ns), and a `poller` that does not block. `finder` finds sessions.
+        Args:
+            agent: The agent, or the checkpoints that sessions can choose from.
+            max_batch_size: Maximum number of observations in a batch.
+            patience: See `BatchQueue`.
+            batch_sizes: Sizes to which batches are padded; the largest one is `max_batch_size`. Without them, a
+                compiled policy that names no sizes is compiled for 1, 2, 4, … `max_batch_size`.
+            session_limit: Maximum number of sessions.
+            session_idle_s: Time without a request after which a session may be dropped, s.
+            version: Version of the policy; sessions only move between replicas of equal version and settings.
+            check: Raises an error if a policy with that contract cannot be served.
+            limits: Time limits of the policy's calls, over which the engine is unhealthy.
+            reply_bytes: Maximum size of a reply, bytes.
+            in_flight_bytes: Maximum size of all messages in flight, bytes.
+            clock: Clock, s; a simulated engine has simulated clocks.
+            wall_clock: Wall clock, ns.
+            poller: Poller of the queue; that of a simulated engine does not block.
+            finder: Fetches sessions from other replicas.
         """
         self._source = agent if isinstance(agent, Checkpoints) else Checkpoints(lambda _: agent)
         self.clock, self.finder = clock, finder
@@ -91,8 +103,8 @@ class Engine:
         self._batch_sizes, self._reply_bytes = batch_sizes, reply_bytes
         self._preparations: Preparations | None = None  # None if the engine has no threads
         self._loading = self.models.loading()
-        self._unready: VLAgentsError | None = self._loading  # for clients
-        self._failure: PolicyFailed | None = None  # why the policy did not load, for the operator
+        self._unready: VLAgentsError | None = self._loading  # error for clients
+        self._failure: PolicyFailed | None = None  # reason why the policy did not load, for the operator
         self._not_started: BaseException | None = None  # the error itself, from the policy's thread
         self._hung: PolicyCall | None = None  # overdue call that `notice_hung` found
         self.draining = False  # whether the replica will stop, so that replies ask clients to reconnect elsewhere
@@ -106,9 +118,9 @@ class Engine:
             poller=poller,
         )
         self._thread = threading.Thread(target=self._serve, name="policy", daemon=True)
-        self._started = threading.Event()  # set when the policy was loaded, or was not
-        self._alive = False  # whether something takes batches from the queue
-        self._unsent: list[tuple[PendingRequest, Reply]] = []  # answers for another thread, while the next batch runs
+        self._started = threading.Event()  # set when loading the policy has succeeded or failed
+        self._alive = False  # whether a thread takes batches from the queue
+        self._unsent: list[tuple[PendingRequest, Reply]] = []  # sent by another thread while the next batch runs
         self._answers = ThreadPoolExecutor(1, "policy-answers")
         self.weights = WeightUpdates(lambda: self.models.own_weights, self.sessions.all)
         self.transfer = SessionTransfer(self.sessions, self.models, self.require_ready)
@@ -121,7 +133,7 @@ class Engine:
             threaded: False if the calling thread is the policy's thread, and calls `queue.take` and `run` in turns.
 
         Raises:
-            PolicyFailed: It does not load, or not in time.
+            PolicyFailed: The policy does not load, or not within the time limit.
         """
         try:
             self._alive = True
@@ -145,7 +157,7 @@ class Engine:
         self._unready = None
 
     def _serve(self) -> None:
-        """Run the policy's thread, on which it is loaded and acts."""
+        """Run the policy's thread, which loads the policy and runs its batches."""
         try:
             self.models.start()
         except BaseException as error:  # noqa: BLE001 - raised again by start(), on the caller's thread
@@ -162,7 +174,7 @@ class Engine:
                     unsent, self._unsent = self._unsent, []
                     self._answers.submit(_send, unsent)
                 self.run(taken)
-                del taken  # its observations may lie in memory that their sender needs back
+                del taken  # their observations may be in the sender's memory
             _send(self._unsent)
             self._answers.shutdown()
             self.queue.release()
@@ -190,7 +202,7 @@ class Engine:
     def check_health(self) -> None:
         """Raise the full reason why the policy cannot act, including errors of the agents' own health checks.
 
-        It is meant for the operator, and for the controller that replaces unhealthy replicas.
+        The error is meant for the operator, and for the controller that replaces unhealthy replicas.
         """
         if self._failure is not None:
             raise self._failure
@@ -201,7 +213,7 @@ class Engine:
         self.models.check_health()
 
     def notice_hung(self) -> None:
-        """Refuse requests while a call of the policy exceeds its time limit, and answer those that wait for it.
+        """Refuse requests while a call of the policy exceeds its time limit, and answer the waiting ones with an error.
 
         This is called several times a second, on a thread that makes no calls of the policy.
         """
@@ -219,8 +231,8 @@ class Engine:
             self._hung, self._unready = call, refusal
             logger.error("%s. This replica is not healthy until it does. Its thread:\n%s", said, call.stack())
             self.stats.hung(call.op)
-        # The policy may still act on the running batch, so its requests must not be sent again; waiting ones may be.
-        # Each time, as a request that was checked just before is queued just after.
+        # The policy may still act on the running batch, so its requests must not be sent again; waiting requests may
+        # be. This is repeated at each call, since a request that was checked before may be queued later.
         running, waiting = self.queue.clear()
         for pending in running:
             pending.fail(OutcomeUnknown(said))
@@ -228,7 +240,7 @@ class Engine:
             self._fail(pending, refusal)
 
     def drain(self) -> None:
-        """Ask all clients, with their next replies, to reconnect to other replicas, since this one will stop."""
+        """Ask all clients, in their next replies, to reconnect to other replicas, since this one will stop."""
         self.draining = True
 
     def close(self) -> None:
@@ -241,7 +253,7 @@ class Engine:
         self.models.close()
 
     def stop(self, timeout_s: float) -> None:
-        """Refuse all requests but those of the running batch, and wait at most `timeout_s` for its end."""
+        """Refuse all requests except those of the running batch, and wait at most `timeout_s` for its end."""
         for pending in self.queue.close():
             self._fail(pending, PolicyUnavailable("the replica is stopping; connect again"))
         if self._thread.ident is None:
@@ -265,7 +277,7 @@ class Engine:
         return self.models.version
 
     def submit(self, requests: Sequence[PendingRequest]) -> None:
-        """Check requests, and queue them together; those that cannot be queued are finished with their error."""
+        """Check requests, and queue them together; those that cannot be queued are finished with their errors."""
         ready: list[PendingRequest] = []
         for pending in requests:
             try:
@@ -282,7 +294,7 @@ class Engine:
                 self._fail(pending, error)
 
     def check(self, pending: PendingRequest) -> None:
-        """Check a request before it is queued, and note what the server decides about it; raises its errors."""
+        """Check a request before it is queued, and record the server's decisions in it; raise if it is refused."""
         request, origin = pending.request, pending.origin
         if request.op == "act" and origin.owner and not request.session and pending.session_id not in origin.sessions:
             raise NotReset("act before reset: this connection has no session yet; reset first")
@@ -310,7 +322,7 @@ class Engine:
             origin.sessions.add(pending.session_id)
 
     def withdraw(self, *requests: PendingRequest) -> None:
-        """End requests without an answer as `BatchQueue.withdraw` does, and undo resets that have not begun."""
+        """End requests without an answer, as `BatchQueue.withdraw` does, and undo resets that have not begun."""
         self.queue.withdraw(*requests)
         for pending in requests:
             pending.drop_preparation()
@@ -326,7 +338,7 @@ class Engine:
         pending.fail(error)
 
     def _seek(self, pending: PendingRequest, error: VLAgentsError) -> bool:
-        """Queue an act again once its session was fetched from another replica; False if that is of no use.
+        """Search for an act's session at other replicas, and queue the act again; return False if there is no search.
 
         Args:
             pending: The act, which fails if its session is not found.
@@ -349,7 +361,7 @@ class Engine:
         origin = pending.origin
         if self.finder.fetch(pending.session_id, retry, origin.owner if origin.caller is None else origin.caller.name):
             return True
-        if self.draining:  # the replica has handed over its sessions
+        if self.draining:  # the replica has given its sessions to others
             pending.fail(PolicyUnavailable("the replica is stopping; connect again, or send the same request again"))
             return True
         return False
@@ -358,7 +370,7 @@ class Engine:
         self.models.release(session)
 
     def run(self, taken: Taken) -> None:
-        """Answer what the queue gave: expired requests, and a batch. Called on the policy's thread."""
+        """Answer the expired requests, and run the batch. Called on the policy's thread."""
         for pending in taken.expired:
             deadline_ms = pending.request.deadline_ms
             self._fail(pending, DeadlineExceeded(f"no action within {deadline_ms:g} ms: dropped before inference"))
@@ -400,11 +412,11 @@ class Engine:
                 self._act(model, weights, group, prepared_s)
 
     def _reset(self, pending: PendingRequest, opening: Opening) -> None:
-        """Begin the episode of a reset, and answer it.
+        """Begin the episode of a reset, and answer the reset.
 
-        A reset whose checkpoint is not loaded leaves the queue. It is queued again when the checkpoint is loaded, and
-        answered with an error if that fails. Meanwhile the session may be reset again or closed, or its client may stop
-        waiting.
+        A reset whose checkpoint is not loaded leaves the queue. It is queued again when the checkpoint is loaded, or
+        answered with an error if loading fails. Meanwhile the session may be reset again or closed, or its client may
+        stop waiting.
         """
         session_id = pending.session_id
         if pending.loaded is None:
@@ -416,7 +428,7 @@ class Engine:
             session.first, session.moves = opening.first, 0
             session.expected = max(session.expected, opening.first)
             is_abandoned = partial(self._is_abandoned, pending, session)
-            pending.begun = False  # while its checkpoint is loaded, the policy is not at work on it
+            pending.begun = False  # the policy does no work on it while its checkpoint is loaded
             if self.models.hold(session, opening.choice, partial(self._requeue, pending), is_abandoned) is None:
                 return  # `_requeue` queues it again
             pending.begun = True
@@ -431,13 +443,13 @@ class Engine:
         try:
             self._begin_episode(pending, opening, session)
         except BaseException:
-            self.models.release_model(session)  # else the session might hold the model for long without an episode
+            self.models.release_model(session)  # otherwise the session would hold the model without an episode
             raise
 
     def _begin_episode(self, pending: PendingRequest, opening: Opening, session: Session[LoadedModel]) -> None:
         """Begin an episode on the model that the session holds, and answer the request."""
         request, model = pending.request, session.model
-        if model is None or request.obs is None:  # the decoder ensures the second
+        if model is None or request.obs is None:  # the decoder ensures the second condition
             raise UnknownSession(f"session {pending.session_id!r}: closed before its reset was over")
         model.check(request)
         with model.busy, model.uncaptured, model.call("reset") as call:
@@ -449,7 +461,7 @@ class Engine:
                 raise PolicyFailed(f"reset: the policy returned {type(info).__name__}, want a dict")
             for obs in request.history:
                 agent.observe(obs)
-        info = {**model.identity, **info}  # a session with an adapter states both by itself
+        info = {**model.identity, **info}  # a session with an adapter returns both by itself
         spent = timing(pending.arrived, call.began, call.ended)
         require_serializable(info, self._reply_bytes)
         session.agent, session.instruction = agent, request.instruction or ""
@@ -461,7 +473,7 @@ class Engine:
         pending.finish(Reply(request.request_id, info=info, step=session.steps, timing=spent))
 
     def _requeue(self, pending: PendingRequest, error: VLAgentsError | None) -> None:
-        """Queue a reset again whose checkpoint was loaded, or answer it with the error."""
+        """Queue a reset again whose checkpoint is loaded, or answer it with the error."""
         pending.loaded = self.clock()
         try:
             if error is not None:
@@ -472,11 +484,11 @@ class Engine:
             pending.fail(reason)
 
     def _is_abandoned(self, pending: PendingRequest, session: Session[LoadedModel]) -> bool:
-        """Return whether the caller no longer waits for that reset, or the session was reset again."""
+        """Return whether the caller of that reset no longer waits, or the session was reset again."""
         return pending.over or pending.expired(self.clock()) or session.resetting is not pending
 
     def _other(self, pending: PendingRequest) -> dict[str, Any]:
-        """Return the info of the answer to a request that is neither an act nor a reset."""
+        """Run a request that is neither an act nor a reset, and return the info of its answer."""
         session_id, request = pending.session_id, pending.request
         if request.op == "export":
             return self.transfer.export(session_id)
@@ -493,10 +505,10 @@ class Engine:
 
     def _ready(self, pending: PendingRequest) -> tuple[Session[LoadedModel], LoadedModel, WeightsVersion]:
         session: Session[LoadedModel] | None = pending.session
-        if session is None or session.over:  # it has ended, or moved here from another replica, since the lookup
+        if session is None or session.over:  # since the lookup it has ended, or arrived here from another replica
             session = self.sessions.get(pending.session_id)
         model, weights = session.model, session.weights
-        if session.agent is None:  # an earlier reset in the queue failed, or waits for its checkpoint
+        if session.agent is None:  # an earlier reset in the queue failed, or still waits for its checkpoint
             raise NotReset(f"session {pending.session_id!r}: its last reset failed; reset again")
         step = pending.request.step
         if step is not None and step != session.steps:
@@ -518,7 +530,7 @@ class Engine:
         """Finish the preparations of observations, and answer the requests whose preparation failed.
 
         Returns:
-            The other requests, and the time that this took, s, which counts as inference.
+            The remaining requests, and the duration, s, which counts as inference.
         """
         preparations = [(pending.preparation, session.agent) for pending, session in acting]
         if all(preparation is None for preparation, _ in preparations):
@@ -547,10 +559,11 @@ class Engine:
                 raise PolicyFailed(f"act_batch: got {rows} observations, returned {len(results)} actions")
         except Exception as error:  # noqa: BLE001 - becomes the replies
             results = [error] * rows
-        # Not after a lone act that succeeded as the one before did: the calls would be a hundredth of its time.
+        # This is skipped for a lone act that succeeded like the one before: it would take a hundredth of the act's
+        # time.
         if len(acting) > 1 or isinstance(results[0], Exception) or model.calls.failed_batches:
             model.calls.record_batch(results[: len(acting)])
-        del observations  # they may lie in memory that their sender needs back
+        del observations  # they may be in the sender's memory
         for pending, _ in acting:
             pending.request.drop_observations()
         if padding:

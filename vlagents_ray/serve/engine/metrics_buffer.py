@@ -1,7 +1,7 @@
 """Timings of requests and batches: reported in each reply, and buffered for the metrics exporter.
 
 Per request this costs two readings of the clock and one addition to a sample. The exporter thread
-(`vlagents_ray.serve.replica.metrics`) has little left to do: while it holds the interpreter lock, requests may wait.
+(`vlagents_ray.serve.replica.metrics`) has little work left: requests may wait while it holds the interpreter lock.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The interface of observers, the only access to the requests and the answers of an engine.
 
-An observer is called on the threads that requests and answers take: it copies or passes on references, and leaves the
-rest to its own thread. What it retains is bounded: beyond a limit in bytes or entries it drops data. Requests that
-could not be decoded reach no observer. `vlagents_ray.serve.observers` has the observers.
+An observer is called on the threads that process requests and answers: it copies data or keeps references, and leaves
+the rest to its own thread. Its memory is bounded: beyond a limit in bytes or entries it drops data. Requests that could
+not be decoded reach no observer. The observers are in `vlagents_ray.serve.observers`.
 """
 
 from __future__ import annotations
@@ -19,31 +19,31 @@ logger = logging.getLogger(__name__)
 
 
 class Observer:
-    """Sees requests that could be decoded, and their answers. A class overrides the methods that it needs."""
+    """Observes decoded requests and their answers; a class overrides the methods that it needs."""
 
     def on_request(self, pending: PendingRequest) -> None:
-        """See a request before it is queued. Arrays of the observation may lie in memory that the client reuses."""
+        """Observe a request before it is queued; its observation may be in memory that the client reuses."""
 
     def before_answer(self, pending: PendingRequest, reply: Reply) -> None:
-        """Add to the info of an answer that is about to be sent, as the live page does to reach a robot."""
+        """Add to the info of an answer before it is sent; the live page sends commands to a robot this way."""
 
     def on_answer(self, pending: PendingRequest, reply: Reply) -> None:
-        """See an answer that was sent, with its complete `timing`. The request has lost its observation."""
+        """Observe an answer that was sent, with its complete `timing`; the request's observation has been dropped."""
 
     def close(self) -> None:
-        """Write or export what is kept, and end."""
+        """Write or export the kept data, and end."""
 
 
 class Observers(Observer):
     """The observers of an engine, which are themselves one. Thread-safe."""
 
     def __init__(self) -> None:
-        self.any = False  # whether there are any: without, a request costs one look at this
+        self.any = False  # whether there are observers: without any, each request costs only this check
         self._all: tuple[Observer, ...] = ()
         self._lock = threading.Lock()
 
     def add(self, observer: Observer) -> None:
-        """Add an observer of the requests from now on."""
+        """Add an observer for all requests from now on."""
         with self._lock:
             self._all = (*self._all, observer)
             self.any = True
@@ -55,7 +55,7 @@ class Observers(Observer):
             self.any = bool(self._all)
 
     def on_request(self, pending: PendingRequest) -> None:
-        """Call all observers with a request; their errors are logged, and affect no answer."""
+        """Call all observers with a request; their errors are logged, and do not affect the answer."""
         for observer in self._all:
             with _logged(observer):
                 observer.on_request(pending)

@@ -1,9 +1,9 @@
-"""Pauses of the process, in which messages wait in sockets.
+"""Pauses of the process, during which messages wait in sockets.
 
 Deadlines begin when a message arrives, and the kernel records that time for each message (see
-`vlagents_ray.serve.endpoints.connection`). Serve's HTTP server and Ray's own calls do not pass the record on. After a
-pause of the whole process, it is therefore looked up for HTTP requests; messages of the server's WebSockets and Ray's
-calls are assumed to have waited since the pause began.
+`vlagents_ray.serve.endpoints.connection`). Serve's HTTP server and Ray's own calls do not expose the record. After a
+pause of the whole process, the time is therefore looked up for HTTP requests; messages of the server's WebSockets and
+Ray's calls are assumed to have waited since the pause began.
 """
 
 from __future__ import annotations
@@ -18,31 +18,31 @@ from typing import Any
 
 from vlagents_ray.serve.periodic import Periodic
 
-_LAST_DATA = struct.Struct("@52xI")  # in TCP_INFO: time since data was received last, ms
+_LAST_DATA = struct.Struct("@52xI")  # in TCP_INFO: time since data were last received, ms
 _CHECK_S = 0.1  # interval of the checks for a pause
 _PAUSE_S = 0.3  # time without a check above which the process was paused, rather than merely busy
-_BACKLOG_S = (0.5, 5.0)  # shortest and longest time to read the backlog of a pause; it is half as long as the pause
+_BACKLOG_S = (0.5, 5.0)  # minimum and maximum time to read the backlog of a pause; it is half as long as the pause
 
 # Ports of both ends of the current HTTP request's TCP connection, the server's first.
 _PORTS: ContextVar[tuple[int, int] | None] = ContextVar("vlagents_ray_ports", default=None)
 
 
 def note_connection(scope: Mapping[str, Any]) -> None:
-    """Note the connection of an HTTP request, for `PauseDetector.waited_s` in the same context."""
+    """Record the connection of an HTTP request, for `PauseDetector.waited_s` in the same context."""
     server, client = scope.get("server"), scope.get("client")
     _PORTS.set((server[1], client[1]) if server and client else None)
 
 
 def _since_last_data_s() -> float | None:
-    """Return the time since the connection of the current HTTP request received data, s; None if it is not known.
+    """Return the time since the connection of the current HTTP request received data, s; None if it is unknown.
 
-    The server's sockets are not accessible, so all of this process are searched, which takes milliseconds.
+    Serve does not expose its sockets, so this searches all sockets of the process, which takes milliseconds.
     """
     if (ports := _PORTS.get()) is None:
         return None
     with contextlib.suppress(OSError):  # the system does not list descriptors
         for descriptor in map(int, os.listdir("/proc/self/fd")):
-            with contextlib.suppress(OSError):  # it is no connected socket, or has been closed
+            with contextlib.suppress(OSError):  # not a connected socket, or closed
                 connection = socket.socket(socket.AF_INET, socket.SOCK_STREAM, fileno=descriptor)
                 try:
                     names = connection.getsockname(), connection.getpeername()
@@ -75,7 +75,7 @@ class PauseDetector:
         self._checked = None
 
     def check(self) -> None:
-        """Record the pause since the last check, if there was one; a pause within a backlog extends the backlog."""
+        """Record the pause since the last check, if there was one; a pause during a backlog extends the backlog."""
         now = self._clock()
         if self._checked is not None and (lasted_s := now - self._checked) > _PAUSE_S:
             if self._checked < self._backlog_until:

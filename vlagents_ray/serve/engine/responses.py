@@ -24,7 +24,7 @@ from vlagents_ray.validation import check_action
 
 logger = logging.getLogger(__name__)
 
-_LIBRARIES = (str(Path(__file__).parents[2]), sysconfig.get_path("stdlib"))  # this package's own, and Python's
+_LIBRARIES = (str(Path(__file__).parents[2]), sysconfig.get_path("stdlib"))  # of this package and Python's library
 
 
 def build_reply(
@@ -42,11 +42,11 @@ def build_reply(
         session: Its session.
         result: The policy's result, or the error that it raised.
         contract: The policy's contract, if it has one; the action is checked against it.
-        limit: Largest size of action and info together, bytes.
+        limit: Maximum size of action and info together, bytes.
         policy: Version of the weights that acted, for the info, unless the policy itself names one (as a proxy does).
 
     Returns:
-        The reply; with an error if the policy raised one, or if its result is invalid or too large.
+        The reply; it has an error if the policy raised one, or if its result is invalid or too large.
     """
     request_id = pending.request.request_id
     try:
@@ -54,14 +54,14 @@ def build_reply(
             raise result
         if not isinstance(result, Act):
             raise PolicyFailed(f"act: the policy returned {type(result).__name__}, want an Act")
-        if (size := getattr(result.action, "nbytes", 0)) > limit:  # before it is copied and checked
+        if (size := getattr(result.action, "nbytes", 0)) > limit:  # before the action is copied and checked
             raise PolicyFailed(_too_large("action", size, limit))
         act = Act(check_action(result.action, contract), bool(result.done), result.info)
         if act.action.nbytes > limit:  # the policy may return a list of numbers, which has no `nbytes`
             raise PolicyFailed(_too_large("action", act.action.nbytes, limit))
         if act.info:
             require_serializable(act.info, limit - act.action.nbytes)
-        act.info = {**policy, **(act.info or {})}  # the session's own; policies without info may return None
+        act.info = {**policy, **(act.info or {})}  # the result's own info takes precedence; it may be None
     except Exception as error:  # noqa: BLE001 - becomes the reply
         return Reply(request_id, error=public_error(error, pending))
     session.steps += 1
@@ -69,7 +69,7 @@ def build_reply(
 
 
 def public_error(error: Exception, pending: PendingRequest) -> VLAgentsError:
-    """Return the error for the caller; details of an error that the policy raised are only logged."""
+    """Return the error for the caller; details of an error of the policy are only logged."""
     if isinstance(error, VLAgentsError):
         return error
     request = pending.request
@@ -83,7 +83,7 @@ def public_error(error: Exception, pending: PendingRequest) -> VLAgentsError:
 
 
 def raised_at(error: Exception) -> str:
-    """Return the line of the user's own code that raised an error, " (my_policy.py:12)"; "" if none did."""
+    """Return the line of the user's own code that raised an error, " (my_policy.py:12)"; "" if there is none."""
     for frame in reversed(traceback.extract_tb(error.__traceback__)):
         if not frame.filename.startswith(_LIBRARIES) and "site-packages" not in frame.filename:
             return f" ({Path(frame.filename).name}:{frame.lineno})"
@@ -91,18 +91,21 @@ def raised_at(error: Exception) -> str:
 
 
 def timing(arrived: float, began: float, ended: float) -> dict[str, Any]:
-    """Return the stages of a request that the engine measures, ms: the wait for the policy's call, and the call.
+    """Return the durations that the engine measures, ms: the wait for the policy's call, and the call itself.
 
-    The arguments are times of the engine's clock, s: of the request's arrival, the call's begin, and its end.
+    Args:
+        arrived: Time of the request's arrival, s, of the engine's clock.
+        began: Start of the policy's call, s.
+        ended: End of the call, s.
     """
     return {"queue_ms": (began - arrived) * 1e3, "inference_ms": (ended - began) * 1e3}
 
 
 def require_serializable(info: dict[str, Any], limit: int = DEFAULT_LIMITS.reply_bytes) -> None:
-    """Check that the info of a reply can be sent, so that an invalid one only fails the session's own request.
+    """Check that the info of a reply can be sent, so that an invalid one fails only the session's own request.
 
     Arrays are not copied. An info of more than `limit` bytes, or of more values than the client accepts, is refused,
-    since other replies would wait while it is sent.
+    since sending it would delay other replies.
 
     Raises:
         PolicyFailed: The info cannot be encoded, or is too large.
@@ -122,12 +125,12 @@ class _BoundedWriter(ValueWriter):
         self._bytes = self._values = self._depth = 0
 
     def value(self, value: Any) -> Any:
-        """See `ValueWriter`; raises `MessageTooLarge` before a value is copied that exceeds the limits."""
+        """Encode a value as `ValueWriter` does; raise `MessageTooLarge` before copying one over the limits."""
         self._values += 1
         if self._values > DEFAULT_LIMITS.items:
             raise MessageTooLarge(f"info: more than {DEFAULT_LIMITS.items} values; send arrays instead of lists")
         if value is None or isinstance(value, (int, float)):
-            return value  # first: the abstract classes below take five times as long
+            return value  # checked first: the abstract classes below take five times as long
         if isinstance(value, (np.ndarray, memoryview)):
             self._bytes += value.nbytes
         elif isinstance(value, (str, bytes, bytearray)):

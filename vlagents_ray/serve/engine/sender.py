@@ -1,4 +1,4 @@
-"""From a decoded message to the engine: the sessions and the key of a sender, and the answers of its messages."""
+"""Submission of decoded messages to the engine, with the sessions and the key of their sender."""
 
 from __future__ import annotations
 
@@ -19,19 +19,20 @@ if TYPE_CHECKING:
     from vlagents_ray.serve.engine.engine import Engine
 
 
-REFUSALS = 8  # of messages over the rate of the sender's key, one after the other, after which a connection ends
+REFUSALS = 8  # number of consecutive messages over the rate of the key after which a connection ends
 REFUSED = f"over the rate of its key {REFUSALS} times in a row; send less, or raise the rate"
 
 
 class Sender:
-    """Submits the requests of a connection, with which its sessions end, or of a caller without one.
+    """Submits the requests of a connection, whose end also ends its sessions, or of a caller without a connection.
 
-    A request names its session; without a name it is for `session_id`, the sender's own session. If the server has
-    API keys, a caller cannot reach sessions of other keys: the key's name is part of the session ids in the engine.
+    A request names its session; if it does not, it is for `session_id`, the sender's own session. If the server has API
+    keys, a caller cannot reach sessions of other keys: the key's name is part of the session ids in the engine.
 
-    Each message is charged to the key before it is parsed, and each further request in it before it is submitted: over
-    HTTP by the guard on arrival, then by the `admission`; frames by the `admission` alone; the compact form of shared
-    memory by `count_message`, then by `send`; batches of a dialect by its gate's `admission`, then by `count`.
+    Each message is charged to the key before it is parsed, and each further request in it before it is submitted. The
+    charge for HTTP is made by the guard on arrival, then by the `admission`; for frames, by the `admission` alone; for
+    the compact form of shared memory, by `count_message`, then by `send`; for batches of a dialect, by the `admission`
+    of its gate, then by `count`.
     """
 
     def __init__(
@@ -52,9 +53,10 @@ class Sender:
             session_id: Name of the sender's own session; a random one by default.
             caller: The authenticated caller, or the reason why none is needed. It has no default, so that an endpoint
                 without authentication fails.
-            connected: Whether the sender has a connection, with which its sessions end.
+            connected: Whether the sender has a connection, whose end also ends its sessions.
             counted: Whether the first request of each message was charged to the key on arrival, as it is by default
-                for senders without a connection. Messages sent without an admission charge further ones by `count`.
+                for senders without a connection. Further requests of messages without an admission are charged by
+                `count`.
 
         Raises:
             TypeError: `caller` is neither a `Caller` nor a `NoKey`.
@@ -67,9 +69,9 @@ class Sender:
         self._asked_to_reconnect = False  # whether the client was asked to reconnect, so that its sessions move
         self._caller = caller if isinstance(caller, Caller) else None
         self.rated = self._caller is not None  # whether its key may be over a rate
-        self._paid = False  # whether a message without an admission was counted, and with it its first request
-        self._refused = 0  # number of messages that were refused one after the other
-        self._prefix = f"{caller.name}/" if isinstance(caller, Caller) else ""  # of its session ids in the engine
+        self._paid = False  # whether a message without an admission, and with it its first request, was counted
+        self._refused = 0  # number of consecutive refused messages
+        self._prefix = f"{caller.name}/" if isinstance(caller, Caller) else ""  # prefix of the sender's session ids
         owner = uuid.uuid4().hex if connected else ""
         self._origin = Origin(transport, owner, self._session_id, self._caller, self._prefix)
 
@@ -92,22 +94,22 @@ class Sender:
         return MessageAdmission(self._engine.admission, limits, admit, size, robot=robot, keep_files=keep)
 
     def count(self, requests: int) -> None:
-        """Count requests for the key before any of them is sent; raise `TooManyRequests` over its rate."""
+        """Charge requests to the key before they are sent; raise `TooManyRequests` over its rate."""
         if self._caller is not None:
             for _ in range(requests):
                 self._count(self._caller, "act", counted=False)
 
     def count_message(self) -> None:
-        """Count a message that is sent without an admission, before it is parsed; raise `TooManyRequests`."""
+        """Charge a message without an admission to the key before it is parsed; raise `TooManyRequests`."""
         if self._caller is not None:
             self._paid = False
             self._count_message(self._caller)
             self._paid = True
 
     def throttled_s(self) -> float:
-        """Return for how long the server must not read from the sender, s; 0 if its key kept within its rate limit.
+        """Return for how long the server must not read from the sender, s; 0 if the key is within its rate.
 
-        It slows down the senders of a key whose messages are refused anyway.
+        The pause slows down senders of a key whose messages are refused in any case.
         """
         return 0.0 if self._caller is None else self._caller.throttled_s()
 
@@ -118,7 +120,7 @@ class Sender:
 
     @property
     def refused_too_often(self) -> bool:
-        """Whether so many messages were refused one after the other that the connection has to end."""
+        """Return whether so many consecutive messages were refused that the connection has to end."""
         return self._refused >= REFUSALS
 
     def send(
@@ -135,9 +137,9 @@ class Sender:
         Args:
             message: The message.
             decoded: Its requests.
-            then: Called with the message when it has all its answers, on the thread that brings the last one.
-            admission: Admission of the message, which has already counted the requests for the key.
-            waited_s: Time that counts towards the deadlines, as the message has waited before it was read, s.
+            then: Called with the message when all its answers have arrived, on the thread of the last one.
+            admission: Admission of the message, which has already charged the requests to the key.
+            waited_s: Time that the message waited before it was read, s, which counts towards the deadlines.
 
         Returns:
             The requests in flight.
@@ -176,7 +178,7 @@ class Sender:
         return sent
 
     def _admitted(self, caller: Caller, requests: list[PendingRequest], counted: bool) -> list[PendingRequest]:
-        """Return the requests that the caller's key allows, with its class; the others are finished with their error.
+        """Return the requests that the caller's key allows, with its class; the others are finished with their errors.
 
         The guard of the HTTP server has already counted the first request of a message.
         """
@@ -202,7 +204,7 @@ class Sender:
             self._asked_to_reconnect = True
         if self._asked_to_reconnect or self._engine.draining:
             for reply in message.replies:
-                reply.draining = True  # the client connects again, and its sessions move to another replica
+                reply.draining = True  # the client reconnects, and its sessions move to another replica
         if admission is not None and admission.holds:
             admission.release()
         observers = self._engine.observers
@@ -220,8 +222,8 @@ class Sender:
     ) -> list[Reply]:
         """Submit the requests of a message, and wait for the replies until the requests' deadlines.
 
-        The time that a request may have waited during a pause of the process counts towards its deadline.
-        When the caller stops waiting (deadline, disconnect), its requests that no batch has taken are withdrawn.
+        If a pause of the process delayed a request, the delay counts towards its deadline. When the caller stops
+        waiting (deadline, disconnect), its requests that no batch has taken are withdrawn.
         """
         loop = asyncio.get_running_loop()
         future: asyncio.Future[list[Reply]] = loop.create_future()
@@ -241,14 +243,14 @@ class Sender:
                 timer.cancel()
 
     def _expire(self, message: Message, sent: Sequence[PendingRequest]) -> None:
-        """Answer the requests without an answer: their deadlines have passed, and those not begun are withdrawn."""
+        """Answer the unanswered requests, whose deadlines have passed; withdraw those that have not begun."""
         self._engine.withdraw(*sent)
         for pending in sent:
             after = f"no action within {pending.request.deadline_ms:g} ms"
             late: VLAgentsError = DeadlineExceeded(f"{after}: not acted on, and never will be")
             if pending.begun:
                 late = OutcomeUnknown(f"{after}, but the policy is at work on it")
-            pending.done(Reply(pending.request.request_id, error=late))  # ignored if it has its answer
+            pending.done(Reply(pending.request.request_id, error=late))  # ignored if the request has been answered
 
     def release(self, *, for_good: bool = False) -> None:
         """End the sessions of a closed connection, unless its client was asked to reconnect elsewhere.
@@ -266,7 +268,7 @@ class Sender:
         return self._prefix + self._session_id
 
     def _count(self, caller: Caller, op: object, counted: bool) -> bool:
-        """Count a request for the key, unless it is `counted` or a close. False if the key has the simulation class."""
+        """Charge a request to the key unless it is `counted` or a close; return False if the key is for simulations."""
         caller.admit(free=counted or op == "close")
         return caller.rank != "simulation"
 

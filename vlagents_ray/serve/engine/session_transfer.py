@@ -1,7 +1,4 @@
-"""Sessions that move between replicas: export, release and adoption of their state.
-
-The state of a session is bytes and settings.
-"""
+"""Sessions that move between replicas: export, release and adoption of their state, which is bytes and settings."""
 
 from __future__ import annotations
 
@@ -22,7 +19,13 @@ class SessionTransfer:
     def __init__(
         self, sessions: SessionTable[LoadedModel], models: ModelManager, require_ready: Callable[[], None]
     ) -> None:
-        """Transfer the `sessions` of one engine; `require_ready` raises an error while the policy cannot act."""
+        """Transfer the sessions of one engine.
+
+        Args:
+            sessions: The sessions.
+            models: The loaded models.
+            require_ready: Raises an error while the policy cannot act.
+        """
         self._sessions = sessions
         self._models = models
         self._require_ready = require_ready
@@ -33,7 +36,7 @@ class SessionTransfer:
         Args:
             session_id: Id of the session.
             state: The `info` of the other replica's reply to "export".
-            timeout_s: Longest time for loading the session's checkpoint, s; 0 if it must be loaded already.
+            timeout_s: Maximum time for loading the session's checkpoint, s; 0 if it must be loaded already.
 
         Raises:
             UnknownSession: The session has, or had, a newer state here, has begun a reset, or needs a checkpoint or a
@@ -42,7 +45,7 @@ class SessionTransfer:
         self.enter(self.prepare(session_id, state, timeout_s))
 
     def prepare(self, session_id: str, state: dict[str, Any], timeout_s: float = 0.0) -> Session[LoadedModel]:
-        """Create a copy of the session that cannot act until `enter`; call `discard` if it is not needed."""
+        """Create a copy of the session that cannot act before `enter`; call `discard` if it is not needed."""
         self._require_ready()
         self._sessions.require_room(session_id)
         arriving: Session[LoadedModel] = Session(

@@ -1,12 +1,12 @@
-"""The batch queue: all requests for the policy wait here, and the policy's thread takes its batches from here.
+"""The batch queue: it holds all requests for the policy until the policy's thread takes them in batches.
 
-The queue is work-conserving except for one short wait: as soon as the policy is free, it takes all waiting requests
-up to the batch limit, so that batching never delays a lone request. `vlagents_ray.serve.queue.fair_queue` decides the
-order. Expired requests, and those that are over, never reach the policy, but are only dropped when it is next free; a
-caller that must learn of its expired deadline sooner sets a timer.
+The queue is work-conserving except for one short wait: as soon as the policy is free, it takes all waiting requests up
+to the batch limit, so that batching never delays a lone request. `vlagents_ray.serve.queue.fair_queue` defines the
+order. Expired and finished requests never reach the policy, but are only dropped when it is next free; a caller that
+needs an earlier notice of its expired deadline sets a timer.
 
 The queue waits for the remaining requests of a group of simulations that were answered together and are about to send
-their next requests. `vlagents_ray.serve.queue.batch_window` decides when and for how long. `patience=0` disables it.
+their next requests. `vlagents_ray.serve.queue.batch_window` decides when and for how long. `patience=0` disables this.
 """
 
 from __future__ import annotations
@@ -23,32 +23,32 @@ from vlagents_ray.serve.queue.fair_queue import FairQueue
 from vlagents_ray.serve.queue.poller import Poller
 from vlagents_ray.serve.requests import PendingRequest, Rank
 
-_SPIN_S = 100e-6  # time for which the thread polls for a next request before it sleeps
-_DENSE_S = 500e-6  # gap between two requests below which the next one is expected as soon
+_SPIN_S = 100e-6  # time for which the thread polls for the next request before it sleeps
+_DENSE_S = 500e-6  # interval between two requests below which the next one is expected as quickly
 
 
 class Taken(NamedTuple):
-    """The work that the policy's thread takes at once; both are empty after a long time without requests."""
+    """The work that the policy's thread takes at once; both lists are empty after a long time without requests."""
 
     batch: list[PendingRequest]
-    expired: list[PendingRequest]  # whose deadlines have passed: not in the batch, and still to be answered
+    expired: list[PendingRequest]  # requests whose deadlines have passed: not in the batch, and still unanswered
 
 
 class BatchQueue:
-    """The waiting requests, and the files that bring new ones.
+    """The waiting requests, and the watched files that deliver new ones.
 
     One thread, the policy's, calls `bind`, then in turns `next`, `begin` and `end`, and at last `release`. It waits on
-    file descriptors, so that a local client's socket can be one of them: its request then reaches the policy
-    without a thread switch. While batches take milliseconds and are not all for one session, a second thread polls
-    these files, so that the next batch is already decoded when the current one ends.
+    file descriptors, so that a local client's socket can be one of them: its request then reaches the policy without a
+    thread switch. While batches take milliseconds and are not all for one session, a second thread polls these files,
+    so that the next batch is already decoded when the current one ends.
 
     Args:
-        max_batch_size: Largest number of requests in a batch.
+        max_batch_size: Maximum number of requests in a batch.
         idle_s: Time without a request after which `next` returns nothing, s.
-        patience: After a batch that took D s, the thread waits at most `patience` * D s for the sessions of that
-            batch that are about to send their next requests.
+        patience: After a batch that took D s, the thread waits at most `patience` * D s for the sessions of that batch
+            that are about to send their next requests.
         is_open: Returns whether a session still exists.
-        clock: Time, s.
+        clock: Clock, s.
         poller: Poller for the watched files; by default the queue creates one.
     """
 
@@ -66,12 +66,12 @@ class BatchQueue:
         self._idle_s = idle_s
         self._max = max_batch_size
         self._waiting = FairQueue()
-        self._load_timer = LoadTimer()  # counts the time in which the policy loads as idle
+        self._load_timer = LoadTimer()  # counts the time until the policy is loaded as idle
         self._lock = threading.Lock()
         self._closed = False
-        self._thread = 0  # the policy's
+        self._thread = 0  # id of the policy's thread
         self._asleep = False
-        self._driven = False  # whether a caller of `take` drives the queue; each new request wakes it up
+        self._driven = False  # whether a caller of `take` drives the queue; each new request then wakes that caller
         self._dense = False  # whether requests arrive in quick succession
         self.poller = poller or Poller()
         self.window = BatchWindow(patience, max_batch_size, is_open)
@@ -87,7 +87,7 @@ class BatchQueue:
         self._load_timer.mark_busy()
 
     def put(self, *requests: PendingRequest) -> None:
-        """Queue requests; those of one call enter the same batch if it has room. `PolicyUnavailable` after `close`."""
+        """Queue requests, for the same batch if it has room for all; raise `PolicyUnavailable` after `close`."""
         with self._lock:
             if self._closed:
                 raise PolicyUnavailable("the replica is stopping; connect again")
@@ -101,13 +101,13 @@ class BatchQueue:
             self._wake()
 
     def withdraw(self, *requests: PendingRequest) -> None:
-        """End requests without an answer. No batch takes them any more, but a reset whose checkpoint was loaded."""
+        """End requests without an answer; no batch takes them, except a reset whose checkpoint was loaded."""
         with self._lock:
             for pending in requests:
                 pending.over = True
 
     def next(self) -> Taken | None:
-        """Wait for requests, and return the next batch; one without requests after `idle_s`, None after `close`."""
+        """Wait for requests, and return the next batch; it is empty after `idle_s`, and None after `close`."""
         if not self._wait_for_request():
             return Taken([], [])
         if self.window.slow:
@@ -135,17 +135,17 @@ class BatchQueue:
             self.poller.hand_to_reader()
 
     def end(self) -> None:
-        """Note that the batch has ended."""
+        """Record that the batch has ended."""
         ended = self._clock()
         with self._lock:
-            self._running = ()  # its observations may lie in memory that their sender needs back
+            self._running = ()  # its observations may be in the sender's memory
             self.window.record_end(ended, ended - self._begun)
         self.poller.reclaim()
 
     def clear(self) -> tuple[Sequence[PendingRequest], list[PendingRequest]]:
-        """Return the running batch, and the waiting requests, which no longer wait. May be called on any thread.
+        """Return the running batch, and the waiting requests, which are removed. May be called on any thread.
 
-        Later requests are read by another thread until the batch ends, so that they can be refused while it hangs.
+        Another thread reads later requests until the batch ends, so that they can be refused while it hangs.
         """
         with self._lock:
             self._load_timer.count(self._waiting.size, self._clock())
@@ -154,7 +154,7 @@ class BatchQueue:
             return self._running, self._waiting.clear()
 
     def full_batch_waits(self) -> bool:
-        """Return whether a full batch waits, so that replies to simulations can be sent while that one runs."""
+        """Return whether a full batch waits, so that replies to simulations can be sent while it runs."""
         return self.window.slow and self._waiting.sessions >= self._max
 
     def depth(self) -> int:
@@ -175,7 +175,7 @@ class BatchQueue:
         return self._load_timer.idle_time_s()
 
     def close(self) -> list[PendingRequest]:
-        """Refuse further requests, have `next` return None after the running batch, and return those that wait."""
+        """Refuse further requests, make `next` return None after the running batch, and return the waiting requests."""
         with self._lock:
             self._closed = True
             self._load_timer.count(self._waiting.size, self._clock())
@@ -188,7 +188,7 @@ class BatchQueue:
         self.poller.close()
 
     def _wake(self) -> None:
-        if self._asleep and threading.get_ident() != self._thread:  # the policy's thread is awake if it calls
+        if self._asleep and threading.get_ident() != self._thread:  # if the policy's thread calls this, it is awake
             self._asleep = False
             self.poller.wake()
 
@@ -206,9 +206,9 @@ class BatchQueue:
                 return False
 
     def _wait_for_event(self) -> bool:
-        """Wait for a watched file or a wake-up call; False if there was none within `idle_s`.
+        """Wait for a watched file or a wake-up call; return False if there was none within `idle_s`.
 
-        If the last request followed soon, the thread polls for `_SPIN_S` before it sleeps, since waking up takes as
+        If the last request followed quickly, the thread polls for `_SPIN_S` before it sleeps, since waking up takes as
         long as a fast policy. While polling it yields the core to other processes.
         """
         begun = self._load_timer.mark_idle()
@@ -229,7 +229,7 @@ class BatchQueue:
                 return
             self._wait_over.clear()
             self._gathering = True
-        self.poller.hand_to_reader()  # an epoll waits for whole milliseconds, the event below for exact times
+        self.poller.hand_to_reader()  # epoll waits for whole milliseconds, the event below for exact times
         complete = self._wait_over.wait(wait_s)
         self.poller.reclaim()
         if not complete:
@@ -238,7 +238,7 @@ class BatchQueue:
             self._gathering = False
 
 
-# The measured load: how long requests have waited for the policy, and how long its thread was idle.
+# The measured load: the waiting time of requests, and the idle time of the policy's thread.
 
 
 class LoadTimer:

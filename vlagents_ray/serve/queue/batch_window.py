@@ -29,7 +29,7 @@ SLOW_S = 0.002  # a shorter batch ends before a wait could pay off, or another t
 
 
 class _AnsweredBatch:
-    """The simulations of a batch, and the recent return time of each, s; None where that is unknown.
+    """The simulations of a batch, and the recent return time of each, s; None if it is unknown.
 
     The return time of a session is the time from an answer to its next request.
     """
@@ -82,9 +82,9 @@ class BatchWindow:
         self._last = self._previous = self._no_batch
         self._duration = 0.0  # duration of the last batch, s
         self._mean_s = 0.0  # mean duration of recent batches, s
-        self.slow = False  # whether batches take longer than `SLOW_S`; if not, the window keeps no records
-        # Whether it pays that other threads work on the next requests while a batch runs: batches are slow, and the
-        # last two were not both for one session, nor the last one if no other is known.
+        self.slow = False  # whether batches take longer than `SLOW_S`; otherwise the window keeps no records
+        # Whether other threads should work on the next requests while a batch runs: batches are slow, and the last two
+        # were not both for one session, nor the last one if there is no other session.
         self.overlaps = False
         self._cost = BatchCost()
         self._missing: set[str] = set()
@@ -136,7 +136,7 @@ class BatchWindow:
         return bound
 
     def ends_wait(self, pending: PendingRequest, waiting: FairQueue) -> bool:
-        """Return whether the wait ends with the arrival of this request."""
+        """Return whether the arrival of this request ends the wait."""
         self._missing.discard(pending.session_id)
         return (
             not self._missing

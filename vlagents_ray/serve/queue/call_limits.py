@@ -1,4 +1,4 @@
-"""Running calls into a policy, and whether one of them exceeds its time limit.
+"""Running calls of a policy, and whether one of them exceeds its time limit.
 
 A deadlocked driver, or a policy that waits for an event that never occurs, keeps its thread alive. Only the time since
 the call began distinguishes it from a policy that is computing. A policy that compiles takes long for its first few
@@ -21,7 +21,7 @@ from vlagents_ray.policies.base.accelerator import is_device_failure
 _WARM_UP_CALLS = 2  # per kind of call: the first one compiles, and the second one compiles for dynamic sizes
 _MULTIPLE = 10  # limit of a call, as a multiple of the longest call of its kind so far
 LOAD = "load"
-FAILED_BATCHES = 20  # in a row, without any action, after which a replica is replaced
+FAILED_BATCHES = 20  # number of consecutive batches without any action, after which a replica is replaced
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +44,7 @@ class PolicyCall:
         self.began = self.ended = 0.0  # times of the last call, s of `PolicyCalls.clock`; for the calling thread only
         self._thread = self._process = 0
         self._count = 0
-        self._longest_s = 0.0  # longest call; of the warm-up calls only the shortest counts
+        self._longest_s = 0.0  # duration of the longest call; of the warm-up calls only the shortest counts
 
     def __enter__(self) -> PolicyCall:
         self._thread, self._process = threading.get_ident(), os.getpid()
@@ -54,7 +54,7 @@ class PolicyCall:
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         if os.getpid() != self._process:
-            # The policy forked this process during the call: it shares the clients' sockets.
+            # The policy forked this process during the call; the process shares the clients' sockets.
             os.write(2, f"a child that the policy forked in {self.op!r} has returned; it is ended\n".encode())
             os._exit(1)
         if error is not None:
@@ -102,16 +102,16 @@ class PolicyCalls:
         self.limits = limits or CallLimits()
         self.clock = clock
         self.under_way: set[PolicyCall] = set()
-        self.failed_batches = 0  # in a row
-        self.broken: BaseException | None = None  # error of an accelerator, after which no call succeeds
+        self.failed_batches = 0  # number of consecutive failed batches
+        self.broken: BaseException | None = None  # error of an accelerator, after which every call fails
 
     def record_error(self, error: BaseException) -> None:
-        """Record an error of the policy, if it reports a failed accelerator."""
+        """Record an error of the policy if it reports a failed accelerator."""
         if self.broken is None and is_device_failure(error):
             self.broken = error
 
     def record_batch(self, results: Sequence[object]) -> None:
-        """Count the batches in a row that gave errors of the policy alone; errors of requests do not count."""
+        """Count consecutive batches with errors of the policy only; errors of requests do not count."""
         errors = [one for one in results if isinstance(one, Exception)]
         for error in errors:
             self.record_error(error)

@@ -55,12 +55,12 @@ class _ClassQueue:
 
 
 class FairQueue:
-    """Waiting requests. Adding and taking one takes constant time, whatever the number of others. Not thread-safe."""
+    """The waiting requests. Adding or taking one takes constant time for any number of others. Not thread-safe."""
 
     def __init__(self) -> None:
         self._rank_queues = [_ClassQueue() for _ in Rank]
         self._sessions: dict[str, _SessionQueue] = {}
-        self._lone: PendingRequest | None = None  # the only waiting request, which is in no other queue
+        self._lone: PendingRequest | None = None  # the only waiting request, which is not in a session's queue
         self._yielded = False  # whether the last batch had a slot for an impatient simulation
         self.depth = [0] * len(Rank)  # waiting requests by rank, including those that are over
         self.size = 0  # waiting requests of all ranks
@@ -107,7 +107,7 @@ class FairQueue:
         """Take the next batch of at most `size` requests.
 
         Returns:
-            The batch, and the expired requests that were removed. Finished requests are dropped.
+            The batch, and the expired requests, which are removed. Finished requests are dropped.
         """
         lone = self._lone
         if lone is not None and not lone.over and now <= lone.deadline:
@@ -124,7 +124,7 @@ class FairQueue:
         yields = bool(robots.sources) and not self._yielded and simulations.impatient(now)
         if yields:
             self._pick(simulations.next(), now, batch, expired, again)
-        self._yielded = bool(batch)  # not if all that waited there is over or has expired
+        self._yielded = bool(batch)  # not if all requests there are over or have expired
         for rank_queue in self._rank_queues:
             while rank_queue.sources and len(batch) < size:
                 self._pick(rank_queue.next(), now, batch, expired, again)
@@ -150,7 +150,7 @@ class FairQueue:
         expired: list[PendingRequest],
         again: list[_SessionQueue],
     ) -> None:
-        """Move the session's first live request to the batch, and drop those that are over or expired before it."""
+        """Move the session's first live request to the batch, and drop finished and expired requests before it."""
         session_id = queue[0].session_id
         while queue:
             pending = queue.popleft()

@@ -67,7 +67,7 @@ class Poller:
 
     def wake(self) -> None:
         """End the current `poll`, or the next one. May be called on any thread."""
-        with self._waking, contextlib.suppress(BlockingIOError):  # the pipe is full: a wake-up is pending already
+        with self._waking, contextlib.suppress(BlockingIOError):  # the pipe is full: a wake-up is already pending
             if not self._released:
                 os.write(self._wake_write, b"x")
 
@@ -89,7 +89,7 @@ class Poller:
             self._reader.start()
         self._lent.set()
         if self._timers:
-            self.wake()  # the reader may have begun to wait before they were set
+            self.wake()  # the reader may have begun to wait before the timers were set
 
     def reclaim(self) -> None:
         """Take the poller back from the reader thread, after the callback that it is running."""
@@ -106,7 +106,7 @@ class Poller:
             self._lent.set()
             self._reader.join()
         self._poll.close()
-        with self._waking:  # the number of the pipe's end may soon be another file's
+        with self._waking:  # the descriptor of the pipe may soon belong to another file
             self._released = True
             os.close(self._wake_read)
             os.close(self._wake_write)
@@ -137,7 +137,7 @@ class Poller:
                 return  # the epoll is level-triggered: the owner's next poll reports the remaining events
             ready = self._ready.get(descriptor)
             if ready is None:
-                continue  # an earlier callback of this loop has unwatched it
+                continue  # an earlier callback of this loop has stopped watching it
             try:
                 ready()
             except Exception:

@@ -1,7 +1,7 @@
 """Preparation of observations on other threads than the policy's, so that the next batch is ready when one ends.
 
-A batch does not wait for a preparation that has not begun: the policy's thread then does that itself, beginning with
-the last one. So a robot whose request arrives last does not wait for the preparations of earlier simulations.
+A batch does not wait for preparations that have not begun: the policy's thread runs those itself, beginning with the
+last one. So a robot whose request arrives last does not wait for the preparations of earlier simulations.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from typing import Any
 from vlagents_ray.images import thread_map
 from vlagents_ray.interface import Agent, Obs
 
-_THREADS = 4  # at most; images are resized without Python's lock
+_THREADS = 4  # maximum number of threads; images are resized without Python's lock
 
 
 class Preparation:
-    """`Agent.prepare` of one observation."""
+    """The call of `Agent.prepare` for one observation."""
 
     __slots__ = ("_agent", "_future", "_obs")
 
@@ -26,11 +26,11 @@ class Preparation:
         self._future: Future[Any] = threads.submit(agent.prepare, obs)
 
     def cancel(self) -> bool:
-        """Return whether it had not begun, and never will."""
+        """Cancel the preparation unless it has begun; return whether it was canceled."""
         return self._future.cancel()
 
     def finish(self, agent: Agent | None, *, begun: bool) -> None:
-        """Wait for the result, if it has `begun`, else compute it here; it is set only if `agent` is the session's.
+        """Set the result if `agent` is still the session's: wait for it if it has `begun`, otherwise compute it here.
 
         Raises:
             Exception: Any error of the agent's `prepare`.
@@ -51,12 +51,12 @@ class Preparations:
             return None
         try:
             return Preparation(agent, obs, self._threads)
-        except RuntimeError:  # they have ended
+        except RuntimeError:  # the threads have ended
             return None
 
     @staticmethod
     def finish(preparations: Sequence[tuple[Preparation | None, Agent | None]]) -> dict[int, Exception]:
-        """Return when the observations of a batch are prepared, with the errors by their places in the batch.
+        """Finish the preparations of a batch; return their errors by their indices in the batch.
 
         Called on the policy's thread.
         """
@@ -80,5 +80,5 @@ class Preparations:
         return errors
 
     def close(self) -> None:
-        """End the threads after the preparations that they have begun."""
+        """End the threads after the preparations that have begun."""
         self._threads.shutdown(wait=False, cancel_futures=True)
