@@ -1,8 +1,8 @@
 """Access control of a replica's HTTP paths and WebSockets: API keys, and time limits for slow clients.
 
-The middleware is an ASGI application around another one, so that everything behind it, the dialects included, is
-protected in the same way. Two paths require no key: `/healthz` reports only whether the policy is ready, or which step
-of loading it is at, and `/live` is a page without data. A WebSocket is refused before it is accepted.
+The middleware wraps an ASGI application, so that all of its paths, including the dialects, are protected in the same
+way. Two paths require no key: `/healthz` reports only whether the policy is ready, or the step of loading that it has
+reached, and `/live` is a page without data. A WebSocket is refused before it is accepted.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ logger = logging.getLogger(__name__)
 LIVE_PAGE = "/live"  # see `vlagents_ray.serve.observers.live_page`
 
 _TICK_S = 0.5  # period at which a WebSocket's key and time limits are checked
-_DROPPED_BYTES = 2**20  # a refused request with a longer body loses its connection
+_DROPPED_BYTES = 2**20  # a connection is closed after a refused request with a longer body
 _GOING_AWAY, _POLICY_VIOLATION = 1001, 1008  # WebSocket close codes
 _TIMEOUT = 408
 
@@ -82,7 +82,7 @@ class AccessMiddleware:
             if _is_public(scope):
                 pass
             elif self._keys is None:
-                require_own_page(headers, self._hosts)  # any page that the robot's user opens can reach loopback
+                require_own_page(headers, self._hosts)  # a page that the robot's user opens can reach loopback
             else:
                 key = caller = self._keys.check(token_of(headers), self._name)
                 if (wait_s := key.throttled_s()) > 0:  # bounds how often the key's requests are refused
@@ -191,8 +191,8 @@ class _TimedWebSocket:
         self._receive = receive
         self._send = send
         self._loop = asyncio.get_running_loop()
-        self._silent_since: float | None = None  # start of the wait for the next message, s; None outside of one
-        self._sending_since: float | None = None  # start of the current sending, s; None outside of one
+        self._silent_since: float | None = None  # start of the wait for the next message, s; None if there is no wait
+        self._sending_since: float | None = None  # start of the current sending, s; None if there is none
         self._end: tuple[int, str] | None = None  # close code and reason, once the WebSocket has to end
 
     async def run(self, app: ASGIApp, scope: Scope) -> None:
@@ -240,7 +240,7 @@ class _TimedWebSocket:
 
     async def _close(self, code: int, reason: str) -> None:
         logger.info("a WebSocket is closed: %s", reason)
-        with suppress(asyncio.TimeoutError, RuntimeError):  # the client does not read, or has closed
+        with suppress(asyncio.TimeoutError, RuntimeError):  # the client does not read, or has closed the connection
             closing = self._send({"type": "websocket.close", "code": code, "reason": reason[:120]})
             await asyncio.wait_for(closing, _TICK_S)
 
@@ -256,6 +256,6 @@ def _cancel_again(over: bool) -> None:
 
 
 def _uncancel(task: asyncio.Task[object] | None) -> None:
-    """Undo the task's cancellation by this module, which has been handled."""
+    """Undo this module's cancellation of the task, after it was handled."""
     if task is not None and hasattr(task, "uncancel"):  # since Python 3.11
         task.uncancel()

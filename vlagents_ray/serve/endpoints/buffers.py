@@ -16,13 +16,13 @@ from vlagents_ray.serve.endpoints.connection import STAMP_SPACE, Control
 
 logger = logging.getLogger(__name__)
 
-READ_BYTES = 1024 * 1024  # holds a message with two or three raw images
-_SMALL_BYTES = 1024  # parts of a frame up to this size are copied, since a view of them may be kept while more arrive
-_SLOW_S = 10.0  # within this time a client must take a part of the bytes that its connection does not hold
+READ_BYTES = 1024 * 1024  # room for a message with two or three raw images
+_SMALL_BYTES = 1024  # parts of a frame up to this size are copied, since a view of them may outlast the buffer
+_SLOW_S = 10.0  # maximum time without progress for a client that does not read all replies at once
 
 
 class _ReadBuffer(threading.local):
-    """Memory that a thread reads into: reading into fresh memory costs as much as copying from here."""
+    """Memory that a thread reads into: reading into newly allocated memory costs as much as copying from here."""
 
     def __init__(self) -> None:
         self.view = memoryview(bytearray(READ_BYTES))
@@ -42,22 +42,22 @@ class ReceiveBuffer(StreamReader):
 
     def __init__(self) -> None:
         super().__init__()
-        self._start = 0  # of the bytes that wait, in `buffer`
+        self._start = 0  # start of the unparsed bytes in `buffer`
 
     @property
     def size(self) -> int:
-        """Number of bytes that wait; on other threads than that of `parse`, only whether it is 0 can be used."""
+        """Number of unparsed bytes; on other threads than that of `parse`, only whether it is 0 is reliable."""
         return len(self.buffer) - self._start
 
     def attach(self, protocol: Protocol) -> None:
-        """Become the reader of a protocol whose bytes so far are all parsed."""
+        """Become the reader of a protocol that has parsed all its bytes so far."""
         protocol.reader = self
-        protocol.parser = Protocol.parse(protocol)  # the one so far reads from the reader so far
+        protocol.parser = Protocol.parse(protocol)  # the old parser reads from the old reader
         next(protocol.parser)
         self._protocol = protocol
 
     def parse(self, data: bytes | memoryview) -> None:
-        """Parse bytes that `receive` returned, and copy those that no complete frame contains."""
+        """Parse bytes that `receive` returned, and copy the rest after the last complete frame."""
         self._protocol.receive_data(data)  # type: ignore[arg-type]
         if isinstance(self.buffer, bytearray):
             del self.buffer[: self._start]
@@ -66,7 +66,7 @@ class ReceiveBuffer(StreamReader):
         self._start = 0
 
     def feed_data(self, data: bytes | bytearray) -> None:
-        """Add bytes, for the protocol that parses them; `EOFError` after `feed_eof`."""
+        """Add bytes, as the protocol's parser requires; raise `EOFError` after `feed_eof`."""
         if self.eof:
             raise EOFError("stream ended")
         if self.size:
@@ -75,7 +75,7 @@ class ReceiveBuffer(StreamReader):
             self.buffer, self._start = data, 0
 
     def read_exact(self, n: int) -> Generator[None, None, bytearray]:
-        """Return the next `n` bytes once they are there; of many that `receive` has just read, a view."""
+        """Return the next `n` bytes once they have arrived; many bytes that `receive` has just read are a view."""
         while self.size < n:
             if self.eof:
                 raise EOFError(f"stream ends after {self.size} bytes, expected {n} bytes")
@@ -85,7 +85,7 @@ class ReceiveBuffer(StreamReader):
         return found if n > _SMALL_BYTES else bytearray(found)  # type: ignore[return-value]
 
     def at_eof(self) -> Generator[None, None, bool]:
-        """Return whether the connection has ended, once that is known: as soon as there are bytes, it has not."""
+        """Return whether the connection has ended, as soon as that is known; unparsed bytes mean that it has not."""
         while not self.size:
             if self.eof:
                 return True
@@ -93,16 +93,16 @@ class ReceiveBuffer(StreamReader):
         return False
 
     def discard(self) -> None:
-        """Drop the bytes that wait."""
+        """Drop the unparsed bytes."""
         self.buffer, self._start = bytearray(), 0
 
 
 def receive(connection: socket.socket, size: int) -> tuple[bytes | memoryview, Control]:
-    """Read at most `size` bytes from a connection, which has some or has ended.
+    """Read at most `size` bytes from a connection that is readable.
 
     Returns:
-        The bytes, which are valid until this thread reads the next ones; none if the connection has ended. And their
-        control data.
+        The bytes, none if the connection has ended, and their control data. The bytes are valid until this thread reads
+        again.
     """
     view = _read_buffer.view
     count, control, _, _ = connection.recvmsg_into([view[:size]], STAMP_SPACE)
@@ -110,22 +110,22 @@ def receive(connection: socket.socket, size: int) -> tuple[bytes | memoryview, C
 
 
 class SendBuffer:
-    """The bytes that one connection has to send.
+    """The unsent bytes of one connection.
 
     Call the methods with the connection's lock held; the thread that sends to a slow client acquires the same lock.
     """
 
     def __init__(self, connection: socket.socket, lock: threading.Lock, limit: int) -> None:
-        """Create an empty buffer; a client is cut off if more than `limit` bytes wait, or if it reads none for 10 s."""
+        """Create an empty buffer; a client is cut off if more than `limit` bytes wait, or it reads none for 10 s."""
         self._connection = connection
         self._lock = lock
         self._limit = limit
         self._unsent = bytearray()
-        self._slow = False  # whether a thread sends the rest
+        self._slow = False  # whether a thread is sending the rest
         self._closed = self._last = False
 
     def send(self, data: bytes, *, last: bool = False) -> None:
-        """Send as many bytes as the connection takes now; a thread sends the rest later.
+        """Send as many bytes as the connection accepts now; a thread sends the rest later.
 
         After the `last` bytes the client reads the end of the connection, which stays open for reading.
         """
@@ -142,7 +142,7 @@ class SendBuffer:
             self._disconnect()
 
     def close(self) -> None:
-        """Stop sending; call it before the connection is closed."""
+        """Stop sending; call this before the connection is closed."""
         self._closed = True
 
     def _send_now(self) -> None:
@@ -150,7 +150,7 @@ class SendBuffer:
             sent = self._connection.send(self._unsent) if self._unsent else 0
         except BlockingIOError:
             return
-        except OSError as error:  # the client is gone; the thread that reads handles the end of the connection
+        except OSError as error:  # the client is gone; the reading thread handles the end of the connection
             logger.info("client: %s", error)
             sent = len(self._unsent)
         del self._unsent[:sent]

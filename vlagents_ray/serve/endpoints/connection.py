@@ -1,8 +1,8 @@
-"""Servers and connections whose sockets the thread of the batch queue reads: shared memory, plasma, own WebSockets.
+"""Servers and connections that are read by the thread of the batch queue: shared memory, plasma, own WebSockets.
 
 That thread accepts clients, reads and decodes their messages, and submits the requests, so that a request needs no
-change of threads; while a batch runs for milliseconds, another thread does (`vlagents_ray.serve.queue.poller`).
-Answers are written by the thread that has them.
+thread switch; while a batch runs for milliseconds, another thread does this (`vlagents_ray.serve.queue.poller`).
+Answers are written by the thread that produced them.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ logger = logging.getLogger(__name__)
 
 BACKLOG = 128
 POLICY_VIOLATION = 1008  # WebSocket close code
-# Reasons for which a connection is not polled.
+# Reasons for not polling a connection.
 DECODING, THROTTLED = "a frame is decoded on another thread", "the key is over its rate"
 
 _TIMESTAMP = 35  # SO_TIMESTAMPNS of Linux, which Python's socket does not name
@@ -66,7 +66,7 @@ class Acceptor:
         self._spare = _descriptor()
 
     def accept(self) -> None:
-        """Accept one client; call it when the listener is readable."""
+        """Accept one client; call this when the listener is readable."""
         try:
             connection, _ = self._listener.accept()
         except OSError as error:
@@ -104,16 +104,16 @@ class PolledConnection(ABC):
         self._remove = server.remove
         self._name = server.name
         self._connection = connection
-        self.caller: Identity | None = None  # None until the client has shown its key
-        self._sender: Sender | None = None  # also None until then
-        self._sending = threading.Lock()  # guards the sending: other threads send answers, or end the connection
+        self.caller: Identity | None = None  # None until the client has sent its key
+        self._sender: Sender | None = None  # None until then as well
+        self._sending = threading.Lock()  # guards sending: other threads send answers, or end the connection
         self._ended = False
         self._polled = True  # whether the poller watches the connection
-        self._unpolled_for: set[str] = set()  # reasons against it
+        self._unpolled_for: set[str] = set()  # reasons for not polling the connection
 
     @abstractmethod
     def _read(self) -> None:
-        """Read the connection, which has bytes or has ended."""
+        """Read from the connection, which is readable."""
 
     @abstractmethod
     def _write(self, message: Message) -> None:
@@ -121,13 +121,13 @@ class PolledConnection(ABC):
 
     @abstractmethod
     def _discard(self) -> None:
-        """Free the memory of a connection that is about to be closed; called with the lock held."""
+        """Free the memory of a connection before it is closed; called with the lock held."""
 
     def _send_close(self, code: int, reason: str) -> None:  # noqa: B027 - not all protocols have close codes
-        """Send a close code and its reason, if the protocol has any; called with the lock held."""
+        """Send a close code and its reason, if the protocol has close codes; called with the lock held."""
 
     def _continue(self) -> None:
-        """Continue after a reason not to poll has gone; called on the thread that polls."""
+        """Continue after a reason for not polling has ended; called on the polling thread."""
         self._poll()
 
     def ready(self) -> None:
@@ -155,7 +155,7 @@ class PolledConnection(ABC):
             self._poller.watch(self._connection, self.ready)
 
     def _is_throttled(self) -> bool:
-        """Return whether the client's key is over its rate; if so, the connection is read again later."""
+        """Return whether the client's key is over its rate; if so, schedule the next reading of the connection."""
         if THROTTLED in self._unpolled_for:
             return True
         if self._ended or self._sender is None or (wait_s := self._sender.throttled_s()) <= 0:
@@ -165,7 +165,7 @@ class PolledConnection(ABC):
         return True
 
     def _unthrottle(self) -> None:
-        """Read the connection again, unless the client is gone or another one with its key was over the rate since."""
+        """Read the connection again, unless it has ended or its key has exceeded the rate again."""
         self._unpolled_for.discard(THROTTLED)
         if not self._ended and not self._is_throttled():
             self._continue()
@@ -188,7 +188,7 @@ class PolledConnection(ABC):
             submit(decoded)
 
     def _decoded(self, message: Message, submit: Callable[[Decoded], None], result: Callable[[], Decoded]) -> None:
-        """Submit the requests that another thread has decoded; called on the thread that polls."""
+        """Submit the requests that another thread has decoded; called on the polling thread."""
         try:
             if not self._ended:
                 submit(result())
@@ -205,7 +205,7 @@ class PolledConnection(ABC):
 
         Args:
             now: Time, s, of `time.monotonic`.
-            refusal: Returns the reason if a key is no longer valid.
+            refusal: Returns the reason why a key is no longer valid, or None.
         """
         reason = refusal(self.caller) if isinstance(self.caller, Caller) else None
         return None if reason is None else (reason, POLICY_VIOLATION)
@@ -216,11 +216,11 @@ class PolledConnection(ABC):
         with self._sending:
             if not self._ended:
                 self._send_close(code, reason)
-                with contextlib.suppress(OSError):  # the client closed it already
+                with contextlib.suppress(OSError):  # the client has already closed it
                     self._connection.shutdown(socket.SHUT_RDWR)
 
     def disconnect(self) -> None:
-        """Stop polling the connection and close it; call it on the thread that polls."""
+        """Stop polling the connection and close it; call this on the polling thread."""
         if not self._ended:
             if self._polled:
                 self._poller.unwatch(self._connection)
@@ -231,7 +231,7 @@ class PolledConnection(ABC):
         if self._sender is not None:
             self._sender.release()
         with self._sending:
-            self._ended = True  # the number of its descriptor may soon be reused
+            self._ended = True  # its descriptor's number may soon be reused
             self._discard()
             self._connection.close()
         self._remove(self)
@@ -241,12 +241,13 @@ C = TypeVar("C", bound=PolledConnection)
 
 
 class PolledServer(ABC, Generic[C]):
-    """Listens from `open` on; all reading happens on the thread that polls for the batch queue.
+    """Listens from `open` on; the polling thread of the batch queue reads all connections.
 
     Args:
         engine: Executes the requests.
         limits: Limits of a request.
-        admit: Returns the caller that a key belongs to, or raises for an invalid key; or why no key is needed.
+        admit: Returns the caller that a key belongs to, or raises for an invalid key; or the reason why no key is
+            needed.
         listener: A non-blocking socket.
     """
 
@@ -263,12 +264,12 @@ class PolledServer(ABC, Generic[C]):
         """Serve a client by `_serve`, or close its connection."""
 
     def open(self) -> None:
-        """Accept clients; call it before the engine starts."""
+        """Accept clients; call this before the engine starts."""
         self.engine.queue.poller.watch(self._listener, self._acceptor.accept)
         each_half_second.add(self.close_overdue)
 
     def close(self) -> None:
-        """Close the listener and all connections; call it after the engine has ended."""
+        """Close the listener and all connections; call this after the engine has ended."""
         each_half_second.remove(self.close_overdue)
         self._listener.close()
         self._acceptor.close()
@@ -276,7 +277,7 @@ class PolledServer(ABC, Generic[C]):
             client.release()
 
     def close_overdue(self) -> None:
-        """Close the connections that are overdue, or whose key is no longer valid; works on any thread."""
+        """Close the connections that are overdue, or whose key is no longer valid; may be called on any thread."""
         now = time.monotonic()
         refusal = cache(Caller.refusal)  # evaluated once for all connections of a key
         for client in list(self._clients):
@@ -294,7 +295,7 @@ class PolledServer(ABC, Generic[C]):
         self.engine.queue.poller.watch(connection, client.ready)
 
 
-# The time that a message has waited in its socket: the thread that reads it may do so seconds late.
+# The time that a message has waited in its socket, which may be seconds if the reading thread is busy.
 
 
 def enable_timestamps(connection: socket.socket) -> None:
@@ -314,7 +315,7 @@ def time_in_socket_s(control: Control) -> float:
 
 
 def has_unread(connection: socket.socket) -> bool:
-    """Return whether the socket has received data that was not read yet."""
+    """Return whether the socket has received data that are still unread."""
     waiting = array("i", [0])
     fcntl.ioctl(connection, termios.FIONREAD, waiting)
     return waiting[0] > 0

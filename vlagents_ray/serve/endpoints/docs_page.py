@@ -1,4 +1,4 @@
-"""`GET /docs`: one page that shows how clients use this server and loads nothing from the network."""
+"""`GET /docs`: one page that describes how clients use this server, and loads nothing from the network."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Middleware before Serve's own code, which a replica's server runs for each connection.
+"""Middleware that a replica's server runs before Serve's own code, for each connection.
 
 Serve loads it by `RAY_SERVE_HTTP_PROXY_CALLBACK_IMPORT_PATH`: see `vlagents_ray.serve.launch.haproxy`.
 """
@@ -20,8 +20,8 @@ from vlagents_ray.protocol.messages import STREAM_BYTES
 from vlagents_ray.serve.endpoints.http_messages import problem_response
 
 _MESSAGE_TOO_BIG = 1009  # WebSocket close code
-_DRAINED_BYTES = 8 * STREAM_BYTES  # most bytes that are discarded after a message that was too large
-_DRAINED_S = 5.0  # and the most time
+_DRAINED_BYTES = 8 * STREAM_BYTES  # maximum number of bytes that are discarded after a message that was too large
+_DRAINED_S = 5.0  # maximum time of discarding
 
 
 def middlewares() -> list[Middleware]:
@@ -30,7 +30,7 @@ def middlewares() -> list[Middleware]:
 
 
 class FrontMiddleware:
-    """Refuses headers that are not UTF-8, which Serve decodes, and lets clients read why a message was too large."""
+    """Refuses headers that are not UTF-8, which Serve decodes, and lets clients read the reason for a code 1009."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
@@ -57,10 +57,10 @@ class FrontMiddleware:
         await self._app(scope, received, send)
 
     def _drain(self, receive: Receive) -> None:
-        """Discard what the client still sends: a socket that is closed with unread bytes resets the connection.
+        """Discard incoming bytes, since closing a socket with unread bytes resets the connection.
 
-        The reset discards the close code on its way. uvicorn closes the socket after this callback; a duplicate keeps
-        the connection open. ASGI does not name the socket, of which uvicorn's bound method `receive` has the transport.
+        The reset would discard the close code on its way. uvicorn closes the socket after this callback; a duplicate
+        keeps the connection open. ASGI does not expose the socket; uvicorn's bound method `receive` has its transport.
         """
         transport: Any = getattr(getattr(receive, "__self__", None), "transport", None)
         connection = None if transport is None else transport.get_extra_info("socket")
@@ -68,7 +68,7 @@ class FrontMiddleware:
             return
         duplicate = socket.socket(fileno=os.dup(connection.fileno()))
         task = asyncio.get_running_loop().create_task(_discard(duplicate))
-        self._draining.add(task)  # the loop holds only weak references
+        self._draining.add(task)  # the loop holds only weak references to tasks
         task.add_done_callback(self._draining.discard)
 
 
@@ -76,7 +76,7 @@ async def _discard(connection: socket.socket) -> None:
     loop, end, left = asyncio.get_running_loop(), time.monotonic() + _DRAINED_S, _DRAINED_BYTES
     connection.setblocking(False)
     buffer = bytearray(2**18)
-    await asyncio.sleep(0)  # uvicorn has stopped to read the socket, and has sent the close code
+    await asyncio.sleep(0)  # by then uvicorn has stopped reading, and has sent the close code
     with connection, contextlib.suppress(OSError, asyncio.TimeoutError):
         connection.shutdown(socket.SHUT_WR)
         while left > 0 and (wait_s := end - time.monotonic()) > 0:

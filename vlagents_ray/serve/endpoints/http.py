@@ -1,9 +1,10 @@
 """The HTTP endpoint: HTTP and WebSocket on one port, as an ASGI application over an engine.
 
-    POST /v1/reset, /v1/act, /v1/close multipart/form-data, application/json, or one binary frame WS /v1/stream sessions
-    that end with the connection; binary frames or probes WS /v1/weights new weights from a learner, see
-    `vlagents_ray.serve.endpoints.weights` GET /live, /v1/live, WS /v1/live the state of the sessions, see
-    `vlagents_ray.serve.observers.live_page` GET /healthz, /v1/metadata, /docs
+    POST /v1/reset, /v1/act, /v1/close   multipart/form-data, application/json, or one binary frame
+    WS   /v1/stream                      sessions that end with the connection; binary frames or probes
+    WS   /v1/weights                     new weights from a learner, see `vlagents_ray.serve.endpoints.weights`
+    GET  /live, /v1/live, WS /v1/live    the state of the sessions, see `vlagents_ray.serve.observers.live_page`
+    GET  /healthz, /v1/metadata, /docs
 
 Errors over HTTP are problem+json with a stable code; over WebSocket they are reply frames.
 """
@@ -79,7 +80,7 @@ def build_http_app(
     Args:
         engine: Executes the requests.
         metadata: Returns the document of `GET /v1/metadata`.
-        limits: Of a request.
+        limits: Limits of a request.
         machine_metadata: Returns the metadata for a caller on the machine with the given boot id.
         dialects: The routes of other systems' clients, see `vlagents_ray.serve.dialects`.
         others: The routes of learners and viewers, see `vlagents_ray.serve.endpoints.weights` and
@@ -98,7 +99,7 @@ def build_http_app(
         ],
         exception_handlers={HTTPException: _http_problem},
     )
-    app.router.redirect_slashes = False  # a redirected POST loses its body with many clients
+    app.router.redirect_slashes = False  # many clients drop the body of a redirected POST
     app.router.default = partial(_no_such_path, app.router.default)
     return app
 
@@ -118,10 +119,10 @@ class _HttpEndpoint:
         self._machine_metadata = machine_metadata
 
     async def health(self, http: HttpRequest) -> Response:
-        """Reply whether the policy is ready, or at which step of loading, and nothing else: this path needs no key."""
+        """Reply whether the policy is ready, or its step of loading, and nothing else: this path needs no key."""
         try:
             ready = await asyncio.wait_for(asyncio.to_thread(lambda: self._engine.ready), _HEALTH_S)
-        except asyncio.TimeoutError:  # a policy's own check hangs
+        except asyncio.TimeoutError:  # the policy's own check hangs
             ready = False
         if ready:
             return PlainTextResponse("OK\n")
@@ -179,7 +180,7 @@ class _HttpEndpoint:
         return handle
 
     async def stream(self, socket: WebSocket) -> None:
-        """Serve one WebSocket, whose sessions end with it; a malformed request gets an error and changes no session."""
+        """Serve one WebSocket, whose sessions end with it; a malformed request gets an error and affects no session."""
         await socket.accept()
         if len(self._engine.sessions) >= self._engine.sessions.limit:
             full = self._engine.sessions.full()
@@ -244,7 +245,7 @@ def _timed(http: HttpRequest, incoming: Incoming) -> HttpRequest:
 
 
 async def _no_such_path(of_http: ASGIApp, scope: Scope, receive: Receive, send: Send) -> None:
-    """Refuse a path that no route has: Starlette would refuse a WebSocket with 403, which is for keys."""
+    """Refuse an unknown path: Starlette would refuse a WebSocket with 403, which means an invalid key."""
     if scope["type"] == "websocket":
         await deny(WebSocket(scope, receive, send), UnknownApp("no such path; GET /docs lists what there is"))
     else:

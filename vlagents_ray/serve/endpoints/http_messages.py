@@ -42,14 +42,14 @@ from vlagents_ray.protocol.messages import (
 )
 from vlagents_ray.serve.engine.admission import MessageAdmission
 
-LONG_BYTES = 512 * 1024  # longer JSON or msgpack is decoded in another thread, as other requests need the event loop
+LONG_BYTES = 512 * 1024  # longer JSON or msgpack is decoded on another thread, to keep the event loop responsive
 _POLICY_VIOLATION = 1008  # WebSocket close code
 _GZIP = b"\x1f\x8b"  # the first bytes of a gzip file
 _HEADERS = "vlagents_ray.headers"  # key of the decoded headers in an ASGI scope
 
 
 class _Refused(MultiPartException):
-    """Stops the reading of a form, so that the parser closes its files."""
+    """Raised to stop the parsing of a form, so that the parser closes its files."""
 
     def __init__(self, error: VLAgentsError) -> None:
         super().__init__(str(error))
@@ -63,7 +63,7 @@ class RequestDecoder:
         self._limits = limits
 
     async def read(self, op: Op, http: HttpRequest, admission: MessageAdmission, name: str) -> Decoded:
-        """Return the requests of a POST to the path of `op`; the first gets the id `name` if it has none."""
+        """Read the requests of a POST to the path of `op`; the first one gets the id `name` if it has none."""
         headers = headers_of(http.scope)
         kind = headers.get("content-type", "").partition(";")[0].strip().lower()
         declared = headers.get("content-length", "")
@@ -146,7 +146,7 @@ class RequestDecoder:
         )
 
     def _limited(self, http: HttpRequest, admission: MessageAdmission) -> Receive:
-        """Return a `receive` that limits the whole body: the parser limits each part alone, and files not at all."""
+        """Return a `receive` that limits the whole body: the parser limits only single parts, and files not at all."""
         size = 0
 
         async def receive() -> Message:
@@ -168,9 +168,9 @@ class RequestDecoder:
         """Return the whole body.
 
         Raises:
-            MessageTooLarge: It is over the limit of a body.
-            MalformedMessage: It is compressed.
-            Overloaded: The replica has no room for it among the messages in flight.
+            MessageTooLarge: The body is over its limit.
+            MalformedMessage: The body is compressed.
+            Overloaded: The replica has no room for the body among its messages in flight.
         """
         _require_uncompressed(http)
         chunks: list[bytes] = []
@@ -186,7 +186,7 @@ class RequestDecoder:
         return b"".join(chunks)
 
     async def decode(self, frame: bytes, admission: MessageAdmission) -> Decoded:
-        """Return the requests of a frame."""
+        """Decode the requests of a frame."""
         return await admission.decoded(partial(decode_requests, frame))
 
 
@@ -209,7 +209,7 @@ def _require_uncompressed(http: HttpRequest) -> None:
 
 
 def headers_of(scope: Scope) -> dict[str, str]:
-    """Return the headers of a request by lower-case name, decoded once; of two equal names the last one counts."""
+    """Return the headers of a request by lower-case name, decoded once; of equal names the last one counts."""
     headers: dict[str, str] | None = scope.get(_HEADERS)
     if headers is None:
         headers = {name.decode("latin-1").lower(): value.decode("latin-1") for name, value in scope["headers"]}
@@ -218,7 +218,7 @@ def headers_of(scope: Scope) -> dict[str, str]:
 
 
 def session_id(http: HttpRequest) -> str:
-    """Return the session id that every request must state in its header; raise `MalformedMessage` without one."""
+    """Return the session id, which every request must have in its header; raise `MalformedMessage` without one."""
     name = headers_of(http.scope).get(SESSION_HEADER, "")
     if not name or not is_name(name):
         raise MalformedMessage(
@@ -247,17 +247,17 @@ def _whole(text: str) -> int:
 
 
 def request_id(http: HttpRequest) -> str:
-    """Return the request id of the caller, or the one that Serve assigned; Serve sends either back as a header."""
+    """Return the request id from the caller or, without one, from Serve, which returns it in a header."""
     return named(headers_of(http.scope).get(REQUEST_ID_HEADER, ""))
 
 
 def named(shown: str) -> str:
-    """Return the request id of a header, or a new one if that is empty, no valid name, or could forge a log line."""
+    """Return the request id of a header, or a new one if the header is empty, invalid, or could forge a log line."""
     return shown if shown and is_name(shown) else uuid.uuid4().hex
 
 
 async def deny(socket: WebSocket, error: VLAgentsError) -> None:
-    """Refuse a WebSocket that was not accepted yet, with the error as an HTTP response if the server can send one."""
+    """Refuse a WebSocket before it is accepted, with the error as an HTTP response if the server supports that."""
     if "websocket.http.response" in (socket.scope.get("extensions") or {}):
         await socket.send_denial_response(problem_response(error, ""))
     else:
@@ -265,11 +265,11 @@ async def deny(socket: WebSocket, error: VLAgentsError) -> None:
 
 
 def html_response(html: str, *, styles: Sequence[str] = (), scripts: Sequence[str] = (), more: str = "") -> Response:
-    """Return a page that loads nothing from elsewhere, and that no other site's page may frame.
+    """Return a page that loads nothing from other servers, and that no other site's page may frame.
 
     Args:
         html: The page.
-        styles: The texts of its style elements; no other style counts.
+        styles: The texts of its style elements; no other style applies.
         scripts: The texts of its script elements; no other script runs.
         more: Further directives of its content security policy.
     """

@@ -1,16 +1,15 @@
 """The endpoint for processes of the Ray cluster on this node: frames in mutable plasma objects.
 
-The replica keeps a pool of observation channels (mutable objects, the memory under Ray's `Channel`) and leases them to
-clients: a client writes its frames into one as raw bytes, so that nothing is unpickled and the client may use another
-version of numpy. The rest is `vlagents_ray.serve.endpoints.shm`: a message on a Unix socket announces a
-frame, the policy thread reads the frame and replies, and the end of the connection, whatever its cause, returns the
-channel to the pool.
+The replica keeps a pool of observation channels (mutable objects, on which Ray's `Channel` is built) and leases them to
+clients. A client writes its frames into one as raw bytes, so that nothing is unpickled and the client may use another
+version of numpy. The rest is `vlagents_ray.serve.endpoints.shm`: a message on a Unix socket announces a frame, the
+policy thread reads the frame and replies, and the end of the connection, whatever its cause, returns the channel to the
+pool.
 
 A socket accompanies the channel because Ray's readers wait by polling (an idle `Channel.read` takes one CPU, with a
-time-out or without) and do not notice the death of the writer. The channels are pooled because Ray frees a channel's
-memory only when all processes that registered as its readers or writers have ended. The socket lies in Ray's own
-folder, beside the object store's, so that it is reachable from wherever the store is, other network namespaces
-included.
+timeout or without) and do not notice the death of the writer. The channels are pooled because Ray frees a channel's
+memory only when all processes that registered as its readers or writers have ended. The socket is in Ray's own folder,
+beside the object store's, so that it is reachable wherever the store is, including other network namespaces.
 """
 
 from __future__ import annotations
@@ -51,7 +50,7 @@ logger = logging.getLogger(__name__)
 _SHARE = 0.5  # maximum share of the node's object store; beyond the store's size Ray silently puts channels on disk
 _LEAST = 64 * 1024  # minimum size of a channel, bytes
 _HEADER = 64  # size of Ray's own metadata, bytes
-_CLAIM_S = 60.0  # a lease that no connection claims within this time belongs to a client that is gone
+_CLAIM_S = 60.0  # time after which an unclaimed lease is ended, since its client is gone
 
 
 @dataclass(slots=True)
@@ -65,12 +64,12 @@ class Channel:
     def read(self) -> bytes:
         """Return a copy of the written frame, without waiting; raise `MalformedMessage` if there is none."""
         found = self._take()
-        if found.metadata != PlasmaAddress.TAG:  # Ray's parser below trusts its input, as it does everywhere
+        if found.metadata != PlasmaAddress.TAG:  # Ray's parser below trusts its input, as everywhere
             raise MalformedMessage("plasma: what the channel holds is no frame; is this a client of vlagents_ray?")
         return b"".join(channel_pieces(found.data))
 
     def intact(self) -> bool:
-        """Discard an unread frame; return False if the writer was killed while writing, which locks the channel."""
+        """Discard an unread frame; return False if the writer was killed during a write, which locks the channel."""
         with contextlib.suppress(MalformedMessage):
             self._take()
         try:
@@ -83,7 +82,7 @@ class Channel:
         return True
 
     def _take(self) -> Any:
-        """Return the frame that was written last, in place; it is valid as long as the caller holds it."""
+        """Return the latest frame in place; it is valid while the caller holds it."""
         try:
             return read_channel(self.ref)
         except RayChannelTimeoutError as error:
@@ -91,7 +90,7 @@ class Channel:
 
 
 class Pool:
-    """The channels of one replica, as many as were ever in use at once; thread-safe."""
+    """The channels of one replica, whose number is the largest number used at once; thread-safe."""
 
     def __init__(self, limits: Limits) -> None:
         self._limits = limits
@@ -131,7 +130,7 @@ class Pool:
         return key, channel.capacity
 
     def claim(self, key: bytes) -> Channel:
-        """Return the leased channel `key`, which from now on belongs to the connection that named it."""
+        """Return the leased channel `key`, which then belongs to the connection that named it."""
         with self._lock:
             channel = self._leased.pop(key, None)
         if channel is None:
@@ -158,7 +157,7 @@ class Pool:
         )
 
     def _create(self, capacity: int) -> Channel:
-        """Create a channel without holding the lock: the policy thread needs that, and allocation can be slow."""
+        """Create a channel without the lock, which the policy thread needs: allocation can be slow."""
         store = _store_bytes()
         with self._lock:
             if self._bytes + capacity > _SHARE * store:
@@ -183,7 +182,7 @@ class PlasmaServer(UnixServer):
     name: ClassVar[str] = "plasma"
 
     def __init__(self, engine: Engine, limits: Limits) -> None:
-        """Prepare the pool and the socket; `limits` are those of a frame."""
+        """Prepare the pool and the socket; `limits` are the limits of a frame."""
         self.pool = Pool(limits)
         super().__init__(engine, NoKey.INSIDE, limits, partial(LeasedChannel, self.pool))  # the cluster needs no key
         folder = plasma_folder()
@@ -192,7 +191,7 @@ class PlasmaServer(UnixServer):
         self.plasma = PlasmaAddress(str(self._path), ray.get_runtime_context().get_node_id())
 
     def listen(self) -> None:
-        """Listen, and only then give the socket its name; remove the sockets of killed replicas."""
+        """Listen, then give the socket its name; remove the sockets of killed replicas."""
         for other in self._path.parent.glob("vla????????"):
             _remove_if_dead(other)
         hidden = self._path.with_name(f".{self._path.name}")
@@ -202,13 +201,13 @@ class PlasmaServer(UnixServer):
         hidden.rename(self._path)
 
     def close(self) -> None:
-        """Close the listener and all connections, and remove the socket; call it after the engine has ended."""
+        """Close the listener and all connections, and remove the socket; call this after the engine has ended."""
         super().close()
         self._path.unlink(missing_ok=True)
 
 
 class LeasedChannel:
-    """A `Payload`: the channel of one client, which leases a larger one when its frames outgrow it."""
+    """A `Payload`: the channel of one client, which leases a larger one for larger frames."""
 
     def __init__(self, pool: Pool) -> None:
         self._pool = pool
@@ -248,5 +247,5 @@ def _remove_if_dead(path: Path) -> None:
             probe.connect(str(path))
         except ConnectionRefusedError:
             path.unlink(missing_ok=True)
-        except OSError:  # the socket is busy or another user's, so its replica is alive
+        except OSError:  # the socket is busy or another user's, so its replica runs
             return

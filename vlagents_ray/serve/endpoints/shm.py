@@ -3,7 +3,7 @@
 A `Payload` reads that memory: the client's memory files, or channels in the node's object store
 (`vlagents_ray.serve.endpoints.plasma`). For memory files, a client connects to an abstract socket whose unguessable
 name is in the metadata, and passes files that it writes its frames into. Neither side creates a file name, so that
-memory and socket are freed with their processes, however those end. Only processes of the same user may connect.
+memory and socket are freed when their processes end for any reason. Only processes of the same user may connect.
 """
 
 from __future__ import annotations
@@ -54,28 +54,28 @@ logger = logging.getLogger(__name__)
 
 _MESSAGE_BYTES = 256 * 1024
 _CONTROL = socket.CMSG_SPACE(struct.calcsize("i")) + STAMP_SPACE  # room for one descriptor and the time stamp
-_INLINE = 64 * 1024  # a longer reply travels in a memory file
+_INLINE = 64 * 1024  # a longer reply is sent in a memory file
 _KEY_S = 5.0  # time within which a client must send its key
 _KEY_BYTES = 4096  # maximum size of a key
-_MAX_VIEWS = 8  # number of memory files that a policy may hold views of before requests are copied
+_MAX_VIEWS = 8  # number of memory files with views held by the policy above which requests are copied
 
 
 class Payload(Protocol):
     """The memory outside of the messages that holds the requests of one connection."""
 
     def read(self, message: memoryview, descriptors: list[int]) -> tuple[np.ndarray, bool, memoryview]:
-        """Return the memory of a message, whether that is in compact form, and the message's text for that form.
+        """Return the memory of a message, whether it is in compact form, and the text for that form.
 
-        Removes the descriptors that it uses from `descriptors`.
+        The descriptors in use are removed from `descriptors`.
         """
         ...
 
     def freed(self) -> int:
-        """Return a bit field; bit n means that the client may reuse its memory n, which no reply has stated yet."""
+        """Return a bit field: bit n is set if memory n is free for the client and no reply has reported that."""
         ...
 
     def free(self) -> None:
-        """Free the memory of a connection that has ended."""
+        """Free the memory of a closed connection."""
         ...
 
 
@@ -90,9 +90,14 @@ class UnixServer(PolledServer["UnixConnection"]):
         payload: Callable[[], Payload],
         ops: Sequence[Op] = OPS,
     ) -> None:
-        """See `PolledServer`; `payload` creates the payload of a connection.
+        """Create the server.
 
-        Requests of other operations than `ops` are refused.
+        Args:
+            engine: Executes the requests.
+            admit: See `PolledServer`.
+            limits: Limits of a request.
+            payload: Creates the payload of a connection.
+            ops: The accepted operations.
         """
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
         super().__init__(engine, limits, admit, listener)
@@ -104,7 +109,7 @@ class UnixServer(PolledServer["UnixConnection"]):
         """Bind the socket to its name and listen."""
 
     def open(self) -> None:
-        """Start to listen; call it before the engine starts."""
+        """Start to listen; call this before the engine starts."""
         self.listen()
         super().open()
 
@@ -115,7 +120,7 @@ class UnixServer(PolledServer["UnixConnection"]):
             return
         if len(self._clients) >= self.engine.sessions.limit:
             full = PolicyUnavailable(f"this replica has {len(self._clients)} local clients, its limit of sessions")
-            with contextlib.suppress(OSError):  # the client is gone already
+            with contextlib.suppress(OSError):  # the client is already gone
                 connection.send(LocalAddress.REPLY.pack(0, 0) + encode_replies([Reply(error=full)]))
             connection.close()
             return
@@ -176,7 +181,7 @@ class UnixConnection(PolledConnection):
     def _receive(
         self, sender: Sender, message: Message, waited_s: float, data: memoryview, descriptors: list[int]
     ) -> None:
-        try:  # only locates the memory; a new memory file of the client is taken even if the message is refused
+        try:  # only locates the memory; a client's new memory file is kept even if the message is refused
             memory, compact_form, text = self._payload.read(data, descriptors)
         except VLAgentsError:
             sender.count_message()
@@ -201,12 +206,12 @@ class UnixConnection(PolledConnection):
         sender.send(message, decoded, self._write, admission=admission, waited_s=waited_s)
 
     def _unthrottle(self) -> None:
-        if not self._ended and _has_hung_up(self._connection):  # its messages, if decoded, would delay others
+        if not self._ended and _has_hung_up(self._connection):  # its messages are not decoded, which would delay others
             self.disconnect()
         super()._unthrottle()
 
     def _authenticate(self, message: bytes) -> Sender | None:
-        """Take the first message for the client's key; if that is refused, each later message tries that key again."""
+        """Read the key from the first message; if it is refused, check it again at each later message."""
         if isinstance(self._admit, NoKey):
             raise TypeError(f"a key, although none is asked for: {self._admit.value}")
         first, self._key = self._key is None, self._key or message
@@ -217,7 +222,7 @@ class UnixConnection(PolledConnection):
         return None if first else self._sender
 
     def overdue(self, now: float, refusal: Callable[[Caller], str | None]) -> tuple[str, int] | None:
-        """See `PolledConnection`; a client must send its key within 5 s."""
+        """Return a reason to end the connection, as in `PolledConnection`; a client must send its key within 5 s."""
         if self._sender is not None:
             return super().overdue(now, refusal)
         with self._sending:
@@ -250,7 +255,7 @@ class UnixConnection(PolledConnection):
                     os.close(descriptor)
             except OSError as error:  # the client is gone, or does not read its replies: `ready` handles the end
                 logger.info("local client: %s", error)
-                with contextlib.suppress(OSError):  # the connection is closed already
+                with contextlib.suppress(OSError):  # the connection is already closed
                     self._connection.shutdown(socket.SHUT_RDWR)
 
 
@@ -260,25 +265,25 @@ class ShmServer(UnixServer):
     name: ClassVar[str] = "shm"
 
     def __init__(self, engine: Engine, limits: Limits, admit: Admit | NoKey, ops: Sequence[Op] = OPS) -> None:
-        """Create the server and its address; see `UnixServer`."""
+        """Create the server and the address for the metadata; see `UnixServer`."""
         super().__init__(engine, admit, limits, partial(MemoryFiles, limits), ops)
         self.address = LocalAddress(
             f"vlagents-ray-{secrets.token_hex(16)}", boot_id(), keyed=not isinstance(admit, NoKey)
         )
 
     def listen(self) -> None:
-        """Listen at the address of the metadata."""
+        """Listen at the address in the metadata."""
         self._listener.bind(f"\0{self.address.socket}")
         self._listener.listen(BACKLOG)
 
 
 class MemoryFiles:
-    """A `Payload`: the memory files of one client, read in place and given back when no view is left."""
+    """A `Payload`: the memory files of one client, read in place and returned when no view is left."""
 
     def __init__(self, limits: Limits) -> None:
         self._limits = limits
         self._files: dict[int, mmap.mmap] = {}
-        self._views: dict[int, weakref.ref[np.ndarray]] = {}  # the array on each file, until it is garbage-collected
+        self._views: dict[int, weakref.ref[np.ndarray]] = {}  # the array over each file, until it is garbage-collected
         self._freed: set[int] = set()  # freed files that no reply has reported yet
 
     def read(self, message: memoryview, descriptors: list[int]) -> tuple[np.ndarray, bool, memoryview]:
@@ -292,7 +297,7 @@ class MemoryFiles:
         return memory, bool(flags & LocalAddress.COMPACT), message[LocalAddress.REQUEST.size :]
 
     def freed(self) -> int:
-        """Return the bits of the freed files since the last call."""
+        """Return the bits of the files freed since the last call."""
         bits = 0
         while self._freed:
             bits |= 1 << self._freed.pop()
@@ -305,7 +310,7 @@ class MemoryFiles:
     def _memory(self, number: int, length: int) -> np.ndarray:
         """Return the client's memory in place; the client does not write into it until a reply reports it as freed.
 
-        Return a copy if the policy holds views of many files already.
+        If the policy already holds views of many files, return a copy.
         """
         file = self._files.get(number)
         if file is None or length > len(file):
@@ -330,7 +335,7 @@ class MemoryFiles:
                 raise MessageTooLarge(
                     f"local: memory file {number} of {size} bytes; {LocalAddress.FILES} files are the limit"
                 )
-            # Reading a file that has shrunk would kill this process.
+            # Reading beyond the end of a file that has shrunk would kill this process.
             if not fcntl.fcntl(descriptor, fcntl.F_GET_SEALS) & fcntl.F_SEAL_SHRINK:
                 raise MalformedMessage("local: the memory file is not sealed against shrinking")
             mapped = mmap.mmap(descriptor, size, prot=mmap.PROT_READ)
@@ -344,7 +349,7 @@ class MemoryFiles:
 
 
 def _has_hung_up(connection: socket.socket) -> bool:
-    """Return whether the peer has closed its end; messages may be unread."""
+    """Return whether the peer has closed its end; there may be unread messages."""
     poller = select.poll()
     poller.register(connection, 0)  # reports a hang-up in any case
     return bool(poller.poll(0))

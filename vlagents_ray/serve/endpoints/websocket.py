@@ -1,9 +1,9 @@
 """The WebSocket port of a replica, without a proxy between the robot and the policy thread.
 
-The metadata gives a client the port and an unguessable path, so that a client that may not read the metadata cannot use
-the port; with API keys, the handshake must also contain one. Messages are those of `WS /v1/stream` on the server's
-port, which remains for clients that cannot reach this one. As with local clients the policy thread reads the sockets
-(see `vlagents_ray.serve.endpoints.connection`) and decodes the messages.
+The metadata contains the port and an unguessable path, so that only clients that may read the metadata can use the
+port; with API keys, the handshake must also contain one. Messages are those of `WS /v1/stream` on the server's port,
+which remains for clients that cannot reach this one. As for local clients, the policy thread reads the sockets (see
+`vlagents_ray.serve.endpoints.connection`) and decodes the messages.
 """
 
 from __future__ import annotations
@@ -65,17 +65,17 @@ from vlagents_ray.serve.requests import Message
 
 logger = logging.getLogger(__name__)
 
-_MAX_HANDSHAKES = 64  # maximum of connections without a completed handshake
+_MAX_HANDSHAKES = 64  # maximum number of connections without a completed handshake
 _HANDSHAKE_BYTES = 16 * 1024  # maximum size of a handshake
 _HANDSHAKE_S = 5.0  # maximum time of a handshake
 _REFUSED_S = 1.0  # maximum time for which the refusal of a handshake is delayed
 _END_OF_HEADERS = b"\r\n\r\n"
-_UNANSWERED = 256  # maximum of unanswered messages of one client: further ones stay unread in its connection
+_UNANSWERED = 256  # maximum number of a client's unanswered messages; further ones stay unread in its connection
 _GOING_AWAY, _UNSUPPORTED_DATA, _TRY_AGAIN_LATER = 1001, 1003, 1013  # close codes
-# Further reasons for which a connection is not polled.
+# Further reasons for not polling a connection.
 _BACKLOGGED, _REFUSED = "too much of it is unanswered", "its handshake is refused"
 
-# The kernel detects a peer that vanished: after 20 s of silence it sends three probes, 5 s apart.
+# The kernel detects that a peer has disappeared: after 20 s of silence it sends three probes, 5 s apart.
 _KEEPALIVE = (("TCP_KEEPIDLE", 20), ("TCP_KEEPINTVL", 5), ("TCP_KEEPCNT", 3), ("TCP_USER_TIMEOUT", 35_000))
 
 
@@ -100,7 +100,7 @@ class WebSocketServer(PolledServer["WebSocketConnection"]):
 
         Args:
             engine: Executes the requests.
-            limits: Of a request.
+            limits: Limits of a request.
             host: The address to bind.
             ports: The first and last port to try, both included; None for any free port.
             admit: Returns the caller that a key belongs to, or raises for an invalid key.
@@ -115,16 +115,16 @@ class WebSocketServer(PolledServer["WebSocketConnection"]):
         self.slow_s, self.idle_s = slow_s, idle_s
         self._hosts = hosts
         self.path = STREAM_PATH + secrets.token_urlsafe(24)
-        self._handshaking: dict[WebSocketConnection, None] = {}  # without a handshake so far, in order of arrival
+        self._handshaking: dict[WebSocketConnection, None] = {}  # before their handshake, in order of arrival
         self.address = StreamAddress(self._listener.getsockname()[1], self.path)
 
     def open(self) -> None:
-        """Accept clients; call it before the engine starts."""
-        enable_timestamps(self._listener)  # accepted connections inherit it; the kernel takes a moment to begin
+        """Accept clients; call this before the engine starts."""
+        enable_timestamps(self._listener)  # accepted connections inherit it; the kernel enables it after a moment
         super().open()
 
     def identify(self, client: WebSocketConnection, request: Handshake) -> Identity:
-        """Return the owner of the handshake's key, and count one connection more for that key.
+        """Return the owner of the handshake's key, and count one more connection for that key.
 
         Raises:
             UnknownApp: The path is another one.
@@ -153,7 +153,7 @@ class WebSocketServer(PolledServer["WebSocketConnection"]):
         return caller
 
     def remove(self, client: WebSocketConnection) -> None:
-        """Forget a connection, also during its handshake."""
+        """Remove a connection, possibly during its handshake."""
         self._handshaking.pop(client, None)
         super().remove(client)
 
@@ -179,18 +179,19 @@ class WebSocketConnection(PolledConnection):
         self._arrived = 0.0  # arrival time of the bytes read last, s
         self._protocol = ServerProtocol(max_size=STREAM_BYTES)  # guarded by the lock
         self._head = b""  # received part of the handshake
-        self._refused_for_s = 0.0  # time after which the handshake would not be over the rate of its key
+        self._refused_for_s = 0.0  # time after which the handshake is no longer over the rate of its key
         self._received = ReceiveBuffer()
         self._out = SendBuffer(connection, self._sending, STREAM_BYTES)
-        self._paused = False  # whether too much is unanswered; guarded by the lock
+        self._paused = False  # whether too many messages are unanswered; guarded by the lock
         # Received but unprocessed frames, their arrival times, s, and the admissions of those received in parts.
         self._frames: deque[tuple[Frame, float, MessageAdmission | None]] = deque()
-        self._partial: MessageAdmission | None = None  # admission of the message of which a part is here
+        self._partial: MessageAdmission | None = None  # admission of a partly received message
         self._unanswered = self._unanswered_bytes = 0  # messages; bytes with the decoded images
         self._messages = 0  # number received so far
-        self._ending = False  # `end` was called; bytes that arrive now are ignored
-        self._discarded = 0  # unread bytes after a wrong message
-        # Of `overdue` alone: messages at its last call, since when so many, since when a part of the next is here (s).
+        self._ending = False  # whether `end` was called, so that arriving bytes are ignored
+        self._discarded = 0  # unread bytes after an invalid message
+        # For `overdue` only: messages at its last call, time of the last change, and arrival of the current partial
+        # message, s.
         self._seen, self._quiet_since, self._part_since = 0, time.monotonic(), float("inf")
 
     def _read(self) -> None:
@@ -209,7 +210,7 @@ class WebSocketConnection(PolledConnection):
         if self._ending or self._discarded > self._limits.body_bytes or not (data or (self._sender and not closing)):
             self.disconnect()
             return
-        if closing:  # bytes left unread would reset the connection before the client reads the close code
+        if closing:  # unread bytes would reset the connection before the client reads the close code
             return
         if self._sender is None:
             self._head += data
@@ -251,7 +252,7 @@ class WebSocketConnection(PolledConnection):
             self._pause(_BACKLOGGED)
 
     def _hold_partial(self, sender: Sender) -> None:
-        """Count a partly received message for its key, before the rest is read, and its bytes as they arrive."""
+        """Count a partly received message for its key before the rest is read, and its bytes as they arrive."""
         try:
             if self._partial is None:
                 admission = sender.admission(self._limits)
@@ -277,8 +278,8 @@ class WebSocketConnection(PolledConnection):
     def overdue(self, now: float, refusal: Callable[[Caller], str | None]) -> tuple[str, int] | None:
         """Return a reason and a close code if the connection is too slow or has to end; see `PolledConnection`.
 
-        Time counts against the client only while the server has read all that arrived: a slow policy keeps its thread
-        from reading.
+        Time counts against the client only if the server has read all bytes that arrived: a slow policy keeps the
+        thread from reading.
         """
         if (cause := super().overdue(now, refusal)) is not None:
             return cause
@@ -307,7 +308,7 @@ class WebSocketConnection(PolledConnection):
             self._flush()
 
     def _handshake(self, head: bytes) -> bool:
-        """Accept the handshake; return False if it is refused, with the response yet to be sent."""
+        """Accept the handshake; return False if it is refused, before the refusal is sent."""
         with self._sending:
             self._protocol.receive_data(head)
             events = self._protocol.events_received()
@@ -324,7 +325,7 @@ class WebSocketConnection(PolledConnection):
         return True
 
     def _refuse_handshake(self) -> None:
-        """Refuse the handshake, after a moment if the key is over its rate, which bounds how often it is refused."""
+        """Refuse the handshake; if the key is over its rate, after a moment, which bounds the rate of refusals."""
         self._pause(_REFUSED)
 
         def refuse() -> None:
@@ -351,7 +352,7 @@ class WebSocketConnection(PolledConnection):
             return response
 
     def _process_frames(self) -> None:
-        """Process the received frames in order, until one has to wait."""
+        """Process the received frames in order, until one of them has to wait."""
         while self._frames and not (self._ended or self._unpolled_for & {DECODING, THROTTLED}):
             self._process(*self._frames.popleft())
 
@@ -368,7 +369,7 @@ class WebSocketConnection(PolledConnection):
         self._poll()
 
     def _process(self, frame: Frame, arrived: float, admission: MessageAdmission | None) -> None:
-        if self._sender is None:  # nothing is read before the handshake is accepted
+        if self._sender is None:  # no frame is read before the handshake is accepted
             raise VLAgentsError("stream: a message before the handshake was accepted")
         if frame.opcode is Opcode.CONT or not frame.fin:
             with self._sending:

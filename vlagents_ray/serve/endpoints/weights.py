@@ -3,10 +3,10 @@
     WS   /v1/weights?mode=keep   a header, then the bytes of the values in parts; each is acknowledged
     GET  /v1/weights             the newest version of each replica
 
-One connection is one push, and ends with it, so that all of its parts reach one replica, and nothing is left of a push
-whose learner dies. A learner sends a part when the one before is acknowledged, so that no proxy on the way collects
-them. The header is checked against the policy's own weights, whose size bounds the push, before memory is allocated.
-Keys need the scope "weights"; without keys, only processes of this machine may push.
+One connection is one push, which ends with it, so that all of its parts reach one replica, and no data of a push remain
+if its learner dies. A learner sends a part when the previous one is acknowledged, so that no proxy on the way buffers
+many parts. The header is checked against the policy's own weights, whose size bounds the push, before memory is
+allocated. Keys need the scope "weights"; without keys, only processes of this machine may push.
 """
 
 from __future__ import annotations
@@ -35,17 +35,17 @@ from vlagents_ray.weights.safetensors import MESSAGE_BYTES, ValueSpec, ValuesRea
 logger = logging.getLogger(__name__)
 
 PATH = "/v1/weights"
-LEAST_RATE = 2**18  # average bytes a second of a push, since it blocks other pushes
+LEAST_RATE = 2**18  # minimum average rate of a push, bytes/s, since it blocks other pushes
 _SCOPE = "weights"
-_DIGITS = 20  # most of a version's number
+_DIGITS = 20  # maximum number of digits of a version's number
 _TRUTH = {"true": True, "false": False}
 
 
 class ReceivesWeights(Protocol):
-    """The replicas of a policy, for which one of them receives new weights."""
+    """The replicas of a policy, of which one receives new weights for all."""
 
     def read_header(self, header: bytes, options: PushOptions) -> dict[str, ValueSpec]:
-        """Return types and shapes of the announced values; raise an error if they do not fit the policy."""
+        """Return the types and shapes of the announced values; raise an error if they do not fit the policy."""
         ...
 
     async def push_received(self, named: Mapping[str, Any], options: PushOptions) -> PushResult:
@@ -61,9 +61,9 @@ def weights_routes(replicas: ReceivesWeights, slow_s: float, *, open_to_network:
     """Return the routes for new weights.
 
     Args:
-        replicas: The replicas that get them.
+        replicas: The replicas that get the weights.
         slow_s: Time limit for the next part to arrive, s.
-        open_to_network: Whether other machines reach this server without a key; none may then push.
+        open_to_network: Whether other machines reach this server without a key; pushes are then refused.
     """
     endpoint = _WeightsEndpoint(replicas, slow_s, open_to_network)
     return [Route(PATH, endpoint.show), WebSocketRoute(PATH, endpoint.receive)]
@@ -125,7 +125,7 @@ class _WeightsEndpoint:
                         f"weights: got {reader.received} bytes in {time.monotonic() - begun:.0f} s, want at least "
                         f"{LEAST_RATE} a second; another push may wait"
                     )
-            # Once all values are here, the push does not depend on the learner's connection.
+            # When all values have arrived, the push does not depend on the learner's connection.
             pushed = await asyncio.shield(self._replicas.push_received(reader.values(), options))
             replicas = len(pushed.replicas)
             return {"version": pushed.version, "fingerprint": pushed.fingerprint, "replicas": replicas}
