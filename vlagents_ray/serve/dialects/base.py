@@ -93,7 +93,7 @@ _OUR_NAMES = "vlagents"  # preset for clients without a mapping
 
 @dataclass(frozen=True, slots=True)
 class ReplicaContext:
-    """The replica in which the dialects of the server's own port run."""
+    """The replica that runs the dialects of the server's own port."""
 
     engine: Engine
     metadata: Callable[[], dict[str, Any]]
@@ -110,17 +110,17 @@ class GatewayContext:
     """The gateway, a separate process that runs the dialects with their own port."""
 
     app: str
-    connect: Connect  # connects to the application, for one client
+    connect: Connect  # connects one client to the application
     limits: Limits
     sessions: int  # maximum number of clients of one dialect
-    idle_s: float  # the sessions of a client that sends nothing for this time end
+    idle_s: float  # time without a message after which a client's sessions end
     contract: Contract | None
-    check: Check | NoKey  # checks the key of a client, or states why none is needed
+    check: Check | NoKey  # checks the key of a client; or the reason why none is needed
     admission: Admission = field(default_factory=lambda: Admission(DEFAULT_LIMITS.in_flight_bytes))
 
 
 class Dialect(abc.ABC):
-    """A dialect that is on in a deployment; its two kinds are `RouteDialect` and `PortDialect`.
+    """A dialect that is enabled in a deployment; its two kinds are `RouteDialect` and `PortDialect`.
 
     Args:
         name: The dialect's name in the deployment, which is also the transport in statistics.
@@ -142,7 +142,7 @@ class Dialect(abc.ABC):
 
     @classmethod
     def lacks(cls, config: DialectConfig, contract: Contract | None) -> list[str]:
-        """Return the policy's inputs that no observation of these clients has, one sentence each with its remedy."""
+        """Return the policy's inputs that these clients never send, one sentence each with its remedy."""
         mapping = config.keys()
         return [] if mapping is None else mapping.lacks(contract)
 
@@ -152,7 +152,7 @@ class Dialect(abc.ABC):
         """Return the `paths` or the `address` at which clients connect, for the metadata."""
 
     def read(self, theirs: Any) -> tuple[Obs, str | None]:
-        """Return a client's observation, a map, as `Obs`, and its instruction; None if there is none."""
+        """Convert a client's observation, a map, to `Obs`, and return it with the instruction, or None without one."""
         if not isinstance(theirs, dict):
             raise MalformedMessage(f"observation: got {type(theirs).__name__}, want a map")
         return self.mapping.obs(theirs, self.context.limits, self.context.contract)
@@ -168,8 +168,8 @@ class Dialect(abc.ABC):
 class RouteDialect(Dialect):
     """A dialect over HTTP or WebSocket, on the server's own port, in each replica."""
 
-    paths: ClassVar[Mapping[str, str]]  # "POST /act" or "WS /openpi" -> the name of the method that serves it
-    root: ClassVar[str] = ""  # protocol of its clients at the server's root, if they connect there
+    paths: ClassVar[Mapping[str, str]]  # "POST /act" or "WS /openpi" -> name of the method that serves the path
+    root: ClassVar[str] = ""  # protocol at the server's root, if its clients connect there
     context: ReplicaContext
 
     def __init__(self, name: str, config: DialectConfig, context: ReplicaContext) -> None:
@@ -181,17 +181,17 @@ class RouteDialect(Dialect):
         return {"paths": list(cls.paths)}
 
     def routes(self) -> list[BaseRoute]:
-        """Return the routes of its paths, without the root."""
+        """Return the routes of the dialect's paths, without the root."""
         return [_route(getattr(self, method), *path.split()) for path, method in self.paths.items()]
 
     def at_root(self, sharing: Sequence[Any]) -> Stream:
-        """Serve WebSockets at the server's root for all dialects that speak this protocol there, this one first."""
+        """Serve WebSockets at the server's root for all dialects with this protocol there, beginning with this one."""
         raise NotImplementedError(f"{self.name} states a root and does not serve it")
 
     def sender(self, session_id: str = "") -> Sender:
-        """Return the sender of a connection or, with a session's name, of a request.
+        """Return the sender of a connection or, given a session's name, of a request.
 
-        It does not count requests for the key, as `decoded` has counted them.
+        The sender does not count requests for the key, as `decoded` has counted them.
         """
         caller, connected = current_caller(), not session_id
         return Sender(self.context.engine, self.name, session_id, caller=caller, connected=connected, counted=True)
@@ -205,18 +205,18 @@ class RouteDialect(Dialect):
         return Sender(self.context.engine, self.name, caller=current_caller(), connected=False, counted=counted)
 
     def session(self, sender: Sender, name: str = "") -> ImplicitSession:
-        """Return a session of that sender, its own if `name` is empty, which begins without a reset by the client."""
+        """Return a session of that sender, which begins without a reset by the client; by default its own session."""
         return ImplicitSession(self.context.engine, sender, self.rank, name)
 
     async def receive(self, socket: WebSocket, gate: Sender) -> tuple[bytes | None, MessageAdmission] | None:
-        """Wait for the next message of a WebSocket, unless its key is over its rate.
+        """Wait for the next message of a WebSocket, and before that until its key is within its rate.
 
         Args:
             socket: The connection.
             gate: The sender that `gate` returned for it.
 
         Returns:
-            The message, None for a text, and its admission; or None if the client is gone.
+            The message, or None for a text message, and its admission; None if the client is gone.
         """
         await gate.wait_unthrottled()
         event = await socket.receive()
@@ -226,7 +226,7 @@ class RouteDialect(Dialect):
         return data, gate.admission(self.context.limits, 0 if data is None else len(data), self.rank)
 
     def arrived(self) -> Message:
-        """Return the message of an observation that has just arrived."""
+        """Create the `Message` of an observation that has just arrived."""
         return Message(self.context.engine.stats, self.name, "act", self.rank)
 
 
@@ -272,9 +272,12 @@ def _route(endpoint: Callable[..., Any], method: str, path: str) -> BaseRoute:
 
 
 async def decoded(read: Callable[[bytes, Budget], T], data: bytes | None, admission: MessageAdmission) -> T:
-    """Return the result of `read` on a message, which counts as one request of the key, even if it is invalid.
+    """Decode a message with `read`, counting it as one request of the key even if it is invalid.
 
-    `data` is None for a WebSocket's text, which is refused.
+    Args:
+        read: Decodes the message.
+        data: The message; None for a WebSocket's text, which is refused.
+        admission: The admission of the message.
     """
     admission.begin_message()
     if data is None:
@@ -284,7 +287,7 @@ async def decoded(read: Callable[[bytes, Budget], T], data: bytes | None, admiss
 
 
 def public_problem(error: Exception, what: str, request_id: str) -> VLAgentsError:
-    """Return the error that a client may see; the details of an unexpected error go to the log."""
+    """Return the error that a client may see; details of an unexpected error are only logged."""
     if isinstance(error, VLAgentsError):
         return error
     logger.error("%s failed (request %s)", what, request_id, exc_info=error)
@@ -292,7 +295,7 @@ def public_problem(error: Exception, what: str, request_id: str) -> VLAgentsErro
 
 
 async def accept_or_refuse(websocket: WebSocket, context: ReplicaContext) -> bool:
-    """Accept a WebSocket; return False if it was refused because the policy is not ready or the replica is full."""
+    """Accept a WebSocket; return False if it was refused, as the policy is not ready or the replica is full."""
     try:
         context.engine.require_ready()
         sessions = context.engine.sessions
@@ -317,7 +320,7 @@ class ImplicitEpisode:
 
     def __init__(self) -> None:
         self.instruction: str | None = None  # instruction of the last reset
-        self.begun = False  # whether there was an observation of this episode
+        self.begun = False  # whether the episode has had an observation
 
     def begins(self, instruction: str | None) -> bool:
         """Return whether an observation with that instruction begins an episode."""
@@ -331,16 +334,16 @@ class ImplicitEpisode:
         return instruction
 
     def began(self, instruction: str | None) -> None:
-        """Note that the session was reset with that instruction."""
+        """Record that the session was reset with that instruction."""
         self.begun, self.instruction = True, instruction
 
     def end(self) -> None:
-        """Begin an episode with the next observation."""
+        """Make the next observation begin an episode."""
         self.begun = False
 
 
 class ImplicitSession:
-    """A session of a client on the server's own port; it must not be called concurrently.
+    """A session of a client on the server's own port. Not thread-safe.
 
     Args:
         engine: The engine that serves it.
@@ -357,7 +360,7 @@ class ImplicitSession:
         self._name = name
 
     async def act(self, message: Message, obs: Obs, instruction: str | None, request_id: str) -> Reply:
-        """Return the policy's action; see `act_together`."""
+        """Return the policy's reply to an observation; see `act_together`."""
         (reply,) = await act_together(message, [SessionObs(self, obs, instruction)], request_id)
         return reply
 
@@ -370,7 +373,7 @@ class ImplicitSession:
 
 
 class SessionObs(NamedTuple):
-    """An observation of a session, and its instruction; None if there is none."""
+    """An observation of a session, with its instruction, or None without one."""
 
     session: ImplicitSession
     obs: Obs
@@ -378,7 +381,7 @@ class SessionObs(NamedTuple):
 
 
 async def act_together(message: Message, seen: Sequence[SessionObs], request_id: str) -> list[Reply]:
-    """Return the policy's action for each observation in a client's message; their acts are queued at once.
+    """Return the policy's reply to each observation in a client's message; their acts are queued together.
 
     A session whose episode begins is reset first. One that was removed because it was idle is reset again, which is
     safe since the observation was not acted on.
@@ -439,15 +442,15 @@ def _raise_first(replies: Sequence[Reply]) -> None:
 class HttpDialect(RouteDialect):
     """A dialect of HTTP requests.
 
-    Each request is an episode of one step, unless it has the header `x-session-id`: then it belongs to that session,
-    in which each new instruction begins an episode, and a request to a path of `end_episode`. Errors have their status
-    and a problem+json document.
+    A request without the header `x-session-id` is an episode of one step. With the header it belongs to that session,
+    in which each new instruction begins an episode, as does a request to a path of `end_episode`. Errors have their
+    status and a problem+json document.
     """
 
     def __init__(self, name: str, config: DialectConfig, context: ReplicaContext) -> None:
         super().__init__(name, config, context)
         self._requests = RequestDecoder(context.limits)
-        # The sessions by caller and session id in the engine. A new key with the name of a revoked one continues the
+        # Sessions by caller and session id in the engine. A new key with the name of a revoked one continues the
         # sessions of that name, but not with the revoked key.
         self._kept: dict[tuple[Identity, str], ImplicitSession] = {}
 
@@ -499,7 +502,7 @@ class HttpDialect(RouteDialect):
             admission.release()
 
     async def end_episode(self, http: HttpRequest) -> Response:
-        """Answer `{}`; the next observation of the session that the header names begins an episode."""
+        """Answer `{}`, and make the next observation of the session in the header begin an episode."""
         name = request_id(http)
         try:
             self._kept_session(session_id(http)).episode.end()
@@ -508,7 +511,7 @@ class HttpDialect(RouteDialect):
         return Response(b"{}", media_type="application/json")
 
     def _kept_session(self, name: str) -> ImplicitSession:
-        """Return the session that a client names, which is kept as long as the engine keeps it."""
+        """Return the session that a client names, which exists as long as it exists in the engine."""
         sessions = self.context.engine.sessions
         if len(self._kept) > 2 * len(sessions) + 16:
             self._kept = {kept: one for kept, one in self._kept.items() if kept[1] in sessions}

@@ -24,12 +24,12 @@ from vlagents_ray.serve.ports import LOOPBACK, reserve
 
 logger = logging.getLogger(__name__)
 
-_LOADING_S = 3600.0  # time for the policy to load; a failure to load is raised at once
+_LOADING_S = 3600.0  # time limit for loading the policy; a failure is raised at once
 _ANSWER_S = 30.0
 
 
 class Gateway:
-    """Reserves its ports when it starts, and is RUNNING and accepts clients only once the policy can act."""
+    """Reserves its ports at the start; it is RUNNING and accepts clients only when the policy can act."""
 
     async def __init__(self, args: dict[str, Any]) -> None:  # type: ignore[misc]  # Serve awaits it
         self._dialects: list[PortDialect] = []
@@ -75,7 +75,7 @@ class Gateway:
         return self._description
 
     def check_health(self) -> None:
-        """Raise if a dialect no longer accepts clients; Serve calls this, and replaces the gateway."""
+        """Raise an error if a dialect no longer accepts clients; Serve calls this, and then replaces the gateway."""
         if failed := [dialect.name for dialect in self._dialects if not dialect.alive()]:
             raise PolicyUnavailable(f"the gateway no longer accepts clients of {failed}; its log has the details")
 
@@ -85,7 +85,7 @@ class Gateway:
 
 
 def wait_for_policy(app: str) -> Contract | None:
-    """Wait until the policy can act and return its contract; raise the error if it does not load."""
+    """Wait until the policy can act and return its contract; raise the error if loading fails."""
     with RemoteAgent(f"serve://{app}", transport="handle", connect_timeout_s=_LOADING_S) as agent:
         return agent.contract
 
@@ -93,8 +93,8 @@ def wait_for_policy(app: str) -> Contract | None:
 def _connector(app: str, rank: RankName, *, keyed: bool) -> Connect:
     def connect(key: str | None, allowed: RankName | None) -> RemoteAgent:
         # The gateway itself enforces the permissions of the key, in `GatewaySessions`, as not every transport to a
-        # replica carries the key. A client without a key could not use the replica's shared memory, which requires
-        # one; the handle does not.
+        # replica contains the key. Shared memory of a replica requires a key, which some clients lack; the handle does
+        # not.
         return RemoteAgent(
             f"serve://{app}",
             transport="handle" if keyed and key is None else "auto",

@@ -1,8 +1,8 @@
-"""The gateway's clients, and the sessions of each, whose episodes begin as in `ImplicitEpisode`.
+"""The gateway's clients and their sessions, whose episodes begin as in `ImplicitEpisode`.
 
-The gateway enforces the permissions of the client's key, since not every transport to a replica carries a key: each
-observation (with the reset before it) counts against the key's rate, each session against its sessions, and the key's
-class applies to all its requests.
+The gateway enforces the permissions of the client's key, since not every transport to a replica contains a key: each
+observation (with the reset before it) counts towards the key's rate, each session towards its limit of sessions, and
+the key's class applies to all its requests.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from vlagents_ray.serve.dialects.base import Connect, GatewayContext, ImplicitEp
 
 logger = logging.getLogger(__name__)
 
-_QUIET_S = 30.0  # a client without a session is removed after this time without a request
+_QUIET_S = 30.0  # time without a request after which a client without a session is removed
 
 
 class GatewaySessions:
-    """The sessions of one client, all over one connection; for one thread at a time."""
+    """The sessions of one client, all over one connection; not thread-safe."""
 
     def __init__(self, connect: Connect, contract: Contract | None) -> None:
         """Prepare the sessions; `show` must be called first, with the client. `contract` is the policy's."""
@@ -45,7 +45,7 @@ class GatewaySessions:
 
     @property
     def known(self) -> bool:
-        """Whether the client has shown a valid key, or needs none."""
+        """Whether the client has sent a valid key, or needs none."""
         return self._caller is not None
 
     @property
@@ -63,7 +63,7 @@ class GatewaySessions:
         return info
 
     def act(self, obs: Obs, instruction: str | None) -> Act:
-        """Return the next action of the client's only session, which is reset first for a new instruction."""
+        """Return the next action of the client's only session; a new instruction resets the session first."""
         return self.act_batch([obs], [instruction])[0]
 
     def act_on(self, obs: Obs) -> Act:
@@ -95,7 +95,7 @@ class GatewaySessions:
         return [act for act in acts if isinstance(act, Act)]
 
     def show(self, caller: Identity, key: str | None) -> None:
-        """Set the client and its API key; sessions of another client or class end."""
+        """Set the client and its API key; end the sessions of another client or class."""
         rank = caller.rank if isinstance(caller, Caller) else None
         if caller != self._caller or rank != self._rank:
             self.close()
@@ -104,21 +104,21 @@ class GatewaySessions:
                 caller.note("let in by", "a gateway")
 
     def refusal(self) -> str | None:
-        """Return the reason if the client's key is no longer valid; None if it is valid or there is none."""
+        """Return the reason why the client's key is no longer valid; None if it is valid or not needed."""
         return self._caller.refusal() if isinstance(self._caller, Caller) else None
 
     def begin(self) -> None:
-        """Count a message for the key before it is read; this counts the first of its requests."""
+        """Count a message for the key before it is read, which includes the first of its requests."""
         self._counted = 0
         self._admit(1)
         self._counted = 1
 
     def throttled_s(self) -> float:
-        """Return the time for which not to read the client, s: over 0 if its key is over its rate."""
+        """Return the time for which not to read from the client, s; 0 unless its key is over its rate."""
         return self._caller.throttled_s() if isinstance(self._caller, Caller) else 0.0
 
     def restart(self) -> None:
-        """Have every session reset before its next action."""
+        """Make each session reset before its next action."""
         for episode in self._episodes:
             episode.end()
 
@@ -159,7 +159,7 @@ class GatewaySessions:
 
 
 def internal_error(dialect: str) -> str:
-    """Log the current exception under a new name, and return the text about it for the client."""
+    """Log the current exception under a new id, and return the text about it for the client."""
     name = uuid.uuid4().hex
     logger.exception("%s: request %s failed", dialect, name)
     return f"internal error; the server's log has the details under {name}"
@@ -171,7 +171,7 @@ def _raise_first(found: Sequence[object]) -> None:
             raise one
 
 
-# Clients of a dialect whose protocol does not announce their end.
+# Clients of a dialect whose protocol has no message for their end.
 
 
 class GatewayClient(abc.ABC):
@@ -184,12 +184,12 @@ class GatewayClient(abc.ABC):
         self._used = time.monotonic()  # time of the last reply, s
 
     def quiet_s(self, now: float) -> float:
-        """Return the time since the client's last request, s; 0 while it waits for a reply."""
+        """Return the time since the client's last request, s; 0 while a request is unanswered."""
         return 0.0 if self._unanswered else now - self._used
 
     @abc.abstractmethod
     def end(self) -> None:
-        """End the client's sessions, after the current request."""
+        """End the client's sessions after the current request."""
 
 
 K = TypeVar("K", bound=Hashable)
@@ -197,7 +197,7 @@ C = TypeVar("C", bound=GatewayClient)
 
 
 class GatewayClients(Generic[K, C]):
-    """The clients by the protocol's identity of a client, at most `sessions` of the context. Thread-safe."""
+    """The clients by their identity in the protocol, at most `sessions` of the context. Thread-safe."""
 
     def __init__(self, context: GatewayContext) -> None:
         self._context = context
@@ -205,16 +205,16 @@ class GatewayClients(Generic[K, C]):
         self._lock = threading.Lock()
 
     def get(self, key: K) -> C | None:
-        """Return a client; None if it is not known, or was removed."""
+        """Return a client; None if it is unknown or was removed."""
         return self._clients.get(key)
 
     def add(self, key: K, make: Callable[[], C]) -> C:
-        """Make a client, in place of one with the same key.
+        """Add a client, in place of one with the same key.
 
-        If there are too many, the one without a session that has been idle for the longest is removed.
+        If there are too many clients, the one without a session that has been idle for the longest is removed.
 
         Raises:
-            PolicyUnavailable: There are too many, and all have sessions or wait for a reply.
+            PolicyUnavailable: There are too many clients, and each has a session or an unanswered request.
         """
         removed = []
         try:

@@ -32,7 +32,7 @@ from vlagents_ray.wire.mapping import KeyMapping, matches
 logger = logging.getLogger(__name__)
 
 _FOLDER = re.compile(r"^(video|state|language)\.")
-WAITING = 4  # maximum of waiting requests of one client; a REQ socket sends one at a time
+WAITING = 4  # maximum number of waiting requests of one client; a REQ socket sends one at a time
 Envelope = tuple[bytes, ...]  # sender of a message: the connection's id, and the parts between it and the payload
 _ENVELOPE = 8  # maximum number of parts
 _HEARTBEAT_MS = 10_000
@@ -40,7 +40,7 @@ _TICK_MS = 500
 _END_S = 3.0
 _STRANGERS = 64  # maximum number of connections without a valid key
 _STRANGERS_MS = 50  # period at which their bytes are counted
-_STRANGER_S = 30.0  # maximum time until a connection shows a valid key
+_STRANGER_S = 30.0  # time within which a connection must send a valid key
 _RECEIVED = struct.Struct("<Q")  # `tcpi_bytes_received` in Linux' `struct tcp_info`
 _RECEIVED_AT = 128
 
@@ -60,7 +60,8 @@ class GR00TConnection(GatewayClient):
     def put(self, payload: bytes) -> bool:
         """Queue a request; return False if too many are waiting.
 
-        Raises `Overloaded` if the requests of all clients leave no memory for it.
+        Raises:
+            Overloaded: The requests of all clients leave no memory for it.
         """
         with self._lock:
             if self._unanswered >= WAITING:
@@ -100,7 +101,7 @@ class GR00TConnection(GatewayClient):
             return gr00t.pack({"error": internal_error("gr00t")})
 
     def _let_in(self, payload: bytes) -> None:
-        """Identify the client by the key in the message, before anything else of that is decoded."""
+        """Identify the client by the key in the message, before the rest of the message is decoded."""
         check = self._context.check
         if isinstance(check, NoKey):
             self.sessions.show(check, None)
@@ -144,7 +145,7 @@ class GR00TConnection(GatewayClient):
 
 
 def _theirs(entries: Iterable[tuple[str, str]], needed: Iterable[str]) -> list[str]:
-    """Return the client's names of the policy's cameras or states, from the mapping, in which `*` keeps our names."""
+    """Return the client's names of the policy's cameras or states; `*` in the mapping keeps the policy's names."""
     found: dict[str, None] = {}
     for ours, key in entries:
         names = needed if "*" in key else [key.rpartition("/")[2]]
@@ -224,7 +225,7 @@ class GR00TDialect(PortDialect):
         self._wake()
 
     def _wake(self) -> None:
-        with contextlib.suppress(OSError):  # the thread is being woken already, or the dialect is closed
+        with contextlib.suppress(OSError):  # the thread is already being woken, or the dialect is closed
             self._ring.send(b".")
 
     def _run(self, listener: socket.socket) -> None:
@@ -235,11 +236,11 @@ class GR00TDialect(PortDialect):
             router.setsockopt(zmq.LINGER, 0)
             router.setsockopt(zmq.MAXMSGSIZE, self.context.limits.body_bytes)
             router.setsockopt(zmq.RCVHWM, WAITING)
-            router.setsockopt(zmq.SNDHWM, WAITING)  # replies that a client does not read are dropped
+            router.setsockopt(zmq.SNDHWM, WAITING)  # drops replies that a client does not read
             router.setsockopt(zmq.HEARTBEAT_IVL, _HEARTBEAT_MS)
             router.setsockopt(zmq.HEARTBEAT_TIMEOUT, 3 * _HEARTBEAT_MS)
             router.setsockopt(zmq.HANDSHAKE_IVL, _HEARTBEAT_MS)
-            # With an authenticator ZMQ refuses peers with protocols before 3.0, whose dead connections it would keep.
+            # With an authenticator ZMQ refuses peers with protocols before 3.0, whose dead connections it would retain.
             authenticator.bind("inproc://zeromq.zap.01")
             router.setsockopt(zmq.ZAP_DOMAIN, b"gr00t")
             router.setsockopt(zmq.USE_FD, listener.fileno())
@@ -260,7 +261,7 @@ class GR00TDialect(PortDialect):
                 if self._bell.fileno() in ready:
                     self._bell.recv(4096)
                     self._send(router, zmq)
-                if authenticator in ready:  # accepts every peer, as API keys are in the messages
+                if authenticator in ready:  # it accepts every peer, as API keys are in the messages
                     version, request, *_ = authenticator.recv_multipart()
                     authenticator.send_multipart([version, request, b"200", b"", b"", b""])
                 if router in ready:
@@ -325,14 +326,14 @@ class GR00TDialect(PortDialect):
 
 
 class _Strangers:
-    """The connections that have not shown a valid key yet; bounds their number, their time and their bytes.
+    """The connections without a valid key so far; limits their number, their duration and their bytes.
 
-    ZeroMQ collects a message of any peer until it is complete, with one limit for all peers, and the key is in the
-    message. It states the descriptor of each connection: a duplicate of that ends the connection from outside.
+    ZeroMQ buffers a message of any peer until it is complete, with one limit for all peers, and the key is in the
+    message. ZeroMQ reports the descriptor of each connection; shutting down a duplicate ends the connection.
     """
 
     def __init__(self, router: Any, zmq: Any, port: int, most_bytes: int) -> None:
-        """`most_bytes` is the limit of the bytes of all these connections together, and of one message."""
+        """Monitor connections; `most_bytes` limits the bytes of all these connections together, and of one message."""
         self.monitor = router.get_monitor_socket(zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED)
         self._router, self._zmq = router, zmq
         self._port = port
@@ -344,7 +345,7 @@ class _Strangers:
         return len(self._since)
 
     def note_events(self) -> None:
-        """Take the connections that ZeroMQ has accepted, and drop those that have ended."""
+        """Add the connections that ZeroMQ has accepted, and drop those that have ended."""
         parse = require("zmq.utils.monitor").parse_monitor_message
         while True:
             try:
@@ -356,12 +357,12 @@ class _Strangers:
                 self._add(event["value"])
 
     def note_client(self, descriptor: int, client: GR00TConnection) -> None:
-        """Take the client of a connection's message; its key is checked on another thread."""
+        """Record the client of a connection's message; its key is checked on another thread."""
         if descriptor in self._since:
             self._clients[descriptor] = client
 
     def end_overdue(self) -> None:
-        """End the connections that take too long or, together, too much; forget those with a valid key."""
+        """End connections that take too long, and the largest while all are too large; drop those with a valid key."""
         for descriptor in [one for one, client in self._clients.items() if client.sessions.known]:
             self._drop(descriptor)
         late = time.monotonic() - _STRANGER_S
@@ -375,7 +376,7 @@ class _Strangers:
             self._end(largest, f"{sizes.pop(largest)} bytes without a valid key")
 
     def close(self) -> None:
-        """Forget all connections, which end with the ROUTER socket."""
+        """Drop all connections, which end with the ROUTER socket."""
         for descriptor in list(self._since):
             self._drop(descriptor)
         self._router.disable_monitor()
@@ -383,10 +384,10 @@ class _Strangers:
     def _add(self, descriptor: int) -> None:
         try:
             connection = socket.socket(fileno=os.dup(descriptor))
-        except OSError:  # it has ended already
+        except OSError:  # the connection has already ended
             return
         if connection.family not in (socket.AF_INET, socket.AF_INET6) or connection.getsockname()[1] != self._port:
-            connection.close()  # it has ended already, and another file of this process has its number
+            connection.close()  # it has ended, and its descriptor belongs to another file
             return
         if len(self._since) >= _STRANGERS:
             self._end(next(iter(self._since)), f"{_STRANGERS} connections are without a valid key")
@@ -394,7 +395,7 @@ class _Strangers:
 
     def _end(self, descriptor: int, reason: str) -> None:
         logger.info("gr00t: a connection is closed: %s", reason)
-        with contextlib.suppress(OSError):  # the client closed it already
+        with contextlib.suppress(OSError):  # the client has already closed it
             self._since[descriptor][0].shutdown(socket.SHUT_RDWR)
         self._drop(descriptor)
 
@@ -408,7 +409,7 @@ def _received(connection: socket.socket) -> int:
     """Return the number of bytes that a connection has received."""
     try:
         info = connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _RECEIVED_AT + _RECEIVED.size)
-    except OSError:  # it has ended
+    except OSError:  # the connection has ended
         return 0
     (size,) = _RECEIVED.unpack_from(info, _RECEIVED_AT)
     return int(size)

@@ -39,15 +39,15 @@ from vlagents_ray.wire.mapping import KeyMapping
 
 logger = logging.getLogger(__name__)
 
-_WAIT_S = 2.0  # time for which a request for actions waits for an observation, as at LeRobot's own server
-_HZ = 30.0  # rate of the actions' time stamps if the policy's contract states none, as at LeRobot's own server
-_UPLOAD_S = 30.0  # maximum time of an observation, from its first part to its last
+_WAIT_S = 2.0  # time that a request for actions waits for an observation, as at LeRobot's own server
+_HZ = 30.0  # rate of the actions' timestamps if the policy's contract has none, as at LeRobot's own server
+_UPLOAD_S = 30.0  # maximum time from an observation's first part to its last
 _TICK_S = 0.5
 _END_S = 3.0
-_REQUESTS = 4  # maximum number of requests of one client at a time; LeRobot's has two
+_REQUESTS = 4  # maximum number of concurrent requests of one client; LeRobot's has two
 _HEARTBEAT_MS = 10_000
 _DETAILS = 500  # maximum number of characters of an error, which gRPC sends in a header of 8 KiB at most
-# HTTP status -> name of gRPC's; the client sends a request again by itself if it is UNAVAILABLE or DEADLINE_EXCEEDED
+# HTTP status -> name of gRPC's; clients repeat a request by themselves after UNAVAILABLE or DEADLINE_EXCEEDED
 _STATUS = {
     400: "INVALID_ARGUMENT",
     403: "PERMISSION_DENIED",
@@ -63,7 +63,7 @@ _STATUS = {
 
 @dataclass(slots=True)
 class _Waiting:
-    """An observation that the policy did not get yet."""
+    """An observation that the policy has not received yet."""
 
     seen: RobotObservation
     obs: Obs
@@ -72,7 +72,7 @@ class _Waiting:
 
 
 class LeRobotConnection(GatewayClient):
-    """One client, from its `Ready` on. Its requests arrive on several threads; one at a time uses the session."""
+    """One client since its `Ready`. Its requests arrive on several threads, of which one at a time uses the session."""
 
     def __init__(self, context: GatewayContext, mapping: KeyMapping, checkpoint: str | None) -> None:
         super().__init__(context)
@@ -80,7 +80,7 @@ class LeRobotConnection(GatewayClient):
         self._checkpoint = checkpoint
         self.sessions.show(NoKey.OPEN, None)  # the protocol has no key, and the deployment accepted that
         self._robot: PolicyInstructions | None = None
-        self._acted = -1  # time step of the last observation that the policy got
+        self._acted = -1  # time step of the last observation that the policy received
         self._waiting: _Waiting | None = None
         self._arrival = threading.Condition()
         self._acting = threading.Lock()
@@ -88,7 +88,7 @@ class LeRobotConnection(GatewayClient):
 
     @contextmanager
     def request(self) -> Iterator[None]:
-        """Count a request as without a reply."""
+        """Count a request as unanswered within the context."""
         with self._arrival:
             self._unanswered += 1
         try:
@@ -99,7 +99,7 @@ class LeRobotConnection(GatewayClient):
                 self._used = time.monotonic()
 
     def set_up(self, robot: PolicyInstructions) -> None:
-        """Take the policy instructions; raise `InvalidInput` for another checkpoint than the deployment's."""
+        """Set the policy instructions; raise `InvalidInput` if they name another checkpoint than the deployment."""
         if self._checkpoint not in (None, robot.checkpoint):
             raise InvalidInput(
                 f"pretrained_name_or_path: got {robot.checkpoint[:80]!r}, this server acts for {self._checkpoint!r}; "
@@ -109,9 +109,9 @@ class LeRobotConnection(GatewayClient):
         self._robot = robot
 
     def observe(self, data: bytes, admission: MessageAdmission) -> None:
-        """Take an observation in place of an earlier one that the policy did not get yet.
+        """Store an observation for the next act, in place of an earlier one that the policy has not received yet.
 
-        One of a time step that the policy got already is left out, unless the client has no action left.
+        An observation of a time step that the policy has received is ignored, unless the client has no action left.
 
         Args:
             data: The pickle.
@@ -134,7 +134,7 @@ class LeRobotConnection(GatewayClient):
             earlier.admission.release()
 
     def actions(self) -> bytes | None:
-        """Return the pickle of the actions for the newest observation; None after two seconds without one."""
+        """Return the pickled actions for the newest observation; None if there is none within two seconds."""
         deadline = time.monotonic() + _WAIT_S
         if not self._acting.acquire(timeout=_WAIT_S):
             return None
@@ -173,7 +173,7 @@ class LeRobotConnection(GatewayClient):
         try:
             act = self.sessions.act(waiting.obs, waiting.instruction)
         except BaseException:
-            self._acted = before  # the client's next observation of this time step is not left out
+            self._acted = before  # the client's next observation of this time step must not be ignored
             raise
         finally:
             waiting.admission.release()
@@ -195,7 +195,7 @@ class LeRobotDialectConfig(KeylessPortConfig):
 
 
 class LeRobotDialect(PortDialect):
-    """LeRobot's gRPC service; gRPC's threads process the requests, one more thread removes clients that are gone."""
+    """LeRobot's gRPC service; gRPC's threads process the requests, another thread removes clients that are gone."""
 
     Config = LeRobotDialectConfig
     clients = "LeRobot"
@@ -226,13 +226,13 @@ class LeRobotDialect(PortDialect):
             ThreadPoolExecutor(most, "lerobot-client"),
             handlers=[grpc.method_handlers_generic_handler(lerobot.SERVICE, self._methods(grpc))],
             options=[
-                ("grpc.so_reuseport", 0),  # another process could share the port otherwise
+                ("grpc.so_reuseport", 0),  # otherwise another process could share the port
                 ("grpc.max_concurrent_streams", _REQUESTS),
                 ("grpc.max_connection_idle_ms", int(1e3 * self.context.idle_s)),
                 ("grpc.server_handshake_timeout_ms", _HEARTBEAT_MS),
                 ("grpc.keepalive_time_ms", _HEARTBEAT_MS),
                 ("grpc.keepalive_timeout_ms", _HEARTBEAT_MS),
-                # a compressed message would be decompressed whatever its size
+                # a compressed message would be decompressed regardless of its size
                 ("grpc.compression_enabled_algorithms_bitset", 1),
             ],
             maximum_concurrent_rpcs=most,
@@ -240,7 +240,7 @@ class LeRobotDialect(PortDialect):
         try:
             self._server.add_insecure_port(f"[{host}]:{port}" if ":" in host else f"{host}:{port}")
         finally:
-            listener.close()  # gRPC has the port now
+            listener.close()  # gRPC listens at the port by now
         self._server.start()
         self._thread.start()
 
@@ -266,7 +266,7 @@ class LeRobotDialect(PortDialect):
         }
 
     def _answer(self, grpc: Any, method: Callable[[Any, Any], bytes], request: Any, context: Any) -> bytes:
-        """Return the reply to a request, or end it with gRPC's status of an error."""
+        """Return the reply to a request, or end the request with gRPC's status for the error."""
         try:
             return method(request, context)
         except VLAgentsError as error:

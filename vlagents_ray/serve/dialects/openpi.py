@@ -70,7 +70,7 @@ class MapDialect(RouteDialect):
         """Begin an episode if the message requires it.
 
         Returns:
-            The reply if the message is not an observation; empty if the client waits for none.
+            The reply if the message is not an observation; empty if the client expects no reply.
         """
         return None
 
@@ -79,7 +79,7 @@ class MapDialect(RouteDialect):
         return None
 
     def answer(self, replies: Sequence[Reply], before_ms: float | None, *, batched: bool) -> Any:
-        """Return the replies in the client's format; `before_ms` is the server's time for the previous message."""
+        """Encode the replies in the client's format; `before_ms` is the server's time for the previous message."""
         inference_ms = max(reply.timing["inference_ms"] for reply in replies)
         infer_ms = max(reply.timing["queue_ms"] + reply.timing["inference_ms"] for reply in replies)
         rows = [self.rows(reply) for reply in replies]
@@ -91,7 +91,7 @@ class MapDialect(RouteDialect):
 
 
 def _stacked(chunks: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the chunks of a batch as (B, H, D)."""
+    """Stack the chunks of a batch to (B, H, D)."""
     if len(shapes := {chunk.shape for chunk in chunks}) > 1:
         raise VLAgentsError(
             f"batch: got chunks of the shapes {sorted(shapes)}, and its reply is one array; send each by itself"
@@ -159,12 +159,12 @@ class MapConnection:
         self.dialect = dialect
         self.sender: Sender = dialect.sender()
         self.session: ImplicitSession = dialect.session(self.sender)
-        self.episode: str | None = None  # the client's name of the episode
-        self._batched: list[ImplicitSession] = []  # the session of each place in a batch
+        self.episode: str | None = None  # name of the episode, set by the client
+        self._batched: list[ImplicitSession] = []  # sessions by index in a batch
         self._before_ms: float | None = None
 
     def end_episodes(self) -> None:
-        """Begin an episode of each session with its next observation."""
+        """Make the next observation of each session begin an episode."""
         for session in (self.session, *self._batched):
             session.episode.end()
 
@@ -189,7 +189,7 @@ class MapConnection:
         return data
 
     async def _of_batch(self, number: int) -> list[ImplicitSession]:
-        """Return the session of each place in a batch of that size; the episodes of another size end."""
+        """Return the sessions of a batch of that size, in order; a change of the size ends the episodes."""
         if number != len(self._batched):
             surplus, self._batched = self._batched[number:], self._batched[:number]
             for session in surplus:

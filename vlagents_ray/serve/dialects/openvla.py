@@ -38,7 +38,7 @@ class OpenVLADialect(HttpDialect):
     config: OpenVLADialectConfig
 
     async def act(self, http: HttpRequest) -> Response:
-        """Answer one request; the reply is encoded once or twice like the request."""
+        """Answer one request; the reply is encoded once or twice, like the request."""
         twice = False
 
         def read(data: bytes, budget: Budget) -> dict[str, Any]:

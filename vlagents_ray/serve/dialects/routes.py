@@ -39,7 +39,7 @@ def dialect_routes(args: DialectArgs, context: ReplicaContext) -> list[BaseRoute
 
 
 def describe(args: DialectArgs) -> dict[str, Any]:
-    """Describe the dialects that are on for the metadata: by name, their addresses, clients and mapping."""
+    """Describe the enabled dialects for the metadata: addresses, clients and mapping by name."""
     found: dict[str, Any] = {}
     for name, config in args.on().items():
         cls, mapping = dialect_class(name), config.keys()
@@ -55,7 +55,7 @@ def describe(args: DialectArgs) -> dict[str, Any]:
 
 
 def require_fit(args: DialectArgs, contract: Contract | None) -> None:
-    """Raise `ConfigError` if the policy needs a part of the observation that a mapping does not provide."""
+    """Raise `ConfigError` if the policy needs a part of the observation that a dialect's mapping does not provide."""
     found = [
         f"- dialects.{name}: {line}"
         for name, config in args.on().items()
@@ -66,14 +66,14 @@ def require_fit(args: DialectArgs, contract: Contract | None) -> None:
 
 
 def require_packages(args: DialectArgs) -> None:
-    """Raise `MissingDependency` if a dialect that is on needs a package that is not installed."""
+    """Raise `MissingDependency` if an enabled dialect needs a package that is not installed."""
     for name in args.on():
         for module in dialect_class(name).requires:
             require(module)
 
 
 def _at_root(args: DialectArgs) -> list[str]:
-    """Return the dialects that are served at the root: the first that states a root, and others of that protocol."""
+    """Return the dialects at the root: the first one that has a root, and others with the same protocol there."""
     roots = {name: getattr(dialect_class(name), "root", "") for name in args.on()}
     first = next(filter(None, roots.values()), None)
     return [name for name, root in roots.items() if root == first]

@@ -40,7 +40,7 @@ from vlagents_ray.serve.engine.sender import REFUSED, Sender
 from vlagents_ray.wire import vla_eval
 from vlagents_ray.wire.vla_eval import PRESETS
 
-_WAITING = 16  # maximum of waiting messages of a client that does not wait for replies
+_WAITING = 16  # maximum number of waiting messages of a client that does not wait for replies
 
 
 class VlaEvalDialectConfig(DialectConfig):
@@ -84,7 +84,7 @@ class VlaEvalDialect(RouteDialect):
         if not await accept_or_refuse(socket, self.context):
             return
         sender, gate = self.sender(), self.gate()
-        session, chunk = self.session(sender), ChunkBuffer()  # of rows that are not sent yet
+        session, chunk = self.session(sender), ChunkBuffer()  # the buffer holds unsent rows
         inbox = _Inbox()
         reading = asyncio.ensure_future(inbox.fill(socket, gate, self))
         try:
@@ -115,7 +115,7 @@ class VlaEvalDialect(RouteDialect):
             session.episode.end()
             return None
         if message.kind != "observation":
-            return None  # the message reports an error of the client
+            return None  # the client reports an error
         return await self._act(message, received.admission, session, chunk)
 
     def _hello(self, message: vla_eval.Message) -> vla_eval.Message:
@@ -150,7 +150,7 @@ class VlaEvalDialect(RouteDialect):
                 rows = incoming.written(lambda: self.rows(reply))
                 chunk.replace(rows[: self.config.execute])
             return vla_eval.Message("action", {"actions": chunk.take().action}, message.seq)
-        except Exception as error:  # noqa: BLE001 - the client is answered with it
+        except Exception as error:  # noqa: BLE001 - the error is the reply to the client
             problem = public_problem(error, self.name, request_id)
             incoming.record_failure(problem.code)
             return _error(problem, message.seq, request_id)
@@ -160,7 +160,7 @@ class VlaEvalDialect(RouteDialect):
 
 @dataclass(slots=True)
 class _Received:
-    """A received message, whose images are not decoded yet, or the error of a refused one."""
+    """A received message, whose images are not decoded yet, or the error of a refused message."""
 
     message: vla_eval.Message | VLAgentsError
     admission: MessageAdmission
@@ -207,7 +207,7 @@ class _Inbox:
         try:
             message = await decoded(lambda data, budget: vla_eval.decode(data, budget.limits), data, admission)
             return _Received(message, admission)
-        except Exception as error:  # noqa: BLE001 - the client is answered with it
+        except Exception as error:  # noqa: BLE001 - the error is the reply to the client
             return _Received(public_problem(error, "vla_eval", "of an unreadable message"), admission)
 
     def _put(self, received: _Received | None) -> None:

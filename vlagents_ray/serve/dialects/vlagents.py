@@ -120,7 +120,7 @@ class VlagentsConnection:
         if method == "name":
             return self._dialect.config.name or self._context.app
         if method == "is_initialized":
-            return True  # the gateway accepts clients only then
+            return True  # the gateway accepts clients only when the policy is loaded
         return json_numpy.dumps({"vlagents_ray": importlib.metadata.version("vlagents-ray")})
 
     def _act(self, text: str | bytes) -> str:
@@ -150,7 +150,7 @@ class VlagentsConnection:
         return MessageAdmission(self._context.admission, self._context.limits, None, len(text), inline=False)
 
     def _ours(self, obs: Obs) -> Obs:
-        """Return the observation under our names, converted if the deployment has a mapping."""
+        """Return the observation under the policy's names, converted if the deployment has a mapping."""
         mapping = self._dialect.stated_mapping
         if mapping is None:
             return obs
@@ -179,7 +179,7 @@ class VlagentsConnection:
         Args:
             length: The number of bytes.
             silent_s: Maximum time between two parts, s.
-            deadline: End of the reception, s, of `time.monotonic()`.
+            deadline: Latest time of the last part, s, of `time.monotonic()`.
         """
         data = bytearray()
         while len(data) < length:
@@ -201,7 +201,7 @@ class VlagentsConnection:
 
 
 def _echo(call: RpycCall) -> str | bytes | None:
-    """Return the value with which a ping is answered."""
+    """Return the value that a ping is answered with."""
     match call.args:
         case ():
             return None
@@ -211,7 +211,7 @@ def _echo(call: RpycCall) -> str | bytes | None:
 
 
 def _number(args: tuple[Any, ...]) -> int:
-    """Return the number of the method that a client looks up."""
+    """Return the number that identifies the method a client looks up."""
     match args:
         case (rpyc.Reference(rpyc.ROOT), str(name)) if name in _METHODS:
             return _METHODS.index(name) + 1
@@ -242,7 +242,7 @@ def _is_same_machine(connection: socket.socket) -> bool:
     """Return whether the client is on this machine, in which case both ends have the same address."""
     try:
         return bool(connection.getpeername()[0] == connection.getsockname()[0])
-    except OSError:  # the client is gone already
+    except OSError:  # the client is already gone
         return False
 
 
@@ -373,7 +373,7 @@ class VlagentsDialect(PortDialect):
     )
     scheme = "rpyc"
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
-        # our own names, for clients that need a mapping but whose protocol defines no names
+        # this project's own names, for clients that need a mapping but whose protocol defines no names
         "vlagents": {
             "cameras": {"*": "cameras/*"},
             "state": {"*": "state/*"},
@@ -386,7 +386,7 @@ class VlagentsDialect(PortDialect):
 
     def __init__(self, name: str, config: VlagentsDialectConfig, context: GatewayContext) -> None:
         super().__init__(name, config, context)
-        self.stated_mapping = config.keys()  # None if clients use our names
+        self.stated_mapping = config.keys()  # None if clients use this project's names
         spec = ActionSpec() if context.contract is None else context.contract.action
         # The columns of each robot, or of the only one.
         self.parts: Mapping[str, vlagents.Part] | vlagents.Part = {
@@ -436,7 +436,7 @@ class VlagentsDialect(PortDialect):
                 if self._closing.is_set():
                     break
                 logger.warning("vlagents: cannot accept a client: %s", error)
-                time.sleep(0.1)  # if descriptors are exhausted, other connections have to end first
+                time.sleep(0.1)  # other connections must end first if descriptors are exhausted
                 continue
             client = VlagentsConnection(self, connection)
             thread = threading.Thread(target=self._serve, args=(client,), name=f"vlagents {peer[0]}", daemon=True)
