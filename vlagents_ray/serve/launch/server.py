@@ -1,7 +1,7 @@
 """Start Ray and Serve here, or use a running cluster, and serve a deployment for the length of a context.
 
 A server on its own Ray has HAProxy in front of its replicas if the binary is installed, with files and ports that no
-other server on the machine uses. HAProxy is the only part of it that may listen on the network.
+other server on the machine uses. Only HAProxy may listen on the network.
 """
 
 from __future__ import annotations
@@ -60,19 +60,23 @@ from vlagents_ray.serve.ports import EVERYWHERE, HOST, LOOPBACK, free_port, is_f
 log = logging.getLogger(__name__)
 
 _SHUTDOWN_S = 30.0
-_PROXIES_S = 60.0  # for Serve's proxies to listen; the first ones may be replaced
-_LOOK_S = 0.2  # between two looks at the proxies that Serve has
-_START_S, _GROW_S = 600.0, 3600.0  # time for a policy to get ready: here; on a cluster that may add a machine first
-# Keys of a deployment file, and of an application in it, that Serve does not have to apply.
+_PROXIES_S = 60.0  # time for Serve's proxies to listen; the first ones may be replaced
+_LOOK_S = 0.2  # interval of the checks which proxies Serve has
+_START_S, _GROW_S = 600.0, 3600.0  # time for a policy to become ready: here; on a cluster that may add a machine first
+# Keys of a deployment file, and of an application in it, that do not require Serve to apply the file.
 _OUR_KEYS = {"applications", "http_options", "proxy_location"}
 _OUR_APP_KEYS = {"name", "route_prefix", "import_path", "args"}
 _REMIND_S = 30.0
 
 
 def wait_for_proxies(proxies: list[Any], look_again: Callable[[], list[Any]]) -> None:
-    """Wait until each of the proxies listens; raise the error of one that cannot.
+    """Wait until each of the proxies listens; raise the error of a proxy that cannot listen.
 
     Serve kills a proxy that does not start within some seconds, as on a busy node, and starts another one.
+
+    Args:
+        proxies: The refs of the proxies.
+        look_again: Returns the refs of the current proxies.
     """
     import ray
 
@@ -90,11 +94,11 @@ def wait_for_proxies(proxies: list[Any], look_again: Callable[[], list[Any]]) ->
 
 
 def shut_down(client: Any) -> None:
-    """End Serve, so that replicas drain and HAProxy stops, like `serve.shutdown`, but without its error message.
+    """Shut Serve down like `serve.shutdown`, so that replicas drain and HAProxy stops, but without its error message.
 
     The controller ends itself during this call, which Ray would report as a failed task that will be retried. A signal
-    to the whole process group or service, as systemd's SIGTERM, also ends Ray's head: then Serve can neither answer nor
-    continue, and the reaper ends its processes.
+    to the whole process group or service, such as systemd's SIGTERM, also ends Ray's head: then Serve can neither
+    answer nor continue, and the reaper ends its processes.
     """
     import ray
 
@@ -117,7 +121,7 @@ __all__ = ["Server", "deploy", "free_port", "running_server", "spread_over_gpus"
 
 @dataclass(frozen=True, slots=True)
 class Server:
-    """Says where a running server is reached."""
+    """The addresses of a running server."""
 
     url: str  # http(s)://host:port
     apps: Mapping[str, str] = field(default_factory=dict)  # URL of each application
@@ -138,14 +142,26 @@ def running_server(
     tls: Tls | None = None,
     ingress: bool = True,
 ) -> Iterator[Server]:
-    """Serve `config` for the length of the context, and stop on exit what was started here.
+    """Serve `config` for the length of the context, and stop on exit everything that was started here.
 
-    `port` 0 selects a free port. `address` names a running Ray cluster (or is "auto"); without it a local cluster is
-    started, unless this process is connected to one. `timeout_s` defaults to 600 s, with an `address` to 3600 s.
-    `keys_file`, `insecure` and `plain_http` replace those of `access` in the applications' args; unless `host` is a
-    loopback address, one of the first two must be set somewhere. Without `ingress` a Ray that is started here serves
-    only its own processes, at `serve://APP`, and nothing over HTTP, which makes start and end faster.
-    Raises `ConfigError` if the deployment fails, `PolicyUnavailable` if it takes too long.
+    Args:
+        config: The deployment.
+        host: The address to listen on, IPv4. Other than loopback addresses require `keys_file`, keys in the deployment,
+            or `insecure`.
+        port: The port; 0 selects a free one.
+        address: A running Ray cluster, or "auto"; by default this process's cluster, or a new local one.
+        num_cpus: Number of CPUs of a new local cluster.
+        timeout_s: Time limit for the start; by default 600 s, with an `address` 3600 s.
+        keys_file: Replaces `access.keys_file` of the applications.
+        insecure: Whether other machines may connect without keys; replaces `access.insecure`.
+        plain_http: Replaces `access.plain_http`.
+        tls: The server's certificate and key.
+        ingress: Whether to serve HTTP. Without it, a new local cluster serves only its own processes, at `serve://APP`,
+            and starts and ends faster.
+
+    Raises:
+        ConfigError: The deployment is invalid or fails.
+        PolicyUnavailable: The start exceeds its time limit.
     """
     if ":" in host:
         raise ConfigError(
@@ -200,13 +216,13 @@ def running_server(
 
 
 def _access(config: ServeDeploySchema, keys_file: Path | None, insecure: bool, plain_http: bool) -> ServeDeploySchema:
-    """Return the deployment with the access settings of the command line, if there are any."""
+    """Return the deployment with the access settings of the command line, if any."""
     if keys_file is not None and insecure:
         raise ConfigError("keys and insecure exclude each other; keep one")
     changed = config.model_copy(deep=True)
     for app in our_apps(changed):
         access = dict(app.args.get("access") or {})
-        if keys_file is not None or insecure:  # either one replaces both settings of the file
+        if keys_file is not None or insecure:  # either option replaces both settings of the file
             access |= {"insecure": insecure, "keys_file": None if keys_file is None else str(keys_file.absolute())}
         if plain_http:
             access["plain_http"] = True
@@ -218,10 +234,10 @@ def _access(config: ServeDeploySchema, keys_file: Path | None, insecure: bool, p
 def deploy(client: Any, config: ServeDeploySchema, *, own: bool, ingress: bool) -> None:
     """Deploy the applications, without waiting for them.
 
-    Serve starts a process for a deployment file, which imports the server once more. On our `own` Ray, applications of
-    this package are built here instead, unless their file has settings that Serve must apply: such a file may also be
-    deployed again, and Serve would replace all replicas of an application that it did not build.
-    Without `ingress` replicas end without a wait for requests: their clients have ended before.
+    For a deployment file, Serve starts a process that imports the server again. On our `own` Ray, applications of this
+    package are built here instead, unless their file has settings that Serve must apply: such a file may also be
+    deployed again, and Serve would replace all replicas of an application that it did not build. Without `ingress`,
+    replicas end without waiting for requests, since their clients have already ended.
     """
     from ray import serve
 
@@ -241,10 +257,10 @@ def deploy(client: Any, config: ServeDeploySchema, *, own: bool, ingress: bool) 
 
 
 def _require_gpus(config: ServeDeploySchema, here: float | None = None) -> None:
-    """Raise `ConfigError` if the replicas need more GPUs than a Ray started here has: they would wait for ever.
+    """Raise `ConfigError` if the replicas need more GPUs than a Ray started here has, since they would wait forever.
 
-    `here` is the number of GPUs that a Ray to be started will find. A cluster that others started may grow: there the
-    lack is a warning, which is repeated while the replicas wait.
+    `here` is the number of GPUs that a new local Ray would have. An existing cluster may grow: there, missing GPUs
+    cause a warning, which is repeated while the replicas wait.
     """
     if here is None and not started_here():
         return
@@ -278,7 +294,7 @@ def _gpus(args: ServerArgs) -> float:
 def _require_access(config: ServeDeploySchema, host: str, insecure: bool) -> None:
     """Raise `ConfigError` if an application accepts other machines without keys, or its keys cannot be read."""
     ours = our_apps(config)
-    for app in config.applications:  # applications of others require no keys
+    for app in config.applications:  # applications of other packages require no keys
         access = AccessArgs(**app.args.get("access", {})) if app in ours else AccessArgs(insecure=insecure)
         require_access(host, access.keys() if app in ours else None, access.insecure)
 
@@ -350,13 +366,13 @@ def own_ray(
 ) -> Iterator[PublicListener | None]:
     """Run a private Ray for the length of the context, which no other machine and no other user can reach.
 
-    The other arguments are those of `running_server`; the server will listen at `host` and `port`.
+    The arguments are those of `running_server`; the server will listen at `host` and `port`.
 
     Yields:
         HAProxy's listener for clients; None if Serve listens itself.
 
     Raises:
-        ConfigError: The port is taken, or the environment excludes Ray's token or HAProxy's settings.
+        ConfigError: The port is in use, or the environment excludes Ray's token or HAProxy's settings.
     """
 
     if os.environ.get(MODE, "token").lower() != "token":
@@ -368,7 +384,7 @@ def own_ray(
         raise ConfigError(f"cannot listen on {host}:{port}: it is taken; choose another --port or --host")
     keep(port)
     with ray_folder() as folder, contextlib.ExitStack() as stack:
-        # Ray starts its workers with a low priority, so that a policy would wait for all other processes.
+        # By default Ray starts workers with a low priority, so that a policy would wait for all other processes.
         # Proxies start while policies load: on a slow machine Serve would replace them after three times its 5 s.
         environment = {"RAY_worker_niceness": "0", "RAY_SERVE_PROXY_READY_CHECK_TIMEOUT_S": "60"}
         # The address at which replicas listen for WebSockets: loopback if only TLS may cross the network.
@@ -379,11 +395,11 @@ def own_ray(
         elif (binary := haproxy_binary()) is not None:
             listener = _public_listener(folder, host, port, tls)
             settings = ingress_environment(folder, binary, listener)
-            # HAProxy's files and admin socket are in the folder, whatever the user has set for clusters.
+            # HAProxy's files and admin socket are in the folder, regardless of the user's settings for clusters.
             ours |= {key: value for key, value in settings.items() if value.startswith(str(folder))}
             environment |= settings
-        # A process that another server's process started has inherited that server's files and ports, which are
-        # replaced. Otherwise the user's values stay, unless they are in `ours`.
+        # If another server's process started this one, it has inherited that server's files and ports, which are
+        # replaced. Otherwise the user's values are kept, unless they are in `ours`.
         inherited = MARK in os.environ
         new = {key: value for key, value in environment.items() if inherited or key not in os.environ}
         stack.enter_context(variables(new | ours))
@@ -454,7 +470,7 @@ def wait_until_ready(
 
 
 def _unready_reason(serve: Any, app: str, url: str | None, ours: Collection[str]) -> str | None:
-    """Return the reason why the application is not ready; None if it is.
+    """Return the reason why the application is not ready; None if it is ready.
 
     The reason comes from a replica, since over HTTP it is reported only to clients with a key.
     """

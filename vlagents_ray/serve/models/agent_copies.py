@@ -40,7 +40,7 @@ _PLAIN = (
 
 
 class _Shared:
-    """The objects that the sessions of a replica share, in the order in which the pickler encountered them."""
+    """The objects that the sessions of a replica share, in the order in which the pickler found them."""
 
     def __init__(self) -> None:
         self.objects: list[Any] = []
@@ -64,7 +64,7 @@ class _Shared:
     def must_have(self, obj: Any) -> bool:
         """Return whether copies must share the object, even if `Agent.shared` does not name it.
 
-        A large array becomes read-only.
+        A large array is made read-only.
         """
         if isinstance(obj, _BY_REFERENCE) or (self._parameter is not None and isinstance(obj, self._parameter)):
             return True
@@ -92,7 +92,7 @@ class _Shared:
 
 
 class _Pickler(pickle.Pickler):
-    """Pickles an agent in memory without the shared objects; `find` adds objects that must be shared to these."""
+    """Pickles an agent in memory without its shared objects; with `find`, objects that must be shared join them."""
 
     def __init__(self, file: io.BytesIO, shared: _Shared, *, find: bool) -> None:
         super().__init__(file, protocol=pickle.HIGHEST_PROTOCOL)

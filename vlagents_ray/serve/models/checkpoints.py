@@ -1,10 +1,10 @@
-"""The checkpoints that a deployment offers, and the choice of a session among them. It loads nothing.
+"""The checkpoints that a deployment offers, and a session's choice among them; this module loads nothing.
 
 A policy's settings name its checkpoint, and optionally a training step of it (`checkpoint: /runs/a/{step}`,
 `checkpoint_step: 20000`). A session chooses among the checkpoints in the deployment file; it never names a path.
 
-A choice may be a LoRA adapter over the deployment's own checkpoint. All adapters are loaded with that, as its setting
-`adapters`, so that sessions with different ones have the same model; which one is an option of their reset.
+A choice may be a LoRA adapter over the deployment's own checkpoint. All adapters are loaded with that checkpoint, as
+its setting `adapters`, so that sessions with different adapters share a model; the adapter is an option of their reset.
 """
 
 from __future__ import annotations
@@ -34,7 +34,15 @@ class Checkpoints:
         steps: bool = False,
         loaded: int = 2,
     ) -> None:
-        """See `CheckpointArgs`; `make` creates an agent from settings, without loading anything."""
+        """Define the checkpoints of a deployment.
+
+        Args:
+            make: Creates an agent from settings, without loading anything.
+            config: The deployment's own settings.
+            choices: See `CheckpointArgs`, as for the other arguments.
+            steps: Whether sessions may choose a step.
+            loaded: Maximum number of loaded checkpoints.
+        """
         self.make = make
         self.limit = loaded
         offered = choices or {}
@@ -44,10 +52,10 @@ class Checkpoints:
         self.config = self.own(config or {})
 
     def own(self, config: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the deployment's own settings `config`, with its adapters beside those that stand there.
+        """Return the deployment's own settings `config`, with the offered adapters added to those in `config`.
 
         Raises:
-            ConfigError: Two adapters have the same name, or those that stand there are no mapping.
+            ConfigError: Two adapters have the same name, or the adapters in `config` are not a mapping.
         """
         if not self._adapters:
             return dict(config)
@@ -89,7 +97,7 @@ class Checkpoints:
     def settings(self, choice: CheckpointChoice, config: Mapping[str, Any]) -> dict[str, Any]:
         """Return the settings of an agent for that choice, based on the deployment's own settings `config`."""
         chosen = {} if choice.name is None else self._choices[choice.name]
-        if self._adapters and choice != DEFAULT:  # they belong to the deployment's own checkpoint
+        if self._adapters and choice != DEFAULT:  # the adapters are for the deployment's own checkpoint
             config = {name: value for name, value in config.items() if name != _ADAPTERS}
         return {**config, **chosen, **({} if choice.step is None else {STEP: choice.step})}
 
@@ -103,7 +111,7 @@ class Checkpoints:
         return {"choices": choices | self._adapters, "steps": self._steps, "limit": self.limit}
 
     def offers(self, choice: CheckpointChoice, settings: Mapping[str, Any], config: Mapping[str, Any]) -> bool:
-        """Return whether the deployment offers that choice, and it results in these settings."""
+        """Return whether the deployment offers that choice, and the choice has these settings."""
         known = choice.name is None or choice.name in self._choices
         return known and (choice.step is None or self._steps) and self.settings(choice, config) == settings
 

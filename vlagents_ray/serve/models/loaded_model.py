@@ -42,16 +42,16 @@ class _DummySession:
 
 
 def powers_up_to(most: int) -> list[int]:
-    """Return 1, 2, 4, … and, as the last of them, `most`."""
+    """Return the powers of two below `most`, and `most` itself: 1, 2, 4, …"""
     return [*(2**power for power in range((most - 1).bit_length())), most]
 
 
 class Padding:
-    """Dummy sessions that pad a batch to the next of `sizes`. May only be used on the policy's thread.
+    """Dummy sessions that pad a batch to the next of `sizes`. Use them on the policy's thread only.
 
     Each is a pristine copy of the agent, reset with the first reset request that the policy accepted, and acts on an
-    observation of a real session in the same batch. Its actions and errors are dropped. If it cannot be created, the
-    policy gets batches without padding.
+    observation of a real session in the same batch. Its actions and errors are dropped. If a dummy session cannot be
+    created, the policy gets batches without padding.
 
     Args:
         sizes: Batch sizes for which the model is compiled.
@@ -65,9 +65,9 @@ class Padding:
         self._rows: list[_DummySession] = []
 
     def record_reset(self, request: Request, kwargs: dict[str, Any]) -> None:
-        """Store the first reset that the policy accepted, with which padding sessions are reset."""
+        """Store the first reset that the policy accepted, which resets the padding sessions."""
         if self._first is None and self._sizes and request.obs is not None:
-            # The request is copied, since the observation may lie in memory that its sender needs back.
+            # The request is copied, since the observation may be in the sender's memory.
             self._first = copy.deepcopy((request.obs, request.instruction, kwargs))
 
     def sessions(self, rows: int) -> list[Agent]:
@@ -104,30 +104,30 @@ class Padding:
 class LoadedModel:
     """A loaded agent, and the data that its sessions share."""
 
-    choice: CheckpointChoice  # the choice for which it was loaded first
+    choice: CheckpointChoice  # the choice that it was loaded for
     settings: dict[str, Any]
     agent: Agent
     contract: Contract | None
     copies: AgentCopies
     padding: Padding
     weights: dict[str, Any] | None  # digest and revision, see `Agent.weights_id`
-    files: Program  # digests of the files that its settings name
+    files: Program  # digests of the files named in its settings
     version: tuple[str, str]  # equal in replicas that can take over each other's sessions of this model
     calls: PolicyCalls  # running calls of the replica, including those of this agent
     parameters: ModelWeights  # versions of the weights
     busy: threading.Lock  # lock held while its agent runs, or is being closed
-    report: LoadingReport  # what it reported while it loaded
+    report: LoadingReport  # devices and other facts that it reported while loading
     since: float = field(default_factory=time.monotonic)  # time at which it was loaded, s
     sessions: int = 0  # number of sessions that hold it
     closed: bool = False
     key: str = field(init=False)  # `key_of(settings)`
-    # Held beside `busy` while the agent runs, so that no other model is captured as a CUDA graph. Where none
-    # can be, it is a lock of no other use, which costs less.
+    # Held together with `busy` while the agent runs, so that no other model is captured as a CUDA graph. Without an
+    # accelerator it is an unshared lock, which costs less.
     uncaptured: AbstractContextManager[Any] = field(init=False)
     _calls_by_kind: dict[tuple[str, Hashable], PolicyCall] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Find out whether its process computes on an accelerator."""
+        """Determine whether this process computes on an accelerator."""
         self.key = key_of(self.settings)
         torch = sys.modules.get("torch")
         on_gpu = any(device["kind"] != "cpu" for device in self.report.devices)
@@ -135,12 +135,12 @@ class LoadedModel:
 
     @property
     def checkpoint(self) -> str | None:
-        """The checkpoint's name for its sessions."""
+        """The checkpoint's name, for its sessions."""
         return resolved(self.settings) or self.choice.name
 
     @property
     def identity(self) -> dict[str, str]:
-        """Checkpoint, digest and commit of the loaded weights, for the info of a reset."""
+        """The checkpoint, digest and commit of the loaded weights, for the info of a reset."""
         weights = self.weights or {}
         known = {"checkpoint": self.checkpoint, "weights": weights.get("digest"), "revision": weights.get("revision")}
         return {name: value for name, value in known.items() if value is not None}
@@ -154,9 +154,9 @@ class LoadedModel:
                 check_observation(obs, self.contract)
 
     def call(self, op: str, kind: Hashable = None) -> PolicyCall:
-        """Return a context for calls of the agent, which detects one that does not return.
+        """Return a context for a call of the agent, which detects a call that does not return.
 
-        Calls of one `op` and `kind` take similarly long, and two threads never make them at once.
+        Calls with the same `op` and `kind` take similarly long, and never run on two threads at once.
         """
         call = self._calls_by_kind.get((op, kind))
         if call is None:
@@ -164,12 +164,12 @@ class LoadedModel:
         return call
 
     def require_open(self) -> None:
-        """Raise `UnknownSession` if the model and its sessions have been closed; `busy` is held."""
+        """Raise `UnknownSession` if the model and its sessions have been closed; the caller holds `busy`."""
         if self.closed:
             raise UnknownSession(f"{self.choice} has just been unloaded for another; reset the session")
 
     def pad(self, observations: list[Obs | None], agents: list[Agent | None]) -> int:
-        """Append rows that fill a batch up to the next size; return their number. On the policy's thread alone."""
+        """Append rows that fill a batch up to the next size; return their number. Runs on the policy's thread only."""
         with self.call("reset", "padding"):
             padding = self.padding.sessions(len(agents))
         observations += observations[-1:] * len(padding)
@@ -204,7 +204,7 @@ class Loader:
         check: Callable[[Contract | None], None],
         calls: PolicyCalls,
     ) -> None:
-        """Create the loader; see `Engine` for the arguments."""
+        """Create the loader; its arguments are described at `Engine`."""
         self._source = source
         self._version = version
         self._batch_sizes = batch_sizes
@@ -212,7 +212,7 @@ class Loader:
         self._check = check
         self._calls = calls
         self.on_progress: Callable[[str], None] = lambda _: None  # called with each step of a long load
-        self.on_out_of_memory: Callable[[], None] = lambda: None  # called each time that a model finds none left
+        self.on_out_of_memory: Callable[[], None] = lambda: None  # called each time that a model runs out of memory
 
     def load(self, choice: CheckpointChoice, settings: dict[str, Any], agent: Agent | None = None) -> LoadedModel:
         """Load a model into `agent`, by default a new one; the agent is closed if it cannot be served.

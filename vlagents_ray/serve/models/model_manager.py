@@ -30,9 +30,9 @@ from vlagents_ray.serve.requests import DEFAULT, CheckpointChoice
 from vlagents_ray.serve.sessions import Session, SessionTable
 from vlagents_ray.serve.weights import ModelWeights
 
-PATIENCE_S = 10.0  # waiting time for a slot after which a checkpoint in use accepts no further episodes
+PATIENCE_S = 10.0  # waiting time for a slot after which a checkpoint in use accepts no more episodes
 
-# Called with None once a session holds its model, else with the error.
+# Called with None when a session holds its model, otherwise with the error.
 OnLoaded = Callable[[VLAgentsError | None], None]
 DueCallbacks = list[tuple[OnLoaded, VLAgentsError | None]]  # callbacks to call, each with its argument
 logger = logging.getLogger(__name__)
@@ -75,7 +75,7 @@ class ModelCache:
 
     - The least recently used checkpoint without a session is evicted.
     - If all have sessions, the waiting sessions wait for episodes to end. After `PATIENCE_S`, the checkpoint that was
-      loaded first accepts no further episodes, until its sessions have ended and it is evicted. So ten checkpoints can
+      loaded first accepts no more episodes, until its sessions have ended and it is evicted. So ten checkpoints can
       take turns in two slots, each for long enough to be worth loading.
     """
 
@@ -85,7 +85,7 @@ class ModelCache:
         self.failure: str | None = None  # error of the last swap
         self.loaded: dict[str, LoadedModel] = {}  # models by the keys of their settings, the least recently used first
         self.waiting: list[Waiter] = []  # waiting sessions in order of arrival
-        self.draining = ""  # key of the model that accepts no further episodes before its eviction
+        self.draining = ""  # key of the model that accepts no more episodes before its eviction
         self._source = source
 
     def describe(self) -> dict[str, Any]:
@@ -100,22 +100,22 @@ class ModelCache:
         return {**self._source.describe(self.config), "loaded": loaded, "weights": weights, "swap": swap}
 
     def offers(self, choice: CheckpointChoice, settings: Mapping[str, Any]) -> bool:
-        """Return whether the deployment offers that choice, and it results in these settings."""
+        """Return whether the deployment offers that choice, and the choice has these settings."""
         return self._source.offers(choice, settings, self.config)
 
     def find(self, choice: CheckpointChoice) -> LoadedModel | None:
-        """Return the model with which an episode of that choice would begin now, or None if it is not loaded."""
+        """Return the model that an episode of that choice would use now; None if it is not loaded."""
         return self.loaded.get(key_of(self._settings(choice)))
 
     def free(self, choice: CheckpointChoice) -> LoadedModel | None:
-        """Return the model with which an episode of that choice may begin now; None if it has to wait for it."""
+        """Return the model that an episode of that choice may use now; None if the episode has to wait for it."""
         model = self.find(choice)
         return None if model is None or model.key == self.draining else model
 
     def assign(self, session: Session[LoadedModel], model: LoadedModel) -> LoadedModel:
         """Assign the model to the session, in place of any other, and return the model."""
         self.release_model(session)
-        self.loaded[model.key] = self.loaded.pop(model.key)  # the most recently used is the last
+        self.loaded[model.key] = self.loaded.pop(model.key)  # the most recently used model is the last one
         session.model = model
         model.sessions += 1
         return model
@@ -135,7 +135,7 @@ class ModelCache:
         return model
 
     def pop_due(self) -> DueCallbacks:
-        """Remove the sessions that no longer need to wait; return their callbacks with the errors, if any."""
+        """Remove the sessions whose wait has ended; return their callbacks with the errors, if any."""
         due: DueCallbacks = []
         for waiter in list(self.waiting):
             error: VLAgentsError | None = None
@@ -164,7 +164,7 @@ class ModelCache:
         task, since = wanted
         if len(self.loaded) < self._source.limit:
             return task
-        old = None if self.next is None else self.config  # episodes begin with it during a swap: it is evicted last
+        old = None if self.next is None else self.config  # episodes begin with it during a swap: evicted last
         if idle:
             self.draining = min(idle, key=lambda model: model.settings == old).key
             return EvictTask(self.draining)
@@ -190,7 +190,7 @@ class ModelCache:
         return self._source.settings(choice, self.config)
 
     def _most_wanted(self) -> tuple[LoadTask, float] | None:
-        """Return the next model to load, and the start of the wait for it, s; a swap goes first."""
+        """Return the next model to load, and the start of the wait for it, s; a swap has priority."""
         if self.next is not None:
             return LoadTask(DEFAULT, self.next), float("-inf")
         for waiter in self.waiting:
@@ -208,14 +208,20 @@ class ModelManager:
     """The models of a replica. Thread-safe; it releases its lock before it calls other components."""
 
     def __init__(self, source: Checkpoints, loader: Loader, sessions: SessionTable[LoadedModel]) -> None:
-        """Manage models from `loader` for `sessions`; a model's sessions are closed when it is evicted at once."""
-        self.continues_plans = False  # whether that model's chunks continue the executed plan
+        """Manage the models of a replica.
+
+        Args:
+            source: The offered checkpoints.
+            loader: Loads the models.
+            sessions: The sessions; those of a model are closed if it is evicted at once.
+        """
+        self.continues_plans = False  # whether chunks of the deployment's own model continue the executed plan
         self.contract: Contract | None = None  # contract of the deployment's own model that was loaded last
         self.weights: dict[str, Any] | None = None  # weights of the deployment's own model that was loaded last
-        self.devices: list[dict[str, Any]] = []  # on which that model computes
-        self.files: Program = {}  # digests of the files that the settings of that model name
+        self.devices: list[dict[str, Any]] = []  # devices of that model
+        self.files: Program = {}  # digests of the files named in the settings of that model
         self.step = ""  # the step of a long first load, such as "compiling 4 rows (3 of 5)"
-        self.on_step: Callable[[str], None] = lambda _: None  # called with it, on the thread that loads
+        self.on_step: Callable[[str], None] = lambda _: None  # called with `step`, on the loading thread
         self._source = source
         self._loader = loader
         loader.on_progress = self._set_step
@@ -297,7 +303,7 @@ class ModelManager:
             return [what for model in self._cache.loaded.values() for what in model.report.uncompiled]
 
     def loading(self) -> PolicyUnavailable:
-        """Return the error for clients while the first checkpoint is loaded, which names the step."""
+        """Return the error for clients while the first checkpoint is loaded, which names the step of loading."""
         return PolicyUnavailable(f"the policy is loading{self.step and f' ({self.step})'}; try again")
 
     def describe(self) -> dict[str, Any]:
@@ -306,7 +312,7 @@ class ModelManager:
             return self._cache.describe()
 
     def loaded(self, choice: CheckpointChoice) -> LoadedModel | None:
-        """Return the model with which an episode of that choice would begin now, or None if it is not loaded."""
+        """Return the model that an episode of that choice would use now; None if it is not loaded."""
         with self._changed:
             return self._cache.find(choice)
 
@@ -456,7 +462,7 @@ class ModelManager:
             logger.info("there is room for one checkpoint: its sessions end, for the next")
             self._sessions.close_those_of(model)
         with self._changed:
-            if task.at_once and model.sessions:  # a session from another replica holds it, but is in no table yet
+            if task.at_once and model.sessions:  # a session from another replica holds it, but is not in a table yet
                 self._changed.wait(_CHECK_S)
             if model.sessions:  # a session still holds it, or has taken it
                 return

@@ -33,17 +33,17 @@ from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.python_env import child_main
 from vlagents_ray.serve.python_env.child_main import Settings
 
-_FOREVER_S = 1e6  # no limit here: as for any policy, a replica whose call takes too long is replaced
+_FOREVER_S = 1e6  # no limit here: as for any policy, a replica with an overdue call is replaced
 _CONNECT_S = 10.0
 _CLOSE_S = 10.0
 _EXIT_S = 2.0
-_LAST_WORDS = 20  # last lines of the child's error output that an error quotes
+_LAST_WORDS = 20  # number of lines at the end of the child's error output that an error quotes
 
 
 class Child:
-    """A child process, which ends with this process, however that ends; `child_main` is the other side.
+    """A child process, which ends when this process ends for any reason; the other side is `child_main`.
 
-    Calls of the replica's engine to the policy travel through shared memory (`vlagents_ray.client.transports.shm`) to
+    Calls of the replica's engine to the policy are sent through shared memory (`vlagents_ray.client.transports.shm`) to
     an engine in the child: a batch is one message, and each session has a session in the child.
 
     `call` and the methods below it may be called from any thread.
@@ -75,7 +75,7 @@ class Child:
             ConfigError: The interpreter cannot be started.
             PolicyFailed: The policy did not load.
         """
-        # The kernel kills the child when the thread that started it ends: this thread ends after the child.
+        # The kernel kills the child when the thread that started it ends; this thread ends after the child.
         keeper = threading.Thread(target=self._keep, name="policy-process", daemon=True)
         keeper.start()
         spawned = self._spawned.get()
@@ -104,7 +104,7 @@ class Child:
                 replies = self._transport.call(requests, _FOREVER_S)
             except PolicyUnavailable as error:
                 raise ConnectionLost(f"{self._ended()}; the replica is being replaced") from error
-        if len(replies) != len(requests):  # a single reply to the message as a whole
+        if len(replies) != len(requests):  # a single reply to the whole message
             raise replies[0].error or PolicyFailed(f"got {len(replies)} replies to {len(requests)} requests")
         return replies
 
@@ -118,7 +118,7 @@ class Child:
         return name
 
     def close_session(self, name: str) -> None:
-        """Have a session closed soon; return at once, as the garbage collector may call this at any moment."""
+        """Close a session soon; return at once, as the garbage collector may call this at any moment."""
         self._left.put(name)
 
     def require_alive(self) -> None:
@@ -127,7 +127,7 @@ class Child:
             raise PolicyUnavailable(self._ended())
 
     def close(self) -> None:
-        """Have the policy closed, and end the process."""
+        """Close the policy, and end the process."""
         process = self._process
         if process is None or self._closed:
             return
@@ -148,7 +148,7 @@ class Child:
                     pipe.close()
 
     def _introduced(self, process: subprocess.Popen[bytes], keeper: threading.Thread) -> dict[str, Any]:
-        """Return the document that the process sends once its policy is loaded; raise `PolicyFailed` if it did not."""
+        """Return the document that the process sends when its policy is loaded; raise `PolicyFailed` otherwise."""
         _write(process, json.dumps(asdict(self._settings)).encode() + b"\n")
         while True:
             line = b"" if process.stdout is None else process.stdout.readline()
@@ -231,7 +231,7 @@ def make_agent(args: ServerArgs, config: Mapping[str, Any]) -> Agent:
 def version_of(args: ServerArgs) -> str:
     """Return a text that is equal in replicas between which sessions can move.
 
-    It covers policy, wrappers and environment, since pickles of one environment are valid in no other.
+    It covers the policy, wrappers and environment, since pickles of one environment are valid in no other.
     """
     return json.dumps([args.policy, args.wrappers, args.environment.model_dump()], sort_keys=True)
 

@@ -1,11 +1,11 @@
-"""The child process of a replica, which runs a policy whose packages, or Python, the replica cannot have.
+"""The child process of a replica, which runs a policy with packages, or a Python, that the replica cannot use.
 
     python -m vlagents_ray.serve.python_env.child_main
 
-It needs the light install and pydantic, not Ray. The first line of its standard input is `Settings`, as JSON. Each step
-of a long load is a line of JSON. When the policy is loaded, it writes one with the contract and the address of its
-`ShmServer`, through which all requests go; if the policy does not load, the line holds the error. A further byte of
-input lets it close the policy and end. The end of its input, or the death of its parent, ends it at once.
+It needs the light install and pydantic, not Ray. The first line of its standard input is `Settings`, as JSON. It writes
+a line of JSON for each step of a long load and, when the policy is loaded, a line with the contract and the address of
+its `ShmServer`, which receives all requests; if the policy does not load, that line contains the error. A further byte
+of input makes it close the policy and end. The end of its input, or the death of its parent, ends it at once.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def run() -> None:
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     answers = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)  # anything printed goes to the replica's log
+    os.dup2(2, 1)  # redirects printed text to the replica's log
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
     settings = Settings(**json.loads(_line()))
     over = threading.Event()
@@ -145,7 +145,7 @@ def _wait_for_the_end(end: Callable[[], None]) -> None:
     if not os.read(0, 1):
         os._exit(1)
     end()
-    os.read(0, 1)  # the end of the input: the replica waits no longer
+    os.read(0, 1)  # at the end of the input the replica no longer waits
     os._exit(1)
 
 

@@ -23,12 +23,12 @@ Progress = Callable[[str], None]
 
 _US = "vlagents-ray"
 _FIXES = "vlagents_ray_import_fixes"  # a module and a .pth file in the environments created here
-_NOT_IN_A_WHEEL = {"RECORD", "INSTALLER", "REQUESTED", "direct_url.json"}  # an installer writes them
-_SHOWN = 2000  # last characters of uv's output that an error quotes
+_NOT_IN_A_WHEEL = {"RECORD", "INSTALLER", "REQUESTED", "direct_url.json"}  # files that an installer writes
+_SHOWN = 2000  # number of characters at the end of uv's output that an error quotes
 _MINOR = "import sys; print('%d.%d' % sys.version_info[:2])"
 _PYTHON = re.compile(r"^# python: (3\.\d+)\s*$", re.MULTILINE)
 _CUDA = re.compile(r"^ \+ ((?:nvidia|cuda)-\S+)", re.MULTILINE)
-# pip's variables for package sources, and uv's, which take precedence.
+# pip's variables for package sources, and those of uv, which take precedence.
 _PIP_VARIABLES = {
     "PIP_INDEX_URL": "UV_DEFAULT_INDEX",
     "PIP_EXTRA_INDEX_URL": "UV_INDEX",
@@ -42,18 +42,18 @@ def python_in(folder: Path) -> Path:
 
 
 def create(folder: Path, python: str | None = None, progress: Progress = lambda _: None) -> Path:
-    """Create an empty environment in `folder`, unless there is one.
+    """Create an empty environment in `folder`, unless there is one already.
 
     Args:
         folder: The folder of the environment.
-        python: A version or the path of an interpreter; by default that of this process.
-        progress: Gets a line about each step.
+        python: A version or the path of an interpreter; by default this process's.
+        progress: Called with a line about each step.
 
     Returns:
         The path of its Python.
 
     Raises:
-        ConfigError: The folder holds something else, or uv cannot create the environment.
+        ConfigError: The folder contains something else, or uv cannot create the environment.
     """
     found = python_in(folder)
     if found.exists():
@@ -68,7 +68,7 @@ def create(folder: Path, python: str | None = None, progress: Progress = lambda 
 def find_python(version: str) -> str:
     """Return the path of an interpreter of that minor version, such as "3.12".
 
-    It is this process's own, one on PATH, or one that pyenv or uv has installed for this user.
+    It may be this process's own, one on PATH, or one that pyenv or uv has installed for this user.
 
     Raises:
         ConfigError: There is no such interpreter.
@@ -87,7 +87,7 @@ def find_python(version: str) -> str:
 
 
 def install(python: Path, wanted: Sequence[str]) -> None:
-    """Install `wanted`, arguments of `uv pip install`, for `python`; raise `ConfigError` with uv's output otherwise."""
+    """Install `wanted`, arguments of `uv pip install`, for `python`; raise `ConfigError` with uv's output."""
     _uv(["pip", "install", "--quiet", "--python", str(python), *wanted])
 
 
@@ -101,7 +101,7 @@ def make_environment(
     cuda: bool = False,
     progress: Progress = lambda _: None,
 ) -> Path:
-    """Create an environment for a policy, with this same package in it.
+    """Create an environment for a policy, with this package in it.
 
     On a machine without an NVIDIA GPU it gets the version of torch of this environment, and the replacements for other
     requirements in `NAME.cpu.txt`, in the folder of `requirements`.
@@ -110,18 +110,18 @@ def make_environment(
         requirements: The requirements file of the policy.
         folder: The folder of the environment.
         more: Further requirements files.
-        python: See `create`; by default that which the requirements name, `# python: 3.12`, if they name one.
-        light: Whether to leave out Ray, for a child process; always so for another Python minor version, in which no
+        python: See `create`; by default the version that the requirements name, `# python: 3.12`, if any.
+        light: Whether to omit Ray, for a child process; always true for another Python minor version, in which no
             replica can run.
         cuda: Whether CUDA packages, which take several GB, may be installed without an NVIDIA GPU.
-        progress: Gets a line about each step.
+        progress: Called with a line about each step.
 
     Returns:
         The path of its Python.
 
     Raises:
-        ConfigError: A file or the Python does not exist, uv fails, or a CUDA build would be installed without an
-            NVIDIA GPU.
+        ConfigError: A file or the Python does not exist, uv fails, or a CUDA build would be installed without an NVIDIA
+            GPU.
     """
     files = [requirements, *more]
     for file in files:
@@ -152,7 +152,7 @@ def make_environment(
 def _ourselves(light: bool, scratch: Path) -> list[str]:
     """Return uv's arguments for this package as it is installed here, with the same Ray, or pydantic if `light`.
 
-    It is never installed by its name: an index may have another package under that name.
+    The package is never installed by its name: an index may have another package of that name.
     """
     extra = "" if light else "[serve]"
     source = Path(vlagents_ray.__file__).parents[1]
@@ -167,9 +167,10 @@ def _ourselves(light: bool, scratch: Path) -> list[str]:
 
 
 def installed_wheel(folder: Path) -> Path:
-    """Write a wheel of this package, from the files that are installed here, into `folder`, and return its path.
+    """Write a wheel of this package, from the installed files, into `folder`, and return its path.
 
-    See https://packaging.python.org/en/latest/specifications/binary-distribution-format: the files, and a list of them.
+    The wheel contains the files and a list of them, see
+    https://packaging.python.org/en/latest/specifications/binary-distribution-format.
     """
     here = importlib.metadata.distribution(_US)
     kept = [
@@ -230,7 +231,7 @@ def _minor(python: Path) -> str:
 
 
 def _is(python: Path, version: str) -> bool:
-    """Return whether an interpreter runs and has that minor version; a shim of pyenv's may not run."""
+    """Return whether an interpreter runs and has that minor version; a shim of pyenv may not run."""
     done = subprocess.run([str(python), "-c", _MINOR], capture_output=True, text=True, check=False)  # noqa: S603
     return done.returncode == 0 and done.stdout.strip() == version
 
@@ -241,7 +242,7 @@ def _said_by(python: Path, program: str) -> str:
 
 
 def _uv(arguments: Sequence[str]) -> str:
-    """Run uv and return its error output, in which it reports its work."""
+    """Run uv and return its error output, which reports its work."""
     if importlib.util.find_spec("uv") is not None:
         command = [sys.executable, "-m", "uv"]
     else:

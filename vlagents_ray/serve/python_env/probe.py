@@ -1,4 +1,4 @@
-"""Checks of a virtual environment: whether it has an interpreter, its packages, and whether the policy builds there."""
+"""Checks of a virtual environment: whether it has an interpreter and its packages, and can build the policy."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from vlagents_ray.serve.config.deployment import EnvironmentArgs
 _PACKAGES = ("ray", "numpy", "vlagents-ray")
 _TIMEOUT_S = 120.0  # imports from a network drive without a cache are slow
 OLDEST = (3, 10)
-# The program must run in any file that the path names, an old Python included; imports may print before the last line.
+# The program must run in any interpreter, including an old Python; imports may print before the last line.
 _PROBE = """
 import json, sys
 found = {"python": "%d.%d.%d" % sys.version_info[:3]}
@@ -44,7 +44,7 @@ class EnvironmentProbe:
     """The answer of an interpreter."""
 
     python: str  # path of the interpreter
-    versions: dict[str, str]  # versions of "python", "ray", "numpy", "vlagents-ray"; only those installed are included
+    versions: dict[str, str]  # versions of "python", "ray", "numpy" and "vlagents-ray", as far as they are installed
     policy: dict[str, Any] | None = None  # result of `child_main.examine`, if it was requested
 
     def hosts_replicas(self) -> str | None:
@@ -63,8 +63,13 @@ def probe(
 ) -> EnvironmentProbe:
     """Start the interpreter once, to get its versions and optionally to build a policy.
 
-    `policy` has the arguments of `child_main.examine`; None builds none. Raises `ConfigError` if no policy of this
-    server can run in the interpreter.
+    Args:
+        python: The path of the interpreter.
+        policy: The arguments of `child_main.examine`; None builds no policy.
+        env_vars: Further environment variables.
+
+    Raises:
+        ConfigError: No policy of this server can run in the interpreter.
     """
     if not Path(python).is_file():
         inside = Path(python) / "bin" / "python"
@@ -88,7 +93,7 @@ def probe(
 
 
 def _making(python: str) -> str:
-    """Return the command that makes the environment of an interpreter: .venv-NAME is that of requirements/NAME.txt."""
+    """Return the command that creates an interpreter's environment: .venv-NAME is that of requirements/NAME.txt."""
     folder = Path(python).parent.parent
     prefix, _, name = folder.name.partition(".venv-")
     if prefix or not name:
@@ -109,10 +114,10 @@ def check_policy(
     """Build the policy in its environment, as a replica will, and return its contract.
 
     Returns:
-        The contract; None if the policy states none before it is loaded.
+        The contract; None if the policy has none before it is loaded.
 
     Raises:
-        ConfigError: The policy cannot be built there, or the environment cannot be used, or names no interpreter.
+        ConfigError: The policy cannot be built there, or the environment is unusable or names no interpreter.
     """
     if environment.python is None:
         raise ConfigError("environment: names no interpreter to ask")
