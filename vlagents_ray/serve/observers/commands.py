@@ -1,9 +1,9 @@
-"""Commands to the sessions of a replica, from keys that may operate them on the live page.
+"""Commands to the sessions of a replica, from the holders of keys that may operate them on the live page.
 
-From a network a robot can only be made to stop: it is paused, stopped, or its episode is marked. What makes it move
-(resuming, another instruction, an operator's motion) is done at the robot. A command travels in the answer to the next
-request of the robot, within `_WAITS_S` or never, since a late one would surprise the person beside it; a later request
-states the outcome. The server itself executes `SAVE`.
+Over a network a robot can only be stopped: it is paused, stopped, or its episode is marked. Commands that make it move
+(resuming, another instruction, an operator's motion) are given at the robot. A command is sent in the answer to the
+robot's next request, within `_WAITS_S` or never, since a late one could stop the robot unexpectedly; a later request
+reports the outcome. The server itself executes `SAVE`.
 """
 
 from __future__ import annotations
@@ -32,28 +32,28 @@ SAVE = "save"
 COMMANDS = (*TO_ROBOT, SAVE)
 
 TRACKED_S = 15.0  # time for which the outcome of a command is awaited
-_WAITS_S = 5.0  # time within which a command has to reach the robot
-_SHOWN = 5  # last commands of a session that are shown
-_UNANSWERED = 3  # requests without the outcome of a command, after which it counts as ignored
-_REFUSAL = 200  # most characters of a reason
+_WAITS_S = 5.0  # time within which a command must reach the robot
+_SHOWN = 5  # number of commands shown per session, the latest ones
+_UNANSWERED = 3  # number of requests without the outcome of a command after which it counts as ignored
+_REFUSAL = 200  # maximum length of a reason
 
 State = Literal["waiting", "sent", "saving", "done", "refused", "ignored", "too late"]
 
 
 @dataclass(slots=True)
 class Press:
-    """A button that was pressed."""
+    """A button press."""
 
     id: str
     do: str
     by: str  # name of the key; empty without keys
-    pressed: float  # s, of the board's clock
+    pressed: float  # s, of the clock of the board
     state: State = "waiting"
-    why: str = ""  # it was refused; or the folder into which the session was saved
-    requests: int = 0  # of the session since it was sent
+    why: str = ""  # reason for a refusal, or the folder into which the session was saved
+    requests: int = 0  # number of the session's requests since the command was sent
 
     def describe(self) -> dict[str, Any]:
-        """Return it for viewers."""
+        """Describe the command for viewers."""
         return {"id": self.id, "do": self.do, "by": self.by, "state": self.state, "why": self.why}
 
 
@@ -68,7 +68,10 @@ class CommandBoard:
     ) -> None:
         """Create a board without commands.
 
-        `save` writes the last seconds of a session, and returns where to; it may take long, and raise errors.
+        Args:
+            sessions: The sessions of the replica.
+            save: Writes the last seconds of a session and returns the path; it may be slow, and may raise errors.
+            clock: Clock, s.
         """
         self._save = save
         self._sessions = sessions
@@ -79,11 +82,11 @@ class CommandBoard:
         self._lock = threading.Lock()
 
     def press(self, session_id: str, do: str, by: str) -> dict[str, Any]:
-        """Accept the command `do`, one of `COMMANDS`, of the holder of the key `by`, and return it as `of` does.
+        """Accept the command `do`, one of `COMMANDS`, from the holder of the key `by`, and describe it as `of` does.
 
         Raises:
             UnknownSession: The session is not here.
-            InvalidInput: There is no such command.
+            InvalidInput: The command is unknown.
             Overloaded: Too many commands wait for the session's next request.
         """
         if do not in COMMANDS:
@@ -100,7 +103,7 @@ class CommandBoard:
             self._expire(held)
             if len(held) == _SHOWN:
                 over = next((one for one in held if one.state not in ("waiting", "saving")), None)
-                if over is None and do == "stop":  # is never refused for commands that matter less
+                if over is None and do == "stop":  # a "stop" replaces a less important command
                     over = next((one for one in held if one.state == "waiting" and one.do != "stop"), None)
                 if over is None:
                     raise Overloaded(f"session {session_id!r}: {_SHOWN} commands wait already for its robot's request")
@@ -112,7 +115,7 @@ class CommandBoard:
         return pressed.describe()
 
     def read_outcomes(self, session_id: str, request: Request) -> None:
-        """Read the outcomes of earlier commands that a session's request states."""
+        """Read the outcomes of earlier commands that a session's request reports."""
         held = self._presses.get(session_id)
         if not held or request.obs is None:
             return
@@ -129,7 +132,7 @@ class CommandBoard:
                     one.state = "ignored" if one.requests >= _UNANSWERED else one.state
 
     def send(self, session_id: str, reply: Reply) -> None:
-        """Put the oldest command that waits into the answer to a session's act; "stop" goes first."""
+        """Add the oldest waiting command to the answer to a session's act; "stop" has priority."""
         held = self._presses.get(session_id)
         if not held or reply.act is None:
             return
@@ -142,14 +145,14 @@ class CommandBoard:
                     return
 
     def of(self, session_id: str) -> list[dict[str, Any]]:
-        """Return the last commands to a session, oldest first: `id`, `do`, `by`, `state` and `why` of each."""
+        """Describe the last commands to a session, oldest first: `id`, `do`, `by`, `state` and `why` of each."""
         with self._lock:
             held = self._presses.get(session_id, [])
             self._expire(held)
             return [one.describe() for one in held]
 
     def forget_others(self, sessions: Collection[str]) -> None:
-        """Drop the commands to all sessions but these, since those have ended."""
+        """Drop the commands to all other sessions, which have ended."""
         with self._lock:
             for session in self._presses.keys() - set(sessions):
                 del self._presses[session]
@@ -163,7 +166,7 @@ class CommandBoard:
             pressed.why, pressed.state = str(error)[:_REFUSAL], "refused"
 
     def _expire(self, held: Collection[Press]) -> None:
-        """Give up the commands that have waited for too long; the caller holds the lock."""
+        """Expire the commands that have waited for too long; the caller holds the lock."""
         oldest = self._clock() - _WAITS_S
         for one in held:
             if one.state == "waiting" and one.pressed < oldest:

@@ -1,4 +1,4 @@
-"""The episodes of sessions, written into datasets."""
+"""Writing the episodes of sessions into datasets."""
 
 from __future__ import annotations
 
@@ -24,31 +24,31 @@ logger = logging.getLogger(__name__)
 
 CHUNK, ROWS, SESSION = "chunk", "chunk_rows", "session"  # columns of each frame
 TRACE = "trace"  # key in `info.json`
-_FRAMES = 2000  # most frames of an episode, whose numbers are in memory; the session continues in the next one
-_BYTES = 16 * 2**20  # most bytes of these numbers
-_SESSIONS = 32  # most sessions that are recorded at once, each with an encoder for each camera
-_FREE_BYTES = 2**30  # room that the recording leaves on its disk
-_LOOK_S = 10.0  # time after which the size of the folder is looked up again
+_FRAMES = 2000  # maximum number of frames of an episode, whose numbers are in memory; then another episode begins
+_BYTES = 16 * 2**20  # maximum size of these numbers
+_SESSIONS = 32  # maximum number of sessions that are recorded at once; each has an encoder per camera
+_FREE_BYTES = 2**30  # space that the recording leaves free on its disk
+_LOOK_S = 10.0  # interval of the checks of the folder's size
 _STATED = ("policy", "checkpoint", "weights", "policy_version", "contract", "version", "code")  # of the metadata
 
 
 class RecordingEnded(Exception):
-    """Nothing more is recorded, for the reason that it states."""
+    """Raised when nothing more is recorded, with the reason."""
 
 
 @dataclass(frozen=True, slots=True)
 class RecordedAct:
-    """One act of a session: the observation, and the chunk that answered it."""
+    """One act of a session: the observation, and the chunk in its answer."""
 
     obs: Obs
     chunk: np.ndarray  # (H, D) float32
     captured_at: float  # s since 1970
-    tick: int  # acts of the session since its reset
+    tick: int  # number of acts of the session since its reset
     columns: Mapping[str, Any]  # see `RobotEpisode.add`
 
     @property
     def shapes(self) -> tuple[Any, ...]:
-        """The common columns of the frames of one dataset."""
+        """The shapes that all frames of one dataset have in common."""
         obs = self.obs
         cameras = tuple((name, obs.cameras[name].shape) for name in sorted(obs.cameras))
         state = tuple((name, obs.state[name].shape) for name in sorted(obs.state))
@@ -57,12 +57,12 @@ class RecordedAct:
 
 @dataclass(frozen=True, slots=True)
 class _Shelf:
-    """A dataset, and the common columns of its frames."""
+    """A dataset, with the shapes that its frames have in common."""
 
     dataset: Dataset
     shapes: tuple[Any, ...]
-    rows: int  # of `CHUNK`
-    meaning: ActionSpec  # of the actions
+    rows: int  # number of rows of `CHUNK`
+    meaning: ActionSpec  # specification of the actions
 
     def fits(self, frame: RecordedAct) -> bool:
         return self.shapes == frame.shapes and self.rows >= len(frame.chunk)
@@ -70,20 +70,20 @@ class _Shelf:
 
 @dataclass(slots=True)
 class _Running:
-    number: int  # of the session, the same in all its episodes
+    number: int  # number of the session, the same in all its episodes
     instruction: str
     reset: str  # options of the reset, as `to_text` writes them; empty once they are recorded
     weights: str  # the loaded weights in the reset's info, as text; empty once recorded
-    shelf: _Shelf | None = None  # of `episode`
+    shelf: _Shelf | None = None  # dataset of `episode`
     episode: RobotEpisode | None = None  # None before the first frame
-    frames: int = 0  # of `episode`
-    size: int = 0  # bytes of its numbers
+    frames: int = 0  # number of frames of `episode`
+    size: int = 0  # size of its numbers, bytes
 
 
 class EpisodeWriter:
     """Writes the episodes of one replica. Not thread-safe.
 
-    Frames of other cameras, states or actions go into another dataset: `FOLDER/NAME-0`, `FOLDER/NAME-1`, …
+    Frames with other cameras, states or actions are written to another dataset: `FOLDER/NAME-0`, `FOLDER/NAME-1`, …
     """
 
     def __init__(
@@ -96,13 +96,18 @@ class EpisodeWriter:
         most_bytes: float,
         describe: Callable[[], Mapping[str, Any]] | None = None,
     ) -> None:
-        """Create a writer, which makes no file before the first frame; its datasets are `folder`/`name`-0 and so on.
+        """Create a writer; its first file is created with the first frame.
 
-        Timestamps of frames assume a rate of `fps`, Hz. Above `most_bytes` in the folder nothing more is recorded.
-        `describe` returns the metadata of the policy, which a trace states; None if the frames make no trace.
+        Args:
+            folder: The folder of the datasets.
+            name: The beginning of their names.
+            fps: The rate of frames that timestamps assume, Hz.
+            lossless: Whether videos are encoded without loss.
+            most_bytes: Maximum size of the folder, over which recording ends.
+            describe: Returns the metadata of the policy, for a trace; None if the frames make no trace.
         """
-        self.saved = 0  # frames of complete episodes
-        self.lost = 0  # frames of episodes that could not be written
+        self.saved = 0  # number of frames in complete episodes
+        self.lost = 0  # number of frames in episodes that could not be written
         self._folder = folder
         self._name = name
         self._fps = fps
@@ -112,13 +117,16 @@ class EpisodeWriter:
         self._shelves: list[_Shelf] = []
         self._running: dict[str, _Running] = {}
         self._numbers = 0
-        self._looked = float("-inf")  # time at which the size of the folder was looked up, s
+        self._looked = float("-inf")  # time of the last check of the folder's size, s
 
     def begin(self, session: str, instruction: str, reset: str = "", weights: str = "") -> None:
-        """Begin to record a session, and end its episode before.
+        """Begin to record a session, and end its previous episode.
 
-        `reset` are the options of its reset, and `weights` the checkpoint and the weights that it acts with, both as
-        text, and empty if they are not known.
+        Args:
+            session: The session's id.
+            instruction: The episode's instruction.
+            reset: The options of the reset, as text; empty if unknown.
+            weights: The checkpoint and weights that act, as text; empty if unknown.
         """
         self.end(session)
         if len(self._running) >= _SESSIONS:
@@ -130,11 +138,11 @@ class EpisodeWriter:
         return session in self._running
 
     def add(self, session: str, frame: RecordedAct) -> None:
-        """Append a frame to a session that has begun.
+        """Append a frame to a session that is being recorded.
 
         Raises:
             RecordingEnded: The folder, or its disk, is full; the recorded episodes are complete.
-            OSError: It cannot be written.
+            OSError: The frame cannot be written.
         """
         running = self._running[session]
         full = running.frames >= _FRAMES or running.size >= _BYTES
@@ -160,19 +168,19 @@ class EpisodeWriter:
         running.size += columns[CHUNK].nbytes + sum(len(text) for text in columns.values() if isinstance(text, str))
 
     def end(self, session: str) -> Path | None:
-        """End the session's episode, and return the folder of the dataset that it is now a part of, if it has any."""
+        """End the session's episode, and return the folder of the dataset that contains it; None without an episode."""
         running = self._running.pop(session, None)
         return None if running is None else self._save(running)
 
     def drop(self, session: str) -> None:
-        """Drop the session's running episode, which cannot be written."""
+        """Drop the session's current episode, which cannot be written."""
         running = self._running.pop(session, None)
         if running is not None and running.episode is not None:
             self.lost += running.frames
             running.episode.abandon()
 
     def close(self) -> None:
-        """End all episodes; those that cannot be written are dropped."""
+        """End all episodes; drop those that cannot be written."""
         for session in list(self._running):
             try:
                 self.end(session)
@@ -186,7 +194,7 @@ class EpisodeWriter:
         size = 0
         for root, _, names in os.walk(self._folder):
             for name in names:
-                with suppress(OSError):  # just renamed
+                with suppress(OSError):  # renamed a moment ago
                     size += os.stat(os.path.join(root, name)).st_size
         if size > self._most_bytes:
             raise RecordingEnded(f"{self._folder} holds {size / 1e9:.3g} GB, want {self._most_bytes / 1e9:g} at most")
@@ -208,13 +216,13 @@ class EpisodeWriter:
         return shelf.dataset.root
 
     def _shelf(self, frame: RecordedAct) -> _Shelf:
-        """Return the dataset of such frames, with at least so many rows of a chunk."""
+        """Return the dataset for such frames, with at least as many rows per chunk."""
         for shelf in self._shelves:
             if shelf.fits(frame):
                 return shelf
         root = self._folder / f"{self._name}-{len(self._shelves)}"
         self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        root.mkdir(mode=0o700)  # pictures are only for this user
+        root.mkdir(mode=0o700)  # other users must not read the pictures
         dataset = Dataset(root, self._fps, lossless=self._lossless)
         meaning = ActionSpec()
         if self._describe is not None:

@@ -1,8 +1,8 @@
-"""The latest answers and observations of a replica's sessions, kept while something reads them, and only then.
+"""The latest answers and observations of a replica's sessions, kept only while a reader renews its lease.
 
-Clients choose what is kept, so all of it is bounded in bytes: of an answer, numbers and short texts; of observations,
-the latest of each session, at most `RATE` times a second; and of both, the oldest are dropped beyond `ANSWER_BYTES` and
-`OBSERVATION_BYTES`. The live page, the last seconds of each session and the viewers read them on their own threads.
+Clients determine the data, so all of it is bounded in bytes: answers keep numbers and short texts; observations are the
+latest of each session, at most `RATE` per second; and of both, the oldest are dropped beyond `ANSWER_BYTES` and
+`OBSERVATION_BYTES`. The live page, the last seconds of each session and the viewers read the data on their own threads.
 """
 
 from __future__ import annotations
@@ -24,43 +24,43 @@ from vlagents_ray.serve.engine.observer import Observer, Observers
 from vlagents_ray.serve.observers.commands import CommandBoard
 from vlagents_ray.serve.requests import PendingRequest
 
-ENCODING_SHARE = 0.04  # of a core, for encoding pictures
-RATE = 10.0  # observations a second and session that are kept
-LEASE_S = 2.0  # time after the last reading at which nothing is kept any more
-ANSWER_BYTES = 2**25  # most bytes of the answers that are kept
-OBSERVATION_BYTES = 2**28  # most bytes of the observations: 70 sessions of four unencoded VGA cameras
-VALUES = 64  # most numbers of one part of a state, or of one action
-ROWS = 128  # most actions of a chunk
-TEXT = 200  # most characters of a text
+ENCODING_SHARE = 0.04  # share of a core for encoding pictures
+RATE = 10.0  # maximum rate of kept observations per session, Hz
+LEASE_S = 2.0  # time after the last reading for which data are kept
+ANSWER_BYTES = 2**25  # maximum size of the kept answers
+OBSERVATION_BYTES = 2**28  # maximum size of the observations: 70 sessions of four unencoded VGA cameras
+VALUES = 64  # maximum number of values of one part of a state, or of one action
+ROWS = 128  # maximum number of actions of a chunk
+TEXT = 200  # maximum length of a text
 SHOWN_OPS = ("act", "reset")
-_ACTION = 4096  # an action of more numbers is not kept with its observation
-_PARTS = 64  # an observation with more cameras, or parts of its state, is not kept
-_INFO = 24  # most entries of an act's info
-_OWN = ("timing", "policy", "behaviour", "distribution")  # of an act's info: shown elsewhere, or our own
-_MOST = 2**53  # largest number that JSON keeps
-_OBJECTS = 1000  # bytes of an answer or an observation besides its arrays, files and texts, estimated
+_ACTION = 4096  # maximum number of values of an action that is kept with its observation
+_PARTS = 64  # maximum number of cameras, and of parts of the state, of a kept observation
+_INFO = 24  # maximum number of entries of an act's info
+_OWN = ("timing", "policy", "behaviour", "distribution")  # entries of an act's info: shown elsewhere, or internal
+_MOST = 2**53  # largest integer that JSON represents exactly
+_OBJECTS = 1000  # estimated size of an answer or an observation besides its arrays, files and texts, bytes
 _ENCODING = threading.Lock()
 _KEPT_S = 1.0  # time for which pixels are kept for a reader
 
 
 class Answer(NamedTuple):
-    """The kept data of the answer to one request."""
+    """The kept data of one answer."""
 
     number: int  # increases with every answer of the replica
     session: str
     op: str
     rank: str
-    timing: Mapping[str, float]  # ms by stage; still completed when the answer was sent
-    error: str = ""  # its code; empty if there is none
+    timing: Mapping[str, float]  # ms by stage; completed when the answer was sent
+    error: str = ""  # error code; empty without an error
     detail: str = ""
-    rows: int = 0  # of the chunk
-    action: np.ndarray | None = None  # (rows, D) float32, as far as `ROWS` and `VALUES` reach; None without an act
+    rows: int = 0  # number of rows of the chunk
+    action: np.ndarray | None = None  # (rows, D) float32, truncated to `ROWS` and `VALUES`; None without an act
     done: bool = False
     info: Mapping[str, Any] = MappingProxyType({})  # the numbers and short texts in the policy's info
 
     @property
     def size(self) -> int:
-        """The memory that it takes, bytes."""
+        """The size of its memory, bytes."""
         arrays = 0 if self.action is None else self.action.nbytes
         texts = (self.session, self.detail, *self.info, *self.info.values())
         return _OBJECTS + arrays + sum(4 * len(text) for text in texts if isinstance(text, str))
@@ -68,26 +68,26 @@ class Answer(NamedTuple):
 
 @dataclass(slots=True)
 class KeptObservation:
-    """An observation as the policy got it."""
+    """An observation as received by the policy."""
 
     number: int
     time: float  # s, of `time.monotonic`
     state: dict[str, np.ndarray]  # (D,) float32, with the gripper as a part
-    cameras: dict[str, np.ndarray]  # (H, W, 3) uint8 RGB; empty once they are encoded
-    files: dict[str, bytes]  # JPEG or PNG files by camera: those that the client sent, or encoded by the reader
-    action: np.ndarray | None = None  # (D,) float32, the first row of its answer, once that was sent
-    counted: int = 0  # bytes, in the observer's sum
+    cameras: dict[str, np.ndarray]  # (H, W, 3) uint8 RGB; empty after they are encoded
+    files: dict[str, bytes]  # JPEG or PNG files by camera: those of the client, or those encoded for the reader
+    action: np.ndarray | None = None  # (D,) float32, the first row of its answer, after that was sent
+    counted: int = 0  # size that is included in the observer's sum, bytes
 
     @property
     def size(self) -> int:
-        """The memory that it takes, bytes."""
+        """The size of its memory, bytes."""
         arrays = sum(part.nbytes for part in self.state.values()) + (0 if self.action is None else self.action.nbytes)
         pixels = {id(owner): size for owner, size in map(_owner, self.cameras.values())}
         return _OBJECTS + arrays + sum(pixels.values()) + sum(len(file) for file in self.files.values())
 
     def pictures(self) -> dict[str, bytes]:
-        """Return the files of all cameras; raw pixels are encoded now, which may take milliseconds."""
-        with _ENCODING:  # several may read
+        """Return the files of all cameras; raw pixels are encoded first, which may take milliseconds."""
+        with _ENCODING:  # there may be several readers
             for camera, image in self.cameras.items():
                 self.files[camera] = JPEG.file(image)
             self.cameras = {}
@@ -108,19 +108,19 @@ class LiveObserver(Observer):
         self._active = False
         self._numbers = itertools.count(1)
         self._answers: deque[Answer] = deque()
-        self._observations: dict[str, KeptObservation] = {}  # by session, the oldest first
+        self._observations: dict[str, KeptObservation] = {}  # by session, oldest first
         self._answer_bytes = self._observation_bytes = 0
         self._lock = threading.Lock()
 
     def renew(self, lease_s: float = LEASE_S) -> None:
-        """Keep recording events for `lease_s` more seconds."""
+        """Keep recording for `lease_s` more seconds."""
         self._until = max(self._until, self._clock() + lease_s)
         if not self._active:
             self._active = True
             self._observers.add(self)
 
     def expire(self) -> None:
-        """Drop everything after the last lease, and pixels that were not read; called every half second."""
+        """Drop all data after the last lease, and pixels that were not read; called every half second."""
         if self._active and self._clock() >= self._until:
             self.close()
         with self._lock:
@@ -131,7 +131,7 @@ class LiveObserver(Observer):
             for kept in self._observations.values():
                 if kept.time < self._clock() - _KEPT_S:
                     kept.cameras = {}
-                kept.counted = kept.size  # pictures have been encoded
+                kept.counted = kept.size  # the pictures have been encoded
             self._observation_bytes = sum(kept.counted for kept in self._observations.values())
 
     def close(self) -> None:
@@ -151,7 +151,7 @@ class LiveObserver(Observer):
             self._commands.send(pending.session_id, reply)
 
     def on_answer(self, pending: PendingRequest, reply: Reply) -> None:
-        """Add the answer to the session's observation."""
+        """Add the answer to its session's observation."""
         observation = pending.kept.pop(self, None)
         if observation is not None and reply.act is not None and (row := reply.act.rows()[0]).size <= _ACTION:
             observation.action = np.array(row)
@@ -173,7 +173,7 @@ class LiveObserver(Observer):
         return self._observations.get(session)
 
     def forget_others(self, sessions: Collection[str]) -> None:
-        """Drop the records of all sessions but these; the others have ended."""
+        """Drop the data of all other sessions, which have ended."""
         with self._lock:
             for session in self._observations.keys() - set(sessions):
                 self._observation_bytes -= self._observations.pop(session).counted
@@ -218,7 +218,7 @@ def _answer(number: int, pending: PendingRequest, reply: Reply) -> Answer:
 
 
 def _info(info: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the entries of an act's info that are numbers or texts, of those the first characters."""
+    """Return the entries of an act's info that are numbers or texts; texts are truncated."""
     kept: dict[str, Any] = {}
     for name, stated in info.items():
         if len(kept) == _INFO:
@@ -234,14 +234,14 @@ def _info(info: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _is_number(value: object) -> bool:
-    """Return whether it is a number of bounded size, and no NaN."""
+    """Return whether the value is a number of bounded size other than NaN."""
     return type(value) in (int, float) and -_MOST <= value <= _MOST  # type: ignore[operator]
 
 
 def _owner(image: np.ndarray) -> tuple[object, int]:
-    """Return the object whose memory an image keeps, and its bytes: a small image may be a part of a large message.
+    """Return the object whose memory an image keeps alive, and its size: a small image may be part of a large message.
 
-    Of memory that a client shares only the image itself counts, as the rest is the client's in any case.
+    Of memory shared by a client only the image itself counts, as the rest belongs to the client in any case.
     """
     owner: Any = image
     while (further := getattr(owner, "base" if isinstance(owner, np.ndarray) else "obj", None)) is not None:

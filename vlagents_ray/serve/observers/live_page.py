@@ -1,11 +1,11 @@
-"""The live page, and the WebSocket that feeds it.
+"""The live page, and the WebSocket that delivers its data.
 
     GET /live      the page: it holds no data, and needs no key
-    GET /v1/live   what the replicas do now, as JSON without pictures; keys need the scope "watch"
+    GET /v1/live   the current state of the replicas, as JSON without pictures; keys need the scope "watch"
     WS  /v1/live   the same with pictures, at most ten times a second
     POST /v1/live/command   {"session": …, "do": "pause"}: see `CommandBoard.press`; keys need the scope "operate"
 
-A process that is no replica, such as the driver of an evaluation, serves them by `page_server`. Its page offers no
+A process other than a replica, such as the driver of an evaluation, serves them by `page_server`. Its page has no
 commands, but videos:
 
     GET /v1/live/videos/7   a video to which the document refers by its number
@@ -14,7 +14,7 @@ The viewer requests each message, with the sessions whose pictures it shows: {"s
 misses old messages, and delays no other. The answer is the length of a JSON document (32 bits, little-endian), the
 document, and the files to which it refers by their index in `files`, the list of their lengths.
 
-A page in a browser cannot set a header: it states its key among the WebSocket's subprotocols, as "vlagents.key.KEY".
+A page in a browser cannot set a header: it sends its key among the WebSocket's subprotocols, as "vlagents.key.KEY".
 """
 
 from __future__ import annotations
@@ -55,15 +55,15 @@ PATH = "/v1/live"
 _PROTOCOL = "vlagents.live"
 _COMMAND = f"{PATH}/command"
 _WATCH, _OPERATE = "watch", "operate"  # scopes of keys
-_COMMAND_BYTES = 2**14  # longest command
-_VIEWERS = 32  # most viewers at once
-_SILENT_S = 30.0  # longest time between two messages of a viewer
+_COMMAND_BYTES = 2**14  # maximum size of a command
+_VIEWERS = 32  # maximum number of viewers
+_SILENT_S = 30.0  # maximum time between two messages of a viewer
 _SCRIPTS = ("evaluation.js", "live.js")
-_CHARACTERS = 2**16  # longest message of a viewer
+_CHARACTERS = 2**16  # maximum length of a viewer's message
 _POLICY_VIOLATION = 1008  # WebSocket close code
-_LAST_S = 0.5  # time for viewers to be sent how an evaluation ended
+_LAST_S = 0.5  # time in which viewers are sent the end of an evaluation
 _END_S = 1  # time limit for their connections to close, s
-_LEAVE_S = 5.0  # time limit for all of it
+_LEAVE_S = 5.0  # time limit for the whole shutdown
 
 VideoFiles = Callable[[int], Path | None]
 """Returns the file of the video with a number; None if there is none."""
@@ -72,9 +72,11 @@ VideoFiles = Callable[[int], Path | None]
 def live_routes(fleet: Fleet, *, open_to_network: bool, videos: VideoFiles | None = None) -> list[BaseRoute]:
     """Return the routes of the live page.
 
-    If the server is `open_to_network`, as other machines reach it without a key, watching is refused: the pictures of
-    all robots would be public. `videos` finds those to which the document of an evaluation refers; None on a policy's
-    server.
+    Args:
+        fleet: Gathers the data.
+        open_to_network: Whether other machines reach this server without a key. Watching is then refused, since the
+            pictures of all robots would be public.
+        videos: Finds the videos that the document of an evaluation refers to; None on a policy's server.
     """
     endpoint = _LiveEndpoint(fleet, open_to_network, videos)
     routes: list[BaseRoute] = [
@@ -180,7 +182,7 @@ class _LiveEndpoint:
 
 
 class _Viewed(BaseModel):
-    shown: list[str]  # sessions
+    shown: list[str]  # ids of the sessions
 
 
 class _Command(BaseModel):
@@ -189,9 +191,9 @@ class _Command(BaseModel):
 
 
 async def _command(http: HttpRequest) -> _Command:
-    """Return the command in a body; of a longer one no more is read."""
+    """Return the command in a body; a body that is too long is not read completely."""
     kind = http.headers.get("content-type", "").partition(";")[0].strip().lower()
-    if kind != "application/json":  # which no other site's page can send unasked
+    if kind != "application/json":  # no other site's page can send this type without the server's permission
         raise MalformedMessage(f"content-type: got {kind or 'none'!r}, want application/json")
     body = b""
     async for part in http.stream():
@@ -218,7 +220,7 @@ async def _page(_: HttpRequest) -> Response:
 
 @cache
 def live_page() -> list[str]:
-    """Return the page with its style and scripts in it, and these: the style first."""
+    """Return the page with its style and scripts included, then the style, then the scripts."""
     folder = package_files("vlagents_ray.serve.observers") / "page"
     parts = {name: folder.joinpath(name).read_text(encoding="utf-8") for name in ("live.css", *_SCRIPTS)}
     html = folder.joinpath("live.html").read_text(encoding="utf-8")
@@ -241,13 +243,17 @@ def require_watch_keys(host: str, keys: Keys | None) -> None:
 def page_server(
     fleet: Fleet, address: tuple[str, int], keys: Keys | None, *, name: str, videos: VideoFiles
 ) -> Iterator[str]:
-    """Serve the live page of an evaluation on a thread for the length of the context, and yield its address.
+    """Serve the live page of an evaluation on a thread for the length of the context, and yield its URL.
 
-    `address` is (host, port) to listen on; port 0 is any that is free. Without `keys`, which only loopback allows, all
-    are admitted; keys for some applications alone call this one `name`. See `live_routes` for `videos`.
+    Args:
+        fleet: Gathers the data.
+        address: Host and port to listen on; port 0 selects a free one.
+        keys: The accepted keys; None, which only loopback allows, admits all clients.
+        name: The name by which keys for single applications allow this page.
+        videos: See `live_routes`.
 
     Raises:
-        ConfigError: Other machines would reach the page without a key, or the address is not free.
+        ConfigError: Other machines would reach the page without a key, or the address is in use.
     """
     host, port = address
     require_watch_keys(host, keys)
@@ -270,4 +276,4 @@ def page_server(
         if fleet.watched:
             time.sleep(_LAST_S)
         server.should_exit = True
-        thread.join(_LEAVE_S)  # it may wait for a Ray that is lost
+        thread.join(_LEAVE_S)  # it may be waiting for a lost Ray

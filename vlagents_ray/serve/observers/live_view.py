@@ -1,6 +1,6 @@
 """The data for viewers: the snapshots of a replica, as a JSON document and picture files, and those of a fleet.
 
-The snapshots of all replicas, and the other content of a page, are gathered once for all its viewers.
+The snapshots of all replicas, and the other data of a page, are gathered once for all its viewers.
 """
 
 from __future__ import annotations
@@ -40,25 +40,25 @@ from vlagents_ray.serve.sessions import Session
 
 logger = logging.getLogger(__name__)
 
-_SESSIONS = 256  # most sessions of a replica that are described
-_INSTRUCTION = 1000  # most characters of an instruction
-PICTURES = 2**24  # most bytes of the pictures in a snapshot; further sessions have none
-_STATE_S = 0.5  # time for which slow things are not looked up again
-_BEHIND = 20  # most gathered snapshots that wait for a slow viewer; it misses the oldest
-_WAITING_BYTES = 2**26  # most bytes of pictures that wait for it
+_SESSIONS = 256  # maximum number of sessions that a replica's snapshot describes
+_INSTRUCTION = 1000  # maximum length of an instruction
+PICTURES = 2**24  # maximum size of the pictures in a snapshot; further sessions have none
+_STATE_S = 0.5  # time for which data that are slow to collect are reused
+_BEHIND = 20  # maximum number of gathered snapshots that wait for a slow viewer; it misses the oldest
+_WAITING_BYTES = 2**26  # maximum size of the pictures that wait for it
 
 
 @dataclass(slots=True)
 class Snapshot:
-    """One replica since the snapshot before."""
+    """The events of one replica since the previous snapshot."""
 
-    number: int  # of the last answer or observation in it
+    number: int  # number of its last answer or observation
     document: dict[str, Any]
-    files: list[bytes] = field(default_factory=list)  # which `document` refers to by their index
+    files: list[bytes] = field(default_factory=list)  # files to which `document` refers by index
 
 
 class ReplicaView:
-    """Makes the snapshots of one replica; each viewer of another process states how far it has read."""
+    """Makes the snapshots of one replica; each viewer in another process states its last snapshot."""
 
     def __init__(
         self,
@@ -69,9 +69,15 @@ class ReplicaView:
         metadata: Callable[[], Mapping[str, Any]],
         settings: LiveArgs | None = None,
     ) -> None:
-        """Create the view of the replica `name` on `node`, whose `engine` acts as `metadata` describes.
+        """Create the view of a replica.
 
-        With `settings`, the last seconds of each session are held, from `open` on.
+        Args:
+            engine: The engine of the replica.
+            observers: The engine's observers.
+            name: The name of the replica.
+            node: The name of its node.
+            metadata: Returns the metadata of the policy.
+            settings: Settings for keeping the last seconds of each session, from `open` on; None keeps none.
         """
         self._engine = engine
         self._about = {"name": name, "node": node, "ring_s": None if settings is None else settings.ring_s}
@@ -85,13 +91,13 @@ class ReplicaView:
         self._pictured: dict[str, int] = {}  # number of the observation whose pictures were read last, by session
 
     def open(self) -> None:
-        """Begin to end the leases of viewers that no longer look."""
+        """Start to end leases that viewers no longer renew."""
         each_half_second.add(self.live.expire)
         if self.ring is not None:
             self.ring.open()
 
     def close(self) -> None:
-        """Keep nothing any more."""
+        """Stop keeping data."""
         if self.ring is not None:
             self.ring.close()
         each_half_second.remove(self.live.expire)
@@ -100,7 +106,8 @@ class ReplicaView:
     def press(self, session: str, do: str, by: str) -> dict[str, Any] | None:
         """Give a command to a session and await its outcome for a limited time; see `CommandBoard.press`.
 
-        Returns None if the session is not at this replica.
+        Returns:
+            The description of the command; None if the session is not at this replica.
         """
         try:
             pressed = self.commands.press(session, do, by)
@@ -112,7 +119,7 @@ class ReplicaView:
     def read(self, since: int, shown: Collection[str]) -> Snapshot:
         """Return the events since the snapshot with the number `since`, with pictures of the sessions `shown`.
 
-        It may take milliseconds, so it does not belong on an event loop or the policy's thread.
+        This may take milliseconds, too long for an event loop or the policy's thread.
         """
         engine, live = self._engine, self.live
         live.renew()
@@ -126,7 +133,7 @@ class ReplicaView:
         sessions = {one.id: _session(one, last.get(one.id)) for one in held}
         begun = time.thread_time()
         self._pictured = {name: self._pictured.get(name, 0) for name in sessions}
-        for name in sorted(sessions, key=self._pictured.__getitem__):  # longest without first
+        for name in sorted(sessions, key=self._pictured.__getitem__):  # the session first whose pictures are the oldest
             kept, described = live.observation(name), sessions[name]
             described["commands"] = self.commands.of(name)
             if kept is None or kept.number <= since:
@@ -173,7 +180,7 @@ class ReplicaView:
 
 
 def _session(session: Session[LoadedModel], last: Answer | None) -> dict[str, Any]:
-    """Return a session as a viewer needs it, with its last answer if that is new."""
+    """Describe a session for viewers, with its last answer if that is new."""
     weights = session.weights
     described = {
         "id": session.id,
@@ -197,7 +204,7 @@ def _pictures(kept: KeptObservation, files: list[bytes]) -> dict[str, int]:
 
 
 def _act(answer: Answer) -> dict[str, Any]:
-    """Return an answer as a viewer needs it."""
+    """Describe an answer for viewers."""
     ms = {name: round(value, 3) for name, value in answer.timing.items()}
     found: dict[str, Any] = {"n": answer.number, "op": answer.op, "ms": ms}
     if answer.error:
@@ -209,13 +216,13 @@ def _act(answer: Answer) -> dict[str, Any]:
 
 
 def _numbers(values: np.ndarray) -> list[Any]:
-    """Return the values, rounded to the digits that a page shows."""
+    """Return the values, rounded to the precision that a page shows."""
     found: list[Any] = plain_values(np.round(values.astype(float), 4))
     return found
 
 
 def _counted(answers: list[Answer]) -> dict[str, Any]:
-    """Return the acts and errors among the answers, the sizes of the acts' batches, and times of all acts, ms."""
+    """Return the numbers of acts and errors among the answers, the batch sizes of the acts, and their times, ms."""
     acts = [one.timing for one in answers if one.op == "act" and not one.error]
     sample = acts[:: max(1, len(acts) // SAMPLE)]
     return {
@@ -234,11 +241,11 @@ class OtherReplicas(Protocol):
     """The other replicas of the application."""
 
     async def views(self) -> dict[str, SnapshotReader]:
-        """Return the reader of the snapshots of each, by name."""
+        """Return the readers of the replicas' snapshots, by name."""
         ...
 
     async def press(self, session: str, do: str, by: str) -> dict[str, Any] | None:
-        """Give a command to a session of one of them, see `CommandBoard.press`; None if none has the session."""
+        """Give a command to a session, see `CommandBoard.press`; return None if no replica has the session."""
         ...
 
 
@@ -246,14 +253,14 @@ class Viewer:
     """The unsent data of one viewer."""
 
     def __init__(self) -> None:
-        self.shown: frozenset[str] = frozenset()  # the sessions whose pictures it shows
+        self.shown: frozenset[str] = frozenset()  # sessions whose pictures it shows
         self._waiting: deque[list[Snapshot]] = deque()
         self._came = asyncio.Event()
-        self._more: dict[str, Any] = {}  # what was last to be sent beside the snapshots
+        self._more: dict[str, Any] = {}  # latest data to send beside the snapshots
         self._sent = self._more
 
     def put(self, snapshots: list[Snapshot], more: dict[str, Any] | None = None) -> None:
-        """Queue data to be sent, and drop the oldest if it is too much; `more` is sent only if it has changed."""
+        """Queue data to be sent, and drop the oldest if there are too many; `more` is sent only if it has changed."""
         self._waiting.append(snapshots)
         self._came.set()
         while len(self._waiting) > 1 and (len(self._waiting) > _BEHIND or self._waiting_bytes() > _WAITING_BYTES):
@@ -261,7 +268,7 @@ class Viewer:
         self._more = more or self._more
 
     async def next(self) -> tuple[dict[str, Any], list[bytes]]:
-        """Wait for snapshots; return all that wait as one document and the files that it refers to."""
+        """Wait for snapshots; return all waiting ones as one document, with the files to which it refers."""
         await self._came.wait()
         self._came.clear()
         gathered, self._waiting = self._waiting, deque()
@@ -278,7 +285,7 @@ class Viewer:
 
 
 class Fleet:
-    """Gathers while there are viewers."""
+    """Gathers snapshots while there are viewers."""
 
     def __init__(
         self,
@@ -288,14 +295,14 @@ class Fleet:
     ) -> None:
         """Gather snapshots of `own`, if this process is a replica, and of the `others`.
 
-        `more` returns further entries of the document; the same object as before if nothing in them has changed.
+        `more` returns further entries of the document; if nothing has changed, it returns the same object as before.
         """
         self._own = own
         self._others = others
         self._more = more
         self._viewers: set[Viewer] = set()
         self._gathering: asyncio.Task[None] | None = None
-        self._read: dict[str, int] = {}  # number of the last snapshot, by replica; "" is the own one
+        self._read: dict[str, int] = {}  # number of the last snapshot, by replica; "" is this one
 
     @property
     def watched(self) -> bool:
@@ -303,7 +310,7 @@ class Fleet:
         return bool(self._viewers)
 
     def add(self) -> Viewer:
-        """Begin to gather for a new viewer."""
+        """Add a viewer, and gather snapshots for it from now on."""
         viewer = Viewer()
         self._viewers.add(viewer)
         if self._gathering is None:
@@ -311,14 +318,14 @@ class Fleet:
         return viewer
 
     def remove(self, viewer: Viewer) -> None:
-        """Stop to gather for a viewer."""
+        """Remove a viewer; without viewers nothing is gathered."""
         self._viewers.discard(viewer)
         if not self._viewers and self._gathering is not None:
             self._gathering.cancel()
             self._gathering = None
 
     async def press(self, session: str, do: str, by: str) -> dict[str, Any]:
-        """Give a command to a session of any replica, see `CommandBoard.press`, and return it."""
+        """Give a command to a session of any replica, and describe it, as `CommandBoard.press` does."""
         pressed = None if self._own is None else self._own.press(session, do, by)
         if pressed is None and self._others is not None:
             pressed = await self._others.press(session, do, by)
@@ -359,7 +366,7 @@ async def _read_own(own: ReplicaView, since: int, shown: Collection[str]) -> Sna
 
 
 def _with_files(snapshot: Snapshot, files: list[bytes], shown: Collection[str]) -> dict[str, Any]:
-    """Return the document of a snapshot, whose references lead into `files`, with pictures of `shown` alone."""
+    """Return the document of a snapshot, which refers to the collected `files`, with pictures of `shown` only."""
     sessions = []
     for session in snapshot.document["sessions"]:
         pictures: dict[str, int] = {}

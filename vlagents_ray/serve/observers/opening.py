@@ -25,7 +25,7 @@ class ReplicaObservers:
     _opened: ExitStack
 
     def close(self) -> None:
-        """Close them, the last one first, and let them write what they have kept; this may take seconds."""
+        """Close the observers in reverse order; they write the data that they have kept, which may take seconds."""
         self._opened.close()
 
 
@@ -36,12 +36,17 @@ def open_observers(
     node: str,
     metadata: Callable[[], Mapping[str, Any]],
 ) -> ReplicaObservers:
-    """Observe the requests of an engine from now on.
+    """Create the observers in the settings of a replica, which observe the engine's requests from now on.
 
-    `replica` is Ray's name of the replica, which is unique over time. Viewers see the name of its `node`.
+    Args:
+        engine: The engine.
+        args: The settings.
+        replica: Ray's name of the replica, which is unique over time.
+        node: The name of its node, for viewers.
+        metadata: Returns the metadata of the policy.
 
     Raises:
-        ConfigError: A folder cannot be written to.
+        ConfigError: A folder is not writable.
         MissingDependency: An extra is not installed.
     """
     observers, name = engine.observers, replica.rpartition("#")[2]

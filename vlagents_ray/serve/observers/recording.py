@@ -1,8 +1,8 @@
 """Records requests and answers of sessions as LeRobotDatasets; other threads copy, encode and write them.
 
-The thread that handles a message only puts references into a queue. A second thread copies the observations, since they
-may be in memory that their client needs again, and a third one encodes and writes. If these fall behind, or the disk is
-full, frames are dropped and counted; no answer waits for them.
+The thread that handles a message only puts references into a queue. A second thread copies the observations, since
+their memory may belong to the client, and a third one encodes and writes. If these are too slow, or the disk is full,
+frames are dropped and counted; they delay no answer.
 """
 
 from __future__ import annotations
@@ -38,28 +38,28 @@ from vlagents_ray.serve.sessions import SessionTable
 
 logger = logging.getLogger(__name__)
 
-NO_VERSION = -1  # of an answer whose policy names no version of its weights
-_HELD_BYTES = 256 * 2**20  # most bytes of observations that wait to be written
-_OTHER_BYTES = 16 * 2**10  # counted for an act beside its pictures and the bytes in its `info`
-_NICE = 5  # the threads run after the policy's
-_CLOSING_S = 30.0  # time that the threads get to write what waits
+NO_VERSION = -1  # version of the weights for answers without one
+_HELD_BYTES = 256 * 2**20  # maximum size of the observations that wait to be written
+_OTHER_BYTES = 16 * 2**10  # estimated size of an act besides its pictures and the bytes in its `info`
+_NICE = 5  # lower priority than the policy's thread
+_CLOSING_S = 30.0  # time for the threads to write the waiting frames
 
 
 class Worker:
-    """A thread that makes calls one after the other, after the policy's thread; its user bounds those that wait."""
+    """A thread for scheduled calls, at a lower priority than the policy's; its user bounds their number."""
 
     def __init__(self, name: str) -> None:
-        """Start the thread of that name."""
+        """Start the thread with the given name."""
         self._calls: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
     def put(self, call: Callable[[], None]) -> None:
-        """Call `call` on the thread; an error is logged, and ends nothing."""
+        """Schedule `call` to run on the thread; its errors are logged, and do not end the thread."""
         self._calls.put(call)
 
     def close(self, timeout_s: float) -> None:
-        """End after the calls that wait, and wait for that."""
+        """End the thread after the scheduled calls, and wait for that."""
         self._calls.put(None)
         self._thread.join(timeout_s)
 
@@ -70,7 +70,7 @@ class Worker:
             pass
 
     def _made(self, call: Callable[[], None] | None) -> bool:
-        """Make a call, to which nothing refers afterwards; False at the end."""
+        """Make a call, and drop all references to it; return False at the end."""
         if call is None:
             return False
         try:
@@ -82,7 +82,7 @@ class Worker:
 
 @dataclass(slots=True, eq=False)
 class _Recorded:
-    """A request that is to be recorded; its memory counts as held until nothing refers to it."""
+    """A request to be recorded; its memory counts as held until it is garbage-collected."""
 
     recorder: SessionRecorder
     session: str
@@ -90,12 +90,12 @@ class _Recorded:
     at: float  # s since 1970
     obs: Obs | None  # of an act
     instruction: str
-    options: Any  # of the reset, before the queue removes some of them; text once they are copied
-    size: int  # bytes that it holds
-    info: str = ""  # the observation's, as text
+    options: Any  # options of the reset, before the queue removes some of them; converted to text by `copy`
+    size: int  # size of its memory, bytes
+    info: str = ""  # the observation's info, as text
 
     def copy(self) -> None:
-        """Copy what may lie in the client's memory."""
+        """Copy the data that may be in the client's memory."""
         self.options = to_text(self.options) if self.op == "reset" else ""
         if (obs := self.obs) is not None:
             info = dict(obs.info)
@@ -122,19 +122,23 @@ class SessionRecorder(Observer):
         share: float = 1.0,
         held_bytes: int = _HELD_BYTES,
     ) -> None:
-        """Create a recorder of a `share` of the episodes, drawn at each reset, and start its threads.
+        """Create a recorder, and start its threads.
 
-        At most `held_bytes` of requests wait to be written.
+        Args:
+            writer: Writes the episodes.
+            sessions: The sessions of the replica.
+            share: Share of the episodes to record, drawn at each reset, in [0, 1].
+            held_bytes: Maximum size of the requests that wait to be written.
         """
-        self.dropped = 0  # acts without memory for them, or in an episode that could not be written
-        self.ended: str | None = None  # why nothing more is recorded
+        self.dropped = 0  # number of acts that exceeded the memory, or whose episode could not be written
+        self.ended: str | None = None  # reason why nothing more is recorded
         self._writer = writer
         self._sessions = sessions
         self._share = share
         self._held_bytes = held_bytes
         self._held = 0
-        self._lock = threading.RLock()  # of `_held`, which the garbage collector may lower at any time
-        self._looking = False  # whether the sessions that are here wait to be compared with `_first`
+        self._lock = threading.RLock()  # guards `_held`, which the garbage collector may reduce at any time
+        self._looking = False  # whether a comparison of the current sessions with `_first` is scheduled
         self._missing: set[str] = set()  # sessions in `_first` that were not here when they were looked up
         self._first: dict[str, int | None] = {}  # step at the reset of each session; None if it is not recorded
         self._copier, self._worker = Worker("record-copy"), Worker("record-write")
@@ -147,7 +151,7 @@ class SessionRecorder(Observer):
 
     @property
     def lost(self) -> int:
-        """The number of acts that are missing in the recording."""
+        """The number of acts that the recording lacks."""
         return self.dropped + self._writer.lost
 
     def on_request(self, pending: PendingRequest) -> None:
@@ -174,7 +178,7 @@ class SessionRecorder(Observer):
             self._write_later(partial(self._handle, recorded, reply))
 
     def close(self) -> None:
-        """Write the waiting frames, and complete all episodes, as far as the disk is fast enough."""
+        """Write the waiting frames, and complete all episodes, if the disk is fast enough."""
         each_half_second.remove(self._look)
         until = time.monotonic() + _CLOSING_S
         self._copier.close(_CLOSING_S)
@@ -182,7 +186,7 @@ class SessionRecorder(Observer):
         self._worker.close(max(0.0, until - time.monotonic()))
 
     def count_held(self, size: int) -> None:
-        """Count so many bytes more of requests that wait."""
+        """Add `size` bytes to the size of the waiting requests."""
         with self._lock:
             self._held += size
 
@@ -196,13 +200,13 @@ class SessionRecorder(Observer):
     def _copy(self, recorded: _Recorded) -> None:
         try:
             recorded.copy()
-        except Exception as error:  # noqa: BLE001 - of this request alone
+        except Exception as error:  # noqa: BLE001 - an error of this request only
             logger.warning("recording: an act of session %s is left out: %s", recorded.session, error)
             self.dropped += 1
             recorded.obs, recorded.options = None, ""
 
     def _write_later(self, write: Callable[[], None]) -> None:
-        """Write after all that was requested before."""
+        """Write after all earlier requests."""
         self._copier.put(lambda: self._worker.put(partial(self._write, write)))
 
     def _write(self, write: Callable[[], None]) -> None:
@@ -214,7 +218,7 @@ class SessionRecorder(Observer):
             self._end(error)
 
     def _end(self, error: Exception) -> None:
-        """End the recording, but no session."""
+        """End the recording, without ending any session."""
         self.ended = str(error)
         logger.error("recording has ended, and the sessions go on: %s", error)
         self._writer.close()
@@ -243,15 +247,15 @@ class SessionRecorder(Observer):
                     self.dropped += 1
         except (OSError, RecordingEnded):
             raise
-        except UnknownSession:  # it has ended, and so has its episode
+        except UnknownSession:  # the session has ended, and its episode with it
             self.dropped += 1
-        except Exception as error:  # noqa: BLE001 - one session's episode
+        except Exception as error:  # noqa: BLE001 - affects one session's episode
             logger.warning("recording: the episode of session %s is lost: %s", session, error)
             self._first[session] = None
             self._writer.drop(session)
 
     def _records(self, session: str) -> bool:
-        """Return whether the session is recorded; one from another replica is drawn here."""
+        """Return whether the session is recorded; for one from another replica this is drawn here."""
         if session not in self._first:
             self._first[session] = None
             if random.random() < self._share:
@@ -267,7 +271,7 @@ class SessionRecorder(Observer):
             self._write_later(partial(self._end_others, frozenset(self._sessions.ids())))
 
     def _end_others(self, held: frozenset[str]) -> None:
-        """End the episodes of sessions that are no longer here; new ones may be missing once."""
+        """End the episodes of ended sessions; a new session may be missing once."""
         self._looking = False
         missing = self._first.keys() - held
         for session in missing & self._missing:
@@ -279,10 +283,16 @@ class SessionRecorder(Observer):
 def open_recorder(
     sessions: SessionTable[LoadedModel], args: RecordArgs, replica: str, metadata: Callable[[], Mapping[str, Any]]
 ) -> SessionRecorder:
-    """Return a recorder of the sessions of the replica that Ray calls `replica`; `metadata` describes it.
+    """Create a recorder of the sessions of a replica.
+
+    Args:
+        sessions: The sessions.
+        args: The settings.
+        replica: Ray's name of the replica.
+        metadata: Returns the metadata of the policy.
 
     Raises:
-        ConfigError: The folder cannot be written to.
+        ConfigError: The folder is not writable.
         MissingDependency: The extra "record" is not installed.
     """
     for module in ("av", "pyarrow"):
@@ -324,7 +334,7 @@ def _frame(recorded: _Recorded, obs: Obs, reply: Reply, first: int) -> RecordedA
 
 
 def _bytes_in(value: Any) -> int:
-    """Return about how many bytes the texts and arrays in a value take."""
+    """Return the approximate size of the texts and arrays in a value, bytes."""
     if isinstance(value, dict):
         return sum(map(_bytes_in, value.values()))
     if isinstance(value, list):

@@ -1,9 +1,9 @@
-"""The last seconds of each session, of which a press on the live page makes an episode of a LeRobotDataset.
+"""The last seconds of each session, which a button of the live page saves as an episode of a LeRobotDataset.
 
-A thread reads the live observer ten times a second, as a viewer does, and keeps pictures as files: those that clients
-kept unchanged, others encoded with at most 4 % of a core, for which frames are left out. All sessions together hold at
-most `memory_mb`; beyond that the oldest frames go first. One session is saved at a time, and one frame of it decoded at
-a time, until the folder holds `most_gb`.
+A thread reads the live observer ten times a second, as a viewer does, and keeps pictures as files: those of clients
+unchanged, others encoded with at most 4 % of a core, by omitting frames. All sessions together hold at most
+`memory_mb`; beyond that the oldest frames are dropped. One session is saved at a time, and one frame of it decoded at a
+time, until the folder holds `most_gb`.
 """
 
 from __future__ import annotations
@@ -27,29 +27,29 @@ from vlagents_ray.serve.observers.live import ENCODING_SHARE, RATE, KeptObservat
 from vlagents_ray.serve.periodic import Periodic
 from vlagents_ray.serve.sessions import SessionTable
 
-_PIXELS = 2**25  # most of all pictures of a frame
+_PIXELS = 2**25  # maximum number of pixels of all pictures of a frame
 
 
 class Ring:
     """The last seconds of the sessions of one replica, from `open` to `close`."""
 
     def __init__(self, live: LiveObserver, sessions: SessionTable[LoadedModel], settings: LiveArgs, name: str) -> None:
-        """Create an empty ring; its episodes go to datasets whose names begin with `name`, the replica's.
+        """Create an empty buffer; its episodes go to datasets whose names begin with the replica's `name`.
 
         Raises:
             MissingDependency: The extra "record" is not installed.
         """
         for module in ("av", "pyarrow"):
             require(module)
-        self.bytes = 0  # that are held now
+        self.bytes = 0  # size of the held frames
         self._live = live
         self._sessions = sessions
         self._settings = settings
         folder, most_bytes = Path(settings.folder), settings.most_gb * 1e9
         self._writer = EpisodeWriter(folder, name, RATE, lossless=False, most_bytes=most_bytes)
         self._frames: dict[str, deque[KeptObservation]] = {}  # by session
-        self._lock = threading.Lock()  # of `_frames`
-        self._saving = threading.Lock()  # of `_writer`
+        self._lock = threading.Lock()  # guards `_frames`
+        self._saving = threading.Lock()  # guards `_writer`
         self._periodic = Periodic(1 / RATE)
 
     def open(self) -> None:
@@ -57,11 +57,11 @@ class Ring:
         self._periodic.add(self.read)
 
     def close(self) -> None:
-        """Keep no more."""
+        """Stop keeping frames."""
         self._periodic.remove(self.read)
 
     def read(self) -> None:
-        """Keep the live observer's latest observations, and drop what is too old or too much."""
+        """Keep the live observer's latest observations, and drop those that are too old or too many."""
         self._live.renew()
         held = self._sessions.ids()
         self._live.forget_others(held)
@@ -83,8 +83,10 @@ class Ring:
     def save(self, session: str) -> str:
         """Write the session's frames as an episode, and return the path of its dataset.
 
-        Raises `InvalidInput` if nothing of the session is held, `Overloaded` while another one is saved, and
-        `StorageFailed` if the folder is full.
+        Raises:
+            InvalidInput: No frame of the session is held.
+            Overloaded: Another session is being saved.
+            StorageFailed: The folder is full.
         """
         if not self._saving.acquire(blocking=False):
             raise Overloaded("save: another session is being saved; press again when that is done")
@@ -93,7 +95,7 @@ class Ring:
         except RecordingEnded as error:
             raise StorageFailed(f"live.folder: {error}; make room there") from error
         finally:
-            self._writer.drop(session)  # what an error has left
+            self._writer.drop(session)  # remains of a failed attempt
             self._saving.release()
 
     def _save(self, session: str) -> str:
@@ -113,7 +115,7 @@ class Ring:
         return frames[-1].number if frames else 0
 
     def _drop(self, held: list[str]) -> None:
-        """Drop ended sessions, old frames, and the oldest ones beyond the memory; the caller holds the lock."""
+        """Drop ended sessions, old frames, and the oldest ones over the memory limit; the caller holds the lock."""
         for name in self._frames.keys() - set(held):
             self.bytes -= sum(frame.size for frame in self._frames.pop(name))
         oldest = time.monotonic() - self._settings.ring_s
@@ -126,7 +128,7 @@ class Ring:
 
 
 def _recorded(frame: KeptObservation) -> RecordedAct:
-    """Decode the pictures of a frame, and return it as it is written."""
+    """Decode the pictures of a frame, and convert it for the writer."""
     cameras, left = {}, _PIXELS
     for name, file in frame.pictures().items():
         cameras[name] = decode(file, left)

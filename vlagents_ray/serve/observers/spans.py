@@ -15,10 +15,10 @@ from vlagents_ray.serve.engine.observer import Observer
 from vlagents_ray.serve.periodic import each_half_second
 from vlagents_ray.serve.requests import PendingRequest
 
-_KEPT = 4096  # most answers between two half seconds; older ones have no spans
-_STAGES = {"queue": "queue", "inference": "batch"}  # in their order from the end of decoding on; names of the spans
+_KEPT = 4096  # maximum number of answers per half second; older ones get no spans
+_STAGES = {"queue": "queue", "inference": "batch"}  # stages in order, after decoding, and names of their spans
 _OPS = ("act", "reset")
-_TEXT = 200  # most characters of an error, or of a client's text
+_TEXT = 200  # maximum length of an error, or of a client's text
 
 
 class _ServedRequest(NamedTuple):
@@ -28,17 +28,17 @@ class _ServedRequest(NamedTuple):
     op: str
     rank: str
     traceparent: str
-    decoded_ns: int  # since 1970: when the request was read
-    timing: Mapping[str, float] = MappingProxyType({})  # ms by stage; still completed when the answer was sent
+    decoded_ns: int  # time at which the request was decoded, ns since 1970
+    timing: Mapping[str, float] = MappingProxyType({})  # ms by stage; completed when the answer was sent
     error: str = ""
     answered_ns: int = 0
 
 
 class RequestSpans(Observer):
-    """Makes spans of requests, twice a second and on its own thread, until `close`."""
+    """Creates spans of requests, twice a second and on its own thread, until `close`."""
 
     def __init__(self, tracer: Any, replica: str) -> None:
-        """Trace requests by `tracer`, as those of the replica of this name."""
+        """Trace requests with `tracer`, under the replica's name."""
         self._tracer = tracer
         self._replica = replica
         self._answered: deque[_ServedRequest] = deque(maxlen=_KEPT)
@@ -54,7 +54,7 @@ class RequestSpans(Observer):
         tracing.flush()
 
     def on_request(self, pending: PendingRequest) -> None:
-        """Remember the begin of the request."""
+        """Store the start of the request."""
         request = pending.request
         if request.op in _OPS:
             session, parent = pending.session_id, _traceparent(request)
@@ -72,7 +72,7 @@ class RequestSpans(Observer):
             )
 
     def export(self) -> None:
-        """Make the spans of the answers since the last call, whose timing is complete by now."""
+        """Create the spans of the answers since the last call, whose timing is complete by now."""
         while self._answered:
             self._make(self._answered.popleft())
 
@@ -104,7 +104,7 @@ class RequestSpans(Observer):
 
 
 def _traceparent(request: Request) -> str:
-    """Return the trace in a request, which is untrusted; "" if there is none."""
+    """Return the trace id in a request, which is untrusted; "" if there is none."""
     stated = "" if request.obs is None else request.obs.info.get(tracing.TRACEPARENT, "")
     return stated[:_TEXT] if isinstance(stated, str) else ""
 

@@ -17,7 +17,7 @@ from vlagents_ray.serve.replica.replica import PolicyReplica
 _FAILURES = 3  # number of consecutive failed health checks after which Serve replaces a replica
 _LEAST_ANSWER_S = 5.0  # minimum time limit of a health check, for a busy machine
 _HEAD = "node:__internal_head__"  # a resource that Ray assigns to the head node of any cluster
-# A replica gets neither these settings nor the dialects of the gateway, and does not restart when they change.
+# A replica gets neither these settings nor the dialects of the gateway, and is not restarted when they change.
 _OUTSIDE: Any = {"replicas": True, "autoscaling": True, "resources": True}
 _AT_ONCE: Any = {"graceful_shutdown_wait_loop_s": 0.1}  # period at which remaining requests are counted; Serve's: 2 s
 
@@ -27,10 +27,10 @@ def build(args: ServerArgs, *, drains: bool = True) -> Application:
 
     Args:
         args: The settings of the policy.
-        drains: Whether replicas that end wait for requests over HTTP.
+        drains: Whether stopping replicas wait for requests over HTTP.
 
     Raises:
-        ConfigError: The policy's environment cannot run it.
+        ConfigError: The policy cannot run in its environment.
     """
     args = args.model_copy(update={"environment": with_process(args.environment)})
     options: dict[str, Any] = {
@@ -65,7 +65,7 @@ def _options(args: ServerArgs) -> dict[str, Any]:
     """Return Serve's options that do not depend on the number of replicas."""
     return {
         "name": POLICY,
-        "health_check_period_s": 1 if args.environment.process == "child" else 5,  # Serve needs three failures
+        "health_check_period_s": 1 if args.environment.process == "child" else 5,  # three failures replace it
         # A replica that does not reply is frozen, or its policy holds the interpreter's lock: then only these checks
         # limit the time of a call. Together they take the limit of a call; Serve's default is 95 s for any policy.
         "health_check_timeout_s": max(_LEAST_ANSWER_S, args.limits.act_s / _FAILURES),
@@ -77,7 +77,7 @@ def _options(args: ServerArgs) -> dict[str, Any]:
             "num_gpus": args.resources.num_gpus,
             "resources": args.resources.custom,
             **({} if args.resources.memory is None else {"memory": args.resources.memory}),
-            # Without one, Serve gives the deployment that of the application.
+            # Without this setting, Serve applies the application's.
             **({"runtime_env": environment} if (environment := args.environment.runtime_env()) else {}),
         },
     }
@@ -89,7 +89,7 @@ def _gateway(args: ServerArgs) -> Application:
         "name": GATEWAY,
         "num_replicas": 1,
         "graceful_shutdown_timeout_s": 10,
-        **_AT_ONCE,  # no Serve request waits for it: its clients use its own ports
+        **_AT_ONCE,  # no request of Serve delays its end: clients use its own ports
         "health_check_period_s": 5,
         "ray_actor_options": {"num_cpus": 0, "resources": {_HEAD: 0.001}},
     }

@@ -65,9 +65,13 @@ class Exporter:
         keys: Keys | None = None,
         recorder: SessionRecorder | None = None,
     ) -> None:
-        """Create the series, with these tags: application, deployment, replica, policy.
+        """Create the series.
 
-        How long the file of `keys` was unreadable, and numbers of the `recorder`, are exported if there are any.
+        Args:
+            engine: The engine.
+            tags: Their tags: application, deployment, replica, policy.
+            keys: The keys, whose file's state is exported; None if there are none.
+            recorder: The recorder, whose counts are exported; None if there is none.
         """
         make = partial(_series, tags)
         self._engine = engine
@@ -90,7 +94,7 @@ class Exporter:
         self._recorded = make(Counter, "recorded_frames", "Acts of recorded sessions.", "outcome")
         self._recording = make(Gauge, "recording", "Whether sessions are recorded.")
         self._keys, self._recorder = keys, recorder
-        self._frames = Counts[str]()  # what was exported of the recorder's numbers
+        self._frames = Counts[str]()  # exported part of the recorder's counts
         self._meter = LoadMeter(engine.queue)
         self._periodic = Periodic(PERIOD_S)
 
@@ -151,13 +155,13 @@ class Exporter:
 
 
 def _series(tags: Mapping[str, str], kind: Any, name: str, text: str, *own: str, **options: Any) -> Any:
-    """Create a series of `kind`, with `tags` and those that each value has of its `own`."""
+    """Create a series of `kind`, with `tags` and its `own` tags, which each value sets."""
     metric = kind(f"vlagents_{name}", description=text, tag_keys=(*tags, *own), **options)
     return metric.set_default_tags(tags)
 
 
 def _in_slices(values: Iterable[T]) -> Iterator[T]:
-    """Yield each value, with pauses, so that the policy thread never waits long for the interpreter's lock."""
+    """Yield each value, pausing at times, so that the policy thread never waits long for the interpreter's lock."""
     until = time.perf_counter() + _SLICE_S
     for value in values:
         yield value

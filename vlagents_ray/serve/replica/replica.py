@@ -63,23 +63,23 @@ _WATCH_S = 0.25
 _LOCKED_S = 1.0  # delay after a call's limit, which `notice_hung` reports unless the interpreter's lock is held
 _STDERR = 2
 _GATEWAY_POLL_S = 10.0
-_CATCH_UP_S = 10.0  # interval of the questions whether this replica has missed a version of the weights
+_CATCH_UP_S = 10.0  # interval of the checks whether this replica has missed a version of the weights
 
 
 class PolicyReplica(ClientApi, SiblingApi):
     """One replica of the policy, with all endpoints for clients.
 
-    Ray calls its methods by name: Serve those of a deployment, clients inside the cluster those of `ClientApi`, and
-    other replicas those of `SiblingApi`. Until the first replica runs, Serve's proxies reply for
-    the application: see `vlagents_ray.serve.scaling.router` and `vlagents_ray.serve.launch.haproxy`.
+    Ray calls its methods by name: Serve the methods of a deployment, clients inside the cluster those of `ClientApi`,
+    and other replicas those of `SiblingApi`. Until the first replica runs, Serve's proxies reply for the application:
+    see `vlagents_ray.serve.scaling.router` and `vlagents_ray.serve.launch.haproxy`.
     """
 
-    _opened = False  # whether there is something to close
+    _opened = False  # whether `close` has anything to close
 
     async def __init__(  # type: ignore[misc]  # Serve awaits it
         self, args: dict[str, Any], gateway: Any = None
     ) -> None:
-        """Make the replica with the settings `args`; the handle makes the gateway a part of the application."""
+        """Create the replica with the settings `args`; passing the gateway's handle adds it to the application."""
         self._args = settings = ServerArgs(**args)
         self._gateway = gateway
         self._gateways: dict[str, Any] = {}
@@ -91,7 +91,7 @@ class PolicyReplica(ClientApi, SiblingApi):
         self._program = {name: of for one in (policy, *wrappers) for name, of in loaded_code(one).items()}
         self._keys = settings.access.keys()
         require_access(http_options().host or EVERYWHERE, self._keys, settings.access.insecure)
-        write_audit()  # without keys as well: of the buttons that are pressed on the live page
+        write_audit()  # also without keys, to log the buttons pressed on the live page
         if self._keys is not None and not settings.access.plain_http:
             warn_of_plain_http(_plain_host())
         self._tasks: list[asyncio.Task[None]] = []
@@ -107,7 +107,7 @@ class PolicyReplica(ClientApi, SiblingApi):
         self._weights = ThisReplica(self._peers.own_name, self._engine.weights)
         self._pusher = WeightPusher(self._weights, self._peers.others)
 
-        # Its observers.
+        # The observers.
         node = ray.get_runtime_context().get_node_id()[:8]
         self._observers = open_observers(self._engine, settings, self._peers.own_name, node, self.metadata)
         self._fleet = Fleet(self._observers.view, self._peers)
@@ -144,7 +144,7 @@ class PolicyReplica(ClientApi, SiblingApi):
             return
         self._configured = True
         await self._load_policy()
-        await self._catch_up()  # takes the others' versions before this replica is ready
+        await self._catch_up()  # gets the other replicas' versions before this replica is ready
         works = [self._watch_shutdown(), self._keep_catching_up(), self._rebalancer.run()]
         if self._gateway is not None:
             works.append(self._poll_gateways())
@@ -157,13 +157,13 @@ class PolicyReplica(ClientApi, SiblingApi):
             if not isinstance(error.__cause__, VLAgentsError):
                 raise
             logger.exception("the policy did not load")
-            # Errors of this package have the cure; without this, `serve status` would show both tracebacks before it.
+            # Errors of this package contain the remedy; without this, `serve status` would show both tracebacks first.
             raise PolicyFailed(str(error)) from None
 
     async def close(self) -> None:
-        """Close everything: first the sources of work, then the engine, then its observers, and last the endpoints.
+        """Close everything: first the sources of requests, then the engine, then its observers, and last the endpoints.
 
-        So the engine answers waiting requests over open endpoints, and observers see all answers.
+        In this order the engine can answer waiting requests over open endpoints, and observers receive all answers.
         """
         for task in self._tasks:
             task.cancel()
@@ -181,11 +181,11 @@ class PolicyReplica(ClientApi, SiblingApi):
             await self.close()
 
     async def check_health(self) -> None:
-        """Raise if the policy died or hangs; Serve calls this once the policy has loaded, and replaces the replica."""
+        """Raise an error if the policy died or hangs; Serve calls this after loading, and then replaces the replica."""
         await asyncio.to_thread(self._engine.check_health)
 
     async def refusal(self) -> str | None:
-        """Return the full reason why the policy cannot act yet, for the process that starts the server; else None."""
+        """Return the full reason why the policy cannot act, for the process that starts the server; None if it can."""
         try:
             self._engine.check_health()
         except Exception as error:  # noqa: BLE001 - a policy's own check may raise any error
@@ -289,7 +289,7 @@ class PolicyReplica(ClientApi, SiblingApi):
         return self.metadata() | {"plasma": plasma}, ray.get_runtime_context().current_actor
 
     async def _metadata_for_machine(self, caller: str) -> dict[str, Any]:
-        """Return the metadata of the least loaded replica on the machine with the boot id `caller`, or else on this."""
+        """Return the metadata of the least loaded replica on the machine with boot id `caller`, or of this replica."""
         machines = [boot_id()] if caller == SERVERS_MACHINE else [caller, boot_id()]
         places = [ClientLocation(boot_id=machine, must_be_near=True) for machine in machines]
         metadata, _ = await self._place_at_sibling(*places) or (self.metadata(), None)
@@ -326,18 +326,18 @@ class PolicyReplica(ClientApi, SiblingApi):
     # New weights: from learners, and from the replica that coordinates a push.
 
     async def push_weights(self, values: Values, options: PushOptions) -> PushResult:
-        """Let all replicas act with new weights; called by a learner."""
+        """Make all replicas act with new weights; called by a learner."""
         return await self._pusher.push(values, options)
 
     async def push_received(self, named: Mapping[str, Any], options: PushOptions) -> PushResult:
-        """Let all replicas act with new weights, which this one has received over the network."""
+        """Make all replicas act with new weights, which this one has received over the network."""
         if not await self._peers.others():
             return await self._pusher.push(named, options)
-        reference = await asyncio.to_thread(ray.put, named)  # a copy, for which no robot on this event loop waits
+        reference = await asyncio.to_thread(ray.put, named)  # a copy, which does not delay robots on this event loop
         return await self._pusher.push([reference], options)
 
     def read_header(self, header: bytes, options: PushOptions) -> dict[str, ValueSpec]:
-        """Check weights that are to be received."""
+        """Check the header of new weights, before they are received."""
         return self._engine.weights.read_header(header, options)
 
     async def versions_of_weights(self) -> list[int]:
@@ -353,8 +353,8 @@ class PolicyReplica(ClientApi, SiblingApi):
     async def _watch_shutdown(self) -> None:
         """Drain the engine as soon as Serve stops this replica, if other replicas can take its clients.
 
-        Until then, detect a policy that hangs. A policy that holds the interpreter's lock also blocks this task: then a
-        thread that needs no lock writes the stack traces into the log.
+        Before that, detect a policy that hangs. A policy that holds the interpreter's lock also blocks this task; in
+        that case a thread that needs no lock writes the stack traces into the log.
         """
         while not replica_is_ending():
             faulthandler.dump_traceback_later(self._engine.calls.limits.act_s + _LOCKED_S, file=_STDERR)
@@ -365,7 +365,7 @@ class PolicyReplica(ClientApi, SiblingApi):
             self._engine.drain()
 
     async def _keep_catching_up(self) -> None:
-        """Take the others' versions of the weights whenever this replica has missed one."""
+        """Get the other replicas' versions of the weights whenever this replica has missed one."""
         while True:
             await asyncio.sleep(_CATCH_UP_S)
             await self._catch_up()
@@ -377,7 +377,7 @@ class PolicyReplica(ClientApi, SiblingApi):
             logger.exception("the newest weights were not taken from the other replicas; tried again later")
 
     async def _poll_gateways(self) -> None:
-        """Ask the gateway periodically for its addresses, which may change without a restart of this replica."""
+        """Query the gateway periodically for its addresses, which may change without a restart of this replica."""
         while True:
             try:
                 self._gateways = await self._gateway.description.remote()  # waits until the gateway runs
@@ -388,7 +388,7 @@ class PolicyReplica(ClientApi, SiblingApi):
 
 
 def _engine(args: ServerArgs, limits: Limits, migrator: SessionMigrator) -> Engine:
-    """Make the engine, without loading the policy."""
+    """Create the engine, without loading the policy."""
     if VISIBLE not in args.environment.env_vars:
         hide_gpus(ray.get_runtime_context().get_accelerator_ids().get("GPU", []))
     return Engine(
@@ -408,10 +408,10 @@ def _engine(args: ServerArgs, limits: Limits, migrator: SessionMigrator) -> Engi
 
 
 def hide_gpus(given: Sequence[str]) -> None:
-    """Hide the node's GPUs from this process and its children, unless Ray has given it some.
+    """Hide the node's GPUs from this process and its children, unless Ray has assigned it some.
 
-    Ray itself does not hide them from a replica with `num_gpus: 0`, which would take memory of the first one,
-    unreserved. It must be called before anything uses CUDA.
+    Ray itself does not hide them from a replica with `num_gpus: 0`, which would use unreserved memory of the first one.
+    Call this before anything uses CUDA.
     """
     if given:
         return

@@ -23,8 +23,8 @@ UTILISATION = "utilisation"
 WAITING = "waiting"
 SESSIONS = "sessions"
 
-_MARGIN = 0.8  # share of each target that fewer replicas must keep to, so that their number does not oscillate
-_NOTHING = 1e-3  # load below which a replica is idle, in replicas: an idle one measures some millionths
+_MARGIN = 0.8  # share of each target below which fewer replicas must stay, so that their number does not oscillate
+_NOTHING = 1e-3  # load below which a replica is idle, as a share of a replica: idle ones measure some millionths
 
 
 class MeasuredLoad:

@@ -24,11 +24,11 @@ from vlagents_ray.serve.engine.engine import Engine
 _SLACK = 0.25  # tolerated excess over the mean, as a share of the mean; at least one session is tolerated
 logger = logging.getLogger(__name__)
 PERIOD_S = 3.0  # interval of the comparisons
-MOVABLE = ("shm", "plasma", "websocket", "handle")  # transports whose connections can be asked to reconnect
+MOVABLE = ("shm", "plasma", "websocket", "handle")  # transports whose connections can be requested to reconnect
 _EXPECTED_S = 3.0  # time after which a client that was sent here is no longer expected
 _SETTLE_S = 6.0  # time for which a connection counts as leaving after it was asked to reconnect
 _RECONNECT_S = 20.0  # shortest time between two requests to reconnect on one connection
-_ACTIVE_S = 30.0  # time since its last request for which a session is active; only replies can ask it to reconnect
+_ACTIVE_S = 30.0  # time since its last request for which a session is active; only replies can request a reconnection
 _AT_ONCE = 32  # largest number of sessions to send away after one comparison
 
 
@@ -46,7 +46,7 @@ class ReplicaLoad:
 
 @dataclass(frozen=True, slots=True)
 class ClientLocation:
-    """The location of a client, as far as the client states it; near replicas are preferred."""
+    """The location of a client, as far as the client states it; replicas nearby are preferred."""
 
     node: str = ""  # Ray's id of its node; empty outside the cluster
     boot_id: str = ""  # boot id of its machine; empty if unknown
@@ -72,7 +72,7 @@ def choose_replica(loads: Sequence[ReplicaLoad], place: ClientLocation) -> Repli
 
 
 def excess_sessions(mine: int, others: Iterable[int], leaving: int = 0) -> int:
-    """Return how many of its sessions a replica should send away, of which `leaving` are leaving already.
+    """Return the number of sessions that a replica should send away, without the `leaving` ones.
 
     It is the excess over the mean, rounded down; 0 if that is at most 25 % of the mean or one session.
     """
@@ -86,7 +86,8 @@ def excess_sessions(mine: int, others: Iterable[int], leaving: int = 0) -> int:
 def choose_connections(connections: Sequence[int], count: int) -> list[int]:
     """Choose the connections to send away, given the number of sessions of each, and return their indices.
 
-    At most `count` sessions leave. All sessions of a connection move together, so one with more than that stays.
+    At most `count` sessions leave. All sessions of a connection move together, so a connection with more sessions
+    stays.
     """
     chosen = []
     for index in sorted(range(len(connections)), key=lambda i: -connections[i]):
@@ -108,7 +109,7 @@ class Siblings(Protocol):
         ...
 
     async def announce_client(self, replica: str) -> Any:
-        """Announce a client to that replica; return its answer to the client, or None if it does not answer at once."""
+        """Announce a client to that replica; return its answer for the client, None if it does not answer at once."""
         ...
 
 
@@ -116,7 +117,13 @@ class Rebalancer:
     """Compares the sessions of one replica with those of the others, and places new clients; on one event loop."""
 
     def __init__(self, engine: Engine, siblings: Siblings, own_load: Callable[[int], ReplicaLoad]) -> None:
-        """Balance the sessions of `engine` with those of `siblings`; `own_load` makes a load of a session count."""
+        """Balance the sessions of one replica.
+
+        Args:
+            engine: The engine of the replica.
+            siblings: The other replicas.
+            own_load: Returns this replica's load for a number of sessions.
+        """
         self._engine = engine
         self._siblings = siblings
         self._own_load = own_load
@@ -155,7 +162,7 @@ class Rebalancer:
         """Choose the replica for a new client, and announce the client there.
 
         Args:
-            *places: Locations of the client in order of preference; the first one that any replica suits is used.
+            *places: Locations of the client in order of preference; the first one that suits any replica is used.
 
         Returns:
             The result of `Siblings.announce_client`; None if the client stays here.
@@ -183,7 +190,7 @@ class Rebalancer:
         if chosen is mine:
             self.expect_client()
             return None
-        chosen.sessions += 1  # valid until the next request to that replica
+        chosen.sessions += 1  # valid until the next request for that replica's load
         return chosen.replica
 
     async def compare(self) -> None:

@@ -20,7 +20,7 @@ _RETRY_AFTER_S = 1
 
 
 class _NoReplica(BackPressureError):  # type: ignore[misc]
-    """No replica is running; Serve's proxy answers it with 503 and `retry-after`."""
+    """Raised if no replica is running; Serve's proxy answers with 503 and `retry-after`."""
 
     def __init__(self, app: str) -> None:
         super().__init__(0, 0, retry_after_s=_RETRY_AFTER_S)

@@ -1,6 +1,6 @@
 """Migration of sessions, when a replica stops or the load balancer sends a session's request to another replica.
 
-A replica that gets a request for an unknown session asks the other replicas for it, and continues the session in
+A replica that gets a request for an unknown session searches the other replicas for it, and continues the session in
 exactly the same state, including instruction, history and random generator. A replica that stops gives its remaining
 sessions to the others.
 
@@ -39,7 +39,7 @@ logger = logging.getLogger(__name__)
 
 EXPORT_S = 10.0  # time limit for the export of a session, which waits for the session's queued acts
 ARRIVAL_S = 3.0  # time limit for a released session to arrive at its new replica
-ON_ITS_WAY_S = 0.1  # interval between questions to the other replicas, since a session may be moving between two
+ON_ITS_WAY_S = 0.1  # interval between queries to the other replicas, since a session may be moving between two of them
 _REMEMBERED = 1000  # number of remembered releases, for replicas that repeat a request
 
 P = ParamSpec("P")
@@ -52,24 +52,31 @@ _OTHERS_S = 0.3  # time limit for the remaining answers, once a replica has answ
 _SILENT_S = 3.0  # time without further requests to a silent replica
 _ATTEMPTS = 5  # number of attempts after which a search is given up, if `ARRIVAL_S` has also passed
 _LOAD_S = 60.0  # time limit for loading the checkpoint of a fetched session
-_BATCH_S = 0.002  # time for which searches are collected into one question
+_BATCH_S = 0.002  # time for which searches are collected into one query
 _GATHER_S = 0.02  # time for which begun episodes are collected into one announcement
 _AT_ONCE = 16  # largest number of sessions that are handed over, or unpickled, at a time
 
 
 class PeerEnded(Exception):
-    """The other replica has ended, and its sessions with it."""
+    """Raised if the other replica has ended, and its sessions with it."""
 
 
 class PeerUnreachable(Exception):
-    """The other replica cannot be reached, and it is unknown whether it has executed the request."""
+    """Raised if the other replica cannot be reached, so that it may or may not have executed the request."""
 
 
 class HeldSessions:
     """Exports, releases and adopts the sessions of one engine, on the replica's event loop."""
 
     def __init__(self, engine: Engine, loop: asyncio.AbstractEventLoop, in_thread: InThread, spawn: Spawn) -> None:
-        """`in_thread` runs a call that takes long (unpickling) on another thread; `spawn` starts a task on `loop`."""
+        """Move the sessions of an engine.
+
+        Args:
+            engine: The engine.
+            loop: The replica's event loop.
+            in_thread: Runs a slow call (unpickling) on another thread.
+            spawn: Starts a task on `loop`.
+        """
         self._engine = engine
         self._loop = loop
         self._in_thread = in_thread
@@ -127,7 +134,7 @@ class HeldSessions:
         """Continue a session that the other replica has released.
 
         Returns:
-            Whether the session is here; also True if a newer state of it has made this one obsolete.
+            Whether the session is here; also True if a newer state of the session has replaced this one.
         """
         if self._engine.draining:
             return False
@@ -149,9 +156,9 @@ class HeldSessions:
     async def send_to_peer(self, session_id: str, peers: Sequence[Peer]) -> bool:
         """Give the session to the first of `peers` that takes it over; return whether one did.
 
-        The next replica only gets a request if the last one refused or has ended.
+        The next replica gets a request only if the previous one refused or has ended.
         """
-        state = await self._ask(session_id, "export", None)  # without a limit, as the session ends here otherwise
+        state = await self._ask(session_id, "export", None)  # no time limit: otherwise the session would end here
         if state is None or not peers:
             return False
         self._leaving[session_id] = self._loop.create_future()
@@ -243,8 +250,8 @@ class SessionMigrator:
         Args:
             peers: Returns the other replicas.
             loop: The replica's event loop.
-            in_thread: Runs a call that takes long (unpickling, loading a checkpoint) on another thread; by default on
-                threads for that purpose only.
+            in_thread: Runs a slow call (unpickling, loading a checkpoint) on another thread; by default on dedicated
+                threads.
         """
         self._peers = peers
         self._threads = ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="session-migration")
@@ -253,7 +260,7 @@ class SessionMigrator:
         self._closed = False
         self._lock = threading.Lock()
         self._callbacks: dict[str, list[Callable[[], None]]] = {}  # callbacks by session, until its search is over
-        self._next_query: dict[str, asyncio.Future[_Answers]] = {}  # sessions of the next question
+        self._next_query: dict[str, asyncio.Future[_Answers]] = {}  # sessions of the next query
         self._callers: Counter[str] = Counter()  # number of running searches by caller
         self._unannounced: dict[str, int] = {}  # steps of begun episodes that are not announced yet, by session
         self._silent: dict[str, float] = {}  # time until which a silent replica gets no request, by its name
@@ -295,7 +302,7 @@ class SessionMigrator:
         return True
 
     def announce(self, session_id: str, step: int) -> None:
-        """Announce to the other replicas that the session began an episode here at that step, so theirs are older."""
+        """Announce to the other replicas that the session began an episode here at `step`; their states are older."""
         with self._lock:
             self._unannounced[session_id] = step
             if len(self._unannounced) > 1:
@@ -346,7 +353,7 @@ class SessionMigrator:
         self._threads.shutdown(wait=False, cancel_futures=True)
 
     async def _search(self, session_id: str) -> None:
-        misses = 0  # consecutive attempts that found no holder; after the second, the session is not moving either
+        misses = 0  # consecutive attempts that found no holder; after two, the session is not moving either
         try:
             begun = self._loop.time()
             for attempt in itertools.count():
@@ -380,7 +387,7 @@ class SessionMigrator:
         version = state["steps"], state["moves"]
         release = self._spawn(self._answer(peer.ask(HeldSessions.release, session_id, version, uuid.uuid4().hex)))
         while not (await asyncio.wait([release], timeout=_ANSWER_S))[0]:
-            if await self._query_peer(peer, []) is None:  # it hangs: only the copy still waits
+            if await self._query_peer(peer, []) is None:  # the replica hangs: only the copy waits for it
                 self._finish(session_id)
         if not release.result():
             self._engine.transfer.discard(arriving)
@@ -392,7 +399,7 @@ class SessionMigrator:
         return True
 
     def _answers(self, session_id: str) -> asyncio.Future[_Answers]:
-        """Return a future of the other replicas' answers to one question about all sessions that are searched now."""
+        """Return a future of the other replicas' answers to one query about all sessions that are being searched."""
         answers: asyncio.Future[_Answers] = self._loop.create_future()
         if not self._next_query:
             self._loop.call_later(_BATCH_S, lambda: self._spawn(self._ask_all()))
@@ -440,7 +447,7 @@ class SessionMigrator:
 
     @staticmethod
     async def _answer(asked: Coroutine[Any, Any, T], timeout_s: float | None = None) -> T | None:
-        """Return another replica's answer; None if that is unknown."""
+        """Return another replica's answer; None if there is no answer."""
         try:
             return await asyncio.wait_for(asked, timeout_s)
         except (PeerEnded, PeerUnreachable, asyncio.TimeoutError) as error:

@@ -27,18 +27,18 @@ logger = logging.getLogger(__name__)
 
 _NAMESPACE = "serve"
 _ANSWER_S = 3.0  # time limit for an answer; a replica that still loads does not answer
-_TRANSFER_S = 600.0  # time limit for an answer that weights are sent with
+_TRANSFER_S = 600.0  # time limit for the answer to a request that contains weights
 _QUICK_S = 0.3  # time limit for an answer while a client waits to connect
 _SILENT_S = 3.0  # time without further requests for a silent replica's load
 _VIEW_ANSWER_S = 0.3  # time limit for an answer; a late replica gets another request
-_VIEW_S = 2.0  # time for which the replicas that were found are not looked up again
+_VIEW_S = 2.0  # time for which the list of replicas is reused
 
 
 class SiblingApi(Protocol):
-    """The actor methods that the replicas of an application call at each other."""
+    """The actor methods that the replicas of an application call on each other."""
 
     async def expect_client(self) -> tuple[dict[str, Any], Any]:
-        """Expect a client that is sent here; return the metadata for the client, and the actor."""
+        """Expect a client that another replica sends here; return the metadata for the client, and the actor."""
         ...
 
     async def peer(self, method: str, *args: Any) -> Any:
@@ -47,9 +47,9 @@ class SiblingApi(Protocol):
 
 
 class PeerMethod(NamedTuple):
-    """A method that replicas call at each other."""
+    """A method that replicas call on each other."""
 
-    part: type  # the part of the replica that has it
+    part: type  # part of the replica that has the method
     call: Callable[..., Any]
     limit_s: float | None  # time limit for the answer
 
@@ -96,7 +96,7 @@ class _Sibling(Peer):
         return found
 
     async def call(self, method: Callable[..., Any], *args: Any) -> Any:
-        """Call one of `PEER_METHODS`; raises `PeerEnded` and `PeerUnreachable` beside its own errors."""
+        """Call one of `PEER_METHODS`; raise `PeerEnded`, `PeerUnreachable` or the method's own errors."""
         limit_s = PEER_METHODS[method.__qualname__].limit_s
         try:
             asked = call_replica(self._actor, SiblingApi.peer, method.__qualname__, *args)
@@ -110,28 +110,28 @@ class _Sibling(Peer):
 
 
 class ReplicasInCluster(OtherReplicas):
-    """The replicas of applications; each call looks them up again, since their set changes."""
+    """The replicas of applications; each call looks them up again, since they may change."""
 
     def __init__(self, apps: Collection[str], but: str = "") -> None:
         """Call the replicas of `apps`, apart from the replica whose full name is `but`."""
         self._apps = apps
         self._but = but
-        self._views: dict[str, SnapshotReader] = {}  # found last
+        self._views: dict[str, SnapshotReader] = {}  # result of the last lookup
         self._found = float("-inf")
 
     async def others(self) -> list[_Sibling]:
-        """Return all of them."""
+        """Return the replicas."""
         return await asyncio.to_thread(lambda: [_Sibling(name, actor) for name, actor in self._actors()])
 
     async def views(self) -> dict[str, SnapshotReader]:
-        """Return the reader of the snapshots of each, by name."""
+        """Return the readers of the replicas' snapshots, by name."""
         if time.monotonic() - self._found > _VIEW_S:
             self._found = time.monotonic()
             self._views = {one.name: partial(one.call, ReplicaView.read) for one in await self.others()}
         return self._views
 
     async def press(self, session: str, do: str, by: str) -> dict[str, Any] | None:
-        """Give a command to a session of one of them, see `CommandBoard.press`; None if none has the session.
+        """Give a command to a session, see `CommandBoard.press`; return None if no replica has the session.
 
         Raises:
             VLAgentsError: The replica that has the session refused the command.
@@ -149,7 +149,7 @@ class ReplicasInCluster(OtherReplicas):
         return None
 
     def _actors(self) -> Iterator[tuple[str, Any]]:
-        """Yield the name and the actor of each."""
+        """Yield the name and the actor of each replica."""
         prefixes = tuple(f"SERVE_REPLICA::{app}#{POLICY}#" for app in self._apps)
         for entry in ray.util.list_named_actors(all_namespaces=True):
             name = entry["name"]
@@ -182,10 +182,10 @@ class SiblingReplicas(ReplicasInCluster):
         return [answer for answer in answers if isinstance(answer, ReplicaLoad)]
 
     async def announce_client(self, replica: str) -> Any:
-        """Announce a client to another replica; return its answer to the client; None after 0.3 s without one."""
+        """Announce a client to another replica; return its answer for the client, or None after 0.3 s without one."""
         try:
             actor = await asyncio.to_thread(ray.get_actor, replica, namespace=_NAMESPACE)
             return await asyncio.wait_for(call_replica(actor, SiblingApi.expect_client), _QUICK_S)
         except (ValueError, ray.exceptions.RayError, TimeoutError, asyncio.TimeoutError) as error:
-            logger.info("another replica does not answer: %s", error)  # it may have ended
+            logger.info("another replica does not answer: %s", error)  # the replica may have ended
             return None

@@ -1,9 +1,9 @@
-"""New weights for all replicas of an application: every replica holds a version before any acts with it.
+"""New weights for all replicas of an application: every replica holds a version before any replica acts with it.
 
 The replica that receives a push coordinates it. It stages the version at all replicas, and commits it only if all of
-them hold it; otherwise it drops it again, and nothing has changed. A replica that starts later, or that has missed a
-commit, takes the versions of the others (`WeightPusher.catch_up`). If the coordinator dies between the phases, the
-replicas drop what they have staged by themselves; if it dies among the commits, those that missed theirs catch up.
+them hold it; otherwise it drops it, and nothing has changed. A replica that starts later, or has missed a commit, gets
+the versions of the others (`WeightPusher.catch_up`). If the coordinator dies before the commits, the replicas drop the
+staged version by themselves; if it dies between two commits, the replicas without a commit catch up.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ of a learner's memory on the GPU of all replicas."""
 
 logger = logging.getLogger(__name__)
 
-_MOST_AHEAD = 10**9  # of a version that a learner numbers, such as by its step of training
-_ATTEMPTS = 3  # at the commit of a replica that cannot be reached
+_MOST_AHEAD = 10**9  # maximum step from one version to the next if a learner numbers them, such as by its training step
+_ATTEMPTS = 3  # attempts to commit at a replica that cannot be reached
 
 
 class WeightsReplica(Protocol):
@@ -40,15 +40,15 @@ class WeightsReplica(Protocol):
         ...
 
     async def weights(self, method: Callable[..., T], *args: Any) -> T:
-        """Call a method of the replica's `WeightUpdates`; also raises `PeerEnded` and `PeerUnreachable`."""
+        """Call a method of the replica's `WeightUpdates`; also raise `PeerEnded` and `PeerUnreachable`."""
         ...
 
 
 class ThisReplica(WeightsReplica):
-    """This replica among those of a push."""
+    """The local replica as the target of a push."""
 
     def __init__(self, name: str, updates: WeightUpdates) -> None:
-        """Set the weights that pushes update, those of this replica's engine."""
+        """Set the updates of this replica's engine."""
         self._name = name
         self._updates = updates
 
@@ -57,7 +57,7 @@ class ThisReplica(WeightsReplica):
         return self._name
 
     async def weights(self, method: Callable[..., T], *args: Any) -> T:
-        """Call the method on another thread, since it may take long."""
+        """Call the method on another thread, since it may be slow."""
         given = [await one[0] if isinstance(one, list) else one for one in args]
         return await asyncio.to_thread(method, self._updates, *given)
 
@@ -73,21 +73,7 @@ class WeightPusher:
         self._known: set[str] = set()  # names of replicas that have answered
 
     async def push(self, values: Values, options: PushOptions) -> PushResult:
-        """Make all replicas act with new weights.
-
-        Args:
-            values: The values: numpy arrays, as `vlagents_ray.weights.trainable.portable` returns them, or on a GPU.
-            options: The time at which sessions change, and the permissions.
-
-        Returns:
-            The version, and the replicas that act with it.
-
-        Raises:
-            VLAgentsError: A replica refused the version. None acts with it.
-            InvalidInput: The number of the version is not above that of the newest one.
-            PolicyUnavailable: A replica cannot be reached. None acts with the version.
-            NotShared: The values are on a GPU on which a replica has none. None acts with the version.
-        """
+        """Pushes new weights to all replicas, on the event loop of one of them."""
         begun = time.perf_counter()
         async with self._pushing:
             newest = {
@@ -135,7 +121,7 @@ class WeightPusher:
             return PushResult(number, staged[self._own], tuple(acting))
 
     async def catch_up(self) -> int:
-        """Take the newest versions of the other replicas, if they are newer; return the own newest one after that.
+        """Get the newest versions of the other replicas if they are newer; then return this replica's newest version.
 
         A replica calls this before it is ready, and regularly, since it may have missed a commit.
         """
@@ -145,7 +131,7 @@ class WeightPusher:
             for replica in await self._others():
                 try:
                     newest = await replica.weights(WeightUpdates.newest)
-                except (PeerEnded, PeerUnreachable, VLAgentsError):  # it has no newer state than this one
+                except (PeerEnded, PeerUnreachable, VLAgentsError):  # the replica has no newer version
                     continue
                 if newest.number > best.number and newest.model == own.model:
                     best, source = newest, replica
@@ -175,7 +161,8 @@ class WeightPusher:
     async def _loaded(self, replicas: Sequence[WeightsReplica]) -> dict[WeightsReplica, NewestVersion]:
         """Return the newest versions of the replicas that have loaded their policy; the others will catch up.
 
-        A replica does not answer while it loads. One that has answered before has loaded, and cannot be reached.
+        A replica that does not answer may be loading. One that has answered before has loaded, so it counts as
+        unreachable.
         """
         found: dict[WeightsReplica, NewestVersion] = {}
         answers = await asyncio.gather(*(one.weights(WeightUpdates.newest) for one in replicas), return_exceptions=True)
