@@ -74,16 +74,7 @@ class SessionFinder(Protocol):
     """Fetches sessions from other replicas: `vlagents_ray.serve.scaling.session_migration.SessionMigrator`."""
 
     def fetch(self, session_id: str, then: Callable[[], None], caller: str = "") -> bool:
-        """Fetch a session, then call `then`, found or not.
-
-        Args:
-            session_id: Id of the session.
-            then: Called when the search is over.
-            caller: Owner of the search.
-
-        Returns:
-            False, without a call of `then`, if the caller has too many searches.
-        """
+        """Fetch a session, then call `then`, found or not; return False, without that, if `caller` has too many."""
 
     def announce(self, session_id: str, step: int) -> None:
         """Announce to the other replicas that the session began an episode here at `step`; their states are older."""

@@ -19,13 +19,7 @@ class SessionTransfer:
     def __init__(
         self, sessions: SessionTable[LoadedModel], models: ModelManager, require_ready: Callable[[], None]
     ) -> None:
-        """Transfer the sessions of one engine.
-
-        Args:
-            sessions: The sessions.
-            models: The loaded models.
-            require_ready: Raises an error while the policy cannot act.
-        """
+        """Transfer the `sessions` of one engine; `require_ready` raises an error while the policy cannot act."""
         self._sessions = sessions
         self._models = models
         self._require_ready = require_ready

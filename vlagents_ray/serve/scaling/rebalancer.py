@@ -117,13 +117,7 @@ class Rebalancer:
     """Compares the sessions of one replica with those of the others, and places new clients; on one event loop."""
 
     def __init__(self, engine: Engine, siblings: Siblings, own_load: Callable[[int], ReplicaLoad]) -> None:
-        """Balance the sessions of one replica.
-
-        Args:
-            engine: The engine of the replica.
-            siblings: The other replicas.
-            own_load: Returns this replica's load for a number of sessions.
-        """
+        """Balance the sessions of `engine` and `siblings`; `own_load` returns the load of this replica for a count."""
         self._engine = engine
         self._siblings = siblings
         self._own_load = own_load
