@@ -319,7 +319,7 @@ class DrainList:
         self._asked: dict[str, float] = {}
 
     def mark(self, connections: set[str]) -> None:
-        """Replace the set of connections asked to reconnect."""
+        """Replace the set of connections requested to reconnect."""
         self._marked = connections
 
     def ask(self, connection: str) -> bool:
@@ -331,12 +331,12 @@ class DrainList:
         return True
 
     def asked_within(self, seconds: float) -> set[str]:
-        """Return the connections that were asked to reconnect within the last `seconds`."""
+        """Return the connections that were requested to reconnect within the last `seconds`."""
         since = time.monotonic() - seconds
         return {connection for connection, when in list(self._asked.items()) if when >= since}
 
     def forget_older(self, seconds: float) -> None:
-        """Forget the connections that were asked to reconnect more than `seconds` ago."""
+        """Forget the connections that were requested to reconnect more than `seconds` ago."""
         lately = self.asked_within(seconds)
         for connection in list(self._asked.keys() - lately):
             self._asked.pop(connection, None)

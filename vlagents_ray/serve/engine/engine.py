@@ -107,8 +107,8 @@ class Engine:
         self._failure: PolicyFailed | None = None  # reason why the policy did not load, for the operator
         self._not_started: BaseException | None = None  # the error itself, from the policy's thread
         self._hung: PolicyCall | None = None  # overdue call that `notice_hung` found
-        self.draining = False  # whether the replica will stop, so that replies ask clients to reconnect elsewhere
-        self.drain_list = DrainList()  # connections asked to reconnect only because others hold fewer sessions
+        self.draining = False  # whether the replica will stop, so that replies request reconnections
+        self.drain_list = DrainList()  # connections to move only because others hold fewer sessions
         self.queue = BatchQueue(
             max_batch_size,
             idle_s=session_idle_s / 10,
@@ -240,7 +240,7 @@ class Engine:
             self._fail(pending, refusal)
 
     def drain(self) -> None:
-        """Ask all clients, in their next replies, to reconnect to other replicas, since this one will stop."""
+        """Request all clients, in their next replies, to reconnect to other replicas, since this one will stop."""
         self.draining = True
 
     def close(self) -> None:

@@ -66,7 +66,7 @@ class Sender:
         self._engine = engine
         self._session_id = session_id or uuid.uuid4().hex
         self._counted = not connected if counted is None else counted
-        self._asked_to_reconnect = False  # whether the client was asked to reconnect, so that its sessions move
+        self._asked_to_reconnect = False  # whether the client has to reconnect, so that its sessions move
         self._caller = caller if isinstance(caller, Caller) else None
         self.rated = self._caller is not None  # whether its key may be over a rate
         self._paid = False  # whether a message without an admission, and with it its first request, was counted
@@ -253,10 +253,10 @@ class Sender:
             pending.done(Reply(pending.request.request_id, error=late))  # ignored if the request has been answered
 
     def release(self, *, for_good: bool = False) -> None:
-        """End the sessions of a closed connection, unless its client was asked to reconnect elsewhere.
+        """End the sessions of a closed connection, unless its client has to reconnect elsewhere.
 
         The sessions of such a client are kept, for another replica to fetch. `for_good` ends them in any case, for
-        protocols that cannot ask a client to reconnect.
+        protocols without a request to reconnect.
         """
         owner = self._origin.owner
         if owner and (for_good or not (self._asked_to_reconnect or self._engine.draining)):

@@ -472,7 +472,7 @@ def wait_until_ready(
 def _unready_reason(serve: Any, app: str, url: str | None, ours: Collection[str]) -> str | None:
     """Return the reason why the application is not ready; None if it is ready.
 
-    The reason comes from a replica, since over HTTP it is reported only to clients with a key.
+    A replica reports the reason, since over HTTP only clients with a key get it.
     """
     refusal = None if url is None else _http_reason(url)
     if app not in ours or (url is not None and refusal is None):

@@ -69,7 +69,7 @@ def _options(args: ServerArgs) -> dict[str, Any]:
         # A replica that does not reply is frozen, or its policy holds the interpreter's lock: then only these checks
         # limit the time of a call. Together they take the limit of a call; Serve's default is 95 s for any policy.
         "health_check_timeout_s": max(_LEAST_ANSWER_S, args.limits.act_s / _FAILURES),
-        # A policy that failed to load once will fail again. While other replicas run, Serve retries for ever.
+        # A policy that failed to load once will fail again. While other replicas run, Serve retries forever.
         "max_constructor_retry_count": 1,
         "user_config": {},  # settings of the policy that a file states beside `args`; they change without a restart
         "ray_actor_options": {
