@@ -132,7 +132,7 @@ class Tuner:
         return found
 
     def _variants(self, ready: Mapping[str, Any], sizes: Sequence[int]) -> list[Variant]:
-        """Return the variants other than the file's own settings; compiled ones use `sizes` unless the file sets any."""
+        """Return the variants other than the file's own settings; compiled ones use `sizes` unless the file sets it."""
         has = ready["settings"]
         wanted = ready["dtypes"] if self._plan.dtypes is None else self._plan.dtypes
         named = [{"quantization" if one in get_args(Quantization) else "dtype": one} for one in wanted]
