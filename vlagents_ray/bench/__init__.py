@@ -1,4 +1,4 @@
-"""`vlagents-ray tune`: the fastest settings of a deployment file on this machine.
+"""`vlagents-ray tune`: the best settings of a deployment file on this machine.
 
 `tuner` measures variants of the file, each in its own process (`tuning_process`, `measured_policy`), and
 `tuning_choice`

@@ -25,7 +25,7 @@ from vlagents_ray.policies.compilation import Quantization
 from vlagents_ray.registry import require
 from vlagents_ray.serve.config.deployment import ServerArgs
 
-_RISING = 1.05  # factor that two larger batches must add to the rate before a still larger one is measured
+_RISING = 1.05  # factor by which two larger batches must raise the rate before a still larger one is measured
 _TURNS = 3
 _END_S = 2.0  # time for a process to end before it is killed
 _SMALLEST_RANGE = 0.1  # of a number of the action, as a share of its largest magnitude: it may hardly move

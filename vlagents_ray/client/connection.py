@@ -229,7 +229,7 @@ class _NextTransport:
                 self.transport.close()
 
     def drop(self) -> None:
-        """Close the transport, waiting for its connection attempt to end."""
+        """Close the transport, at once or when its attempt to connect ends."""
         with self._lock:
             self._dropped = True
         if self.ended:

@@ -306,7 +306,7 @@ def _denoising(forward: Callable[..., Any], condition: str, compilation: Compila
 def _looking(
     forward: Callable[..., Any], names: list[str], steps: int, compilation: Compilation
 ) -> Callable[[Mapping[str, Any]], Any]:
-    """Return the compiled encoder of frames (B * steps, …) by their names; each of its rows has `steps` frames."""
+    """Return the encoder of frames (B * steps, …) by name, whose compiled core takes rows of `steps` frames."""
 
     def encode_images(*frames: Any) -> Any:
         seen = {name: frame.flatten(0, 1) for name, frame in zip(names, frames, strict=True)}

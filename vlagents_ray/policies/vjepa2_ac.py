@@ -66,9 +66,7 @@ class VJepa2AcConfig(ModelConfig):
 
     @property
     def plans_a_pass(self) -> int:
-        """The largest number of plans in a forward pass of the predictor; compiled passes have this number unless the
-        last.
-        """
+        """The largest number of plans in a forward pass of the predictor; compiled, full passes have this number."""
         return min(self.samples, self.pass_size) if self.compile else self.pass_size
 
     @model_validator(mode="after")

@@ -37,7 +37,7 @@ _used: ContextVar[list[Path] | None] = ContextVar("_used", default=None)
 
 @contextmanager
 def used_checkpoints() -> Iterator[list[Path]]:
-    """Yield a list of the paths that `find_checkpoint` finds in this context; a parent replaces paths within it."""
+    """Yield a list of the paths that `find_checkpoint` finds in this context; a path within another replaces it."""
     found: list[Path] = []
     token = _used.set(found)
     try:
