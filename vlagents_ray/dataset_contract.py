@@ -48,8 +48,7 @@ class DatasetContract:
         """Return `observation.state`, (..., D) float32, with each of `angles` within pi of its centre.
 
         A robot's angle jumps by a full turn between -pi and pi, and so does the angle of a rotation vector; a wrapped
-        angle
-        jumps where the demonstrations have no values.
+        angle jumps where the demonstrations have no values.
         """
         if not self.angles:
             return state

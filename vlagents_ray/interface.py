@@ -11,8 +11,8 @@ A policy written as in the paper is served unchanged to many sessions at once:
         def act(self, obs):
             return Act(action=self.target - obs.state["xyzrpy"][:3])
 
-Each session has its own copy of the initialized agent, and all copies share the weights
-(see `vlagents_ray.serve.sessions`). So `self.target` above belongs to only one robot.
+Each session has its own copy of the initialized agent, and all copies share the weights (see
+`vlagents_ray.serve.sessions`). So `self.target` above belongs to only one robot.
 """
 
 from __future__ import annotations
@@ -237,9 +237,8 @@ class Agent:
             obs: The observation to act on next; it must not be changed.
 
         Returns:
-            Any object that does not share memory with the observation. The agent and its shared objects must not
-            be changed (for instance the padding of a tokenizer); read only values that `initialize` and `reset` have
-            set
+            Any object that does not share memory with the observation. The agent and its shared objects must not be
+            changed (for instance the padding of a tokenizer); read only values that `initialize` and `reset` have set
             and that new weights do not change.
         """
         return None

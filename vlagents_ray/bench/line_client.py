@@ -1,9 +1,8 @@
 """The client's side of a benchmark's line protocol, for processes that `line_process` starts.
 
 A client writes one line of JSON when it is connected and warm. Then each line of its input is a number of calls to
-make, which it answers with a JSON list of their milliseconds. It ends with its standard input or with its parent.
-It needs only the standard library: the scripts of other policy servers (`benchmarks/peers`) load this file with a
-Python
+make, which it answers with a JSON list of their milliseconds. It ends with its standard input or with its parent. It
+needs only the standard library: the scripts of other policy servers (`benchmarks/peers`) load this file with a Python
 without vlagents_ray.
 """
 

@@ -50,9 +50,7 @@ class LineProcess:
         return self._process.pid
 
     def read(self, timeout_s: float) -> Any:
-        """Read the next line that the process writes, decoded; raises `ProcessFailed` if it ends or writes none in
-        time.
-        """
+        """Read the next line that the process writes, decoded; raises `ProcessFailed` on its end or a time-out."""
         stream = self._process.stdout
         if stream is None:
             raise ProcessFailed(f"{self.name}: has no standard output")

@@ -94,8 +94,7 @@ class ChunkBuffer:
 
         Args:
             merge: The combination of the rows that several chunks have for one step: a name of `MERGES`, "ensemble", or
-                a
-                function that is folded over them from the oldest to the newest.
+                a function that is folded over them from the oldest to the newest.
             ensemble_m: The m of the ensemble's weights exp(-m * i), oldest first.
         """
         if isinstance(merge, str) and merge not in MERGES and merge != ENSEMBLE:

@@ -46,11 +46,10 @@ class Control:
     | "paused" | nothing | `resume`, or an engaged leader |
     | "stopped" | nothing | `restart` |
 
-    `update` sets the state once per tick. All methods may be called from any thread: a pause takes effect at the
-    next action, a stop at once. Stops and pauses persist from one run of the control loop to the next. Only
-    `pause`, `stop` and `mark` are called over a network (see `vlagents_ray.client.commands`): `resume` and `restart`
-    are
-    for the operator at the robot, and for its own program.
+    `update` sets the state once per tick. All methods may be called from any thread: a pause takes effect at the next
+    action, a stop at once. Stops and pauses persist from one run of the control loop to the next. Only `pause`, `stop`
+    and `mark` are called over a network (see `vlagents_ray.client.commands`): `resume` and `restart` are for the
+    operator at the robot, and for its own program.
 
     Args:
         leader: The operator's device, or None.

@@ -234,11 +234,10 @@ class ChunkPlayer(Agent):
             agent: The policy, in this process or a `RemoteAgent`.
             settings: The requests to the policy, and the use of its answers; default: `PlayerSettings()`.
             check: Checks every action before it is returned, such as a `vlagents_ray.robot.Guard`. If it refuses an
-                action
-                of the policy, the safe one replaces it, and the plan is dropped; if it refuses a safe one, the last
-                action replaces it if that holds the robot still; else `act` raises `InvalidAction`. It also receives
-                the
-                last action; a `Guard` with `measure` uses the measured pose if there is none, and after safe actions.
+                action of the policy, the safe one replaces it, and the plan is dropped; if it refuses a safe one, the
+                last action replaces it if that holds the robot still; else `act` raises `InvalidAction`. It also
+                receives the last action; a `Guard` with `measure` uses the measured pose if there is none, and after
+                safe actions.
             override: The operator's device. While it is engaged, `act` returns its actions with `info["intervention"]`
                 and, if known, `info["policy_action"]`. `check` also applies to them.
         """
@@ -298,8 +297,7 @@ class ChunkPlayer(Agent):
         """Drop the plan: the robot was stopped or moved, and did not execute the last action of `act`.
 
         Answers to earlier observations are discarded, and the policy is queried again. `run_loop` calls this at each
-        tick
-        at which it holds the robot; call it in your own loop when you stop or take over the robot.
+        tick at which it holds the robot; call it in your own loop when you stop or take over the robot.
         """
         self._begin_again(STOPPED)
         self._execution.interrupt()

@@ -357,9 +357,8 @@ class RemoteAgent(Agent):
 
         `act.info["timing"]` holds times in milliseconds by stage. The server measures from the last byte of the
         request: `decode_ms`, `queue_ms`, `inference_ms` (until the device has finished), `encode_ms`, and `total_ms`,
-        which
-        is their sum and the time between them. The client adds `round_trip_ms` and, as the rest of it, `wire_ms`: its
-        own coding, the network, and proxies. `batch_size` is a number of requests, not a time.
+        which is their sum and the time between them. The client adds `round_trip_ms` and, as the rest of it, `wire_ms`:
+        its own coding, the network, and proxies. `batch_size` is a number of requests, not a time.
         """
         commands = self._commands
         [act] = self.act_batch([obs if commands is None else commands.asking(obs)], [self])

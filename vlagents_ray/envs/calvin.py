@@ -198,8 +198,7 @@ class Calvin(SimulatorEnv):
         renderer: RendererName = "egl",
         source_dir: str | None = None,
     ) -> None:
-        """Make the environment; raises the errors of `make_env`, and `ConfigError` if this process already has one
-        open.
+        """Make the environment; raises the errors of `make_env`, and `ConfigError` if another one is open.
 
         Args:
             task: The scene.

@@ -75,9 +75,8 @@ class LiberoProtocol:
     `max_steps` counts the actions of the policy only; openpi and OpenVLA also count the settling steps.
 
     The simulator draws whatever an initial state does not determine, such as the place of a cabinet, from
-    `simulator_seed`. It is seeded again for each episode, so that an episode does not depend on earlier
-    ones; openpi (7) and OpenVLA (0) seed once per task, so that their scenes shift a little from
-    episode to episode.
+    `simulator_seed`. It is seeded again for each episode, so that an episode does not depend on earlier ones; openpi
+    (7) and OpenVLA (0) seed once per task, so that their scenes shift a little from episode to episode.
 
     MuJoCo's images are upside down. For training, those of the demonstrations were turned by 180 degrees (OpenVLA,
     regenerate_libero_dataset.py, which openpi also uses), not flipped: they are upright, and mirrored left

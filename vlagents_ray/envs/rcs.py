@@ -208,10 +208,10 @@ _COMMANDS: dict[ControlMode, tuple[str, Rotation]] = {
 class Rcs(SimulatorEnv):
     """One environment of one task: "pick", or the id of any scene with a task that RCS has registered.
 
-    Observation: the scene's cameras; for each arm `joints` rad, `tquat` and `xyzrpy`, the tool's pose
-    in the frame that all arms share; the gripper, 1 = open. `Arms` describes the names for several arms.
-    `info["objects"]` is {joint: (7,) float64}, the pose of each loose body in the world frame, metres
-    and quaternion wxyz: for scripted experts only.
+    Observation: the scene's cameras; for each arm `joints` rad, `tquat` and `xyzrpy`, the tool's pose in the frame that
+    all arms share; the gripper, 1 = open. `Arms` describes the names for several arms. `info["objects"]` is {joint:
+    (7,) float64}, the pose of each loose body in the world frame, metres and quaternion wxyz: for scripted experts
+    only.
 
     Action: for each arm its command in `control_mode`, then its gripper, which closes at 0.5 and below.
 

@@ -1,8 +1,8 @@
 """SIMPLER's Bridge tasks in ManiSkill 3: digital twins of a real table with a WidowX.
 
-Li et al. 2024, "Evaluating Real-World Robot Manipulation Policies in Simulation",
-https://arxiv.org/abs/2405.05941. Visual matching: photographs of the real scene behind the
-simulated robot and objects, and a fixed list of initial configurations.
+Li et al. 2024, "Evaluating Real-World Robot Manipulation Policies in Simulation", https://arxiv.org/abs/2405.05941.
+Visual matching: photographs of the real scene behind the simulated robot and objects, and a fixed list of initial
+configurations.
 """
 
 from __future__ import annotations
@@ -60,14 +60,13 @@ class Simpler(SimulatorEnv):
     """One Bridge task with its WidowX 250 S, at 5 Hz.
 
     Observation: "3rd_view_camera", (480, 640, 3), the size that the policies of the paper received and resized
-    themselves; `state`: the arm's `joints` (6,) rad, and `tquat` and `xyzrpy`, the pose of the
-    gripper's link in the robot's base frame; `gripper`. For scripted experts only, `info["sim_state"]`, (13,) float32
-    in that frame: the positions in m of object, target, gripper and commanded gripper, and the object's yaw in rad.
+    themselves; `state`: the arm's `joints` (6,) rad, and `tquat` and `xyzrpy`, the pose of the gripper's link in the
+    robot's base frame; `gripper`. For scripted experts only, `info["sim_state"]`, (13,) float32 in that frame: the
+    positions in m of object, target, gripper and commanded gripper, and the object's yaw in rad.
 
-    Action, (7,), as policies trained on Bridge give it: the gripper's change of position in m along
-    the base's axes, its change of roll, pitch and yaw in rad, and the gripper, 1 open, 0 closed. It
-    is relative to the last command, not to the measured pose. As in SIMPLER's script, the controller reads the
-    rotation as the numbers of a rotation vector.
+    Action, (7,), as policies trained on Bridge give it: the gripper's change of position in m along the base's axes,
+    its change of roll, pitch and yaw in rad, and the gripper, 1 open, 0 closed. It is relative to the last command, not
+    to the measured pose. As in SIMPLER's script, the controller reads the rotation as the numbers of a rotation vector.
 
     The initial state is `options["init_state"]`, SIMPLER's episode id; without it the seed modulo
     `init_states`. The seed has no other effect. The env continues after success, and never reports

@@ -52,8 +52,7 @@ class SimulatorEnv(EvalEnv):
 
     A subclass sets the class variables below, makes its simulator in the constructor within `_making`, and registers
     its clean-up with `_resources`. `_begin` begins an episode and `_advance` executes a step; both are only called
-    while
-    the simulator is open, and their errors become `EnvFailed`.
+    while the simulator is open, and their errors become `EnvFailed`.
 
     Most constructors have the following options; None selects the default of the task or the protocol: `width` and
     `height` of each image, pixels; `instruction`, the task in words; `max_steps`, the step limit; `ends_on_success`,
@@ -105,8 +104,7 @@ class SimulatorEnv(EvalEnv):
         """Begin the episode of `seed`, taken modulo 2^32.
 
         If the task has fixed initial states, the episode begins in state `options["init_state"]`, or in one that the
-        seed
-        selects. There are no other options.
+        seed selects. There are no other options.
         """
         self._alive()
         state = self._initial_state(seed, options or {})

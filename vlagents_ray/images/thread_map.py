@@ -33,8 +33,7 @@ _MOST_HELPERS = 3  # largest number of threads beside the caller's; robots have 
 
 
 def thread_map(function: Callable[[Item], Result], items: Sequence[Item], work_s: float) -> list[Result]:
-    """Compute `[function(item) for item in items]`, in several threads if `work_s`, the time on one core, is long
-    enough.
+    """Compute `[function(item) for item in items]`, in several threads if the time on one core, `work_s`, is long.
 
     The function does not wait for other calls of itself. An exception is that of the first item that raised one.
     """
@@ -71,8 +70,7 @@ class _Helpers(ThreadPoolExecutor):
     """Threads that avoid the core of their caller.
 
     Wake-affine scheduling would often place them there, where they wait for the caller: on two cores, two to four
-    cameras
-    took 20 to 50 % longer.
+    cameras took 20 to 50 % longer.
     """
 
     def __init__(self) -> None:

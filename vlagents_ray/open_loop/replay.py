@@ -214,8 +214,7 @@ def replay(
     """Query a policy at each frame, and compare its actions with the dataset's.
 
     A session is reset with its first recorded observation, its instruction and its options, and then receives each of
-    its
-    observations in order, whatever its answers are.
+    its observations in order, whatever its answers are.
 
     Raises:
         ConfigError: There is no dataset, its actions do not fit the policy's, or a name is unknown.

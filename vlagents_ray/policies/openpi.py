@@ -165,9 +165,7 @@ class Transforms:
         return np.asarray(self.outputs({"state": state, "actions": output})["actions"], np.float32)
 
     def plan(self, observation: dict[str, Any], instruction: str, actions: np.ndarray) -> np.ndarray:
-        """Convert a robot's actions (H, D) to the model's units, relative to the observation if the model predicts
-        such.
-        """
+        """Convert a robot's actions (H, D) to the model's units, relative to the observation if the model's are."""
         data = _with(observation, instruction) | {"actions": np.array(actions)}
         return np.asarray(self.forward(data)["actions"], np.float32)
 

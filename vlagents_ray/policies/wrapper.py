@@ -29,9 +29,7 @@ class Wrapper(Agent, abc.ABC):
 
     @classmethod
     def around(cls, agent: Agent, settings: Mapping[str, Any]) -> Wrapper:
-        """Wrap an agent with the wrapper's settings from the deployment file; raises `ConfigError` for invalid
-        settings.
-        """
+        """Wrap an agent with the wrapper's settings from the deployment file; raises `ConfigError` if any is wrong."""
         try:
             return cls(agent) if cls.Config is None and not settings else cls(agent, cls.Config(**settings))  # type: ignore[misc]
         except (TypeError, ValueError) as error:

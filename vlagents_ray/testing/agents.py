@@ -43,8 +43,7 @@ def check_agent(
 
     Three sessions, copies of the initialized agent, run with an observation, an instruction and a seed each: first in
     sequence, then interleaved, with prepared observations, then in batches of 1, 2 and 3. Their actions must not depend
-    on
-    the other sessions, nor on whether `prepare` was called. If the agent defines `prepare`, several threads call it
+    on the other sessions, nor on whether `prepare` was called. If the agent defines `prepare`, several threads call it
     while sessions are reset and acted on, as in a server, and every result must equal that of a single thread.
 
     Args:

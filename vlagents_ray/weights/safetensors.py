@@ -1,8 +1,7 @@
 """The safetensors format: a header in JSON, with type, shape and place of each value, followed by their bytes.
 
 It contains only numbers, so that reading it executes nothing. A reader checks the whole header before it allocates
-memory
-for any value. See https://huggingface.co/docs/safetensors for the format.
+memory for any value. See https://huggingface.co/docs/safetensors for the format.
 """
 
 from __future__ import annotations

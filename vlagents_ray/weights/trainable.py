@@ -1,8 +1,7 @@
 """The named values of a trainable object: a torch module, or nested dicts and lists of numpy or JAX arrays.
 
 The name of a value in a torch module is that in its `state_dict`; in nested dicts it is the keys, joined with "/".
-Torch
-and JAX are never imported here: their objects exist only if they have been imported.
+Torch and JAX are never imported here: their objects exist only if they have been imported.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Conversion of another system's observation to an `Obs`, and of our action to theirs: keys, layouts, grippers.
 
-A deployment file states a mapping as a preset's name (`presets`), as an object, or as an
-object that names a preset and overrides some of its fields:
+A deployment file states a mapping as a preset's name (`presets`), as an object, or as an object that names a preset and
+overrides some of its fields:
 
     {"cameras": {"front": "observation/image", "wrist": {"key": "images/wrist", "layout": "chw"}},
      "state": {"joints": {"key": "state", "stop": 6}, "pose": ["position", "rotation"]},
@@ -503,8 +503,7 @@ class KeyMapping:
         """Log the cameras of a client's observation that the mapping does not read, and the policy never receives.
 
         A message is logged once for all clients of a dialect with the same cameras. This looks at each key: call it
-        when a
-        session begins, not for each observation.
+        when a session begins, not for each observation.
         """
         if unread := self._unread(flat, may_be_camera):
             _log_unread(dialect, tuple(unread), tuple(camera.key for camera in self.cameras.values()))
@@ -599,8 +598,7 @@ def libero_state(key: str) -> dict[str, Any]:
     """Return the mapping of LIBERO's state, which a client sends under `key`.
 
     The state contains the end effector's pose in the robot's base frame (position in m, axis-angle in rad) and two
-    finger
-    joints, 0.04 m when open.
+    finger joints, 0.04 m when open.
     """
     return {
         "state": {

@@ -56,8 +56,7 @@ class UnixTransport(ABC):
 
     @abstractmethod
     def _write(self, requests: Sequence[Request], deadline: float) -> tuple[bytes, int | None]:
-        """Write requests to memory that the server reads; return the message about it, and a descriptor to send, if
-        any.
+        """Write requests to memory that the server reads; return the message and any descriptor to send.
 
         Raises `TimeoutError` at the deadline, and `OSError` if writing fails.
         """

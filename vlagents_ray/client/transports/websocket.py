@@ -214,8 +214,7 @@ class Stream:
         """Close the connection, so that the server notices.
 
         A message that was not answered in time is useless. Over a lost link the kernel would resend it for minutes, and
-        the
-        server would then execute it and hold the sessions until then; a reset of the connection prevents both.
+        the server would then execute it and hold the sessions until then; a reset of the connection prevents both.
         """
         with contextlib.suppress(OSError):
             if self._silent:

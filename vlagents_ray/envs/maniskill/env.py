@@ -41,11 +41,10 @@ class ManiSkill(SimulatorEnv):
     `info["sim_state"]`, (D,) float32, ManiSkill's flat state observation, which includes the positions of
     objects. Some goals, such as PickCube's, are hidden from cameras.
 
-    Action, in the default control mode `pd_ee_delta_pose`: (7,) in [-1, 1], of which the first three
-    move the tool by 0.1 m per unit along the base's axes; the next three turn it about the base's axes
-    by **minus** 0.1 rad per unit, since ManiSkill scales them by their lower bound; the last is the
-    gripper, 1 open, -1 closed. A robot without gripper takes (6,). The arm lags behind its commands:
-    a constant 1.0 moves it by about 0.03 m per step.
+    Action, in the default control mode `pd_ee_delta_pose`: (7,) in [-1, 1], of which the first three move the tool by
+    0.1 m per unit along the base's axes; the next three turn it about the base's axes by **minus** 0.1 rad per unit,
+    since ManiSkill scales them by their lower bound; the last is the gripper, 1 open, -1 closed. A robot without
+    gripper takes (6,). The arm lags behind its commands: a constant 1.0 moves it by about 0.03 m per step.
 
     The env continues after success, so that success once and success at the end can both be measured,
     and never reports `terminated`.

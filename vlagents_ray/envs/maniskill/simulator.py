@@ -154,8 +154,8 @@ def _prepare_process() -> None:
 def _keep_renderer(sim_backend: str, render_backend: str) -> object:
     """Hold one renderer for the life of the process.
 
-    SAPIEN frees its device and compiled shaders with the last scene that uses them; making the
-    next environment would then take 5 s instead of 0.1 s.
+    SAPIEN frees its device and compiled shaders with the last scene that uses them; making the next environment would
+    then take 5 s instead of 0.1 s.
     """
     import sapien.render
 
@@ -373,8 +373,7 @@ class Simulator:
         """Begin the episode of each environment separately, in the existing scenes.
 
         ManiSkill seeds torch once for all environments that it resets together, with the seed of the first. Draws of a
-        task
-        by torch would then depend on the other environments.
+        task by torch would then depend on the other environments.
         """
         env = self.alive()
         with failing(self.name, "reset"):

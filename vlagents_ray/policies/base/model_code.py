@@ -23,8 +23,7 @@ def use_source(package: str, variable: str, source_dir: str | None = None, withi
     """Make `package` importable: from `source_dir`, from the checkout that `variable` names, or from an installation.
 
     A named checkout has priority, since Python would import any folder with the package's name, such as a checkout in
-    the
-    working directory.
+    the working directory.
 
     Args:
         package: The name of the package.
