@@ -105,7 +105,7 @@ class SafeAction:
         """Whether repeating the last action keeps the robot in place."""
 
     def __call__(self, obs: Obs, last: np.ndarray | None) -> np.ndarray:
-        """Return the safe action, (D,) float32, given the last command, if any; raises `InvalidAction` if it needs one."""
+        """Return the safe action, (D,) float32, given any last command; raises `InvalidAction` if it needs one."""
         if callable(self._make):
             return np.asarray(self._make(obs), np.float32)
         if isinstance(self._make, np.ndarray):
