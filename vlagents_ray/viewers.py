@@ -295,7 +295,7 @@ class LoopView:
         return contextlib.nullcontext() if self._viewer is None else self._viewer.episode(dated_name(), instruction)
 
     def add(self, obs: Obs, act: Act, executed: np.ndarray | None, tick: int, work_s: float, stop: str = "") -> None:
-        """Show a tick; never waits."""
+        """Show a tick with the time that the loop worked, `work_s`, and the reason of a stop; never waits."""
         viewer = self._viewer
         if viewer is None:
             return

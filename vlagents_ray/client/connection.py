@@ -47,7 +47,13 @@ class Connection:
     ) -> None:
         """Set up the connection, without opening it.
 
-        With `leaves_silent`, it switches to another replica when one no longer answers.
+        Args:
+            url: The server's URL.
+            new_transport: Makes a transport for each connection.
+            codec: The codec of the cameras, chosen on each connection.
+            timeout_s: The default time limit of a call.
+            connect_timeout_s: The time limit of `open`, by default.
+            leaves_silent: Whether to switch to another replica when one no longer answers.
         """
         self.url = url
         self._new_transport = new_transport

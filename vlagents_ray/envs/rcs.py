@@ -164,10 +164,17 @@ def configure(
     size: Size,
     cameras: Sequence[str] | None,
 ) -> None:
-    """Configure a scene for an evaluation; sizes are (height, width) in pixels.
+    """Configure a scene for an evaluation: without a window, and as fast as it can.
 
-    `env` is the env's name in messages. The simulation runs without a window, as fast as it can, and for
-    1 / `control_hz` s per step, whether or not the arms have reached their targets.
+    Args:
+        config: RCS's configuration of the scene, which is changed.
+        env: The env's name, for errors.
+        control_mode: The quantity that an action commands.
+        delta: Whether commands are relative to the arm's current position.
+        control_hz: Steps per second of simulated time, whether or not the arms have reached their targets.
+        binary_gripper: Whether the gripper only opens or closes.
+        size: (height, width) of each image, pixels.
+        cameras: Cameras of the scene to render; None selects all.
     """
     base = require("rcs.envs.base")
     config.headless = True

@@ -197,7 +197,15 @@ class MujocoCameras:
     def __init__(
         self, env: str, model: Any, cameras: Sequence[str], size: Size, *, upside_down: Collection[str] = ()
     ) -> None:
-        """Make the renderer, and grow the model's frame buffer; images of `upside_down` cameras are turned upright."""
+        """Make the renderer, and grow the model's frame buffer if needed.
+
+        Args:
+            env: The name of the env, for errors.
+            model: The `mujoco.MjModel`.
+            cameras: The names of the cameras.
+            size: (height, width) of each image, pixels.
+            upside_down: Cameras whose images are turned by 180 degrees.
+        """
         require_cameras(env, cameras, camera_names(model))
         self._cameras, self._upside_down = list(cameras), upside_down
         buffer = model.vis.global_

@@ -78,7 +78,17 @@ class Adapters:
         find: Callable[[str], tuple[Adapter, Path]],
         adapt: Callable[[str, Path], None],
     ) -> None:
-        """Read adapters by name, and make the network's layers apply them; raises `ConfigError` if one does not fit."""
+        """Read adapters, and make the network's layers apply them.
+
+        Args:
+            network: The torch module.
+            sources: The path or hub id of each adapter, by its name in resets.
+            find: Returns the adapter at a source, and its folder.
+            adapt: Called with the fingerprint and the folder of each adapter that was read.
+
+        Raises:
+            ConfigError: An adapter does not fit the network.
+        """
         import torch
 
         layers: dict[str, dict[int, tuple[Any, Any]]] = {}  # A and B by layer and index

@@ -290,7 +290,16 @@ class Plans:
 
 
 def plan(world: World, features: Tensor, poses: Tensor, goals: Tensor, noise: Tensor, config: VJepa2AcConfig) -> Plans:
-    """Search plans from `features` (B, N, F) and `poses` (B, 7) to `goals` (B, N, F), with `noise` (B, I, H, S, 4)."""
+    """Search for plans by the cross-entropy method, with I iterations of S samples of H actions.
+
+    Args:
+        world: The predictor.
+        features: (B, N, F), of the current images.
+        poses: (B, 7), the current poses.
+        goals: (B, N, F), features of the goal images.
+        noise: (B, I, H, S, 4), standard normal.
+        config: The settings of the search.
+    """
     torch = require("torch")
     mean = torch.zeros(len(poses), config.rollout, DRAWN, device=poses.device)
     std = torch.ones_like(mean)

@@ -237,10 +237,13 @@ class _Suite:
 def random_observation(
     contract: Contract | None, seed: int, *, side: int = _SIDE, dims: Mapping[str, int] | None = None
 ) -> Obs:
-    """Make a random observation that fits a contract.
+    """Make a random observation that fits a contract; equal seeds give equal observations.
 
-    Returns:
-        The observation; equal seeds give equal observations.
+    Args:
+        contract: The contract; None for one camera and one state.
+        seed: The seed.
+        side: Height and width of images whose size the contract does not state, pixels.
+        dims: Sizes of parts of the state that the contract does not state.
     """
     rng = np.random.default_rng(seed)
     cameras: Mapping[str, CameraSpec] = {"front": CameraSpec()}

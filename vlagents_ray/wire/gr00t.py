@@ -158,7 +158,10 @@ def newest(observation: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def write_actions(actions: Sequence[Mapping[str, np.ndarray]], asked: Observations, info: Mapping[str, Any]) -> Any:
-    """Return the reply to `get_action`: actions of B sessions by name, (H, D) each, become (B, H, D) by name."""
+    """Return the reply to `get_action` with the actions of B sessions by name, each (H, D), as (B, H, D) by name.
+
+    If the request `asked` has no batch dimension, the reply has none. `info` is only sent to N1.6 and newer.
+    """
     shapes = {name: {one[name].shape for one in actions} for name in actions[0]}
     if any(len(found) > 1 for found in shapes.values()):
         raise InvalidObservation(f"the batch's actions differ in length ({shapes}); send its observations one by one")

@@ -86,10 +86,18 @@ def chosen_backend(wanted: str) -> str:
 
 
 def make_bare(task: str, control_mode: str | None, *, sim_backend: str, render_backend: str, **options: Any) -> Any:
-    """Return the bare environment, without Gymnasium's wrappers; options that are None are left to ManiSkill.
+    """Make the bare environment, without Gymnasium's wrappers.
 
-    `control_mode` None selects the default mode, or the robot's own if the robot lacks that. Raises `ConfigError`
-    for a control mode that the robot lacks, else `EnvFailed`.
+    Args:
+        task: ManiSkill's id.
+        control_mode: None selects the default mode, or the robot's own if the robot lacks that.
+        sim_backend: "physx_cpu" or "physx_cuda".
+        render_backend: "cpu" or "gpu".
+        options: Further options of `gymnasium.make`; ManiSkill's defaults replace those that are None.
+
+    Raises:
+        ConfigError: The robot lacks the control mode.
+        EnvFailed: The environment cannot be made for another reason.
     """
     given = {name: value for name, value in options.items() if value is not None}
     given |= {"sim_backend": sim_backend, "render_backend": render_backend}

@@ -86,7 +86,20 @@ def _holds(folder: Path, path: Path) -> bool:
 
 
 def find_adapter(source: str, checkpoint: str, base: Sequence[Path], digest_of_base: str) -> tuple[Adapter, Path]:
-    """Return a LoRA adapter and its folder; raises `ConfigError` if it was trained on another base."""
+    """Find a LoRA adapter.
+
+    Args:
+        source: The adapter's path or hub id.
+        checkpoint: The name of the policy's checkpoint, the base.
+        base: The files and folders of the base.
+        digest_of_base: Their digest.
+
+    Returns:
+        The adapter, and its folder.
+
+    Raises:
+        ConfigError: The adapter is missing, or was trained on another base.
+    """
     folder = find_checkpoint(source, needs=FILES)
     if not folder.is_dir():
         raise ConfigError(f"{folder}: got a file, want the folder with {', '.join(FILES)}, as PEFT saves it")

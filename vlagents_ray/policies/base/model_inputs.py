@@ -93,7 +93,16 @@ def camera_images(obs: Obs, cameras: Mapping[str, str]) -> dict[str, np.ndarray]
 
 
 def state_vector(obs: Obs, parts: Sequence[str], dim: int | None = None) -> np.ndarray:
-    """Return the parts in their order as one new (dim,) float32 vector."""
+    """Return parts of the proprioception as one new (dim,) float32 vector.
+
+    Args:
+        obs: The observation.
+        parts: The names of the parts in order; `GRIPPER` and `CLOSED` select `Obs.gripper`.
+        dim: The length of the vector; None accepts any.
+
+    Raises:
+        MissingState, InvalidObservation: A part is missing, or the length is wrong.
+    """
     found = []
     for part in parts:
         if part in (GRIPPER, CLOSED):

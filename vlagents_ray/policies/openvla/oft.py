@@ -224,9 +224,15 @@ class Parallel:
             return _numpy(self._heads(self._hidden(self._sequences(inputs))))
 
     def denoise(self, inputs: Sequence[ModelInput], owners: Sequence[int], noise: np.ndarray) -> np.ndarray:
-        """Return chunks (B, H, D) in [-1, 1] of the diffusion head, from noise of that shape.
+        """Denoise chunks with the diffusion head.
 
-        `owners` (B,) is the index of each chunk's input; the images of an input are encoded once.
+        Args:
+            inputs: The inputs, whose images are encoded once.
+            owners: (B,), the index of each chunk's input.
+            noise: (B, H, D), standard normal.
+
+        Returns:
+            (B, H, D) in [-1, 1].
         """
         torch = require("torch")
         with torch.inference_mode():
@@ -236,10 +242,15 @@ class Parallel:
             return _numpy(denoise(start, lambda time, noisy: self._noise(seen, time, noisy), *self.steps))
 
     def choose(self, inputs: Sequence[ModelInput], owners: Sequence[int], draws: np.ndarray) -> tuple[Any, Any]:
-        """Return the tokens (B, H, D) of chunks, and the logits (B, H, D, V) from which they were chosen.
+        """Choose the tokens of chunks.
 
-        `owners` (B,) is the index of each chunk's input, which is computed once; `draws` (B, H, D) are those of
-        `ActionBins.choose`.
+        Args:
+            inputs: The inputs, each of which is computed once.
+            owners: (B,), the index of each chunk's input.
+            draws: (B, H, D), as for `ActionBins.choose`.
+
+        Returns:
+            The tokens (B, H, D), and the logits (B, H, D, V) from which they were chosen.
         """
         torch = require("torch")
         with torch.inference_mode():
@@ -316,7 +327,17 @@ def _numpy(tensor: Any) -> np.ndarray:
 
 
 def denoise(noise: Any, predict: Callable[[int, Any], Any], trained: int, steps: int) -> Any:
-    """Return actions (B, H, D) in [-1, 1] from noise; `predict` returns the noise in them at a time of training."""
+    """Denoise actions by DDIM, without noise between steps.
+
+    Args:
+        noise: (B, H, D), standard normal.
+        predict: Returns the noise in actions (B, H, D) at a time of training.
+        trained: The number of diffusion steps in training.
+        steps: The number of diffusion steps at inference.
+
+    Returns:
+        (B, H, D) in [-1, 1].
+    """
     kept = _kept(trained)
     for time, before in _times(trained, steps):
         guessed = predict(time, noise)
