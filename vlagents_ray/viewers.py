@@ -282,7 +282,7 @@ class EpisodeViewer:
 
 
 class LoopView:
-    """Shows one run in a viewer; without one, it costs nothing."""
+    """Shows one run in a viewer; does nothing if there is no viewer."""
 
     def __init__(self, viewer: EpisodeViewer | None) -> None:
         """Show a run in `viewer`."""

@@ -199,7 +199,7 @@ class BatchEnv(Environment):
         """
 
     def restart(self, index: int, *, seed: int, options: Options | None = None) -> Obs:
-        """Begin another episode in one environment that has had one, whatever the state of the others.
+        """Begin the next episode in one environment while the others continue theirs.
 
         Args:
             index: The number of the environment.

@@ -46,7 +46,7 @@ class Adapter:
 
     @classmethod
     def of(cls, source: str, base: str, own: str, revision: str | None = None) -> Adapter:
-        """Return the adapter with this source and commit, for a base and adapter files with these digests."""
+        """Make an adapter from its source and commit, and from the digests of the base and of its own files."""
         digest = hashlib.sha256(f"{base} {own}".encode()).hexdigest()
         return cls(source, f"{own.partition(':')[0]}:{digest}", digest[:_DIGITS], revision)
 
