@@ -63,7 +63,7 @@ _HOMES = ("errors", "contract", "interface", "images.codecs", "client", "ray_too
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name when it is first used: so the command can handle Ctrl-C before numpy is loaded."""
+    """Import a public name on first use, so that the command can handle Ctrl-C before numpy is loaded."""
     if name in __all__:
         for home in _HOMES:
             module = import_module(f"{__name__}.{home}")

@@ -21,7 +21,7 @@ from vlagents_ray.errors import (
 )
 from vlagents_ray.naming import says_its_fields
 
-_MOST_PARTS = 12  # of the env's state, of which combinations are tried
+_MOST_PARTS = 12  # of the env's state, whose combinations are tried
 _SHOWN = 3  # combinations in a message
 
 Rotation = Literal["none", "axis_angle", "euler_xyz", "quat_xyzw", "quat_wxyz", "rot6d"]
@@ -65,7 +65,7 @@ class ActionSpec:
 
     @property
     def relative(self) -> bool | None:
-        """Whether zeros command no motion (deltas, velocities), not a target pose; None if that is not stated."""
+        """Whether zeros command no motion (deltas, velocities) instead of a target pose; None if that is not stated."""
         return True if self.delta or "velocity" in (self.space or "") else self.delta
 
 
@@ -96,7 +96,7 @@ class Contract:
 
     @classmethod
     def from_json(cls, data: object) -> Contract:
-        """Read a contract from the values that `to_json` returned.
+        """Read a contract from the result of `to_json`.
 
         Args:
             data: The decoded JSON document.
@@ -197,7 +197,7 @@ _ANOTHER = "is this another task's or robot's policy?"
 
 
 def _parts_cure(dim: int | None, env: Contract) -> str:
-    """Name the parts of the env's state that have `dim` numbers together, as a cure; "" if there are none."""
+    """Name parts of the env's state whose sizes add up to `dim`, as a cure; "" if there are none."""
     widths = {name: spec.dim for name, spec in sorted((env.state or {}).items()) if spec.dim}
     if env.gripper:
         widths["gripper"] = 1

@@ -1,6 +1,6 @@
-"""The contract of a dataset of demonstrations, and its way into the checkpoints that are trained on it.
+"""The contract of a dataset of demonstrations, and its transfer into checkpoints trained on the dataset.
 
-LeRobot copies nothing of a dataset's `info.json` into a checkpoint, but all of its `stats.json`, by which a policy
+LeRobot copies nothing of a dataset's `info.json` into a checkpoint, but all of its `stats.json`, with which a policy
 normalises. So the contract is written to `info.json` for readers and also to `stats.json`, as a feature whose values
 are the bytes of the contract's JSON. It reaches the checkpoint with every version of LeRobot.
 """
@@ -21,11 +21,11 @@ from vlagents_ray.errors import ConfigError, MalformedMessage
 INFO = "vlagents_ray"  # key in `info.json`
 STATISTICS, BYTES = "vlagents_ray_contract", "mean"  # keys in `stats.json`
 GRIPPER = "gripper"  # as a part of the state: `Obs.gripper`
-_JOINTS = "joints"  # part that `observation.state` is, if nothing else is known
+_JOINTS = "joints"  # the only part of `observation.state` if nothing else is known
 Centre = float | tuple[float, float, float]  # of an angle, or of a rotation vector, rad
 _TURN = 2 * math.pi
 _USUAL = {"joints": "rad", "xyzrpy": "m+rad"}
-_SLACK = 1e-3  # rad: float32 angles may be a little more than pi
+_SLACK = 1e-3  # rad: float32 angles may slightly exceed pi
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,10 +33,10 @@ class DatasetContract:
     """The meaning of the numbers and images of a dataset."""
 
     contract: Contract  # of a policy that is trained on the dataset
-    state: tuple[str, ...] = ()  # parts side by side in `observation.state`; "gripper" is `Obs.gripper`
+    state: tuple[str, ...] = ()  # concatenated parts of `observation.state`; "gripper" is `Obs.gripper`
     cameras: Mapping[str, str] = field(default_factory=dict)  # feature -> camera
-    angles: Mapping[int, Centre] = field(default_factory=dict)  # (first) place in `observation.state` -> centre, rad
-    environment: tuple[str, ...] = ()  # parts side by side in `observation.environment_state`
+    angles: Mapping[int, Centre] = field(default_factory=dict)  # (first) index in `observation.state` -> centre, rad
+    environment: tuple[str, ...] = ()  # concatenated parts of `observation.environment_state`
 
     @property
     def width(self) -> int:
@@ -47,8 +47,8 @@ class DatasetContract:
     def wrapped(self, state: np.ndarray) -> np.ndarray:
         """Return `observation.state`, (..., D) float32, with each of `angles` within pi of its centre.
 
-        A robot's angle jumps by a full turn between -pi and pi, and so does the angle of a rotation vector; wrapped, it
-        jumps where the demonstrations have no values.
+        A robot's angle jumps by a full turn between -pi and pi, and so does the angle of a rotation vector; a wrapped
+        angle jumps where the demonstrations have no values.
         """
         if not self.angles:
             return state
@@ -73,7 +73,7 @@ class DatasetContract:
 
     @classmethod
     def from_json(cls, data: Any) -> DatasetContract:
-        """Read a contract from the values of `to_json`; raises `ConfigError` if this version cannot read them."""
+        """Read a contract from the result of `to_json`; raises `ConfigError` if this version cannot read it."""
         try:
             found = cls(
                 Contract.from_json(data["contract"]),
@@ -98,9 +98,9 @@ class DatasetContract:
         return found
 
     def to_statistics(self, frames: int) -> dict[str, dict[str, list[int]]]:
-        """Return the entry of `stats.json` that holds the contract, for a dataset with so many frames.
+        """Return the entry of `stats.json` with the contract, for a dataset of `frames` frames.
 
-        It has all statistics of a feature, as LeRobot's tools average them when they merge datasets.
+        It has all statistics of a feature, since LeRobot's tools average them when they merge datasets.
         """
         text = list(json.dumps(self.to_json(), separators=(",", ":"), ensure_ascii=False).encode())
         same = dict.fromkeys(("min", "max", BYTES, "q01", "q10", "q50", "q90", "q99"), text)
@@ -125,13 +125,13 @@ def state_parts(
         width: The number of values in `observation.state`.
         policy: The policy's contract, with the sizes of its parts.
         chosen: The parts in their order, "gripper" for `Obs.gripper`; by default those of the contract, or `joints`.
-        option: The option that sets `chosen`, with an example, for the message of the error.
+        option: The option that sets `chosen`, with an example, for the error message.
 
     Returns:
         The parts in their order, each with its size.
 
     Raises:
-        ConfigError: The sizes of the parts are unknown, or are not `width` together.
+        ConfigError: The sizes of the parts are unknown, or do not add up to `width`.
     """
     specs = dict((policy and policy.state) or {})
     parts = list(chosen if chosen is not None else wanted_parts(policy) or [_JOINTS])
@@ -164,7 +164,7 @@ def divided_state(
 
     Args:
         vectors: Features such as `observation.state`, each (D,) float32.
-        parts: The parts in each of them and their sizes, as `state_parts` returns them.
+        parts: The parts of each feature and their sizes, as returned by `state_parts`.
 
     Returns:
         The parts for `Obs.state`, (size,) float32 each, and the value for `Obs.gripper`, or None if there is none.
@@ -199,27 +199,27 @@ def angles_in(part: str, unit: str | None, dim: int) -> range:
 def rotation_vector_in(part: str, unit: str | None, dim: int) -> int | None:
     """Return the index of the first number of a rotation vector (axis times angle) in a part of the state, or None.
 
-    Its part has "axis" in its name, as `xyz_axis_angle`, and no other numbers than a position before it.
+    Such a part has "axis" in its name, as in `xyz_axis_angle`, and only a position before the vector.
     """
     return {("rad", 3): 0, ("m+rad", 6): 3}.get((unit or "", dim)) if "axis" in part else None
 
 
 def usual_unit(part: str) -> str | None:
-    """Return the usual unit of a part of this name, for a dataset without a contract."""
+    """Return the usual unit of a part with this name, for a dataset without a contract."""
     return next((unit for end, unit in _USUAL.items() if part.endswith(end)), None)
 
 
 def centre_between(lowest: float, highest: float) -> float | None:
-    """Return the centre of an angle of which only the range in the dataset is known; None if it is within [-pi, pi].
+    """Return the centre of an angle, given only its range in the dataset; None if the range is within [-pi, pi].
 
-    Values within the range are not changed by wrapping them around this centre.
+    Wrapping around this centre does not change values within the range.
     """
     outside = max(-lowest, highest) > math.pi + _SLACK
     return (lowest + highest) / 2 if outside and highest - lowest < _TURN else None
 
 
 def centre_of(episodes: Sequence[np.ndarray]) -> float | None:
-    """Return the centre around which an angle is to be wrapped, rad, opposite to the widest arc without a value.
+    """Return the centre around which to wrap an angle, rad: opposite to the widest arc without a value.
 
     Args:
         episodes: The angle in each episode, (N,) rad.
@@ -239,7 +239,7 @@ def centre_of(episodes: Sequence[np.ndarray]) -> float | None:
 
 
 def rotation_centre_of(episodes: Sequence[np.ndarray]) -> tuple[float, float, float] | None:
-    """Return the centre around which a rotation vector is to be wrapped, rad: the mean of its rotations.
+    """Return the centre around which to wrap a rotation vector, rad: the mean of its rotations.
 
     Args:
         episodes: The rotation vector in each episode, (N, 3) rad.
@@ -272,8 +272,8 @@ def _centre(value: Any) -> Centre:
 def _near_vector(vectors: np.ndarray, centre: np.ndarray) -> np.ndarray:
     """Replace rotation vectors by those of the same rotations that are nearest to `centre`, (..., 3) each.
 
-    A vector of the same axis and an angle with further full turns is the same rotation. Those that are nearest already
-    stay the same to the bit, and a vector of zeros, which has no axis, stays zero.
+    Adding full turns to the angle about the same axis gives the same rotation. Vectors that are already the nearest
+    stay bit-identical, and a zero vector, which has no axis, stays zero.
     """
     angles = np.linalg.norm(vectors, axis=-1, keepdims=True)
     axes = np.divide(vectors, angles, out=np.zeros_like(vectors), where=angles > 0)
@@ -282,6 +282,6 @@ def _near_vector(vectors: np.ndarray, centre: np.ndarray) -> np.ndarray:
 
 
 def _near(angles: np.ndarray, centre: float | np.ndarray) -> np.ndarray:
-    """Shift angles by full turns to within pi of `centre`; angles that are within stay the same to the bit."""
+    """Shift angles by full turns to within pi of `centre`; angles already within stay bit-identical."""
     off = angles - centre
     return np.where(np.abs(off) > math.pi, centre + (off + math.pi) % _TURN - math.pi, angles)

@@ -11,8 +11,8 @@ A policy written as in the paper is served unchanged to many sessions at once:
         def act(self, obs):
             return Act(action=self.target - obs.state["xyzrpy"][:3])
 
-Each session has its own copy of the initialized agent, and all copies share the weights
-(see `vlagents_ray.serve.sessions`). So `self.target` above belongs to one robot alone.
+Each session has its own copy of the initialized agent, and all copies share the weights (see
+`vlagents_ray.serve.sessions`). So `self.target` above belongs to only one robot.
 """
 
 from __future__ import annotations
@@ -33,23 +33,23 @@ if TYPE_CHECKING:
 
     from vlagents_ray.contract import Contract
 
-# The keys of `Obs.info` and `Act.info` that have a meaning here; others are allowed as well, with values of the types
-# that `Obs.info` names.
+# The keys of `Obs.info` and `Act.info` that have a meaning here; others are also allowed, with values of the types that
+# `Obs.info` names.
 GOAL_IMAGE = "goal_image"  # (H, W, 3) uint8 RGB, for goal-conditioned policies
 DEPTH = "depth"  # {camera: (H, W) float32, metres; or uint16, millimetres}
 SAMPLES = "samples"  # in an observation: the number of samples of its action distribution to return, N
-# In the Act: {"mean", "std": shaped as the action; "samples": (N, *action)} float32, and for each name of WANT what the
-# act states, for every sample, with N as the first dimension.
+# In the Act: {"mean", "std": shaped as the action; "samples": (N, *action)} float32, and for each name of WANT the
+# act's value for every sample, with N as the first dimension.
 DISTRIBUTION = "distribution"
-WANT = "want"  # in an observation: names of values that the Act returns beside the action, out of `Contract.behaviour`
+WANT = "want"  # in an observation: names of values in `Contract.behaviour` that the Act returns beside the action
 BEHAVIOUR = "behaviour"  # in the Act: {name: number, or one for each row or token}, e.g. the action's "logprob", nats
 CAPTURED = "captured_at"  # in an observation: the time at which its first sensor was read, s since 1970 (`time.time`)
-DEADLINE = "deadline_ms"  # in an observation: the time after which `RemoteAgent` gives the request up, ms
+DEADLINE = "deadline_ms"  # in an observation: the time after which `RemoteAgent` abandons the request, ms
 # Real-time chunking (Black, Galliker & Levine 2025, https://arxiv.org/abs/2506.07339), in an observation: when the
 # answer arrives, DELAY rows of LEFTOVER have been executed; the new chunk begins with them, and continues the rest.
 LEFTOVER = "leftover_actions"  # (H', D) float32: the current plan from this observation's tick on
-DELAY = "delay_ticks"  # int: ticks until the answer arrives, the longest of the last ones; at most the rows of LEFTOVER
-EXECUTED = "executed_actions"  # in an observation, (N, D): others than the policy's, executed since the last request
+DELAY = "delay_ticks"  # int: ticks until the answer arrives, the longest recent delay; at most the rows of LEFTOVER
+EXECUTED = "executed_actions"  # in an observation, (N, D): actions not of the policy, executed since the last request
 # In the Act of a served policy: its weights, {"version": int, "fingerprint": str}. Version 0 is the loaded checkpoint.
 POLICY = "policy"
 # In the Act of a chunk player:
@@ -79,7 +79,7 @@ class Obs:
     gripper: float | None = None  # in [0, 1], 1 = open
     state: dict[str, np.ndarray] = field(default_factory=dict)  # (D,) float32
     info: dict[str, Any] = field(default_factory=dict)  # None, bool, int, float, str, bytes, array, list, dict
-    prepared: Any = field(default=None, repr=False, compare=False)  # what the server got from `Agent.prepare`, or None
+    prepared: Any = field(default=None, repr=False, compare=False)  # the server's result of `Agent.prepare`, or None
 
 
 @dataclass(slots=True)
@@ -118,15 +118,15 @@ class Agent:
     weights_id: dict[str, Any] | None = None
     """Optional: {"digest": …, "revision": …}, which identify the weights loaded by `initialize`, and more for metadata.
 
-    A server reports them, and an evaluation keeps results of different digests apart. If this is None, the digest is
+    A server reports them, and an evaluation separates results of different digests. If this is None, the digest is
     that of the files that `initialize` found by `vlagents_ray.policies.base.checkpoint.find_checkpoint`.
     """
 
     check: Callable[[np.ndarray, np.ndarray | None], np.ndarray] | None = None
-    """Optional: a check that every action has passed when `act` returns, given it and the one before, (D,) each."""
+    """Optional: a check that every action from `act` has passed, given the action and the previous one, (D,) each."""
 
     control: Any = None
-    """Optional: the `vlagents_ray.chunking.control.Control` of the robot that `act` decides by at each tick."""
+    """Optional: the `vlagents_ray.chunking.control.Control` of the robot, which `act` reads at each tick."""
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Self:
@@ -167,8 +167,8 @@ class Agent:
         """Act with these values from now on; a server calls this between two batches.
 
         The default replaces the values in `trainable` by reference, and copies those on a GPU to the addresses of the
-        old ones, so that CUDA graphs stay valid. An agent that computes something else from its parameters overrides
-        this, computes it again, and calls the default.
+        old ones, so that CUDA graphs stay valid. An agent that derives other values from its parameters overrides
+        this, computes them again, and calls the default.
 
         Args:
             named: A value for each name of `parameters`, of the same shape, type and device. They have been checked,
@@ -189,7 +189,7 @@ class Agent:
 
     @property
     def contract(self) -> Contract | None:
-        """The inputs that the policy needs and the actions that it returns; None if nothing is to be checked."""
+        """The inputs that the policy needs and the actions that it returns; None to check nothing."""
         return None
 
     @property
@@ -218,7 +218,7 @@ class Agent:
     def observe(self, obs: Obs) -> None:
         """Add an observation to the history without computing an action.
 
-        Policies with a history override this. When a session has to begin again on another replica, it is `reset` with
+        Policies with a history override this. When a session is resumed on another replica, it is `reset` with
         its first observation, and this is then called with the last observations on which it had acted.
 
         Args:
@@ -226,20 +226,20 @@ class Agent:
         """
 
     def prepare(self, obs: Obs) -> Any:
-        """Compute what depends on one observation and the instruction alone, such as resized images and tokens.
+        """Compute values that depend only on one observation and the instruction, such as resized images and tokens.
 
         A server may call this on a session's copy while other sessions, or an earlier request of this one, are acted
-        on, on several threads at once, and sets `obs.prepared` to the result before `act`. It does not have to: `act`
-        computes the same where that is None. An error fails the request of that observation. Override this if it takes
-        a noticeable part of the time of `act`.
+        on, on several threads at once, and sets `obs.prepared` to the result before `act`. The call is optional: `act`
+        computes the same if `obs.prepared` is None. An error fails the request of that observation. Override this if it
+        takes a noticeable part of the time of `act`.
 
         Args:
             obs: The observation to act on next; it must not be changed.
 
         Returns:
-            Anything that does not share memory with the observation. The agent, and what its sessions share, must not
-            be changed, such as the padding of a tokenizer; read only what `initialize` and `reset` have set and what no
-            new weights change.
+            Any object that does not share memory with the observation. The agent and its shared objects must not be
+            changed (for instance the padding of a tokenizer); read only values that `initialize` and `reset` have set
+            and that new weights do not change.
         """
         return None
 
@@ -303,7 +303,7 @@ class Agent:
 
 
 def copied(obs: Obs) -> Obs:
-    """Copy an observation with its arrays, as a caller may write the next observation into the same memory."""
+    """Copy an observation with its arrays, since a caller may write the next observation into the same memory."""
     return Obs(
         {name: np.array(image) for name, image in obs.cameras.items()},
         obs.gripper,
@@ -313,7 +313,7 @@ def copied(obs: Obs) -> Obs:
 
 
 def _copied(value: Any) -> Any:
-    """Copy arrays wherever they are nested: `DEPTH` has one for each camera."""
+    """Copy arrays at any depth: `DEPTH` has one for each camera."""
     if isinstance(value, np.ndarray):
         return np.array(value)
     if isinstance(value, dict):

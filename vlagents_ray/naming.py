@@ -17,7 +17,7 @@ def plain(name: str) -> str:
 
 
 def distinct(names: Iterable[str], simplify: Callable[[str], str] = plain) -> dict[str, str]:
-    """Simplify names, and append numbers where two of them would become the same, whatever their order.
+    """Simplify names, and append numbers if two of them would become the same, whatever their order.
 
     "left/wrist" becomes "left_wrist"; beside a "left_wrist", which keeps its name, it becomes "left_wrist_2".
     """
@@ -40,7 +40,7 @@ def did_you_mean(got: str, known: Iterable[str]) -> str:
 
 
 def says_its_fields(hint: str = "") -> Callable[[type[T]], type[T]]:
-    """Let a dataclass list its fields in the error for an unknown one, with a hint where others are."""
+    """Decorate a dataclass to list its fields in the error for an unknown one; `hint` says where other settings are."""
 
     def decorate(cls: type[T]) -> type[T]:
         made = cls.__init__

@@ -1,8 +1,8 @@
 """Names of policies, environments and dialects, the location of their code, and their requirements.
 
-A name stands for `"module:Class"`, imported only when it is used. Third parties add names through the entry-point
+A name refers to `"module:Class"`, imported only when it is used. Third parties add names through the entry-point
 groups `vlagents_ray.policies`, `vlagents_ray.wrappers`, `vlagents_ray.envs` and `vlagents_ray.dialects`; a
-`"module:Class"` written out in a deployment file works without registration. Wrappers, which change the observations of
+`"module:Class"` in a deployment file works without registration. Wrappers, which change the observations of
 any policy, are all registered that way.
 
 The tables of README and docs/ are made from this file: `python tests/support/tables.py`.
@@ -27,14 +27,14 @@ class Adapter:
     """A policy or environment of this package, and the packages that it needs."""
 
     target: str  # "module:Class"
-    about: str = ""  # its models or tasks, for the tables of README and docs/; empty: it is not in them
+    about: str = ""  # its models or tasks, for the tables of README and docs/; empty: no row in them
     needs: tuple[str, ...] = ()  # import names; the first one may be in a source named by `checkouts`
     requirements: tuple[str, ...] = ()  # files of requirements/ that install these, the usual one first
     extra: str | None = None  # extra of this package that installs them
     checkouts: tuple[str, ...] = ()  # variables, one of which names a checkout of the authors' code
-    wants: str = ""  # what else its users have to get, such as "assets"
+    wants: str = ""  # further requirements of its users, such as "assets"
     tasks: str = ""  # of an environment: the pattern after its name
-    page: str | None = None  # below docs/policies or docs/benchmarks, "" for none; None: that of its name
+    page: str | None = None  # below docs/policies or docs/benchmarks, "" for no page; None: the page with its name
 
 
 POLICIES: dict[str, Adapter] = {
@@ -211,8 +211,8 @@ ENVS: dict[str, Adapter] = {
     ),
 }
 
-# Other systems' protocols: the names under `dialects` in a deployment file. Of several that clients find at the
-# server's root, the first one that is on has it.
+# Other systems' protocols: the names under `dialects` in a deployment file. If several serve the server's root path,
+# the first enabled one receives it.
 DIALECTS: dict[str, str] = {
     "openpi": "vlagents_ray.serve.dialects.openpi:OpenPiDialect",
     "roboarena": "vlagents_ray.serve.dialects.roboarena:RoboArenaDialect",
@@ -255,7 +255,7 @@ _ELSEWHERE = {
     "through a rosbridge, `link: ws://arm-pc:9090`",
     "torchao": "run `pip install torchao` in the policy's environment; its requirements file leaves it out",
 }
-# packages that those of the families bring along
+# packages installed as dependencies of those of the families
 _BROUGHT = {"torchvision": "torch", "tokenizers": "transformers", "safetensors": "transformers"} | {
     "huggingface_hub": "transformers",
     "hydra": "diffusion_policy",
@@ -275,7 +275,7 @@ def require(module: str, *, extra: str | None = None) -> ModuleType:
 
     Args:
         module: The module's full name, e.g. "torch" or "openpi.models.model".
-        extra: The extra of this package that installs it for the caller, if that is not the usual one.
+        extra: The extra of this package that installs it for the caller, if different from the usual one.
 
     Returns:
         The module.
@@ -288,7 +288,7 @@ def require(module: str, *, extra: str | None = None) -> ModuleType:
     except ModuleNotFoundError as error:
         top = module.partition(".")[0]
         if error.name is None or error.name.partition(".")[0] != top:
-            raise  # the module is installed, but an import of it is missing, which this error names
+            raise  # the module is installed, but lacks a dependency, which this error names
         raise MissingDependency(f"{module!r} is not installed; {_install(top, extra)}") from error
 
 
@@ -314,7 +314,7 @@ def _install(package: str, extra: str | None = None) -> str:
 
 
 def names(kind: str) -> dict[str, str]:
-    """All registered names of `kind` ("policies", "wrappers", "envs" or "dialects") with their "module:Class"."""
+    """Return all names of `kind` ("policies", "wrappers", "envs" or "dialects") with their "module:Class"."""
     adapters = {"policies": POLICIES, "envs": ENVS}.get(kind, {})
     own = DIALECTS if kind == "dialects" else {name: one.target for name, one in adapters.items()}
     found = {point.name: point.value for point in entry_points(group=f"vlagents_ray.{kind}")}
@@ -322,17 +322,17 @@ def names(kind: str) -> dict[str, str]:
 
 
 def policy_class(name: str) -> type[Any]:
-    """Return the Agent class registered as `name`, or written out as "module:Class"."""
+    """Return the Agent class registered as `name`, or given as "module:Class"."""
     return named_class(name, names("policies"), UnknownPolicy)
 
 
 def wrapper_class(name: str) -> type[Any]:
-    """Return the wrapper class registered as `name`, or written out as "module:Class"."""
+    """Return the wrapper class registered as `name`, or given as "module:Class"."""
     return named_class(name, names("wrappers"), UnknownWrapper)
 
 
 def dialect_class(name: str) -> type[Any]:
-    """Return the dialect class registered as `name`, or written out as "module:Class"."""
+    """Return the dialect class registered as `name`, or given as "module:Class"."""
     return named_class(name, DIALECTS if name in DIALECTS else names("dialects"))
 
 
@@ -347,7 +347,7 @@ def env_suite(name: str) -> str:
 
 
 def env_task(name: str) -> str | None:
-    """Return the task within the suite: "PushCube-v1" of "maniskill/PushCube-v1"; None if not given."""
+    """Return the task within the suite: "PushCube-v1" of "maniskill/PushCube-v1"; None if there is none."""
     return None if _is_class(name) else name.partition("/")[2] or None
 
 

@@ -1,4 +1,4 @@
-"""Error messages for wrong settings, with the known settings and the one that was probably meant."""
+"""Error messages for wrong settings, with the known settings and a suggestion."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ import numpy as np
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.naming import did_you_mean
 
-_WANT = "Input should be "  # in pydantic's words
-# The types of the values that a plain type allows: also numpy's, and whole numbers for a float, as YAML reads 1 as int.
+_WANT = "Input should be "  # pydantic's wording
+# Types of values that a plain type allows: also numpy's, and whole numbers for a float, since YAML reads 1 as int.
 _PLAIN: dict[type, tuple[type, ...]] = {
     bool: (bool, np.bool_),
     int: (numbers.Integral,),
@@ -25,7 +25,7 @@ _PLAIN: dict[type, tuple[type, ...]] = {
 
 
 def require_arguments(what: str, function: Callable[..., Any], given: Mapping[str, Any]) -> None:
-    """Raise `ConfigError` unless a function takes these keyword arguments.
+    """Raise `ConfigError` unless a function accepts these keyword arguments.
 
     The type of a value is compared with its parameter's annotation, or with the default if there is no annotation. Only
     numbers, strings, booleans and None are compared; values of other types are left to the function.
@@ -126,7 +126,7 @@ def _sentence(item: Mapping[str, Any], model: type | None, option: str | None) -
 def _fields(model: type | None, place: Iterable[Any]) -> Mapping[str, Any]:
     """Return the fields at a place below `model`; empty if they cannot be determined."""
     for name in place:
-        if isinstance(name, int):  # of a list
+        if isinstance(name, int):  # an index in a list
             continue
         field = _of(model).get(name)
         model = None if field is None else next(filter(_of, _parts(field.annotation)), None)
@@ -134,7 +134,7 @@ def _fields(model: type | None, place: Iterable[Any]) -> Mapping[str, Any]:
 
 
 def _of(model: type | None) -> Mapping[str, Any]:
-    """Return the fields of a model; of one whose fields are registered names, those."""
+    """Return the fields of a model; if its fields are registered names, return those names."""
     registered: Callable[[], Mapping[str, Any]] | None = getattr(model, "registered_fields", None)
     return getattr(model, "model_fields", {}) if registered is None else registered()
 

@@ -11,7 +11,7 @@ from vlagents_ray.contract import Contract, _differ
 from vlagents_ray.errors import InvalidAction, InvalidObservation, MissingCamera, MissingState, NotOffered
 from vlagents_ray.interface import WANT, Obs
 
-_FEW = 64  # numbers, up to which Python's own check is faster than numpy's
+_FEW = 64  # size of arrays up to which Python's own check is faster than numpy's
 _UINT8, _FLOAT32 = np.dtype(np.uint8), np.dtype(np.float32)
 
 
@@ -68,7 +68,7 @@ def _check_needs(obs: Obs, contract: Contract) -> None:
 
 
 def check_action(action: object, contract: Contract | None) -> np.ndarray:
-    """Return the action as (D,) or (H, D) float32, or raise `InvalidAction` if it must not reach a robot."""
+    """Return the action as (D,) or (H, D) float32; raises `InvalidAction` if it must not be sent to a robot."""
     try:
         array = np.ascontiguousarray(action, dtype=_FLOAT32)
     except (TypeError, ValueError) as error:
@@ -83,7 +83,7 @@ def check_action(action: object, contract: Contract | None) -> np.ndarray:
 
 
 def _finite(array: np.ndarray) -> bool:
-    """Return whether no number is NaN or infinite; for a robot's few numbers Python is four times as fast as numpy."""
+    """Return whether all numbers are finite; for a robot's few numbers Python is four times as fast as numpy."""
     if array.size <= _FEW:
         return all(map(math.isfinite, array.ravel().tolist()))
     return bool(np.isfinite(array).all())

@@ -1,6 +1,6 @@
-"""Episodes for Rerun (https://rerun.io): `.rrd` files, or a viewer that runs; the extra "rerun".
+"""Episodes for Rerun (https://rerun.io): `.rrd` files, or a running viewer; the extra "rerun".
 
-A thread writes them, and drops frames that come too fast, so that the loop is never delayed.
+A thread writes them, and drops frames that arrive too fast, so that the loop is never delayed.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ if TYPE_CHECKING:
 __all__ = ["EpisodeViewer", "ViewerFrame", "open_viewer"]
 
 logger = logging.getLogger(__name__)
-LIVE = "rerun+http://127.0.0.1:9876/proxy"  # where `rerun`, the viewer, listens by default
+LIVE = "rerun+http://127.0.0.1:9876/proxy"  # the default address of `rerun`, the viewer
 _PORT = 9876
-CLOSING_S = 2.0  # within which a live viewer takes what is left
-FRAMES = 100  # in the queue: 2 s at 50 Hz, 180 MB with two cameras of 640x480
-_NICE = 5  # the writing thread runs after the loop's
+CLOSING_S = 2.0  # s, time limit for a live viewer to receive the remaining frames
+FRAMES = 100  # size of the queue: 2 s at 50 Hz, 180 MB with two cameras of 640x480
+_NICE = 5  # the writing thread has a lower priority than the loop
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,9 +49,9 @@ class ViewerFrame:
     state: Mapping[str, np.ndarray] = field(default_factory=dict)  # (D,) float32; the gripper is a part
     executed: np.ndarray | None = None  # (D,) float32
     planned: np.ndarray | None = None  # (D,) float32, the row of the newest chunk for this tick
-    chunk: np.ndarray | None = None  # (H, D) float32, where a new one begins
-    numbers: Mapping[str, float] = field(default_factory=dict)  # times and whatever else is a number, by name
-    note: str = ""  # what a person should read, such as why the action is a safe one
+    chunk: np.ndarray | None = None  # (H, D) float32, if a new one begins
+    numbers: Mapping[str, float] = field(default_factory=dict)  # times and other numbers, by name
+    note: str = ""  # a message to show, such as why the action is a safe one
 
     @classmethod
     def of(cls, obs: Obs, tick: int, **what: Any) -> ViewerFrame:
@@ -63,7 +63,7 @@ class ViewerFrame:
             what: Further fields.
 
         Returns:
-            The frame, with the time of `info["captured_at"]` if the observation states it, else now.
+            The frame, with the time of `info["captured_at"]` if the observation states it, else the current time.
         """
         state = {name: np.array(part) for name, part in obs.state.items()}
         if obs.gripper is not None:
@@ -73,7 +73,7 @@ class ViewerFrame:
 
 
 def numbers_of(info: Mapping[str, Any]) -> dict[str, float]:
-    """Return the numbers in the info of an `Act` that viewers show: its timing, and that of a chunk player."""
+    """Return the numbers in the info of an `Act` that viewers show: its timing, and the fields of a chunk player."""
     timing = info.get("timing") or {}
     return {**timing, **{name: float(info[name]) for name in (AGE, SILENT) if name in info}}
 
@@ -93,15 +93,15 @@ class RerunRecordings:
         self._rerun = require("rerun")
         self._folder = None if is_live(target) else Path(target)
         self.closing_s = CLOSING_S if self._folder is None else None
-        """How long the end waits for what is left to be written; None: until it is."""
+        """Time limit, s, for writing the remaining frames when it is closed; None for no limit."""
         if self._folder is None:
             _require_viewer(self.target)
-            self._rerun.unregister_shutdown()  # it would wait for a viewer that is gone, without an end
+            self._rerun.unregister_shutdown()  # it would wait forever for a viewer that has gone
         else:
             self._folder.mkdir(parents=True, exist_ok=True)
 
     def begin(self, name: str, instruction: str) -> RerunEpisode:
-        """Begin an episode; `name` is also that of its file, and an empty `instruction` is not shown."""
+        """Begin an episode; `name` is also the name of its file, and an empty `instruction` is not shown."""
         recording = self._rerun.RecordingStream("vlagents_ray", recording_id=uuid4())
         if self._folder is None:
             recording.connect_grpc(self.target)
@@ -148,7 +148,7 @@ class RerunEpisode:
 
 
 def _require_viewer(address: str) -> None:
-    """Raise `ConfigError` if nothing listens at the address: the SDK would retry without an end."""
+    """Raise `ConfigError` if nothing listens at the address; the SDK would otherwise retry forever."""
     where = urlsplit(address)
     try:
         with socket.create_connection((where.hostname or "", where.port or _PORT), CLOSING_S):
@@ -175,7 +175,7 @@ def open_viewer(target: str) -> EpisodeViewer:
 
 
 def is_live(target: str) -> bool:
-    """Return whether a target is a connection, not a folder."""
+    """Return whether a target is a connection instead of a folder."""
     return target == "live" or target.startswith("rerun+")
 
 
@@ -197,8 +197,8 @@ class EpisodeViewer:
 
     def __init__(self, target: RerunRecordings, *, frames: int = FRAMES) -> None:
         self.dropped = 0  # frames
-        self.episodes = 0  # written without an error
-        self.error: Exception | None = None  # the first one
+        self.episodes = 0  # number of episodes written without an error
+        self.error: Exception | None = None  # the first error
         self._recordings = target
         self._frames = frames
         self._queue: queue.SimpleQueue[ViewerFrame | tuple[str, str] | None] = queue.SimpleQueue()
@@ -210,12 +210,12 @@ class EpisodeViewer:
 
     @property
     def has_room(self) -> bool:
-        """Whether a frame that is added now is shown."""
+        """Whether a frame added now would be shown."""
         return self._put - self._got < self._frames
 
     @contextlib.contextmanager
     def episode(self, name: str, instruction: str = "") -> Iterator[None]:
-        """Make the frames that are added within the context one episode, however the context ends.
+        """Show the frames that are added within the context as one episode, however the context ends.
 
         Args:
             name: The name of the episode, and of its file.
@@ -228,7 +228,7 @@ class EpisodeViewer:
             self._queue.put(None)
 
     def add(self, frame: ViewerFrame) -> None:
-        """Show a frame; never waits."""
+        """Queue a frame to be shown; never waits."""
         if not self.has_room:
             self.dropped += 1
             return
@@ -236,7 +236,7 @@ class EpisodeViewer:
         self._queue.put(frame)
 
     def close(self) -> None:
-        """Write the frames in the queue, and close the target; a live viewer gets two seconds for them."""
+        """Write the queued frames, and close the target; a live viewer has two seconds to receive them."""
         if not self._closed:
             self._closed = True
             self._queue.put(None)
@@ -282,12 +282,12 @@ class EpisodeViewer:
 
 
 class LoopView:
-    """Shows one run in a viewer; without one, it costs nothing."""
+    """Shows one run in a viewer; does nothing if there is no viewer."""
 
     def __init__(self, viewer: EpisodeViewer | None) -> None:
         """Show a run in `viewer`."""
         self._viewer = viewer
-        self._chunk: np.ndarray | None = None  # the last one that was shown
+        self._chunk: np.ndarray | None = None  # the last chunk that was shown
         self._note = ""
 
     def episode(self, instruction: str) -> contextlib.AbstractContextManager[None]:
@@ -295,7 +295,7 @@ class LoopView:
         return contextlib.nullcontext() if self._viewer is None else self._viewer.episode(dated_name(), instruction)
 
     def add(self, obs: Obs, act: Act, executed: np.ndarray | None, tick: int, work_s: float, stop: str = "") -> None:
-        """Show a tick; never waits."""
+        """Show a tick with the time that the loop worked, `work_s`, and the reason of a stop; never waits."""
         viewer = self._viewer
         if viewer is None:
             return

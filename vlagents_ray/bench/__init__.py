@@ -1,6 +1,6 @@
-"""`vlagents-ray tune`: the settings of a deployment file that serve best on this machine.
+"""`vlagents-ray tune`: the best settings of a deployment file on this machine.
 
-`tuner` measures variants of the file, each in a process (`tuning_process`, `measured_policy`), and `tuning_choice`
-chooses. Processes obey a line protocol (`line_process`, `line_client`), as those of the folder `benchmarks/` of the
-checkout do.
+`tuner` measures variants of the file, each in its own process (`tuning_process`, `measured_policy`), and
+`tuning_choice` selects one. Processes use a line protocol (`line_process`, `line_client`), as do those of the folder
+`benchmarks/` of the checkout.
 """

@@ -1,9 +1,9 @@
 """The client's side of a benchmark's line protocol, for processes that `line_process` starts.
 
-A client writes one line of JSON when it is connected and warm. Then each line that it reads is a number of calls to
-make, which it answers with a JSON list of their milliseconds. It ends when its standard input ends or its parent dies.
-Standard library only: the scripts of other policy servers (`benchmarks/peers`) load this file with a Python that has no
-vlagents_ray.
+A client writes one line of JSON when it is connected and warm. Then each line of its input is a number of calls to
+make, which it answers with a JSON list of their milliseconds. It ends with its standard input or with its parent. It
+needs only the standard library: the scripts of other policy servers (`benchmarks/peers`) load this file with a Python
+without vlagents_ray.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ _PR_SET_PDEATHSIG = 1
 
 
 def die_with_parent() -> None:
-    """Ask the kernel to kill this process when its parent dies, however that happens. Linux only."""
+    """Make the kernel kill this process when its parent ends, however that happens. Linux only."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 def own_stdout() -> TextIO:
-    """Return the standard output for the protocol alone; all other output goes to standard error."""
+    """Reserve the standard output for the protocol, and return it; all other output goes to standard error."""
     out = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
     return out
 
 
 def timed(prepare: Callable[[], Any], call: Callable[[Any], object], calls: int) -> list[float]:
-    """Make `calls` calls; returns the milliseconds of each, without those of `prepare`, which makes the observation."""
+    """Make `calls` calls; return the milliseconds of each, excluding `prepare`, which makes the observation."""
     taken = []
     for _ in range(calls):
         obs = prepare()
@@ -46,7 +46,7 @@ def timed(prepare: Callable[[], Any], call: Callable[[Any], object], calls: int)
 
 
 def obey(lines: Iterable[str], out: TextIO, measure: Callable[[int], list[float]], said: dict[str, Any]) -> None:
-    """Warm up, write `said` as the line of a ready client, and answer each line until the input ends."""
+    """Warm up, write `said` to report that the client is ready, and answer each line until the input ends."""
     measure(WARM_UP)
     print(json.dumps(said), file=out, flush=True)
     for line in lines:

@@ -1,4 +1,4 @@
-"""Processes of a benchmark: each obeys the line protocol of `line_client`, and never outlives this process."""
+"""Processes of a benchmark: each implements the line protocol of `line_client`, and never outlives this process."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ import vlagents_ray
 from vlagents_ray.errors import VLAgentsError
 
 _END_S = 10.0
-_KEPT = 2000  # characters of its standard error that are shown when it fails
+_KEPT = 2000  # characters of a failed process's standard error that are shown
 
 
 class ProcessFailed(VLAgentsError):
@@ -33,7 +33,7 @@ class LineProcess:
         self, name: str, command: Sequence[str], environment: Mapping[str, str] | None = None, *, end_s: float = _END_S
     ) -> None:
         self.name = name
-        self._end_s = end_s  # how long it may take to end once its input has ended
+        self._end_s = end_s  # time for the process to end after its input
         self._received = b""  # the bytes after the last complete line
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed by `close`
         self._process = subprocess.Popen(  # noqa: S603 - the bench's own scripts
@@ -42,7 +42,7 @@ class LineProcess:
             stdout=subprocess.PIPE,
             stderr=self._errors,
             env={**os.environ, **(environment or {})},
-            start_new_session=True,  # Ctrl-C is for the bench, which ends its children in order
+            start_new_session=True,  # Ctrl-C goes to the bench, which ends its children in order
         )
 
     @property
@@ -50,7 +50,7 @@ class LineProcess:
         return self._process.pid
 
     def read(self, timeout_s: float) -> Any:
-        """Read the next line that it writes, decoded. Raises `ProcessFailed` if it ends or writes none in time."""
+        """Read the next line that the process writes, decoded; raises `ProcessFailed` on its end or a time-out."""
         stream = self._process.stdout
         if stream is None:
             raise ProcessFailed(f"{self.name}: has no standard output")
@@ -85,7 +85,7 @@ class LineProcess:
         return self.read(timeout_s)
 
     def close(self) -> None:
-        """End its standard input, which ends it; kill it if that does not."""
+        """Close the standard input of the process, which ends it; kill it if it continues."""
         if self._process.stdin is not None:
             with contextlib.suppress(OSError):
                 self._process.stdin.close()
@@ -111,7 +111,7 @@ class LineProcess:
 
 
 def our_environment() -> dict[str, str]:
-    """Return the variables with which a process of ours finds this package, installed or not."""
+    """Return the environment variables with which a child process finds this package, installed or not."""
     package = str(Path(vlagents_ray.__file__).parent.parent)
     others = [one for one in os.environ.get("PYTHONPATH", "").split(os.pathsep) if one and one != package]
     return {"PYTHONPATH": os.pathsep.join([package, *others])}

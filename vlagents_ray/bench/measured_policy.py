@@ -1,4 +1,4 @@
-"""A policy in this process, behind a replica's batch queue, whose calls are timed; without Ray."""
+"""A policy in this process, behind a replica's batch queue, with timed calls; without Ray."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.serve.requests import RANKS, PendingRequest
 
 INSTRUCTION = "pick up the cube"
-WARM = 2  # batches that do not count
+WARM = 2  # warm-up batches, which do not count
 _LATE_S = 600.0  # a first batch may be compiled
 
 
@@ -69,14 +69,14 @@ class MeasuredPolicy:
         self.engine.close()
 
     def actions(self, size: int, count: int) -> list[np.ndarray]:
-        """Return the first actions of episodes 0, 1, … of their own observations and seeds, in batches of that size.
+        """Return the first actions of episodes 0, 1, … with their own observations and seeds, in batches of `size`.
 
         Args:
             size: The batch size.
-            count: The number of episodes; if `size` is no divisor of it, the last batch begins again with episode 0.
+            count: The number of episodes; if `size` does not divide it, the last batch continues with episode 0.
 
         Returns:
-            At least `count` actions, (D,) or (H, D) float32; the one at i is of episode i modulo `count`.
+            At least `count` actions, (D,) or (H, D) float32; the one at i belongs to episode i modulo `count`.
         """
         found: list[np.ndarray] = []
         while len(found) < count:
@@ -86,7 +86,7 @@ class MeasuredPolicy:
         return found
 
     def queued(self, size: int, seconds: float, rank: RankName) -> QueuedTurn:
-        """Measure that many sessions, each of which sends the next request as soon as it is answered."""
+        """Measure `size` sessions, each of which sends its next request as soon as the last one is answered."""
         views = self._views(size)
         answers: queue.SimpleQueue[tuple[int, Reply]] = queue.SimpleQueue()
         asked = [0.0] * size
@@ -145,9 +145,9 @@ class MeasuredPolicy:
 
 
 def rate_of(calls: Sequence[Sequence[tuple[float, ...]]]) -> float:
-    """Return actions a second: the slope of the line through all ends of calls.
+    """Return actions per second: the slope of the line through all ends of calls.
 
-    Actions come in batches, so that counting them in a time would be wrong by up to a batch. 0 for fewer than two
+    Actions come in batches, so counting them within a time would be wrong by up to a batch. 0 for fewer than two
     calls.
 
     Args:
@@ -160,26 +160,26 @@ def rate_of(calls: Sequence[Sequence[tuple[float, ...]]]) -> float:
 
 
 def cuda() -> Any:
-    """Return `torch.cuda` if this process uses it."""
+    """Return `torch.cuda` if this process uses it, else None."""
     torch = sys.modules.get("torch")
     return torch.cuda if torch is not None and torch.cuda.is_available() and torch.cuda.is_initialized() else None
 
 
 def jax_device() -> Any:
-    """Return JAX's first device, if this process uses one that is no CPU."""
+    """Return JAX's first device if this process uses JAX and the device is not a CPU, else None."""
     jax = sys.modules.get("jax")
     device = None if jax is None else jax.local_devices()[0]
     return None if device is None or device.platform == "cpu" else device
 
 
 def forget_peak() -> None:
-    """Reset `peak_mib`, where the accelerator can."""
+    """Reset `peak_mib`, if the accelerator supports it."""
     if (used := cuda()) is not None:
         used.reset_peak_memory_stats()
 
 
 def peak_mib() -> float:
-    """Return the peak memory of the policy's accelerator, by torch since `forget_peak`; else of this process."""
+    """Return the peak memory, MiB, of the accelerator, with torch since `forget_peak`; else of this process."""
     if (used := cuda()) is not None:
         return float(used.max_memory_allocated()) / 2**20
     if (device := jax_device()) is not None:

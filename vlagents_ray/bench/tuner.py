@@ -25,9 +25,9 @@ from vlagents_ray.policies.compilation import Quantization
 from vlagents_ray.registry import require
 from vlagents_ray.serve.config.deployment import ServerArgs
 
-_RISING = 1.05  # how much two larger batches must add to the rate for a still larger one to be measured
+_RISING = 1.05  # factor by which two larger batches must raise the rate before a still larger one is measured
 _TURNS = 3
-_END_S = 2.0  # that a process may take to end; then it is killed
+_END_S = 2.0  # time for a process to end before it is killed
 _SMALLEST_RANGE = 0.1  # of a number of the action, as a share of its largest magnitude: it may hardly move
 
 
@@ -42,23 +42,23 @@ class TunePlan:
     args: ServerArgs  # of a deployment file
     goal: TuningGoal
     max_batch: int = 32
-    minutes: float = 5.0  # that all of it may take
+    minutes: float = 5.0  # time limit of the whole tuning
     seconds: float = 2.0  # of each measurement
     tolerance: float = 0.01  # largest difference of actions, as a share of their range
     dtypes: Sequence[str] | None = None  # to try; None: those that the device computes natively
     frames: Path | None = None  # folder of recorded trajectories; None: random observations
-    side: int = 224  # px, of random images of which the policy takes any size
-    dims: Mapping[str, int] = field(default_factory=dict)  # of parts of the state that it leaves open
+    side: int = 224  # px, of random images if the policy accepts any size
+    dims: Mapping[str, int] = field(default_factory=dict)  # sizes of parts of the state that the contract leaves open
 
 
 @dataclass(slots=True)
 class TunedSize:
-    """A variant with one number of sessions, measured in turns with others."""
+    """A variant with one number of sessions, measured in alternation with others."""
 
     variant: Variant
     sessions: int
     difference: float
-    rates: list[float] = field(default_factory=list)  # actions a second, of each turn
+    rates: list[float] = field(default_factory=list)  # actions per second, for each turn
     trips_ms: list[float] = field(default_factory=list)
     peak_mib: float = 0.0
     took_s: float = 0.0  # of the first turn
@@ -78,14 +78,14 @@ class TunedSize:
 
 
 class Tuner:
-    """Measures the plan; skipped variants are in `left_out`, a sentence each."""
+    """Measures the plan; `left_out` has a sentence for each skipped variant."""
 
     def __init__(
         self, plan: TunePlan, progress: Callable[[str], None] = lambda _: None, began: float | None = None
     ) -> None:
         self.left_out: list[str] = []
         self.device = ""
-        self.fixed: Sequence[int] | None = None  # `batch_sizes` of the file's own settings, by itself or by default
+        self.fixed: Sequence[int] | None = None  # `batch_sizes` of the file's own settings, explicit or by default
         self._plan, self._progress = plan, progress
         self._end = (time.monotonic() if began is None else began) + plan.minutes * 60
         self._wanted: list[np.ndarray] = []  # actions of the file's own settings
@@ -106,7 +106,7 @@ class Tuner:
         return [size.point() for size in self._sizes]
 
     def _measure_own(self, frames: Path | None) -> Mapping[str, Any]:
-        """Measure the file's own settings; returns their process's report."""
+        """Measure the file's own settings; return the report of their process."""
         own, ready = Variant(), None
         try:
             with self._loaded(own, frames) as (process, ready):
@@ -132,7 +132,7 @@ class Tuner:
         return found
 
     def _variants(self, ready: Mapping[str, Any], sizes: Sequence[int]) -> list[Variant]:
-        """Return the variants beside the file's own settings; a compiled one has these sizes, unless the file has."""
+        """Return the variants other than the file's own settings; compiled ones use `sizes` unless the file sets it."""
         has = ready["settings"]
         wanted = ready["dtypes"] if self._plan.dtypes is None else self._plan.dtypes
         named = [{"quantization" if one in get_args(Quantization) else "dtype": one} for one in wanted]
@@ -195,7 +195,7 @@ class Tuner:
             yield process, said
 
     def _sweep(self, process: LineProcess, variant: Variant, sizes: Sequence[int], parts: int) -> None:
-        """Measure a loaded variant with growing batches while these help, then again in turns while there is time."""
+        """Measure a loaded variant with growing batches while the rate rises, then again in turns as time permits."""
         now = time.monotonic()
         until = now + (self._end - now) / parts
         found: list[TunedSize] = []
@@ -213,11 +213,11 @@ class Tuner:
                 measured.add(self._turn(process, measured.sessions))
 
     def _worth_more(self, found: Sequence[TunedSize]) -> bool:
-        """Return whether a larger batch may serve the goal better than those that were measured, ascending."""
+        """Return whether a larger batch may serve the goal better than the measured ones, ascending."""
         if found and self._plan.goal.p99_ms is not None:
             return found[-1].point().round_trip_ms <= self._plan.goal.p99_ms
         rates = [measured.rates[0] for measured in found]
-        return len(rates) < 3 or max(rates[-2:]) >= _RISING * max(rates[:-2])  # one may have been disturbed
+        return len(rates) < 3 or max(rates[-2:]) >= _RISING * max(rates[:-2])  # one measurement may have been disturbed
 
     def _add(self, process: LineProcess, variant: Variant, size: int, found: list[TunedSize], until: float) -> bool:
         """Compare the actions of a batch size, and measure it once; return False, with a report, if it is skipped."""
@@ -264,7 +264,7 @@ class Tuner:
         return self._answer(process)
 
     def _answer(self, process: LineProcess) -> dict[str, Any]:
-        """Return the next line of a process. Raises `VariantFailed` for its error, its end, or the end of the time."""
+        """Return the next line of a process; raises `VariantFailed` for its error, its end, or a time-out."""
         try:
             said: dict[str, Any] = process.read(max(0.0, self._end - time.monotonic()))
         except ProcessFailed as error:
@@ -280,9 +280,9 @@ class Tuner:
 def largest_difference(actions: Sequence[np.ndarray], wanted: Sequence[np.ndarray]) -> float:
     """Return the largest difference of two lists of actions, as a share of the range of `wanted`.
 
-    An action is (D,) or (H, D); the one at i belongs to `wanted[i % len(wanted)]`.
+    An action is (D,) or (H, D); the one at i is compared with `wanted[i % len(wanted)]`.
 
-    Each number of an action has its range: the largest minus the smallest value among all actions and rows, or
+    Each number of an action has its own range: the largest minus the smallest value among all actions and rows, or
     a tenth of its largest magnitude if that is more.
 
     Returns:
@@ -337,7 +337,7 @@ def _images(video: Path, steps: list[int]) -> dict[int, np.ndarray]:
             for number, frame in enumerate(container.decode(video=0)):
                 if number in steps:
                     found[number] = frame.to_ndarray(format="rgb24")
-    except (OSError, ValueError) as error:  # PyAV's errors of broken files are of these kinds
+    except (OSError, ValueError) as error:  # PyAV's errors for broken files are of these types
         raise ConfigError(f"--frames: {video} cannot be read ({error})") from error
     if missing := sorted(set(steps) - set(found)):
         raise ConfigError(f"--frames: {video} has no frames {missing}, which its trajectory has")

@@ -1,4 +1,4 @@
-"""The choice of `tune` among what was measured, for a goal."""
+"""The choice of `tune` among the measured settings, for a goal."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, Literal
 from vlagents_ray.errors import ConfigError, VLAgentsError
 from vlagents_ray.serve.config.deployment import BatchArgs
 
-_BETTER = 1.05  # how much better a variant must be for the file's own settings to be changed
+_BETTER = 1.05  # factor by which a variant must be better than the file's own settings to replace them
 
 
 class GoalMissed(VLAgentsError):
@@ -18,10 +18,10 @@ class GoalMissed(VLAgentsError):
 
 @dataclass(frozen=True, slots=True)
 class TuningGoal:
-    """The goal of `tune`: the most actions a second, or the most robots whose round trips are short enough."""
+    """The goal of `tune`: the most actions per second, or the most robots whose round trips are short enough."""
 
     kind: Literal["throughput", "robots"]
-    p99_ms: float | None = None  # of robots: the longest 99th percentile of their round trips
+    p99_ms: float | None = None  # for robots: upper bound of the 99th percentile of round trips
 
     def __post_init__(self) -> None:
         if self.kind == "robots" and self.p99_ms is None:
@@ -32,13 +32,13 @@ class TuningGoal:
 
 @dataclass(frozen=True, slots=True)
 class Variant:
-    """The file's own settings of the policy, or changes of them."""
+    """The file's own settings of the policy, or changes to them."""
 
     changes: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
-        """Return the changes in words, without the batch sizes, which a row of the table shows."""
+        """The changes in words, without the batch sizes, which have their own column in the table."""
         shown = {key: value for key, value in self.changes.items() if key != "batch_sizes"}
         words = [f"{key}: {str(value).lower() if value is True else value}" for key, value in shown.items()]
         return ", ".join(words) or "own settings"
@@ -46,7 +46,7 @@ class Variant:
 
 @dataclass(frozen=True, slots=True)
 class MeasuredPoint:
-    """The figures of one variant and one number of sessions, which is its batch size."""
+    """The figures of one variant and one number of sessions, which equals its batch size."""
 
     variant: Variant
     sessions: int
@@ -57,7 +57,7 @@ class MeasuredPoint:
     difference: float  # largest difference from the actions of the file's own settings, as a share of their range
 
     def reaches(self, goal: TuningGoal) -> bool:
-        """Return whether round trips are short enough for robots, if the goal is of them."""
+        """Return whether round trips are short enough for robots, if that is the goal."""
         return goal.p99_ms is None or self.p99_ms <= goal.p99_ms
 
 
@@ -67,7 +67,7 @@ def sessions(number: int) -> str:
 
 
 def choose(points: Sequence[MeasuredPoint], goal: TuningGoal) -> MeasuredPoint:
-    """Choose the point that is best for a goal.
+    """Choose the best point for a goal.
 
     A variant must be 5 % better than one with fewer changes, or serve more robots.
     """
@@ -83,7 +83,7 @@ def choose(points: Sequence[MeasuredPoint], goal: TuningGoal) -> MeasuredPoint:
 
 
 def default_point(points: Sequence[MeasuredPoint], goal: TuningGoal, max_size: int) -> MeasuredPoint | None:
-    """Return the settings of the file as it is; None if they were not measured, or miss the goal."""
+    """Return the figures of the unchanged file; None if they were not measured, or miss the goal."""
     own = [point for point in points if not point.variant.changes and point.sessions <= max_size]
     if goal.kind == "throughput":
         own = [point for point in own if point.sessions == max_size]

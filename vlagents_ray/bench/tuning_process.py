@@ -1,8 +1,9 @@
 """A process with one variant of a policy, which it loads and measures: `python -m vlagents_ray.bench.tuning_process`.
 
-It needs the light install and pydantic, not Ray, as it runs in the policy's own Python environment. The first line of
-its input is `ProcessSettings`, as JSON. Each line after it is a request, {"measure": SESSIONS, "seconds": S, "rank":
-RANK} or {"act": BATCH}, which a line of JSON answers. {"step": …} are steps of a long load, {"failed": …} is an error.
+It runs in the policy's own Python environment, and so needs the light install and pydantic, but not Ray. The first line
+of its input is `ProcessSettings`, as JSON. Each further line is a request, {"measure": SESSIONS, "seconds": S, "rank":
+RANK} or {"act": BATCH}, and is answered with a line of JSON. {"step": …} is a step of a long load, {"failed": …} an
+error.
 """
 
 from __future__ import annotations
@@ -37,12 +38,12 @@ class ProcessSettings:
     policy: str
     config: dict[str, Any]
     wrappers: Sequence[Any]
-    max_size: int  # largest number of sessions that will be measured
+    max_size: int  # largest number of sessions to be measured
     patience: float  # `batch.patience`
     batch_sizes: Sequence[int]  # `batch.sizes`, or none
     frames: str | None  # a file of `save_observations`; None: random observations
     side: int  # px, of random images whose size the contract does not state
-    dims: Mapping[str, int]  # dimensions of parts of the state that it leaves open
+    dims: Mapping[str, int]  # sizes of parts of the state that the contract leaves open
 
 
 def save_observations(observations: Sequence[Obs], file: Path) -> None:
@@ -56,7 +57,7 @@ def save_observations(observations: Sequence[Obs], file: Path) -> None:
 
 
 def load_observations(file: Path) -> list[Obs]:
-    """Read the observations that `save_observations` wrote."""
+    """Read the observations written by `save_observations`."""
     found: dict[int, Obs] = {}
     with np.load(file, allow_pickle=False) as arrays:
         for key in arrays.files:
@@ -134,7 +135,7 @@ def _views(settings: ProcessSettings) -> Callable[[Contract | None, int], Obs]:
 
 
 def _settings_of(agent: Agent) -> dict[str, Any]:
-    """Return the values of those settings of the policy that `tune` may change and that it has."""
+    """Return the values of the settings that the policy has and `tune` may change."""
     while isinstance(agent, Wrapper):
         agent = agent.agent
     config = getattr(agent, "config", None)
@@ -142,7 +143,7 @@ def _settings_of(agent: Agent) -> dict[str, Any]:
 
 
 def _native_dtypes() -> list[str]:
-    """Return the short types in which the policy's accelerator computes without emulating them."""
+    """Return the 16-bit types in which the policy's accelerator computes without emulation."""
     if (used := cuda()) is not None:
         return ["bfloat16" if used.get_device_capability() >= (8, 0) else "float16"]
     return [] if jax_device() is None else ["bfloat16"]

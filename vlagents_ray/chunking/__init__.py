@@ -1,1 +1,1 @@
-"""Chunks of actions: which row belongs to which tick, and executing them while the next chunk is computed."""
+"""Chunks of actions: the tick of each row, and their execution while the next chunk is computed."""

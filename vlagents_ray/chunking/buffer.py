@@ -1,4 +1,4 @@
-"""The buffer of action chunks, which decides which row is executed next, and the capture times of observations.
+"""The buffer of action chunks, which selects the next row to execute, and the capture times of observations.
 
 The chunk player, episodes of an evaluation (`vlagents_ray.evaluate.episode.latency`), policies that return the rows of
 their chunks one by one (`vlagents_ray.policies.base.policy`), and vla-eval's sessions all use this buffer.
@@ -22,33 +22,34 @@ from vlagents_ray.interface import AGE, AGE_MS, CAPTURED, CHUNK, DELAY, LEFTOVER
 
 Mode = Literal["open_loop", "ensemble", "async"]
 Merge = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""(D,) of the older chunks and (D,) of a newer one -> (D,), for one tick."""
+"""Combines the action of the older chunks, (D,), with that of a newer one, (D,), for one tick; returns (D,)."""
 
 # The names and weights of LeRobot 0.4.4, `lerobot/async_inference/configs.py`, AGGREGATE_FUNCTIONS; its "latest_only"
-# is "newest" here.
+# is called "newest" here.
 MERGES: Mapping[str, Merge] = {
     "newest": lambda _, new: new,
     "average": lambda old, new: 0.5 * old + 0.5 * new,
     "weighted_average": lambda old, new: 0.3 * old + 0.7 * new,
     "conservative": lambda old, new: 0.7 * old + 0.3 * new,
 }
-DELAYS = 10  # the longest delay of so many answers counts: a single slow answer, often the first, drops out
+DELAYS = 10  # recent answers whose longest delay counts: a single slow answer, often the first, drops out
 ENSEMBLE = "ensemble"
 ENSEMBLE_M = 0.01
-"""Of the weights exp(-m * i), i = 0 for the oldest: Zhao et al. 2023 (ACT, https://arxiv.org/abs/2304.13705), and
-`temporal_agg` in their code."""
+"""The m of the weights exp(-m * i), i = 0 for the oldest: Zhao et al. 2023 (ACT, https://arxiv.org/abs/2304.13705), and
+`temporal_agg` in their code.
+"""
 
 
 class Chunk(NamedTuple):
-    """A chunk of actions that the policy answered with."""
+    """A chunk of actions in an answer of the policy."""
 
-    number: int  # 0 for an episode's first
+    number: int  # 0 for the first of an episode
     step: int  # `ChunkBuffer.executed` at its observation: the position of its first row
     rows: np.ndarray  # (H, D) float32
     done: bool = False
     info: Mapping[str, Any] = MappingProxyType({})  # the info of the policy's Act
     tick: int = 0  # the tick of the observation
-    seen_at: float = 0.0  # s, of `time.monotonic`: when the observation was captured
+    seen_at: float = 0.0  # s, of `time.monotonic`: the capture time of the observation
 
     @property
     def end(self) -> int:
@@ -64,7 +65,7 @@ class Step(NamedTuple):
     row: int  # the row of that chunk
 
     def played(self, action: np.ndarray, tick: int, silent_s: float) -> Act:
-        """Return `action` in place of the planned one for a tick, with the data of its chunk."""
+        """Return `action` in place of the planned one for a tick, with the info of its chunk."""
         chunk = self.chunk
         about = {
             AGE: tick - chunk.tick,
@@ -81,10 +82,10 @@ class Step(NamedTuple):
 class ChunkBuffer:
     """The chunks of a plan, positioned by the number of actions that the robot had executed at their observation.
 
-    Row r of a chunk is for r executed actions after its observation. So the rows in place of which rows of earlier
-    chunks were executed are left out, however late the answer came. While the robot holds still, the plan stands still
-    with it, and no row is left out for those ticks. If ticks were counted instead, the rows after a stall would begin
-    ahead of the robot's position: absolute targets would make it jump, and relative ones would leave out a part of the
+    Row r of a chunk is for r executed actions after its observation. Rows that were replaced by rows of earlier
+    chunks are therefore skipped, however late the answer arrives. While the robot holds still, the plan waits
+    with it, and no row is skipped for those ticks. If ticks were counted instead, the rows after a stall would begin
+    ahead of the robot's position: absolute targets would make it jump, and relative ones would omit a part of the
     path. (LeRobot's real-time chunking has the same rule since huggingface/lerobot#4454.)
     """
 
@@ -92,13 +93,13 @@ class ChunkBuffer:
         """Begin a plan without chunks; raises `ConfigError` if `merge` is an unknown name.
 
         Args:
-            merge: How the rows that several chunks have for one step are combined: a name of `MERGES`, "ensemble", or a
-                function that is folded over them from the oldest to the newest.
+            merge: The combination of the rows that several chunks have for one step: a name of `MERGES`, "ensemble", or
+                a function that is folded over them from the oldest to the newest.
             ensemble_m: The m of the ensemble's weights exp(-m * i), oldest first.
         """
         if isinstance(merge, str) and merge not in MERGES and merge != ENSEMBLE:
             raise ConfigError(f"merge: got {merge!r}, want one of {sorted([*MERGES, ENSEMBLE])} or a function")
-        self.executed = 0  # executed actions of this plan
+        self.executed = 0  # number of executed actions of this plan
         self._merge = MERGES.get(merge) if isinstance(merge, str) else merge  # None: the ensemble
         self._newest = merge == "newest"
         self._m = ensemble_m
@@ -107,8 +108,8 @@ class ChunkBuffer:
     def add(self, chunk: Chunk) -> bool:
         """Add a chunk; return False if it has no row left to execute.
 
-        If there is nothing else, the last row may be executed one step late: an answer with a single action has no
-        other row, and comes when the action before it has been executed.
+        If no other row is left, the last row may be executed one step late: an answer with a single action has no
+        other row, and arrives after the previous action has been executed.
         """
         while self._chunks and self._chunks[0].end <= self.executed:
             self._chunks.popleft()
@@ -125,7 +126,7 @@ class ChunkBuffer:
         return self._at(self.executed)
 
     def advance(self) -> None:
-        """Count `next`, or the action in place of it, as executed."""
+        """Count `next`, or an action in its place, as executed."""
         self.executed += 1
 
     def take(self) -> Step:
@@ -142,7 +143,7 @@ class ChunkBuffer:
         self.add(Chunk(0, self.executed if step is None else step, rows))
 
     def leftover(self) -> np.ndarray | None:
-        """Return the remaining actions, (H', D); None without any."""
+        """Return the remaining actions, (H', D); None if there are none."""
         rows: list[np.ndarray] = []
         while (step := self._at(self.executed + len(rows))) is not None:
             rows.append(step.action)
@@ -154,7 +155,7 @@ class ChunkBuffer:
         return {} if rest is None else {LEFTOVER: rest, DELAY: min(max(delays, default=0), len(rest))}
 
     def drop(self, before: float = math.inf) -> bool:
-        """Drop the chunks of observations from before a time, s of `time.monotonic`; return True if there were any."""
+        """Drop chunks with observations from before a time, s of `time.monotonic`; return whether there were any."""
         kept = [chunk for chunk in self._chunks if chunk.seen_at >= before]
         dropped = len(kept) < len(self._chunks)
         if dropped:
@@ -182,17 +183,17 @@ class ChunkBuffer:
 
 
 SKEW_S = 0.1
-"""How far ahead of this machine's clock the clock of a sensor's computer may be."""
+"""The largest lead of the clock of a sensor's computer over this machine's clock, s."""
 
 
 class CaptureClock:
-    """Computes when an observation was captured, in s of `time.monotonic`.
+    """Computes the capture time of an observation, in s of `time.monotonic`.
 
-    `captured_at` is `time.time`, since it travels to other machines, and that clock may be set at any moment. So it is
+    `captured_at` is `time.time`, since it is sent to other machines, and that clock may be set at any moment. So it is
     read once, when a new `captured_at` is first seen; from then on, `time.monotonic` measures the age. If the same
-    observation is passed again, for instance because a camera hangs, it ages whatever happens to the clock. A jump of
+    observation is passed again, for instance because a camera hangs, it ages regardless of the clock. A jump of
     the clock affects only the observation during which it happens: after a jump forward the observation is too old;
-    after one backward it lies in the future (by more than `SKEW_S`), and counts as too old as well, since its age is
+    after one backward it lies in the future (by more than `SKEW_S`), and also counts as too old, since its age is
     unknown.
     """
 
@@ -201,7 +202,7 @@ class CaptureClock:
         self._at = 0.0
 
     def __call__(self, obs: Obs) -> float:
-        """Return the capture time; now, if the observation has none; `-math.inf` for an impossible one."""
+        """Return the capture time; the current time if the observation has none; `-math.inf` for an impossible one."""
         now, stamp = time.monotonic(), obs.info.get(CAPTURED)
         if stamp is None:
             return now

@@ -1,4 +1,4 @@
-"""Who may move a robot: one state for its stops, pauses, take-overs and episodes, decided on the robot's computer."""
+"""The control of a robot: one state for its stops, pauses, takeovers and episodes, held on the robot's computer."""
 
 from __future__ import annotations
 
@@ -18,14 +18,17 @@ PAUSED = "paused by an operator"
 
 
 class Leader(Protocol):
-    """The interface of a device with which an operator moves a robot: a keyboard, a SpaceMouse, a second arm."""
+    """The interface of an operator's device: a keyboard, a SpaceMouse, a second arm."""
 
     def engaged(self) -> bool:
-        """Return at once whether the operator moves the robot at this tick."""
+        """Return whether the operator moves the robot at this tick; must not block."""
         ...
 
     def action(self, obs: Obs) -> np.ndarray:
-        """Return the operator's action at once, (D,) float32 in the contract's units, for a tick with `engaged()`.
+        """Return the operator's action for a tick with `engaged()`; must not block.
+
+        Returns:
+            (D,) float32 in the contract's units.
 
         Raises:
             InvalidAction: The device has no action at this tick; the robot holds still.
@@ -39,13 +42,13 @@ class Control:
     | state | source of motion | ends by |
     |---|---|---|
     | "autonomous" | the policy | any of the others |
-    | "human" | the leader that is engaged | its release: then the policy continues, or the robot is paused |
-    | "paused" | nothing | `resume`, or a leader that is engaged |
+    | "human" | the engaged leader | its release: then the policy continues, or the robot is paused |
+    | "paused" | nothing | `resume`, or an engaged leader |
     | "stopped" | nothing | `restart` |
 
-    The state is decided once a tick, by `update`. All methods may be called from any thread: a pause counts from the
-    next action on, a stop at once. Stops and pauses last from one run of the control loop into the next. Over a network
-    only `pause`, `stop` and `mark` are called (see `vlagents_ray.client.commands`): `resume` and `restart` are for the
+    `update` sets the state once per tick. All methods may be called from any thread: a pause takes effect at the next
+    action, a stop at once. Stops and pauses persist from one run of the control loop to the next. Only `pause`, `stop`
+    and `mark` are called over a network (see `vlagents_ray.client.commands`): `resume` and `restart` are for the
     operator at the robot, and for its own program.
 
     Args:
@@ -60,10 +63,10 @@ class Control:
         """Whether `run_loop` drives the robot, which commands nothing while it is paused or stopped."""
         self._lock = threading.RLock()  # a signal handler may interrupt its owner
         self._state: ControlState = "autonomous"
-        self._stop: str | None = None  # the reason of a stop that was commanded
-        self._barked = False  # stopped by a silence
-        self._silent: set[str] = set()  # sources whose silence stopped the robot, and which are still silent
-        self._unseen = False  # the loop has not held the robot for the last stop yet
+        self._stop: str | None = None  # the reason of a commanded stop
+        self._barked = False  # whether a silence stopped the robot
+        self._silent: set[str] = set()  # sources whose silence stopped the robot and that are still silent
+        self._unseen = False  # whether the loop has yet to hold the robot for the last stop
         self._auto = False
         self._pause: str | None = None
         self._pauses = 0
@@ -71,7 +74,7 @@ class Control:
         self._outcome: Outcome | None = None
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Control:
-        return Control(copy.deepcopy(self.leader, memo))  # that of another robot
+        return Control(copy.deepcopy(self.leader, memo))  # the copy controls another robot
 
     @property
     def state(self) -> ControlState:
@@ -80,7 +83,7 @@ class Control:
 
     @property
     def reason(self) -> str | None:
-        """The reason why the robot is paused, or will be when the operator lets go; None if it is not."""
+        """The reason why the robot is paused, or will be when the operator releases the device; None if it is not."""
         return self._pause
 
     @property
@@ -95,7 +98,7 @@ class Control:
             return sorted(self._silent)
 
     def pause(self, reason: str = PAUSED) -> None:
-        """Hold the robot still until `resume` or a takeover; an operator who moves it is not interrupted."""
+        """Hold the robot still until `resume` or a takeover; a takeover in progress is not interrupted."""
         with self._lock:
             self._pause = reason
             self._pauses += 1
@@ -122,7 +125,7 @@ class Control:
                 self._silent.add(silent)
 
     def heard(self, source: str) -> None:
-        """Note that the silence of a source is over. The robot stays stopped."""
+        """Record that a source is no longer silent. The robot stays stopped."""
         with self._lock:
             self._silent.discard(source)
 
@@ -145,7 +148,7 @@ class Control:
             self._outcome = "success" if label == "success" else "failure"
 
     def adopt(self, other: Control) -> None:
-        """Take over the stop and the pause of another control, which is not used any more."""
+        """Copy the stop and the pause of another control, which is no longer used."""
         with other._lock, self._lock:
             self._stop, self._barked = self._stop or other._stop, self._barked or other._barked
             self._silent |= other._silent
@@ -159,13 +162,13 @@ class Control:
             self._auto, self._outcome, self.running = auto, None, True
 
     def end(self) -> str:
-        """End a run; return its outcome, "" without one."""
+        """End a run; return its outcome, "" if there is none."""
         with self._lock:
             self.running = False
             return self._outcome or ""
 
     def update(self) -> bool:
-        """Set the source of motion at the beginning of a tick; return whether the policy's plan becomes void."""
+        """Set the source of motion at the beginning of a tick; return whether the policy's plan must be discarded."""
         pauses, engaged = self._pauses, False
         if self.leader is not None:
             try:
@@ -188,7 +191,7 @@ class Control:
 
     @property
     def held(self) -> Held | None:
-        """The reason why the robot must not move, by the last `update` and later events; None if it may move."""
+        """The reason why the robot must not move, from the last `update` and later events; None if it may move."""
         with self._lock:
             if self._state == "stopped" or self.stopped or self._unseen:
                 silent = " and the ".join(sorted(self._silent))
@@ -199,9 +202,9 @@ class Control:
             return None
 
     def hold(self) -> Held | None:
-        """Return `held`, once a tick for the control loop, which then commands nothing.
+        """Return `held`, once per tick of a control loop that commands nothing while held.
 
-        After any stop the loop holds the robot for a tick at least, and so drops what was planned before.
+        After any stop the loop holds the robot for at least one tick, and so drops the earlier plan.
         """
         with self._lock:
             held = self.held
@@ -212,5 +215,5 @@ class Control:
 
     @property
     def over(self) -> bool:
-        """Whether the episode ends, since it was marked."""
+        """Whether the episode has been marked, and therefore ends."""
         return self._outcome is not None

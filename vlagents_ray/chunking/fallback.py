@@ -22,25 +22,25 @@ from vlagents_ray.validation import check_action
 
 SafeName = Literal["auto", "hold", "zero"]
 Cause = Literal[
-    "waiting",  # the rows of the last answer are used up before the next answer: not counted as `safe`
-    "late",  # the answer came too late for all its rows
+    "waiting",  # the last answer has no rows left, and the next one is pending: not counted as `safe`
+    "late",  # the answer arrived too late for all its rows
     "old",  # the plan is older than max_age_s
     "stale",  # the observation is older than max_age_s
-    "lost",  # the server gave no answer: no connection, or not in time
+    "lost",  # the server did not answer: no connection, or not in time
     "failed",  # the policy raised an error
     "limits",  # the guard refused the action: beyond a limit
-    "max_step",  # the guard refused the action: too far from the one before
+    "max_step",  # the guard refused the action: too far from the last one
     "invalid",  # the action is NaN, has a wrong shape, or was refused by another check
     "leader",  # the operator's device gave no action
-    "robot",  # the robot must not move (`holds`), such as for a camera that hangs
-    "stopped",  # the robot was stopped, and not restarted yet
-    "paused",  # counted apart
+    "robot",  # the robot must not move (`holds`), for instance because a camera hangs
+    "stopped",  # the robot was stopped and not restarted yet
+    "paused",  # counted separately
     "other",  # an agent other than the chunk player gave a safe action
 ]
 
 
 class Held(NamedTuple):
-    """Why a robot holds still at a tick."""
+    """The reason why a robot holds still at a tick."""
 
     cause: Cause
     reason: str  # in words, with numbers
@@ -60,7 +60,7 @@ _LOST = (ConnectionLost, PolicyUnavailable, DeadlineExceeded)
 
 
 def refused(error: InvalidAction) -> Held:
-    """Return why the robot holds still in place of an action that was refused."""
+    """Return why the robot holds still in place of a refused action."""
     return Held(error.cause, str(error))
 
 
@@ -75,9 +75,9 @@ Safe = SafeName | np.ndarray | Callable[[Obs], np.ndarray]
 class SafeAction:
     """Computes the action that holds a robot still, which depends on the meaning of its actions.
 
-    "hold" commands the last action again, which is right for absolute targets. "zero" commands no motion, which is
-    right for deltas and velocities; the columns in `grippers` keep the last action's value, as 0 would half open a
-    gripper whose command is a position; before the first action, the last column gets the measured opening. "auto"
+    "hold" repeats the last command, which is right for absolute targets. "zero" commands no motion, which is
+    right for deltas and velocities; the columns in `grippers` keep the last action's value, since 0 would half open a
+    gripper whose command is a position; before the first action, the last column is the measured opening. "auto"
     chooses by the contract's `ActionSpec`. An array (D,), or a function of the observation that returns one (for
     instance of the measured joints), is used unchanged.
 
@@ -88,7 +88,7 @@ class SafeAction:
 
     Raises:
         ConfigError: The choice would be a guess or would move the robot: a repeated delta continues the motion, and
-            zeros as joint targets move the arm to its zero position. Only "hold" may be chosen where the contract does
+            zeros as joint targets move the arm to its zero position. Only "hold" is allowed if the contract does
             not describe the actions.
     """
 
@@ -102,10 +102,10 @@ class SafeAction:
         self._grippers = list(grippers) if grippers is not None else [-1] if spec.gripper_open is not None else []
         self._spec = spec
         self.holds = spec.relative is False or (isinstance(safe, str) and safe == "hold")
-        """Does the last action, commanded again, keep the robot where it is?"""
+        """Whether repeating the last action keeps the robot in place."""
 
     def __call__(self, obs: Obs, last: np.ndarray | None) -> np.ndarray:
-        """Return the safe action, (D,) float32, given the last command; raises `InvalidAction` if it needs one."""
+        """Return the safe action, (D,) float32, given any last command; raises `InvalidAction` if it needs one."""
         if callable(self._make):
             return np.asarray(self._make(obs), np.float32)
         if isinstance(self._make, np.ndarray):
@@ -123,7 +123,7 @@ class SafeAction:
         return action
 
     def _first(self, obs: Obs) -> np.ndarray | None:
-        """Return no motion with the gripper held, (D,); None if the contract does not suffice for that."""
+        """Return an action without motion that holds the gripper, (D,); None if the contract is not sufficient."""
         spec = self._spec
         if spec.dim is None:
             return None
@@ -142,7 +142,7 @@ def stopping(spec: ActionSpec) -> SafeName:
 
 
 def neutral(spec: ActionSpec, dim: int | None = None) -> np.ndarray:
-    """Return no motion for relative actions, (D,) float32, with the gripper open if `spec` states its opening."""
+    """Return an action without motion for relative actions, (D,) float32, with an open gripper if `spec` states how."""
     dim = spec.dim if dim is None else dim
     if dim is None:
         raise InvalidAction("neutral action: got a contract without action.dim; want one that states it")
@@ -167,20 +167,20 @@ def _fitting(safe: SafeName, spec: ActionSpec) -> SafeName:
 
 
 Check = Callable[[np.ndarray, "np.ndarray | None"], np.ndarray]
-"""The action and the one before it, (D,) each -> the action to be taken, or `InvalidAction`."""
+"""Returns the action to execute, given the action and the one before it, (D,) each, or raises `InvalidAction`."""
 
 
 class Motion:
     """The motion of a robot in an episode: every action passes the check against the one before it.
 
     Without a `check`, such as a `vlagents_ray.robot.Guard`, only the contract is checked. Without a `safe` action, an
-    error is raised in its place.
+    error is raised instead.
     """
 
     def __init__(self, check: Check | None, contract: Contract | None = None, safe: SafeAction | None = None) -> None:
         self._check, self._contract, self._safe = check, contract, safe
         self._last: np.ndarray | None = None  # the last commanded action
-        self._before: np.ndarray | None = None  # the last one of the ticks before
+        self._before: np.ndarray | None = None  # the last one of earlier ticks
         self._state: Literal["stopped", "moving", "held"] = "stopped"
 
     @property
@@ -193,12 +193,12 @@ class Motion:
         self._before = self._last
 
     def stop(self) -> None:
-        """Note that the robot was stopped, and did not execute a command of this tick."""
+        """Record that the robot was stopped, and did not execute a command of this tick."""
         self._last = self._before
         self._state = "stopped"
 
     def move(self, action: np.ndarray, obs: Obs) -> np.ndarray:
-        """Return an action of policy or operator, (D,) float32, if it may reach the robot, or raise `InvalidAction`."""
+        """Return an action of policy or operator, (D,) float32; raises `InvalidAction` if it must not be sent."""
         if self._state == "held":  # by the last target; the robot may have been moved since, or never have arrived
             with contextlib.suppress(InvalidAction):
                 self._last, self._state = self._checked(action, self._last), "moving"
@@ -226,12 +226,12 @@ class Motion:
         return action.copy(), why
 
     def _standing(self, obs: Obs) -> np.ndarray | None:
-        """Return the robot's position, (D,), as far as it is known."""
+        """Return the robot's position, (D,); None if it is unknown."""
         reference = getattr(self._check, "reference", None)
         return self._last if reference is None else reference(obs, self._last)
 
     def _checked(self, action: np.ndarray, last: np.ndarray | None) -> np.ndarray:
-        """Return a row, (D,) float32, that may be sent to the robot; raises `InvalidAction` for any other."""
+        """Return an action, (D,) float32, that may be sent to the robot; raises `InvalidAction` for any other."""
         action = check_action(action, self._contract)
         if action.ndim != 1:
             raise InvalidAction(f"action: got {action.shape}, want (D,), a single row")

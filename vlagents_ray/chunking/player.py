@@ -1,4 +1,4 @@
-"""The chunk player: one action a tick from a policy's chunks, without blocking a control loop."""
+"""The chunk player: one action per tick from a policy's chunks, without blocking a control loop."""
 
 from __future__ import annotations
 
@@ -59,13 +59,13 @@ from vlagents_ray.interface import (
 from vlagents_ray.validation import check_action
 
 _CLOSE_S = 2.0
-_IN_PLACE = 256  # most actions between two requests that were executed in place of the policy's
+_IN_PLACE = 256  # largest number of recorded actions between two requests
 
 
 class AsyncCaller:
     """A thread that calls `agent.act`, so that the caller's own thread never waits for it.
 
-    One thread uses it, and nothing else may use the agent during a request; `settle` waits for its end.
+    Only one thread may use it, and nothing else may use the agent during a request; `settle` waits for its end.
     """
 
     def __init__(self, agent: Agent) -> None:
@@ -75,7 +75,7 @@ class AsyncCaller:
         self._thread = threading.Thread(target=self._run, name="vlagents-ray-caller", daemon=True)
         self._thread.start()
         self.idle = True
-        """Whether there is neither a request in progress nor an answer to be taken."""
+        """Whether there is no request in progress and no answer to take."""
 
     @property
     def busy(self) -> bool:
@@ -97,13 +97,13 @@ class AsyncCaller:
         return answer
 
     def settle(self) -> None:
-        """Wait for the end of the request in progress, however long that takes, and drop its answer."""
+        """Wait for the end of the request in progress, without a time limit, and drop its answer."""
         if not self.idle:
             self._answers.get()
             self.idle = True
 
     def close(self) -> None:
-        """Close the agent as soon as its request is over; wait for that for two seconds at most."""
+        """Close the agent as soon as its request is over; wait at most two seconds for that."""
         self._jobs.put(None)
         self._thread.join(_CLOSE_S)
 
@@ -121,7 +121,7 @@ class _Request(NamedTuple):
 
     tick: int = -1
     step: int = 0  # `ChunkBuffer.executed` at its observation: the position of the answer's first row
-    seen_at: float = 0.0  # s, of `time.monotonic`: when the observation was captured
+    seen_at: float = 0.0  # s, of `time.monotonic`: the capture time of the observation
 
 
 @dataclass(frozen=True)
@@ -129,27 +129,31 @@ class PlayerSettings:
     """The settings of a `ChunkPlayer`: its requests to the policy, and its use of the answers.
 
     Raises:
-        ConfigError: A setting is out of range, or settings do not go together.
+        ConfigError: A setting is out of range, or settings contradict each other.
     """
 
     mode: Mode = "open_loop"
-    """With "open_loop", execute `execute` rows, then ask again and wait for the answer. With "ensemble", ask each tick,
-    and average what all chunks say of it with the weights exp(-m * i), oldest first (ACT's temporal ensembling). With
-    "async", ask in the background, one request at a time, with the newest observation."""
+    """With "open_loop", execute `execute` rows, then send a request and wait for the answer. With "ensemble", send one
+    at each tick, and average the actions of all chunks with the weights exp(-m * i), oldest first (ACT's temporal
+    ensembling). With "async", send requests in the background, one at a time, with the newest observation.
+    """
     execute: int | None = None  # rows between two requests: of a chunk (default: all), or in "async" ticks (default: 1)
     merge: str | Merge = "newest"
-    """What becomes of a tick that several chunks have a row for, in "async": "newest", "average", "weighted_average",
-    "conservative", "ensemble", or a function (see `vlagents_ray.chunking.buffer`)."""
+    """The combination of several chunks' rows for one tick, in "async": "newest", "average", "weighted_average",
+    "conservative", "ensemble", or a function (see `vlagents_ray.chunking.buffer`).
+    """
     ensemble_m: float = ENSEMBLE_M  # the m of the weights
     real_time_chunking: bool = False
-    """Whether each request carries what is left of the plan and the measured delay (`LEFTOVER`, `DELAY` in
-    `vlagents_ray.interface`), for policies that use them; in "async" only."""
-    deadline_s: float | None = None  # within which `act` returns; 0 by default in "async", else none
-    timeout_s: float | None = None  # after which a request is given up; by default the agent's
-    horizon: int | None = None  # rows of a chunk that may be executed at all
+    """Whether each request contains the rest of the plan and the measured delay (`LEFTOVER`, `DELAY` in
+    `vlagents_ray.interface`), for policies that use them; in "async" only.
+    """
+    deadline_s: float | None = None  # time limit of `act`; 0 by default in "async", else none
+    timeout_s: float | None = None  # time limit of a request; by default the agent's
+    horizon: int | None = None  # largest number of rows of a chunk to execute
     max_age_s: float | None = None
-    """How old the observation of an executed action may be. Its age counts from `info["captured_at"]`, that of the
-    sensor which was read first; without it, from the call of `act` (see `CaptureClock`)."""
+    """The largest age of the observation of an executed action. The age counts from `info["captured_at"]`, that of the
+    sensor read first, or else from the call of `act` (see `CaptureClock`).
+    """
     safe: Safe = "auto"  # the action in place of a missing one (see `SafeAction`)
     grippers: Sequence[int] | None = None  # the columns of the action that are grippers (see `SafeAction`)
 
@@ -168,15 +172,15 @@ class PlayerSettings:
 
 
 class Execution:
-    """Collects the actions of one episode that are executed in place of the policy's; a request states each once."""
+    """Collects the actions of one episode that are executed in place of the policy's; each is sent in one request."""
 
     def __init__(self) -> None:
         """Begin an episode."""
         self._in_place: deque[np.ndarray] = deque(maxlen=_IN_PLACE)
-        self._noted = False  # an action was noted in place of the policy's at this tick
+        self._noted = False  # whether this tick has an action in place of the policy's
 
     def tick(self) -> None:
-        """Begin a tick, at which no action is executed in place of the policy's yet."""
+        """Begin a tick, without an action in place of the policy's yet."""
         self._noted = False
 
     def note_in_place(self, action: np.ndarray) -> None:
@@ -185,36 +189,36 @@ class Execution:
         self._noted = True
 
     def interrupt(self) -> None:
-        """Note that the action of this tick was not executed, since the robot was stopped or moved."""
+        """Discard the recorded action of this tick, which was not executed: the robot was stopped or moved."""
         if self._noted:
             self._in_place.pop()
             self._noted = False
 
     def report(self) -> dict[str, Any]:
-        """Return the extra info of the next request: `EXECUTED`, if other actions than the policy's were executed."""
+        """Return the extra info of the next request: `EXECUTED`, if actions other than the policy's were executed."""
         stated: dict[str, Any] = {EXECUTED: np.stack(self._in_place)} if self._in_place else {}
         self._in_place.clear()
         return stated
 
 
 class ChunkPlayer(Agent):
-    """An `Agent` around another, local or remote, whose `act` returns single actions, (D,), one a control tick.
+    """An `Agent` around another, local or remote, whose `act` returns single actions, (D,), one per control tick.
 
-    Ticks are counted by the calls of `act`. Row r of a chunk is for r executed actions after the observation that the
-    chunk answers, whenever it arrives: rows for ticks at which others were executed are left out, except while the
+    Ticks are counted by the calls of `act`. Row r of a chunk is for r executed actions after the chunk's observation,
+    whenever the chunk arrives: rows for ticks at which others were executed are skipped, except while the
     robot holds still (see `vlagents_ray.chunking.buffer.ChunkBuffer`). `reset` may block: it begins the episode and,
     with a deadline, waits for the first chunk.
 
     In mode "async", and in the others with `deadline_s`, `act` returns within `deadline_s`: the policy's action, or the
-    `safe` one where that is missing, with the reason in `act.info["safe"]` and its kind in
-    `act.info["safe_cause"]`. `info` also has `age_ticks`, `chunk`, `row`, and `silent_s`, for how long an answer has
-    been waited for. Errors that asking again will not cure (`InvalidInput`, and any that is not this package's) are
+    `safe` one if that is missing, with the reason in `act.info["safe"]` and its kind in
+    `act.info["safe_cause"]`. `info` also has `age_ticks`, `chunk`, `row`, and `silent_s`, the time since the oldest
+    unanswered request. Errors that another request cannot cure (`InvalidInput`, and any that is not this package's) are
     raised by the next `act`; the others are the reason of safe actions until the policy answers. Without a deadline,
     errors are raised.
     """
 
     control: Control
-    """The state of the robot, which decides at each `act` who moves it."""
+    """The state of the robot, which selects the source of motion at each `act`."""
 
     def __init__(
         self,
@@ -229,10 +233,11 @@ class ChunkPlayer(Agent):
         Args:
             agent: The policy, in this process or a `RemoteAgent`.
             settings: The requests to the policy, and the use of its answers; default: `PlayerSettings()`.
-            check: Sees every action before it is returned, such as a `vlagents_ray.robot.Guard`. In place of one of the
-                policy's that it refuses the safe one is taken, and the plan is dropped; in place of a safe one the last
-                action, if that holds the robot still; else `act` raises `InvalidAction`. It also gets the last action;
-                a `Guard` with `measure` uses the measured pose without one, and after safe actions.
+            check: Checks every action before it is returned, such as a `vlagents_ray.robot.Guard`. If it refuses an
+                action of the policy, the safe one replaces it, and the plan is dropped; if it refuses a safe one, the
+                last action replaces it if that holds the robot still; else `act` raises `InvalidAction`. It also
+                receives the last action; a `Guard` with `measure` uses the measured pose if there is none, and after
+                safe actions.
             override: The operator's device. While it is engaged, `act` returns its actions with `info["intervention"]`
                 and, if known, `info["policy_action"]`. `check` also applies to them.
         """
@@ -249,7 +254,7 @@ class ChunkPlayer(Agent):
         self._plan.drop()
         self._tick: int | None = None  # tick of the next `act`; None outside an episode
         self._request, self._execution = _Request(), Execution()  # the last request
-        self._dropped = False  # whether the answer to it is not executed
+        self._dropped = False  # whether its answer must not be executed
         self._chunks = 0  # number of answers
         self._waiting_since: float | None = None
         self._trouble = WAITING
@@ -265,14 +270,14 @@ class ChunkPlayer(Agent):
         return None if self._contract is None else replace(self._contract, chunk=1)
 
     def initialize(self) -> None:
-        """Initialize the policy; waits for a request in progress, if the policy was used before."""
+        """Initialize the policy; wait for a request in progress, if the policy was used before."""
         if self._asker is not None:
             self._asker.settle()
         self._agent.initialize()
         self._choose_safe()
 
     def reset(self, obs: Obs, instruction: str | None = None, **kwargs: Any) -> dict[str, Any]:
-        """Begin an episode, however long that takes; the plan and pending requests are dropped."""
+        """Begin an episode, without a time limit; the plan and pending requests are dropped."""
         if self._asker is not None:
             self._asker.settle()
         self._begin()
@@ -291,20 +296,20 @@ class ChunkPlayer(Agent):
     def interrupt(self) -> None:
         """Drop the plan: the robot was stopped or moved, and did not execute the last action of `act`.
 
-        Earlier observations are no longer acted on, so the policy is queried again. `run_loop` calls this at each tick
-        at which it holds the robot; call it in your own loop when you stop or take over the robot.
+        Answers to earlier observations are discarded, and the policy is queried again. `run_loop` calls this at each
+        tick at which it holds the robot; call it in your own loop when you stop or take over the robot.
         """
         self._begin_again(STOPPED)
         self._execution.interrupt()
         self._motion.stop()
 
     def observe(self, obs: Obs, action: np.ndarray | None = None) -> None:
-        """Show the policy an observation for which no action is needed.
+        """Pass an observation to the policy without requesting an action.
 
         Args:
             obs: The observation.
             action: The action that the robot executed in place of the policy's, (D,), if your own loop chose it. It
-                counts as a tick, and the next request has it (`EXECUTED` in `vlagents_ray.interface`).
+                counts as a tick, and the next request contains it (`EXECUTED` in `vlagents_ray.interface`).
 
         Raises:
             InvalidAction: The check refuses the action.
@@ -333,7 +338,7 @@ class ChunkPlayer(Agent):
         except Exception as error:
             if not led:
                 raise
-            self._trouble = Held("failed", str(error))  # the operator continues, and the policy's action is not known
+            self._trouble = Held("failed", str(error))  # the operator continues, without a known action of the policy
         self._tick = tick + 1
         act = self._led(obs) if led else self._chosen(obs, tick)
         if led and SAFE not in act.info:  # the operator's action is executed in place of a row
@@ -356,7 +361,7 @@ class ChunkPlayer(Agent):
             if self._wants(tick, obs):
                 self._note_asked(tick, obs)
                 self._take(self._agent.act(stamped(obs, self._extras())), tick)
-        else:  # no tick waits for an action that is not executed
+        else:  # no tick waits for an action that will not be executed
             wait_s = self.settings.deadline_s if self.control.state == "autonomous" else 0.0
             self._ask_in_time(self._asker, obs, tick, begun + wait_s)
 
@@ -375,7 +380,7 @@ class ChunkPlayer(Agent):
         return self.settings.max_age_s is not None and seen_at < time.monotonic() - self.settings.max_age_s
 
     def _next(self) -> Step | None:
-        """Return the action for now from chunks that are young enough."""
+        """Return the current action from chunks whose observations are recent enough."""
         if self.settings.max_age_s is not None and self._plan.drop(time.monotonic() - self.settings.max_age_s):
             self._trouble = OLD
         return self._plan.next
@@ -389,7 +394,7 @@ class ChunkPlayer(Agent):
             return step is None
         if self.settings.mode == "open_loop":
             return self.settings.execute is not None and step.row >= self.settings.execute
-        last = step.chunk.end == self._plan.executed + 1  # also true for each answer of a single action
+        last = step.chunk.end == self._plan.executed + 1  # also true for every answer with a single action
         return last or tick - self._request.tick >= (self.settings.execute or 1)
 
     def _ask_in_time(self, asker: AsyncCaller, obs: Obs, tick: int, deadline: float) -> None:
@@ -444,7 +449,7 @@ class ChunkPlayer(Agent):
 
     def _led(self, obs: Obs) -> Act:
         """Return the operator's action, or the safe one if the guard refuses it."""
-        info: dict[str, Any] = {INTERVENTION: True, SILENT: 0.0}  # the policy's silence does not stop an operator
+        info: dict[str, Any] = {INTERVENTION: True, SILENT: 0.0}  # a silent policy does not stop an operator
         if (planned := self._next()) is not None:
             info[WANTED] = planned.action.copy()
         try:
@@ -468,7 +473,7 @@ class ChunkPlayer(Agent):
                 self._plan.advance()
                 return step.played(action, tick, self._silent_s())
             except InvalidAction as error:
-                self._plan.drop()  # the rest was planned from where this action would have led
+                self._plan.drop()  # the rest of the plan assumes the result of this action
                 why = refused(error)
                 if not self._motion.can_hold:
                     raise
@@ -476,12 +481,12 @@ class ChunkPlayer(Agent):
             action = np.zeros(0, np.float32)
         else:
             action, why = self._motion.hold(obs, why)
-            if held is not None:  # the policy's action is not to be expected any more
+            if held is not None:  # the policy's action will not be executed
                 self._execution.note_in_place(action)
         return Act(action, info={SAFE: why.reason, CAUSE: why.cause, SILENT: self._silent_s()})
 
     def _begin_again(self, why: Held) -> None:
-        """Take the next action from the answer to a new observation."""
+        """Drop the plan and the pending answer, and wait for the answer to a new observation."""
         self._plan.drop()
         self._dropped = True
         self._trouble = why

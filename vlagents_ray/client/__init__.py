@@ -1,4 +1,4 @@
-"""The client, which runs on the robot or beside the environment: a remote policy as an `Agent`."""
+"""The client, which runs on the robot or with the environment: a remote policy as an `Agent`."""
 
 from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.client.agent import RemoteAgent

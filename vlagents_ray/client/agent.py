@@ -38,13 +38,13 @@ from vlagents_ray.tracing import TRACEPARENT, tracer
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-# no replica has the session; `NotReset` if it was to begin again and did not in time
+# no replica has the session; `NotReset` if it could not be resumed in time
 _LOST = (NotReset, UnknownSession)
-# Errors after which another replica may answer; a living one refuses a reset for instance because it is full.
+# Errors after which another replica may answer; a running replica refuses a reset if it is full, for instance.
 _RETRYABLE = {"reset": (ConnectionLost, NoReplica), "act": (ConnectionLost, PolicyUnavailable, *_LOST)}
 _FIRST_PAUSE_S = 0.02
 _LONGEST_PAUSE_S = 0.5
-# No attempt begins with less time left: a request that takes long to arrive would be executed after its caller gave up.
+# No attempt begins with less time left: a late request would be executed after its caller has given up.
 _RESERVE_S, _RESERVE_SHARE = 0.5, 0.25
 
 
@@ -56,8 +56,8 @@ class EpisodeState:
     instruction: str | None
     kwargs: dict[str, Any]
     contract: dict[str, Any] | None
-    recent: deque[Obs] = field(default_factory=lambda: deque(maxlen=0))  # the last observations that were answered
-    step: int | None = 0  # the server's count of acts; None when an answer may have been lost
+    recent: deque[Obs] = field(default_factory=lambda: deque(maxlen=0))  # the last observations with an answer
+    step: int | None = 0  # the server's count of acts; None if an answer may be lost
 
 
 class ClientSession:
@@ -65,14 +65,14 @@ class ClientSession:
 
     def __init__(self, connection: Connection, rank: RankName) -> None:
         self.id = uuid.uuid4().hex
-        self.episode: EpisodeState | None = None  # None until its first reset, and after its end
+        self.episode: EpisodeState | None = None  # None before the first reset and after the end of an episode
         self.step: int | None = None  # the server's count in its last reply, of any episode
-        self.resumed = False  # the episode was begun again, and no action has reported it yet
+        self.resumed = False  # whether the episode was resumed and no action has reported it yet
         self._connection = connection
         self._rank: RankName = rank
 
     def reset(self, episode: EpisodeState) -> Request:
-        """Return the request that begins `episode`, or begins it again at its current step."""
+        """Return the request that begins `episode`, or resumes it at its current step."""
         return Request(
             "reset",
             episode.obs,
@@ -94,13 +94,13 @@ class ClientSession:
         return Request("act", obs, session=self.id, rank=self._rank, step=self.episode.step, request_id=request_id)
 
     def begun(self, reply: Reply) -> None:
-        """Note the reply that began the episode, or began it again."""
+        """Record the reply that began or resumed the episode."""
         self.step = reply.step
         if self.episode is not None:
             self.episode.step = reply.step
 
     def acted(self, obs: Obs, reply: Reply) -> None:
-        """Note that `obs` was answered."""
+        """Record that `obs` was answered."""
         self.step = reply.step
         if self.episode is not None:
             self.episode.step = reply.step
@@ -108,13 +108,13 @@ class ClientSession:
                 self.episode.recent.append(copied(obs))
 
     def is_lost(self, reply: Reply) -> bool:
-        """Return whether the session must begin again; if not, its replica checks that no answer was lost."""
+        """Return whether the session must be resumed; if not, its replica checks that no answer was lost."""
         return isinstance(reply.error, _LOST) or self.episode is None or self.episode.step is None
 
     def begin_again(self, request: Request) -> Request:
-        """Return the reset that begins the session again under a new id; `request` follows it, with that id.
+        """Return the reset that resumes the session under a new id; `request` follows it, with that id.
 
-        With a new id, any reply to `request` from now on comes from the new session, even if that to the reset is late.
+        With a new id, any later reply to `request` comes from the new session, even if the reply to the reset is late.
         """
         if self.episode is None:
             raise NotReset("act before reset; reset first")
@@ -126,10 +126,10 @@ class ClientSession:
 def call_with_recovery(
     connection: Connection, sessions: Sequence[ClientSession], requests: Sequence[Request], timeout_s: float
 ) -> list[Reply]:
-    """Return the reply to one request of each session, from another replica if theirs is gone.
+    """Return the reply to one request of each session, from another replica if the session's replica is gone.
 
-    Retries until `timeout_s` is over; then the reply holds the last error, or `DeadlineExceeded` for a session that has
-    yet to begin again. The first action after an episode was begun again has `info["resumed"]`.
+    Retries until `timeout_s` is over; then the reply holds the last error, or `DeadlineExceeded` for a session that is
+    not resumed yet. The first action after an episode was resumed has `info["resumed"]`.
     """
     deadline = time.monotonic() + timeout_s
     last_attempt = deadline - min(_RESERVE_S, _RESERVE_SHARE * timeout_s)
@@ -172,12 +172,12 @@ def call_with_recovery(
 class RemoteAgent(Agent):
     """A policy on a server, as an `Agent`; one object is one session.
 
-    When the replica stops, dies or has more sessions than others, the session continues on another replica within
-    `timeout_s`. If the old replica still runs, the session moves with all its state. Otherwise the client begins it
-    again with the same instruction and options and sends the last observations (`Contract.history` of them; see
+    When the replica stops, crashes or has more sessions than others, the session continues on another replica within
+    `timeout_s`. If the old replica still runs, the session moves with all its state. Otherwise the client resumes it
+    with the same instruction and options and sends the last observations (`Contract.history` of them; see
     `Agent.observe`); `act.info["resumed"]` is then set. If a replica has not answered for 5 s (in one call, or in
-    several that reached their deadlines), the next call goes to another replica, if one answers. One session never acts
-    twice on an observation.
+    several that reached their deadlines), the next call uses another replica, if one answers. A session never acts
+    twice on one observation.
     """
 
     def __init__(
@@ -199,22 +199,22 @@ class RemoteAgent(Agent):
 
         Args:
             url: `http(s)://HOST:PORT[/APP]`, `ws(s)://…` or, inside a Ray cluster, `serve://APP`.
-            transport: "auto" takes the fastest available: shared memory to a server of the same user on this machine,
+            transport: "auto" selects the fastest available: shared memory to a server of the same user on this machine,
                 else a WebSocket; inside the cluster a plasma channel to a replica on this node, else a Serve handle.
                 The others force one. `agent.transport` names it, once connected.
-            timeout_s: How long a `reset` or `act` may take; an observation's `info["deadline_ms"]` allows its `act`
-                less. 2 to 5 s suit a robot, since a call to a hung replica lasts until its end.
+            timeout_s: Time limit of a `reset` or `act`; an observation's `info["deadline_ms"]` shortens it for its
+                `act`. 2 to 5 s suit a robot, since a call to a hung replica lasts until this limit.
             connect_timeout_s: How long to wait for a server that cannot be reached or is still loading, by default
                 `timeout_s`; after 2 s, a warning is logged.
-            codec: How images are encoded for a network: "auto" is JPEG, which changes the pixels a little, and
-                "exact" PNG; to a server on this machine, both leave the pixels raw. "raw", which is faster from
+            codec: The encoding of images for a network: "auto" is JPEG, which changes the pixels a little, and
+                "exact" is PNG; to a server on this machine, both leave the pixels raw. "raw", which is faster from
                 300 MB/s (2.4 Gbit/s) on, "lossless" (PNG), "jpeg" or an `ImageCodec` force one.
-            rank: The class of the requests: a "robot" goes before a "simulation".
-            resume: False raises the loss of a session as `ConnectionLost`; the episode then needs a new `reset`.
+            rank: The class of the requests: a "robot" has priority over a "simulation".
+            resume: If False, the loss of a session raises `ConnectionLost`, and the episode needs a new `reset`.
             api_key: The API key, for a server that requires one; by default the value of `VLAGENTS_RAY_API_KEY`.
             ca: With `https://`, `wss://`: PEM file of the server's authorities; by default the system's.
             certificate: The PEM files of this client's certificate and its key, for a server that requires one.
-            commands: Gets the commands from the live page to this agent's session; by default they are ignored.
+            commands: Receives the commands from the live page to this agent's session; by default they are ignored.
 
         Raises:
             ConfigError: The URL has none of these forms, or does not fit the transport.
@@ -249,12 +249,12 @@ class RemoteAgent(Agent):
 
     @property
     def url(self) -> str:
-        """The server's URL, as it was given."""
+        """The server's URL, as passed to the constructor."""
         return self._connection.url
 
     @property
     def session(self) -> str:
-        """The id of its session; it is another one after `close`, or where the episode had to begin again."""
+        """The id of the session; it changes after `close`, and when an episode is resumed on another replica."""
         return self._session.id
 
     @property
@@ -322,13 +322,13 @@ class RemoteAgent(Agent):
         Args:
             obs: The first observation of each session.
             instructions: The instruction of each session.
-            sessions: Agents that `sessions` of this agent returned, or this agent itself.
+            sessions: Agents returned by `sessions` of this agent, or this agent itself.
             contract: The contract of the robot or the environment, as in `reset`.
             seeds: The option `seed` of each session's reset, in place of one for all.
             kwargs: Options of the policy's `reset`, the same for all sessions.
 
         Returns:
-            What `reset` returns for each session, or the exception of a session that failed, which affects it alone.
+            The result of `reset` for each session, or its exception, which affects only that session.
         """
         siblings = self._siblings(sessions)
         self._connection.open()
@@ -356,9 +356,9 @@ class RemoteAgent(Agent):
         """Return the next action, (D,) float32, or chunk of actions, (H, D).
 
         `act.info["timing"]` holds times in milliseconds by stage. The server measures from the last byte of the
-        request: `decode_ms`, `queue_ms`, `inference_ms` (until the device is done), `encode_ms`, and `total_ms`, which
-        is their sum and the time between them. The client adds `round_trip_ms` and, as the rest of it, `wire_ms`: its
-        own coding, the network, and proxies. `batch_size` is a number of requests, not a time.
+        request: `decode_ms`, `queue_ms`, `inference_ms` (until the device has finished), `encode_ms`, and `total_ms`,
+        which is their sum and the time between them. The client adds `round_trip_ms` and, as the rest of it, `wire_ms`:
+        its own coding, the network, and proxies. `batch_size` is a number of requests, not a time.
         """
         commands = self._commands
         [act] = self.act_batch([obs if commands is None else commands.asking(obs)], [self])
@@ -375,7 +375,7 @@ class RemoteAgent(Agent):
             agent.reset_batch(observations, ["pick up the cube"] * 16, envs)
             acts = agent.act_batch(observations, envs)
 
-        The server runs them in as few batches as its limit allows. An exception affects its own session alone.
+        The server runs them in as few batches as its limit allows. An exception affects only its own session.
         """
         begun = time.perf_counter()
         siblings = self._siblings(sessions)
@@ -415,7 +415,7 @@ class RemoteAgent(Agent):
         return self._connection.call(requests, timeout_s)
 
     def _traced(self, requests: Sequence[Request], send: Callable[[], list[Reply]]) -> list[Reply]:
-        """Send one message within a span, below the caller's own if there is one; the server's spans belong to it."""
+        """Send one message within a span, a child of the caller's if there is one and the parent of the server's."""
         trace: Any = require("opentelemetry.trace", extra="otel")
         context: Any = require("opentelemetry.trace.propagation.tracecontext", extra="otel")
         about = {"server.url": self.url, "transport": self.transport, "requests": len(requests)}
@@ -449,7 +449,7 @@ class RemoteAgent(Agent):
 
 
 def _deadline_s(obs: Sequence[Obs]) -> float:
-    """Return the time, s, after which the most urgent of the observations needs no answer any more."""
+    """Return the time, s, until the most urgent observation no longer needs an answer."""
     soonest_ms = math.inf
     for one in obs:
         if DEADLINE in one.info:

@@ -12,10 +12,10 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Act, Obs
 
 COMMAND = "command"  # the entry of `Act.info` with a command: {"id", "do", "by"}, str each
-COMMANDED = "commanded"  # the entry of `Obs.info` with the answers: by id, why it was refused, "" if it was obeyed
+COMMANDED = "commanded"  # the entry of `Obs.info` with outcomes by id: why it was refused, or "" if executed
 COMMANDS = ("pause", "stop", "success", "failure")  # none of them can start a motion
 logger = logging.getLogger(__name__)
-_BY = 80  # most characters of a name that are kept
+_BY = 80  # characters of a name that are kept
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,13 +24,13 @@ class Command:
 
     id: str  # identifies the answer for the server
     do: str  # one of `COMMANDS`
-    by: str = ""  # name of the key whose holder pressed the button; empty on a server without keys
+    by: str = ""  # name of the API key used for the command; empty on a server without keys
 
 
 class CommandInbox:
     """The commands for one session, from `RemoteAgent(url, commands=inbox)` to the state of the robot.
 
-    The agent's thread puts commands in and takes answers out; `obey` runs on the thread of the control loop.
+    The agent's thread adds commands and collects outcomes; `obey` runs on the thread of the control loop.
     """
 
     def __init__(self, allow: Collection[str] = COMMANDS) -> None:
@@ -40,19 +40,19 @@ class CommandInbox:
         self.control = Control()  # that of the last run
         self._allow = frozenset(allow)
         self._waiting: deque[Command] = deque()
-        self._answers: dict[str, str] = {}  # refusal by id of a command, empty if it was obeyed
-        self._sent: dict[str, str] = {}  # those in the last request
+        self._answers: dict[str, str] = {}  # refusal by id of a command, empty if it was executed
+        self._sent: dict[str, str] = {}  # the outcomes in the last request
 
     def asking(self, obs: Obs) -> Obs:
-        """Return the observation of a request with the outcomes of earlier commands."""
+        """Return the observation of a request with the outcomes of earlier commands added."""
         answers = self._sent = dict(self._answers)
         return replace(obs, info={**obs.info, COMMANDED: answers}) if answers else obs
 
     def came(self, act: Act | Exception) -> None:
-        """Take the command out of the answer to that request; one of another form is left out."""
+        """Remove the command from the answer to that request, and queue or refuse it; ignore an invalid entry."""
         if isinstance(act, Exception):
             return
-        for told in self._sent:  # they have reached the server
+        for told in self._sent:  # these have reached the server
             self._answers.pop(told, None)
         stated = act.info.pop(COMMAND, None)
         if not isinstance(stated, dict) or not all(isinstance(stated.get(name), str) for name in ("id", "do")):
@@ -67,7 +67,7 @@ class CommandInbox:
 
     @property
     def waiting(self) -> list[Command]:
-        """The commands received but not yet obeyed, oldest first."""
+        """The commands that were received and not executed yet, oldest first."""
         return list(self._waiting)
 
     def obey(self, control: Control) -> list[Command]:

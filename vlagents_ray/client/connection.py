@@ -1,4 +1,4 @@
-"""The connection to a server, which all sessions of one `RemoteAgent` share, and the server's metadata."""
+"""The connection to a server, shared by all sessions of one `RemoteAgent`, and the server's metadata."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 _CLOSE_S = 2.0
-# The server gets the deadline of a call less the time of transport: this share of it, and at most so many s.
+# The deadline sent to the server is shorter by the time of transport: this share of it, at most this many s.
 _TRANSPORT_SHARE, _TRANSPORT_S = 0.1, 0.2
-_LOOK_UP_S, _LOOK_UP_PAUSE_S = 10.0, 1.0  # time to find another replica, and between two attempts
-SILENT_S = 5.0  # s without any answer, in one or several calls, after which the next call goes to another replica
+_LOOK_UP_S, _LOOK_UP_PAUSE_S = 10.0, 1.0  # s to find another replica, and between two attempts
+SILENT_S = 5.0  # s without any answer, over one or several calls, after which the next call uses another replica
 
 
 class Connection:
     """Connects on first use, and again after a lost connection or at the replica's request.
 
-    A replica that requests it still answers: its connection is used until another replica has answered. Only one thread
-    may use a connection at a time.
+    A replica that requests a reconnection still answers, so its connection is used until another replica has answered.
+    Only one thread may use a connection at a time.
     """
 
     def __init__(
@@ -47,18 +47,23 @@ class Connection:
     ) -> None:
         """Set up the connection, without opening it.
 
-        With `leaves_silent`, it goes to another replica when one no longer answers.
+        Args:
+            url: The server's URL.
+            new_transport: Makes a transport for each connection.
+            codec: The codec of the cameras, chosen on each connection.
+            timeout_s: The default time limit of a call.
+            connect_timeout_s: The time limit of `open`, by default.
+            leaves_silent: Whether to switch to another replica when one no longer answers.
         """
         self.url = url
         self._new_transport = new_transport
         self._leaves_silent = leaves_silent
-        self._silent_since: float | None = None  # time.monotonic(); no call that began later was answered
-        self._silent = False  # whether that has lasted for `SILENT_S`
-        # The transport to the replica that does not answer, kept until another one answers: its sessions may still be
-        # moved.
+        self._silent_since: float | None = None  # time.monotonic(); calls begun since then have no answer
+        self._silent = False  # whether the silence has lasted for `SILENT_S`
+        # The transport to the silent replica, kept until another one answers, since its sessions may still be moved.
         self._old_transport: Transport | None = None
-        self._next: _NextTransport | None = None  # to the replica that is to be next, while the present one answers
-        self._look_up_at = float("-inf")  # no earlier, time.monotonic()
+        self._next: _NextTransport | None = None  # to the next replica, while the current one still answers
+        self._look_up_at = float("-inf")  # time.monotonic(), earliest time of the next look-up
         self.transport = new_transport()
         self.codec = codec
         self.timeout_s = timeout_s
@@ -66,7 +71,7 @@ class Connection:
         self.contract: Contract | None = None
         self.users: set[object] = set()  # owners of the sessions
         self._connect_timeout_s = connect_timeout_s
-        self.reconnects = 0  # how often it has connected again
+        self.reconnects = 0  # number of reconnections
         self._must_reconnect = False  # connect again before the next request
         self._asked_to_move = False  # whether the replica keeps the sessions when its connection is closed
         self._prefix = uuid.uuid4().hex[:16]
@@ -94,7 +99,7 @@ class Connection:
         self._connected(self.transport.connect(self._connect_timeout_s if timeout_s is None else timeout_s))
 
     def _connected(self, metadata: dict[str, Any]) -> None:
-        """Take the metadata of the replica that the transport has connected to."""
+        """Store the metadata of the replica to which the transport has connected."""
         if metadata.get("protocol") != PROTOCOL_VERSION:
             self.transport.close()
             raise ConfigError(
@@ -109,11 +114,11 @@ class Connection:
             local is not None and local["boot_id"] == boot_id() != "" and is_loopback(urlsplit(self.url).hostname or "")
         )
         self.codec.connected(near=near)
-        self._silent, self._silent_since = False, None  # also where the transport is still the same
+        self._silent, self._silent_since = False, None  # even if the transport is unchanged
         self.metadata = metadata
 
     def _move(self) -> None:
-        """Go on with the next transport, once it is connected; if it cannot be, stay, and try again in a while."""
+        """Switch to the next transport once it is connected; if it fails, keep the current one and retry later."""
         if self._next is None or not self._next.ended:
             return
         found, self._next = self._next, None
@@ -140,7 +145,7 @@ class Connection:
             if self._must_reconnect:
                 self.open(timeout_s)
                 timeout_s -= time.monotonic() - begun
-                if timeout_s <= 0:  # nothing is sent; the next call has the new connection
+                if timeout_s <= 0:  # nothing is sent; the next call uses the new connection
                     late = DeadlineExceeded(f"{self.url}: connected again, but too late for this call")
                     return [Reply(request.request_id, error=late) for request in requests]
             left_s = max(1e-3, timeout_s)
@@ -158,7 +163,7 @@ class Connection:
                 self._must_reconnect = self._must_reconnect or (self._silent and self._leaves_silent)
             replies = [Reply(request.request_id, error=error) for request in requests]
         for reply in replies:
-            if reply.act is not None:  # a server may not set the keys of the control loop
+            if reply.act is not None:  # a server must not set keys of the control loop
                 for name in OF_THE_LOOP:
                     reply.act.info.pop(name, None)
         if len(replies) == len(requests) and not any(reply.error or reply.draining for reply in replies):
@@ -166,11 +171,11 @@ class Connection:
         return self._noted(requests, replies)
 
     def _noted(self, requests: Sequence[Request], replies: list[Reply]) -> list[Reply]:
-        """Note errors and whether to connect again; return a reply for each request."""
+        """Record errors and whether to reconnect; return a reply for each request."""
         for reply in replies:
-            if isinstance(reply.error, UnknownApp):  # it existed: the server is stopping or restarting
+            if isinstance(reply.error, UnknownApp):  # the app existed: the server is stopping or restarting
                 reply.error = NoReplica(f"{self.url}: the application is gone ({reply.error})")
-        if len(replies) != len(requests):  # one reply to the frame as a whole
+        if len(replies) != len(requests):  # one reply for the whole frame
             whole = replies[0].error or PolicyUnavailable(f"got {len(replies)} replies to {len(requests)} requests")
             replies = [Reply(request.request_id, error=whole) for request in requests]
         if any(isinstance(reply.error, PolicyUnavailable) for reply in replies):
@@ -188,7 +193,7 @@ class Connection:
         ended = self.transport.holds_sessions and not self.users  # by closing the connection
         if begun and self.metadata is not None and (self._asked_to_move or not (ended or self._must_reconnect)):
             close = Request("close", session=session, request_id=self.request_id(), deadline_ms=_CLOSE_S * 1e3)
-            with contextlib.suppress(VLAgentsError):  # harmless: the server forgets idle sessions
+            with contextlib.suppress(VLAgentsError):  # harmless: the server drops idle sessions
                 self.transport.call([close], _CLOSE_S)  # on the old connection, which holds the session
         if not self.users:
             self._drop_next()
@@ -197,7 +202,7 @@ class Connection:
             self.metadata, self._must_reconnect, self._asked_to_move = None, False, False
 
     def _close_old_transport(self) -> None:
-        """Close the transport to the replica that was left; in a thread, since closing it may take long."""
+        """Close the transport to the former replica, in a thread, since that may take long."""
         if self._old_transport is not None:
             threading.Thread(target=self._old_transport.close, daemon=True).start()
             self._old_transport = None
@@ -208,7 +213,7 @@ class _NextTransport:
 
     def __init__(self, transport: Transport) -> None:
         self.transport = transport
-        self.metadata: dict[str, Any] | None = None  # of the replica; None if none answered
+        self.metadata: dict[str, Any] | None = None  # of the replica; None if there was no answer
         self.ended = False
         self._dropped = False
         self._lock = threading.Lock()
@@ -230,7 +235,7 @@ class _NextTransport:
                 self.transport.close()
 
     def drop(self) -> None:
-        """Close the transport, as soon as it is connected."""
+        """Close the transport, at once or when its attempt to connect ends."""
         with self._lock:
             self._dropped = True
         if self.ended:

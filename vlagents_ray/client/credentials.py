@@ -19,7 +19,7 @@ logger = logging.getLogger(__name__)
 
 KEY_VARIABLE = "VLAGENTS_RAY_API_KEY"
 WEBSOCKET_LOG = logging.getLogger("vlagents_ray.client.transports.websocket.protocol")
-"""For websockets, which at DEBUG logs the headers that it sends: all but the key."""
+"""The logger for websockets, which at DEBUG logs the headers that it sends: drops lines with the key."""
 WEBSOCKET_LOG.addFilter(lambda record: "authorization" not in str(record.args).lower())
 _Path = str | os.PathLike[str]
 _OTHER_NAMES = (62, 64)  # X509_V_ERR_HOSTNAME_MISMATCH, X509_V_ERR_IP_ADDRESS_MISMATCH
@@ -41,17 +41,17 @@ class Credentials:
         object.__setattr__(self, "api_key", key or None)
 
     def become_default(self) -> None:
-        """Make this key the default of the process, as if its environment had held it."""
+        """Make this key the default of the process, as if its environment had contained it."""
         if self.api_key is not None:
             os.environ[KEY_VARIABLE] = self.api_key
 
     @property
     def headers(self) -> dict[str, str]:
-        """Return the HTTP headers that carry the key."""
+        """The HTTP headers that carry the key."""
         return {} if self.api_key is None else {"authorization": f"Bearer {self.api_key}"}
 
     def use_at(self, url: str) -> None:
-        """Warn if the key would go to that URL unencrypted over a network."""
+        """Warn if the key would be sent to that URL unencrypted over a network."""
         parts = urlsplit(url)
         if self.api_key is not None and parts.scheme in ("http", "ws"):
             warn_of_plain_http(f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}")
@@ -90,7 +90,7 @@ def withheld() -> Iterator[None]:
 
 @cache
 def warn_of_plain_http(origin: str) -> None:
-    """Log, once for each server, that an API key goes there unencrypted over a network."""
+    """Log, once per server, that an API key is sent to it unencrypted over a network."""
     if not is_loopback(urlsplit(origin).hostname or ""):
         logger.warning("%s: the API key goes there unencrypted, and others may read it; use https:// or wss://", origin)
 
@@ -119,7 +119,7 @@ def tls_failure(url: str, error: ssl.SSLError) -> VLAgentsError:
 
 
 def require_plain(url: SplitResult, timeout_s: float) -> None:
-    """Raise `ConfigError` if the URL is one without TLS and its port speaks TLS, whatever its certificate."""
+    """Raise `ConfigError` if the URL is not encrypted but its port speaks TLS, whatever the certificate."""
     if url.scheme in ("http", "ws") and _speaks_tls(url, timeout_s):
         port = url.netloc.rpartition("@")[2]
         raise ConfigError(f"http://{port}: this port speaks TLS; write https://{port}")
@@ -132,7 +132,7 @@ def _speaks_tls(url: SplitResult, timeout_s: float) -> bool:
         with socket.create_connection((url.hostname, url.port or 80), timeout_s) as connection:
             context.wrap_socket(connection, server_hostname=url.hostname).close()
     except ssl.SSLError as error:
-        return "ALERT" in (error.reason or "")  # also TLS
+        return "ALERT" in (error.reason or "")  # also a sign of TLS
     except OSError:
         return False
     return True

@@ -3,9 +3,9 @@
     with Policy("ws://gpu-box:8000/v1/stream") as policy:
         policy.reset({"front": image}, {"joints": joints}, instruction="stack the cups")
         answer = policy.act({"front": image}, {"joints": joints})
-        answer["action"]  # (D,) float32, or (H, D) for a chunk; beside it are "done" and "info"
+        answer["action"]  # (D,) float32, or (H, D) for a chunk; the other keys are "done" and "info"
 
-docs/protocol.md specifies the messages. `vlagents_ray.RemoteAgent` also connects again, and resumes its episode.
+docs/protocol.md specifies the messages. `vlagents_ray.RemoteAgent` also reconnects and resumes its episode.
 """
 
 import json
@@ -20,7 +20,7 @@ import simplejpeg
 from websockets.sync.client import connect
 
 Arrays = dict[str, np.ndarray]  # by camera, or by part of the state
-_PREFIX = struct.Struct("<3sBI")  # b"VLA", the version of the protocol, bytes of the header
+_PREFIX = struct.Struct("<3sBI")  # b"VLA", protocol version, bytes of the header
 
 
 class PolicyError(Exception):
@@ -56,9 +56,9 @@ class Policy(ExitStack):
         text = json.dumps(header | {"obs": obs, "blobs": [len(blob) for blob in blobs]}).encode()
         frame = _PREFIX.pack(b"VLA", 1, len(text)) + text
         for blob in blobs:
-            frame += bytes(-len(frame) % 8) + blob  # each begins at a multiple of 8
+            frame += bytes(-len(frame) % 8) + blob  # each blob begins at a multiple of 8
         self._socket.send(frame)
-        while True:  # until the answer to this request; others are late ones to requests that were given up
+        while True:  # until the answer to this request; skip late ones to abandoned requests
             data = self._socket.recv(max(0.0, end - time.monotonic()), decode=False)
             at = _PREFIX.size + _PREFIX.unpack_from(data)[2]
             text, blobs = data[_PREFIX.size : at], []

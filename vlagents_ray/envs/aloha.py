@@ -1,4 +1,4 @@
-"""ALOHA in simulation: two ViperX 300 arms over a table in MuJoCo, the two tasks of ACT.
+"""ALOHA in simulation: two ViperX 300 arms at a table in MuJoCo, with ACT's two tasks.
 
 Zhao et al. 2023, "Learning Fine-Grained Bimanual Manipulation with Low-Cost Hardware", arXiv 2304.13705, as packaged by
 gym-aloha. Images need OpenGL without a display: EGL, which Mesa also provides in software.
@@ -32,7 +32,7 @@ _TASKS = {
     "transfer_cube": "pick up the cube with the right arm and transfer it to the left arm",
     "insertion": "insert the peg into the socket",
 }
-# Where each part of the state is in gym-aloha's vector (14,), whose gripper positions are 0 closed, 1 open.
+# The place of each part of the state in gym-aloha's vector (14,), whose gripper positions are 0 closed, 1 open.
 _STATE = {
     "left/joints": slice(0, 6),
     "left/gripper": slice(6, 7),
@@ -45,12 +45,12 @@ class Aloha(SimulatorEnv):
     """One environment of one of ALOHA's two tasks, "transfer_cube" or "insertion".
 
     Observation: cameras, by default "top", as in ACT's and LeRobot's data; `state`: "left/joints" (6,) rad,
-    "left/gripper" (1,), "right/joints", "right/gripper", which in this order are gym-aloha's `agent_pos`; in
-    `info["sim_state"]`, (7,) float64 or (14,), the poses of the cube, or of peg and socket, in the world's frame:
+    "left/gripper" (1,), "right/joints", "right/gripper", in the order of gym-aloha's `agent_pos`; in
+    `info["sim_state"]`, (7,) float64 or (14,), the poses of the cube, or of peg and socket, in the world frame:
     position in m and quaternion w, x, y, z.
 
     Action: (14,), for the left arm and then for the right: six joint angles, rad, and the gripper, 0 closed, 1 open.
-    They are not clipped to gym-aloha's action space, [-1, 1], in which the arms' first pose is not: neither ACT nor
+    They are not clipped to gym-aloha's action space, [-1, 1], which excludes even the arms' first pose: neither ACT nor
     LeRobot clips them.
     """
 
@@ -70,7 +70,7 @@ class Aloha(SimulatorEnv):
         max_steps: int = PROTOCOL.max_steps,
         ends_on_success: bool = True,
     ) -> None:
-        """Make the environment; raises the errors of `make_env`. Other options are those of most `SimulatorEnv`s.
+        """Make the environment; raises the errors of `make_env`. Other options are described in `SimulatorEnv`.
 
         Args:
             task: "transfer_cube" or "insertion".
@@ -119,7 +119,7 @@ class Aloha(SimulatorEnv):
         return self._observe(qpos), {}
 
     def _advance(self, action: np.ndarray) -> tuple[Obs, float, bool, dict[str, Any]]:
-        """The reward is the stage of the task that the state is in, 0 to 4."""
+        """Execute an action; the reward is the stage of the task in the new state, 0 to 4."""
         qpos, reward, *_ = self._env.step(action.astype(np.float64))
         return self._observe(qpos, look=self.looked_at), float(reward), *self._solved(bool(reward == _SOLVED))
 

@@ -1,4 +1,4 @@
-"""The interface of environments: one alone, or several that step together."""
+"""The interfaces of a single environment and of several that step together."""
 
 from __future__ import annotations
 
@@ -34,23 +34,23 @@ class Environment(ABC):
     """The task's step limit; `step` reports `truncated` when it is reached."""
 
     init_states: int | None = None
-    """How many initial states the benchmark has fixed for the task; None if seeds alone draw them.
+    """The number of initial states that the benchmark fixes for the task; None if the seed alone determines the state.
 
-    Episode i of an evaluation begins in state i modulo this, handed to `reset` as `options["init_state"]`.
+    Episode i of an evaluation begins in state i modulo this number, passed to `reset` as `options["init_state"]`.
     """
 
     looked_at: bool = True
     """Whether the next observation is used; if not, an env may omit its images, which saves rendering them.
 
-    The observations between the rows of a chunk are not used, unless videos are made, nor is that of the last step.
-    Nothing but the images may depend on this.
+    Observations between the rows of a chunk are not used unless videos are made; nor is that of the last step. Only
+    the images may depend on this.
     """
 
     several_tasks: bool = False
-    """Whether an episode has tasks one after another, as CALVIN's have, so that its instruction may change with a step.
+    """Whether an episode is a sequence of tasks, as in CALVIN, so that a step may change the instruction.
 
-    An evaluation then resets the policy with the new instruction, and with the observation of that step, whose images
-    are there whatever `looked_at` says. What is left of a chunk is dropped.
+    An evaluation then resets the policy with the new instruction and with the observation of that step, which has
+    images whatever `looked_at` says. The rest of the chunk is dropped.
     """
 
     @property
@@ -59,7 +59,7 @@ class Environment(ABC):
         """The observations (cameras, state, gripper, rate) and the actions of each environment."""
 
     def renderer(self) -> Renderer | None:
-        """The device that renders the images, once it is made; None without one. Here: this thread's OpenGL context."""
+        """The device that renders the images; None before it is made. Here: that of this thread's OpenGL context."""
         return opengl_renderer()
 
     def describe(self) -> dict[str, Any]:
@@ -87,7 +87,7 @@ class EvalEnv(Environment):
     @property
     @abstractmethod
     def instruction(self) -> str:
-        """The task of the current episode in words; with `several_tasks`, the present one."""
+        """The task of the current episode in words; with `several_tasks`, the current task."""
 
     @abstractmethod
     def reset(self, *, seed: int, options: Options | None = None) -> tuple[Obs, dict[str, Any]]:
@@ -114,8 +114,8 @@ class EvalEnv(Environment):
 
         Returns:
             `(obs, reward, terminated, truncated, info)`, with the meaning of Gymnasium's `Env.step`. `info["success"]`
-            is a bool, whether the task is solved in this state. An env may continue after success; `terminated` only
-            reports that it cannot. `truncated` means that `max_steps` is reached.
+            is a bool: whether the task is solved in this state. An env may continue after success; `terminated` only
+            reports that it cannot continue. `truncated` means that `max_steps` is reached.
 
         Raises:
             InvalidAction: The action has a wrong shape or is not finite.
@@ -124,7 +124,7 @@ class EvalEnv(Environment):
 
     @classmethod
     def tasks(cls) -> list[str]:
-        """List the known tasks; empty if the simulator gets any name."""
+        """List the known tasks; empty if the simulator accepts any name."""
         return []
 
     @classmethod
@@ -148,7 +148,7 @@ class EvalEnv(Environment):
 
     @classmethod
     def missing(cls) -> str | None:
-        """Say why the simulator cannot run here, with the cure; None if it can."""
+        """Return why the simulator cannot run here, with the cure; None if it can."""
         return None
 
     @classmethod
@@ -166,25 +166,25 @@ class EvalEnv(Environment):
 
 
 class BatchEnv(Environment):
-    """Several environments of one task, which differ in their episodes only.
+    """Several environments of one task, which differ only in their episodes.
 
     They begin and step together: an environment whose episode is over is idle, and its rows have no meaning, until all
-    are over and `reset` begins the next ones. Row i of every argument and result belongs to environment i. Its episode
-    is a pure function of its own seed and options, as an `EvalEnv`'s is, and does not depend on the other environments.
+    episodes are over and `reset` begins the next ones. Row i of every argument and result belongs to environment i. Its
+    episode is a pure function of its seed and options, as in `EvalEnv`, and does not depend on the other environments.
 
     The images of a camera in one step are rows of one array, (num_envs, height, width, 3) uint8.
     """
 
     num_envs: int
-    """How many there are."""
+    """The number of environments."""
 
     restarts: bool = False
-    """Whether `restart` begins an episode in one environment while the others go on with theirs."""
+    """Whether `restart` can begin an episode in one environment while the others continue theirs."""
 
     @property
     @abstractmethod
     def instructions(self) -> list[str]:
-        """The tasks of the current episodes in words; with `several_tasks`, the present ones."""
+        """The tasks of the current episodes in words; with `several_tasks`, the current tasks."""
 
     @abstractmethod
     def reset(self, *, seeds: Sequence[int], options: Sequence[Options | None] | None = None) -> list[Obs]:
@@ -199,7 +199,7 @@ class BatchEnv(Environment):
         """
 
     def restart(self, index: int, *, seed: int, options: Options | None = None) -> Obs:
-        """Begin another episode in one environment that has had one, whatever the others do.
+        """Begin the next episode in one environment while the others continue theirs.
 
         Args:
             index: The number of the environment.
@@ -323,8 +323,8 @@ class SequentialBatch(BatchEnv):
         """Combine environments of one task, which are closed together with this object."""
         self.several_tasks = envs[0].several_tasks
         self._envs = list(envs)
-        self._playing = 0  # the first so many have an episode
-        self._seen: list[Obs] = []  # the last observation of each
+        self._playing = 0  # the number of environments, from the first, that have an episode
+        self._seen: list[Obs] = []  # the last observation of each environment
         first = self._envs[0]
         self.num_envs, self.max_steps, self.init_states = len(self._envs), first.max_steps, first.init_states
 
@@ -379,9 +379,10 @@ class SequentialBatch(BatchEnv):
                 closing.callback(env.close)
 
     def _stacked(self, seen: list[Obs], moved: Collection[int]) -> list[Obs]:
-        """Return the observations with the images of each camera as rows of one array, if they are used.
+        """Return the observations with the images of each camera as rows of one array, if images are used.
 
-        An idle environment may have left its images out when it last moved; those of one that moved stand for them.
+        An idle environment may have left its images out when it last moved; images of one that moved then take their
+        place.
         """
         if len(seen) == 1 or not moved or not self.looked_at:
             return seen

@@ -1,4 +1,4 @@
-"""CALVIN: five tasks one after another, told in words, at a table with drawer, sliding door, lights and blocks.
+"""CALVIN: chains of five tasks, given in words, at a table with drawer, sliding door, lights and blocks.
 
 with Calvin("D") as env:
     obs, _ = env.reset(seed=0)
@@ -50,16 +50,15 @@ class Chain:
     """The tasks and the initial state of an episode."""
 
     tasks: tuple[str, ...]  # CALVIN's names, e.g. "open_drawer"
-    robot: np.ndarray  # (15,) its `robot_obs`
-    scene: np.ndarray  # (24,) its `scene_obs`
+    robot: np.ndarray  # (15,) CALVIN's `robot_obs`
+    scene: np.ndarray  # (24,) CALVIN's `scene_obs`
 
 
 class Chains:
     """The chains by their number, as `get_sequences(1000)` orders them.
 
-    CALVIN draws tasks at random until enough of the draws can be done one after another, for each of 192 initial states
-    with a seed of its own. That takes minutes for all; here the draws of a state are made when one of its chains is
-    asked for.
+    For each of 192 initial states, with its own seed, CALVIN draws tasks at random until it has enough feasible
+    sequences. All draws take minutes; here the draws of a state are made when one of its chains is requested.
     """
 
     def __init__(self, checkout: Path) -> None:
@@ -92,14 +91,14 @@ class Chains:
         names, check = list(self._rules["tasks"]), self._rules["check_sequence"]
         random, found = self._drawn.setdefault(seed, (np.random.RandomState(seed), []))
         while len(found) <= place:
-            drawn = tuple(names[i] for i in random.permutation(len(names))[:_LENGTH])  # as `choice` without replacement
+            drawn = tuple(names[i] for i in random.permutation(len(names))[:_LENGTH])  # a `choice` without replacement
             if check(state, drawn):
                 found.append(drawn)
         return Chain(found[place], *self._state_of(state))
 
 
 class _Places:
-    """Stands for the pool of processes: in place of a state's chains it returns the seed and the place of each."""
+    """Replaces the pool of processes: returns the seed and place of each chain of a state instead of the chains."""
 
     def __init__(self, max_workers: int) -> None:
         pass
@@ -115,7 +114,7 @@ class _Places:
 
 
 def fnv1_32(text: str) -> int:
-    """Return pyhash's FNV-1, which begins with 0."""
+    """Return pyhash's FNV-1 hash, whose initial value is 0."""
     found = 0
     for byte in text.encode():
         found = (found * _FNV_PRIME % 2**32) ^ byte
@@ -123,7 +122,7 @@ def fnv1_32(text: str) -> int:
 
 
 def _definitions(path: Path, **given: Any) -> dict[str, Any]:
-    """Execute a module of the checkout without its imports, whose names are `given`."""
+    """Execute a module of the checkout without its imports, whose names are passed in `given`."""
     tree = ast.parse(path.read_text(encoding="utf-8"), str(path))
     tree.body = [node for node in tree.body if not isinstance(node, ast.Import | ast.ImportFrom)]
     names = {"__name__": path.stem, **given}
@@ -141,7 +140,7 @@ _PACKAGE, _CONF = Path("calvin_env"), Path("calvin_env/conf")
 _TASKS = Path("calvin_models/conf/callbacks/rollout/tasks/new_playtable_tasks.yaml")
 _WORDS = Path("calvin_models/conf/annotations/new_playtable_validation.yaml")
 SCENES = ("A", "B", "C", "D")
-TASKS, STEPS = 5, 360  # tasks of an episode, and the steps for each: evaluate_policy.py, EP_LEN
+TASKS, STEPS = 5, 360  # tasks per episode, and the limit of steps per task: evaluate_policy.py, EP_LEN
 PROTOCOL = BenchmarkProtocol(
     name="CALVIN",
     source="Mees et al. 2022, arXiv 2112.03227; calvin_agent/evaluation/evaluate_policy.py at fa03f01",
@@ -173,23 +172,23 @@ CONTRACT = Contract(
 class Calvin(SimulatorEnv):
     """One scene of CALVIN, "A" to "D", in which an episode is a chain of five tasks.
 
-    Observation: cameras `static`, 200x200, and `gripper`, 84x84; in `state`, in the world's frame, `tcp_pos` (3,) m and
+    Observation: cameras `static`, 200x200, and `gripper`, 84x84; in `state`, in the world frame, `tcp_pos` (3,) m and
     `tcp_orn` (3,) rad of the tool, x-y-z angles about fixed axes, `gripper_opening_width` (1,) m, and `robot_joints`
     (7,) rad; `gripper` is the last command, 1 = open.
 
-    Action: (7,): the tool's target moves by 0.02 m a unit along the world's axes, and its angles by 0.05 rad a unit;
-    the last is the gripper, 1 opens, -1 closes, and only its sign counts.
+    Action: (7,): the tool's target moves by 0.02 m per unit along the world's axes, and its angles by 0.05 rad per
+    unit; the last is the gripper: 1 opens, -1 closes, and only its sign counts.
 
     The reward is 1 in the step that solves a task. Its sum over an episode is the number of tasks solved in a row,
-    whose mean is CALVIN's average length. The episode ends with the fifth task, or with one that takes too long.
-    `info["tasks"]` are CALVIN's names of the chain, `info["solved"]` is the number of solved ones.
+    whose mean is CALVIN's average length. The episode ends with the fifth task, or with one that exceeds its steps.
+    `info["tasks"]` are CALVIN's names of the chain, `info["solved"]` is the number of solved tasks.
     """
 
     suite = "calvin"
     _contract = CONTRACT
     several_tasks = True
     init_states = NUMBER
-    _open: ClassVar[str | None] = None  # upstream's code takes the process's only simulation for its own
+    _open: ClassVar[str | None] = None  # upstream's code assumes that the process has only one simulation
 
     def __init__(
         self,
@@ -199,13 +198,14 @@ class Calvin(SimulatorEnv):
         renderer: RendererName = "egl",
         source_dir: str | None = None,
     ) -> None:
-        """Make the environment; raises the errors of `make_env`, `ConfigError` also if this process has one open.
+        """Make the environment; raises the errors of `make_env`, and `ConfigError` if another one is open.
 
         Args:
             task: The scene.
-            task_steps: The steps that each task of a chain may take.
-            renderer: "egl" draws as upstream does; "tiny" is PyBullet's own in software, with other light and shadows.
-            source_dir: A checkout of CALVIN with its submodules; None is that of CALVIN_SRC.
+            task_steps: The limit of steps for each task of a chain.
+            renderer: "egl" renders as upstream does; "tiny" is PyBullet's own in software, with other light and
+                shadows.
+            source_dir: A checkout of CALVIN with its submodules; None selects CALVIN_SRC.
         """
         self.require_task(task)
         super().__init__(f"calvin/{task}", task_steps=task_steps)
@@ -222,9 +222,9 @@ class Calvin(SimulatorEnv):
             self._judge, self._words = read_tasks(self._checkout)
             self._chains = Chains(self._checkout)
         self._chain: Chain | None = None
-        self._done = 0  # tasks
-        self._task_step = 0  # steps of the present task
-        self._before: dict[str, Any] = {}  # CALVIN's information on the state in which the present task began
+        self._done = 0  # number of finished tasks
+        self._task_step = 0  # steps of the current task
+        self._before: dict[str, Any] = {}  # CALVIN's info of the state in which the current task began
 
     @classmethod
     def known_contract(cls, arguments: Mapping[str, Any]) -> Contract:  # noqa: ARG003 - it is the same in each scene
@@ -232,7 +232,7 @@ class Calvin(SimulatorEnv):
 
     @property
     def instruction(self) -> str:
-        """The words of CALVIN's evaluation for the present task."""
+        """The current task in the words of CALVIN's evaluation."""
         return self._words[self._playing().tasks[min(self._done, TASKS - 1)]]
 
     @classmethod
@@ -275,7 +275,7 @@ class Calvin(SimulatorEnv):
         env = self._env
         with quietly():
             chain = self._chains[state]
-            env.load()  # or contacts of the last episode would shift the next one
+            env.load()  # otherwise contacts of the last episode would shift the next one
             env.robot.gripper_action = 1
             env.reset(robot_obs=chain.robot, scene_obs=chain.scene)
             self._before = env.get_info()
@@ -283,13 +283,13 @@ class Calvin(SimulatorEnv):
         return self._observe(look=True), self._info()
 
     def _advance(self, action: np.ndarray) -> tuple[Obs, float, bool, dict[str, Any]]:
-        """The reward is 1 in the step that solves a task; a task that takes too long ends the chain."""
+        """Execute an action; the reward is 1 if it solves a task, and a task that exceeds its steps ends the chain."""
         env, chain = self._env, self._playing()
         if self._ended():
             raise NotReset(f"{self._name}: step after the end of the chain; call reset(seed=...) first")
         command = action.astype(np.float64)
         command[-1] = 1.0 if command[-1] > 0 else -1.0
-        env.robot.apply_action(command)  # as upstream's `step`, which also renders
+        env.robot.apply_action(command)  # as in upstream's `step`, which would also render
         for _ in range(env.action_repeat):
             env.p.stepSimulation(physicsClientId=env.cid)
         env.scene.step()
@@ -307,7 +307,7 @@ class Calvin(SimulatorEnv):
         Calvin._open, self._chain = None, None
         with quietly():
             env.close()
-            env.ownsPhysicsClient = False  # it would be closed again by `__del__`
+            env.ownsPhysicsClient = False  # otherwise `__del__` would close it again
 
     def _observe(self, *, look: bool) -> Obs:
         env = self._alive()
@@ -354,7 +354,7 @@ def make_simulator(checkout: Path, scene: str, renderer: RendererName) -> Any:
         require("pybullet")
         hydra, omegaconf = require("hydra"), require("omegaconf").OmegaConf
         code: Any = importlib.import_module("calvin_env.envs.play_table_env")
-        code.get_git_commit_hash = lambda _: ""  # it needs a repository
+        code.get_git_commit_hash = lambda _: ""  # the original needs a git repository
         parts = {
             "env": "env/play_table_env",
             "scene": f"scene/calvin_scene_{scene}",
@@ -364,7 +364,7 @@ def make_simulator(checkout: Path, scene: str, renderer: RendererName) -> Any:
             "gripper": "cameras/cameras/gripper",
         }
         read = {name: omegaconf.load(checkout / _CONF / f"{path}.yaml") for name, path in parts.items()}
-        read["fingers"].pop("defaults")  # the arm, which hydra would merge
+        read["fingers"].pop("defaults")  # the arm; hydra would merge it
         settings = omegaconf.create(
             {
                 "data_path": "data",
@@ -377,12 +377,12 @@ def make_simulator(checkout: Path, scene: str, renderer: RendererName) -> Any:
         )
         try:
             return hydra.utils.instantiate(settings.env, use_scene_info=True, use_egl=renderer == "egl")
-        except SystemExit as error:  # PyBullet could not load its plug-in, which it has printed
+        except SystemExit as error:  # PyBullet could not load its plug-in, and has printed why
             raise EnvFailed(f"calvin: PyBullet cannot draw through EGL; {EGL_CURE}, or set renderer to tiny") from error
 
 
 def read_tasks(checkout: Path) -> tuple[Any, dict[str, str]]:
-    """Return CALVIN's judge of tasks, `Tasks`, and the words of each task in its evaluation."""
+    """Return CALVIN's task checker, `Tasks`, and the instruction of each task in its evaluation."""
     hydra, omegaconf = require("hydra"), require("omegaconf").OmegaConf
     with quietly():
         judge = hydra.utils.instantiate(omegaconf.load(checkout / _TASKS))
@@ -391,7 +391,7 @@ def read_tasks(checkout: Path) -> tuple[Any, dict[str, str]]:
 
 @contextlib.contextmanager
 def quietly() -> Iterator[None]:
-    """Keep the output and warnings of upstream's code, such as gym's end, off the terminal; errors are raised."""
+    """Keep output and warnings of upstream's code, such as gym's end of life, off the terminal; errors are raised."""
     nowhere = io.StringIO()
     with contextlib.redirect_stdout(nowhere), contextlib.redirect_stderr(nowhere), warnings.catch_warnings():
         warnings.simplefilter("ignore")

@@ -1,8 +1,8 @@
-"""Which device renders an env's images: EGL's devices, their numbers in CUDA, and a check that the chosen one is used.
+"""The device that renders an env's images: EGL's devices, their CUDA numbers, and a check that the chosen one is used.
 
 Ray sets CUDA_VISIBLE_DEVICES to the GPU of a worker, but neither EGL nor Vulkan reads it: each would take its first
-device, which may be the GPU that a policy uses. So the device is chosen here. Nothing is chosen in a process without
-CUDA_VISIBLE_DEVICES.
+device, which may be the GPU that a policy uses. This module therefore chooses the device, unless CUDA_VISIBLE_DEVICES
+is not set.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from vlagents_ray.errors import ConfigError
 
 _MOST = 64  # devices
 _EXTENSIONS = 0x3055
-_DEVICE = 0x322C  # of a display
+_DEVICE = 0x322C  # attribute of a display: its device
 _CUDA_DEVICE = 0x323A
 _GL_RENDERER = 0x1F01
 _SOFTWARE = "EGL_MESA_device_software"
@@ -30,19 +30,19 @@ _Value = ctypes.c_ssize_t  # EGLAttrib
 class EglDevice:
     """A device of EGL."""
 
-    number: int  # in EGL's own order, which is that of MUJOCO_EGL_DEVICE_ID
+    number: int  # in EGL's own order, as in MUJOCO_EGL_DEVICE_ID
     software: bool
     cuda: int | None  # its number among the CUDA devices that this process may use; None if CUDA does not know it
 
 
 def devices() -> list[EglDevice]:
-    """List all devices in EGL's order; empty if EGL is missing, or too old."""
+    """List all devices in EGL's order; empty if EGL is missing or too old."""
     functions = _functions()
     return [] if functions is None else [device for _, device in functions.devices()]
 
 
 class _Functions:
-    """The functions of EGL that are used here; raises `AttributeError` or `OSError` if one is missing."""
+    """The EGL functions used here; the constructor raises `AttributeError` or `OSError` if one is missing."""
 
     def __init__(self) -> None:
         self.library = ctypes.CDLL("libEGL.so.1")
@@ -64,7 +64,7 @@ class _Functions:
         return [(handles[i], self._device(i, handles[i])) for i in range(number.value)]
 
     def value(self, ask: Callable[..., int], of: int | None, what: int) -> int | None:
-        """Return the value of an attribute; None if it has none."""
+        """Return the value of an attribute; None if it has no value."""
         found = _Value(-1)
         return found.value if ask(of, what, ctypes.byref(found)) and found.value >= 0 else None
 
@@ -89,10 +89,10 @@ def _functions() -> _Functions | None:
 
 GPUS = "CUDA_VISIBLE_DEVICES"
 EGL_DEVICE = "MUJOCO_EGL_DEVICE_ID"
-VULKAN_DRIVERS = ("VK_ICD_FILENAMES", "VK_DRIVER_FILES")  # the first is also read by the old loader that SAPIEN brings
+VULKAN_DRIVERS = ("VK_ICD_FILENAMES", "VK_DRIVER_FILES")  # SAPIEN's older loader only reads the first
 _ICD_FOLDERS = ("/usr/local/share/vulkan/icd.d", "/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d")
-_SAPIENS_OWN = "sapien/vulkan_library/"  # of NVIDIA's driver, which it names where it finds no other
-_SOFTWARE_VULKAN = "llvmpipe"  # how lavapipe names its device
+_SAPIENS_OWN = "sapien/vulkan_library/"  # of NVIDIA's driver, which SAPIEN names if it finds no other
+_SOFTWARE_VULKAN = "llvmpipe"  # lavapipe's name of its device
 
 SHARE = "worker: {gpus: 0.25}, or --worker-gpus 0.25, gives each worker a part of a GPU"
 _CURE_HIDDEN = (
@@ -109,10 +109,10 @@ _CURE_OWN = (
 class Renderer:
     """The device that renders an env's images."""
 
-    name: str  # the driver's name of it: "llvmpipe (LLVM 15.0.6, 256 bits)", "NVIDIA H200/PCIe/SSE2"
+    name: str  # the driver's name of the device: "llvmpipe (LLVM 15.0.6, 256 bits)", "NVIDIA H200/PCIe/SSE2"
     software: bool
     cuda: int | None  # its number among the CUDA devices that this process may use; None if CUDA does not know it
-    asked_for: bool = False  # the environment names this very device
+    asked_for: bool = False  # the environment's options name this very device
 
 
 def has_gpu() -> bool | None:
@@ -122,7 +122,7 @@ def has_gpu() -> bool | None:
 
 
 def fitting(devices: Sequence[EglDevice], *, gpu: bool) -> EglDevice | None:
-    """Return the device to render on: CUDA's first one, or the software device without `gpu`; None if there is none."""
+    """Return the device to render on: CUDA's first one, or without `gpu` the software device; None if there is none."""
     if gpu:
         return min((one for one in devices if one.cuda is not None), key=lambda one: one.cuda or 0, default=None)
     return next((one for one in devices if one.software), None)
@@ -132,9 +132,9 @@ def prepare_rendering() -> None:
     """Set variables of drivers and simulators for rendering without a display on shared cores.
 
     Variables set by the user are kept. Call it before any simulator is imported: ManiSkill also imports MuJoCo, which
-    chooses its OpenGL then and for good.
+    chooses its OpenGL once, on import.
     """
-    os.environ.setdefault("LP_NUM_THREADS", "1")  # Mesa's software drivers take all cores otherwise
+    os.environ.setdefault("LP_NUM_THREADS", "1")  # otherwise Mesa's software drivers use all cores
     if not os.environ.get("MUJOCO_GL") and not os.environ.get("DISPLAY") and _has_egl():
         os.environ["MUJOCO_GL"] = "egl"
     choose_devices()
@@ -152,7 +152,7 @@ def choose_devices() -> None:
 
 
 def opengl_renderer() -> Renderer | None:
-    """Return the renderer of this thread's OpenGL context; None if there is none, or it is not EGL's."""
+    """Return the renderer of this thread's OpenGL context; None if there is none, or if it is not EGL's."""
     functions = _functions()
     display = None if functions is None else functions.library.eglGetCurrentDisplay()
     if functions is None or not display:
@@ -174,7 +174,7 @@ def vulkan_renderer(name: str, cuda: int | None, *, asked_for: bool = False) -> 
 
 
 def require_own(renderer: Renderer) -> None:
-    """Raise `ConfigError` if it is not the GPU that this process was given, or a GPU although it was given none."""
+    """Raise `ConfigError` if `renderer` is not the GPU assigned to this process, or a GPU though none is assigned."""
     gpu = has_gpu()
     if gpu is None or renderer.asked_for or (renderer.cuda is not None if gpu else renderer.software):
         return
@@ -194,7 +194,7 @@ def _lavapipe() -> Path | None:
 
 def _has_egl() -> bool:
     try:
-        ctypes.CDLL("libEGL.so.1")  # without it `MUJOCO_GL=egl` makes `import mujoco` fail
+        ctypes.CDLL("libEGL.so.1")  # without this library, `MUJOCO_GL=egl` makes `import mujoco` fail
     except OSError:
         return False
     return True

@@ -1,7 +1,7 @@
 """Environments of Gymnasium behind the interface of `EvalEnv`, and PushT by its published protocol.
 
-`gymnasium/<id>`, for instance `gymnasium/Pendulum-v1` or `gymnasium/gym_pusht/PushT-v0`. Images and vectors that the
-observation space names are found by themselves; an environment without images is rendered. Everything else is an option
+`gymnasium/<id>`, for instance `gymnasium/Pendulum-v1` or `gymnasium/gym_pusht/PushT-v0`. Images and vectors in the
+observation space are found automatically; an environment without images is rendered. Everything else is an option
 of `Gymnasium`.
 """
 
@@ -26,7 +26,7 @@ from vlagents_ray.registry import require
 
 TERMINATED = "terminated"
 SUCCESS_KEYS = ("is_success", "success")
-RENDER = "render"  # instead of a path: the image of the environment's own renderer
+RENDER = "render"  # in place of a path: the image of the environment's own renderer
 _PATH = re.compile(r"(?P<keys>[^\[\]]*?)(?:\[(?P<start>-?\d*):(?P<stop>-?\d*)\])?")
 
 
@@ -43,7 +43,7 @@ class Known:
 
 
 def known(task: str) -> Known:
-    """Return the defaults for a Gymnasium id; empty ones if it is not known."""
+    """Return the default options for a Gymnasium id; empty if the id is not known."""
     if task == "gym_pusht/PushT-v0":
         return _PUSHT
     fetch = re.fullmatch(r"Fetch(\w+?)(?:Dense)?-v\d+", task)
@@ -97,8 +97,8 @@ _FETCH = BenchmarkProtocol(
 class Gymnasium(EvalEnv):
     """A Gymnasium environment with a continuous action vector, Box (D,).
 
-    Actions are clipped to the Box. Success is `info["is_success"]` or `info["success"]` where the environment gives
-    one; without it, and without the option `success`, no episode succeeds and only the returns are meaningful.
+    Actions are clipped to the Box. Success is `info["is_success"]` or `info["success"]` if the environment returns one.
+    Otherwise, and without the option `success`, no episode succeeds and only the returns are meaningful.
     """
 
     def __init__(
@@ -230,7 +230,7 @@ class Gymnasium(EvalEnv):
         self._steps += 1
         success = self._view.succeeded(info, bool(terminated))
         stopped = bool(truncated) or self._steps >= self.max_steps
-        # Unused images are rendered as well: rendering changes the state of some envs (the target of the Fetch tasks).
+        # Unused images are also rendered: rendering changes the state of some envs (the target of the Fetch tasks).
         return self._observe(nested), float(reward), bool(terminated), stopped, {**plain(info), "success": success}
 
     def close(self) -> None:
@@ -240,7 +240,7 @@ class Gymnasium(EvalEnv):
             env.close()
 
     def _make(self, max_steps: int | None) -> Any:
-        # pygame, which several environments draw with, prints a greeting on import otherwise
+        # pygame, the renderer of several environments, otherwise prints a greeting on import
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
         gymnasium = require("gymnasium")
         module = self._module
@@ -348,7 +348,7 @@ class View:
     """One environment's observations, actions and infos, by its spaces and the user's options."""
 
     def __init__(self, name: str, env: Any, mapped: Mapped) -> None:
-        """Read the spaces; raises `ConfigError` if an option does not fit them, or if actions are no vectors."""
+        """Read the spaces; raises `ConfigError` if an option does not fit them, or if actions are not vectors."""
         self._options = mapped
         self._low, self._high, self._dtype = bounds(env.action_space)
         if mapped.unit_actions and not np.isfinite([self._low, self._high]).all():
@@ -362,7 +362,7 @@ class View:
             raise ConfigError(f"{name}: gripper_range is {mapped.gripper_range}, want two different numbers")
 
     def observe(self, nested: Any, render: Callable[[], Any]) -> Obs:
-        """Return an observation of the environment as ours; `render` returns the picture of its own renderer."""
+        """Convert an observation of the environment to `Obs`; `render` returns the image of its own renderer."""
         cameras = {
             name: as_image(render() if pick.text == RENDER else pick.value(nested), name, self._options.size)
             for name, pick in self._cameras.items()
@@ -375,7 +375,7 @@ class View:
         return Obs(cameras, gripper, state)
 
     def command(self, act: Act, contract: Contract) -> np.ndarray:
-        """Return the action that the environment gets, (D,); raises `InvalidAction` if the policy's is not valid."""
+        """Convert an action to the environment's, (D,); raises `InvalidAction` if the policy's is not valid."""
         action = one_row(act, contract).astype(np.float64)
         if self._options.unit_actions:
             action = self._low + (action + 1) / 2 * (self._high - self._low)
@@ -416,7 +416,7 @@ class Pick:
 
     @classmethod
     def parse(cls, text: str) -> Pick:
-        """`"images/top"`, `"agent_pos"`, `"robot/qpos[0:7]"`, `"[2:]"`; `""` is the observation itself."""
+        """Parse a path: `"images/top"`, `"agent_pos"`, `"robot/qpos[0:7]"`, `"[2:]"`; `""` is the whole observation."""
         match = _PATH.fullmatch(text)
         if match is None:
             raise ConfigError(f"path {text!r}: want keys joined by '/', then perhaps a range, as in 'robot/qpos[0:7]'")
@@ -449,7 +449,7 @@ class Pick:
 
 
 def as_image(value: Any, name: str, size: tuple[int | None, int | None] = (None, None)) -> np.ndarray:
-    """Return (H, W, 3) uint8 RGB as a new array, stretched to `size` (height, width), px; None keeps a side."""
+    """Copy a value to an array (H, W, 3) uint8 RGB, stretched to `size` (height, width), px; None keeps a side."""
     image = np.asarray(value)
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
         raise ConfigError(f"camera {name!r}: got {image.shape} {image.dtype}, want (H, W, 3) uint8 RGB")
@@ -495,13 +495,13 @@ def uniform(bounds: np.ndarray) -> float | None:
 
 
 def parts(space: Any, render_mode: str | None) -> tuple[dict[str, str], dict[str, str]]:
-    """Return the cameras and state parts of an observation space, with a rendered camera if it has no image."""
+    """Return the cameras and state parts of an observation space; adds a rendered camera if there is no image."""
     cameras: dict[str, str] = {}
     state: dict[str, str] = {}
     pending = [("", space)]
     while pending:
         path, one = pending.pop(0)
-        if isinstance(one, Mapping):  # gymnasium.spaces.Dict is one
+        if isinstance(one, Mapping):  # gymnasium.spaces.Dict is a Mapping
             pending += [(f"{path}/{key}" if path else str(key), sub) for key, sub in one.items()]
         elif one.dtype == np.uint8 and len(one.shape) == 3 and one.shape[2] == 3:
             cameras[path or "front"] = path

@@ -1,11 +1,11 @@
-"""LIBERO: 130 table-top tasks of a Panda arm in MuJoCo, as the literature evaluates policies in them.
+"""LIBERO: 130 table-top tasks of a Panda arm in MuJoCo, evaluated as in the literature.
 
     with Libero("libero_spatial/0") as env:
         obs, _ = env.reset(seed=0, options={"init_state": 3})
         obs, reward, terminated, truncated, info = env.step(Act(action=np.zeros(7, np.float32)))
 
-The scenes' meshes and textures are in no package: `Libero.missing()` returns how to download them; nothing here does
-so.
+No package contains the meshes and textures of the scenes. `Libero.missing()` returns how to download them; this
+module downloads nothing.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ from vlagents_ray.registry import require
 
 _CONFIG = "LIBERO_CONFIG_PATH"
 VARIABLE = "LIBERO_ASSETS"
-_DATASET = "lerobot/libero-assets"  # hf-libero's own source of them
-_CACHE = Path(".cache") / "libero" / "assets"  # in the home, where hf-libero's own download puts them
+_DATASET = "lerobot/libero-assets"  # hf-libero's own source of the assets
+_CACHE = Path(".cache") / "libero" / "assets"  # in the home folder; hf-libero's own download writes there
 _NEEDED = ("articulated_objects", "scenes", "stable_hope_objects", "stable_scanned_objects", "turbosquid_objects")
 
 CURE = (
@@ -48,7 +48,7 @@ CURE = (
     f"set {VARIABLE} to that folder on every node, or the env's option `assets`"
 )
 CONTROL_HZ = 20.0  # robosuite's default, and the rate of the demonstrations
-_ATTEMPTS = 1000  # to place the scene's objects; one is enough nearly always
+_ATTEMPTS = 1000  # at placing the scene's objects; the first nearly always succeeds
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,36 +72,35 @@ SUITES: Mapping[str, Suite] = {
 class LiberoProtocol:
     """The conventions of an episode; comments state the differences of openpi and OpenVLA.
 
-    `max_steps` counts the policy's actions alone: peers count to `max_steps` plus the settling ones.
+    `max_steps` counts the actions of the policy only; openpi and OpenVLA also count the settling steps.
 
     The simulator draws whatever an initial state does not determine, such as the place of a cabinet, from
-    `simulator_seed`. It is seeded again for each episode, so that an episode does not depend on those
-    before it; openpi (7) and OpenVLA (0) seed once a task, so that their scenes shift a little from
-    episode to episode.
+    `simulator_seed`. It is seeded again for each episode, so that an episode does not depend on earlier ones; openpi
+    (7) and OpenVLA (0) seed once per task, so that their scenes shift a little from episode to episode.
 
-    MuJoCo's images are upside down. The demonstrations' were turned by 180 degrees for training (OpenVLA,
-    regenerate_libero_dataset.py; openpi takes them over), not flipped: they are upright, and mirrored left
+    MuJoCo's images are upside down. For training, those of the demonstrations were turned by 180 degrees (OpenVLA,
+    regenerate_libero_dataset.py, which openpi also uses), not flipped: they are upright, and mirrored left
     to right. Policies expect that.
     """
 
     max_steps: int
-    settling_steps: int = 10  # openpi and OpenVLA: the objects fall into place
+    settling_steps: int = 10  # openpi and OpenVLA: the objects settle
     settling_action: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0)  # still, gripper open
-    image_size: tuple[int, int] = (256, 256)  # height, width: rendered so by both; policies resize
+    image_size: tuple[int, int] = (256, 256)  # height, width: as openpi and OpenVLA render; policies resize
     cameras: Mapping[str, str] = field(default_factory=lambda: {"front": "agentview", "wrist": "robot0_eye_in_hand"})
     turned_180: Literal[True] = True
     simulator_seed: int = 7  # openpi's
     begins: tuple[str, ...] = ("seed", "reset", "set_init_state", "settle")  # in this order, for every episode
     control_hz: float = CONTROL_HZ
-    controller: str = "OSC_POSE"  # LIBERO's default: 0.05 m and 0.5 rad a unit, in the robot base's axes
-    gripper_open: float = -1.0  # of a policy's action: robosuite's, openpi's; OpenVLA's are 1 and 0
+    controller: str = "OSC_POSE"  # LIBERO's default: 0.05 m and 0.5 rad per unit, along the axes of the robot base
+    gripper_open: float = -1.0  # in a policy's action: robosuite's and openpi's; OpenVLA opens with 1, closes with 0
     gripper_closed: float = 1.0
     success: str = "the goal predicates hold after a step"  # LIBERO's `done`
-    stop_at_success: bool = True  # both end the episode there
+    stop_at_success: bool = True  # openpi and OpenVLA end the episode there
 
     @classmethod
     def of(cls, suite: str, **changes: Any) -> LiberoProtocol:
-        """Return the protocol of a suite with the changes that are not None."""
+        """Return the protocol of a suite, with those `changes` that are not None."""
         changed = {name: value for name, value in changes.items() if value is not None}
         return cls(**{"max_steps": SUITES[suite].max_steps} | changed)
 
@@ -124,7 +123,7 @@ class LiberoTask:
     suite: str
     number: int  # in the suite, as openpi and OpenVLA count
     name: str  # LIBERO's, e.g. "pick_up_the_milk_and_place_it_in_the_basket"
-    language: str  # the instruction that policies are given: LIBERO takes it from the name
+    language: str  # the instruction given to policies; LIBERO derives it from the name
     problem: Path  # its BDDL file
     states: Path  # its initial states
 
@@ -135,7 +134,7 @@ def task_names() -> list[str]:
 
 
 def require_suite(name: str) -> tuple[str, str]:
-    """Suite and task of "SUITE/NUMBER" or "SUITE/NAME"; `UnknownEnv` for an unknown suite, or too large a number."""
+    """Split "SUITE/NUMBER" or "SUITE/NAME"; raises `UnknownEnv` for an unknown suite or a number out of range."""
     suite, _, which = name.partition("/")
     if suite not in SUITES:
         raise UnknownEnv(
@@ -172,12 +171,12 @@ def find_task(name: str) -> LiberoTask:
 def read_states(path: Path) -> np.ndarray:
     """Return the initial states in a file, (N, D) float64: time, qpos and qvel of MuJoCo.
 
-    They are pickled numpy arrays, in torch's archives. LIBERO loads them as any pickle; here nothing but such an array
-    is let in.
+    The file is a torch archive of a pickled numpy array. LIBERO loads it as any pickle; here only such an array is
+    accepted.
     """
     torch = require("torch")
     numpys: list[Any] = [
-        (np.empty(0).__reduce__()[0], "numpy.core.multiarray._reconstruct"),  # where numpy 1 had it, and wrote it down
+        (np.empty(0).__reduce__()[0], "numpy.core.multiarray._reconstruct"),  # the name in pickles of numpy 1
         (codecs.encode, "_codecs.encode"),
         np.ndarray,
         np.dtype,
@@ -192,18 +191,18 @@ class Libero(SimulatorEnv):
     """One environment of one LIBERO task, e.g. "libero_spatial/0".
 
     Observation: cameras "front" (LIBERO's agentview) and "wrist" (its eye in hand), turned as policies
-    expect it, see `LiberoProtocol`; in `state` what policies for LIBERO take: `xyz_axis_angle` (6,), the end
-    effector in the world's frame, whose axes are the robot base's, m and rad, the angle in [0, 2 pi] as
+    expect them, see `LiberoProtocol`. In `state` the inputs of policies for LIBERO: `xyz_axis_angle` (6,), the end
+    effector in the world frame, whose axes are those of the robot base, m and rad, the angle in [0, 2 pi] as
     robosuite's quaternion gives it; `gripper_qpos` (2,) m, of the fingers; and `joints` (7,) rad. In
-    `info["sim_state"]`, for scripted experts only: `positions` of objects (3,) m in the world's frame, and
+    `info["sim_state"]`, for scripted experts only: `positions` of objects (3,) m in the world frame, and
     the `goal`.
 
-    Action: (7,) in [-1, 1]: the end effector's target moves by 0.05 m a unit along the base's axes, and
-    turns by 0.5 rad a unit about them, axis-angle; the last is the gripper, -1 opens, 1 closes, and only
+    Action: (7,) in [-1, 1]: the end effector's target moves by 0.05 m per unit along the base's axes, and
+    turns by 0.5 rad per unit about them, axis-angle; the last is the gripper: -1 opens, 1 closes, and only
     its sign counts.
 
-    An episode is a pure function of its initial state, `options["init_state"]`; where that is not given,
-    the seed chooses it, and otherwise the seed is the policy's alone.
+    An episode is a pure function of its initial state, `options["init_state"]`. Without that option the seed
+    selects the state; otherwise only the policy uses the seed.
     """
 
     suite, title = "libero", "LIBERO"
@@ -225,17 +224,17 @@ class Libero(SimulatorEnv):
         instruction: str | None = None,
         assets: str | None = None,
     ) -> None:
-        """Make the environment; raises the errors of `make_env`. Other options are those of most `SimulatorEnv`s.
+        """Make the environment; raises the errors of `make_env`. Other options are described in `SimulatorEnv`.
 
         Args:
             task: "SUITE/NUMBER", or "SUITE/NAME" with LIBERO's name.
-            settling_steps: None is the protocol's.
-            simulator_seed: Seed of whatever an initial state leaves open; None is the protocol's.
+            settling_steps: None selects the protocol's number.
+            simulator_seed: Seed of everything that an initial state leaves open; None selects the protocol's.
             stop_at_success: Report `terminated` when the task is solved.
-            gripper_open: The action's last number that opens the gripper; None is LIBERO's -1. OpenVLA
-                says 1, and 0 to close, which openvla's evaluation turns into LIBERO's as this does.
-            gripper_closed: The one that closes it; None is LIBERO's 1.
-            assets: The folder with LIBERO's meshes and textures; None is the one in LIBERO_ASSETS.
+            gripper_open: The last number of an action that opens the gripper; None selects LIBERO's -1. OpenVLA
+                opens with 1 and closes with 0; its own evaluation converts these to LIBERO's in the same way.
+            gripper_closed: The last number of an action that closes the gripper; None selects LIBERO's 1.
+            assets: The folder with LIBERO's meshes and textures; None selects the one in LIBERO_ASSETS.
         """
         super().__init__(f"libero/{task}", width=width, height=height, max_steps=max_steps)
         if (settling_steps or 0) < 0:
@@ -349,10 +348,10 @@ def _contract_of(protocol: LiberoProtocol) -> Contract:
 
 
 def to_simulator(action: np.ndarray, protocol: LiberoProtocol) -> np.ndarray:
-    """Return an action under `protocol`, (7,), as robosuite takes it: the gripper -1 to open, 1 to close, 0 to stay.
+    """Convert an action under `protocol`, (7,), to robosuite's: the gripper -1 to open, 1 to close, 0 to stay.
 
-    Closer to `gripper_open` means open, as in openvla's evaluation, which binarises, and as robosuite's own
-    gripper does, of whose command only the sign counts.
+    A value closer to `gripper_open` than to `gripper_closed` opens, as in openvla's evaluation, which binarises it,
+    and in robosuite, whose gripper only reads the sign.
     """
     middle = (protocol.gripper_open + protocol.gripper_closed) / 2
     command = np.sign((action[6] - middle) * (protocol.gripper_closed - protocol.gripper_open))
@@ -360,11 +359,10 @@ def to_simulator(action: np.ndarray, protocol: LiberoProtocol) -> np.ndarray:
 
 
 def axis_angle(quaternion: np.ndarray) -> np.ndarray:
-    """Return a unit quaternion xyzw to axis times angle, (3,) rad, the angle in [0, 2 pi].
+    """Convert a unit quaternion xyzw to axis times angle, (3,) rad, the angle in [0, 2 pi].
 
-    As robosuite's `quat2axisangle`, q and -q give different ones: policies were trained on states in which
-    no sign was normalised. For a gripper that points down w is near 0, and a state that chose the sign by it
-    would jump.
+    As in robosuite's `quat2axisangle`, q and -q give different results: policies were trained on states whose sign was
+    not normalised. For a gripper that points down w is near 0, so a normalised state would jump.
     """
     w = min(max(float(quaternion[3]), -1.0), 1.0)
     sine = math.sqrt(1.0 - w * w)
@@ -397,7 +395,7 @@ class LiberoSimulation:
             camera_names=list(protocol.cameras.values()),
             camera_heights=protocol.image_size[0],
             camera_widths=protocol.image_size[1],
-            horizon=protocol.settling_steps + protocol.max_steps + 1,  # so that robosuite's own limit has no effect
+            horizon=protocol.settling_steps + protocol.max_steps + 1,  # robosuite's own limit has no effect
         )
         self._cameras = CameraRenderer(self._env.env)
 
@@ -405,7 +403,7 @@ class LiberoSimulation:
         """Seed, reset, set the initial `state`, (D,) float64, and let the objects settle."""
         settling = self._protocol.settling_steps
         self._use_assets()
-        self._cameras.make_current()  # the last episode's rendering resources are freed in their own context
+        self._cameras.make_current()  # frees the rendering resources of the last episode in their own context
         self._cameras.open = False
         with seeded(self._protocol.simulator_seed):
             self._reset()
@@ -419,7 +417,7 @@ class LiberoSimulation:
         return SimulatorObs(raw, bool(success))
 
     def step(self, action: np.ndarray, *, look: bool = True) -> SimulatorObs:
-        """Execute an action, (7,) float64, clipped to [-1, 1] by the controller; without `look` nothing is rendered."""
+        """Execute an action, (7,) float64, clipped to [-1, 1] by the controller; without `look`, render nothing."""
         self._cameras.open = look
         raw, _, success, _ = self._env.step(action)
         return SimulatorObs(raw, bool(success))
@@ -443,7 +441,7 @@ class LiberoSimulation:
         self._env.close()
 
     def _reset(self) -> None:
-        """Do the work of `OffScreenRenderEnv.reset`, which itself repeats it after any error, without end."""
+        """Replace `OffScreenRenderEnv.reset`, which repeats itself after any error, without end."""
         crowded = require("robosuite.utils.errors").RandomizationError
         for _ in range(_ATTEMPTS):
             try:
@@ -454,7 +452,7 @@ class LiberoSimulation:
         raise EnvFailed(f"the scene's objects found no place in {_ATTEMPTS} draws")
 
     def _use_assets(self) -> None:
-        self._package._assets_path_cache = str(self._assets)  # global in the process: another env may have set it
+        self._package._assets_path_cache = str(self._assets)  # per process: another env may have set another
 
 
 def package_folder() -> Path:
@@ -485,16 +483,16 @@ def import_libero() -> Path:
 
 @contextlib.contextmanager
 def _own_config(folder: Path) -> Iterator[None]:
-    """A configuration of this process alone.
+    """Give LIBERO a configuration for this process alone.
 
-    LIBERO reads one from the home, or else asks on stdin and writes it there. Only helpers that are not used here need
-    its paths, so it is removed after the import.
+    LIBERO reads one from the home folder, or else prompts on stdin and writes it there. Only helpers that are not used
+    here need its paths, so it is removed after the import.
     """
     parts = {"assets": "assets", "bddl_files": "bddl_files", "datasets": "datasets", "init_states": "init_files"}
     paths = {"benchmark_root": str(folder)} | {key: str(folder / name) for key, name in parts.items()}
     before = os.environ.get(_CONFIG)
     with tempfile.TemporaryDirectory(prefix="libero-config-") as own:
-        Path(own, "config.yaml").write_text(json.dumps(paths))  # JSON is YAML
+        Path(own, "config.yaml").write_text(json.dumps(paths))  # JSON is valid YAML
         os.environ[_CONFIG] = own
         try:
             yield
@@ -520,6 +518,6 @@ def find_assets(chosen: str | None = None) -> Path:
 
 
 def assets_digest(folder: Path) -> str:
-    """Return a digest of a folder, which is equal if relative paths and sizes of all files are."""
+    """Return a digest of a folder, which is equal for equal relative paths and sizes of all files."""
     files = sorted((str(path.relative_to(folder)), path.stat().st_size) for path in folder.rglob("*") if path.is_file())
     return hashlib.sha256(repr(files).encode()).hexdigest()[:16]

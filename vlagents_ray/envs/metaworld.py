@@ -22,7 +22,7 @@ from vlagents_ray.registry import require
 PROTOCOL = BenchmarkProtocol(
     name="Meta-World",
     source="Meta-World 3.1.1, metaworld.evaluation and MT1",
-    max_steps=500,  # the simulator refuses to go further
+    max_steps=500,  # the simulator refuses further steps
     control_hz=80.0,
     control="position of the hand, delta",
     success="the task is solved after any step: success_once",
@@ -36,15 +36,15 @@ _UPSIDE_DOWN = ("corner2",)  # cameras that Meta-World mounts upside down; the o
 class MetaWorld(SimulatorEnv):
     """One environment of one Meta-World task, e.g. "reach-v3".
 
-    Observation: cameras, by default "corner2", turned upright; `state["xyz"]` (3,) m, the hand in
-    the world's frame, and `gripper`; in `info["sim_state"]`, (39,) float64, Meta-World's observation
-    with the goal in it, which its oracles need to the bit.
+    Observation: cameras, by default "corner2", turned upright; `state["xyz"]` (3,) m, the hand in the world frame, and
+    `gripper`; in `info["sim_state"]`, (39,) float64, Meta-World's observation including the goal, which its oracles
+    need bit for bit.
 
-    Action: (4,) in [-1, 1]: the hand's target moves by 0.01 m a unit, x, y, z in the world's frame;
-    the last is the gripper's effort, -1 opens, 1 closes.
+    Action: (4,) in [-1, 1]: the hand's target moves by 0.01 m per unit, x, y, z in the world frame; the last is the
+    gripper's effort: -1 opens, 1 closes.
 
-    The seed draws the object's and the goal's position, as Meta-World's own generator of tasks does;
-    with `goals_seed` they are the 50 that its MT1 draws with that, in order. Success ends the episode
+    The seed draws the positions of the object and the goal, as Meta-World's own generator of tasks does.
+    With `goals_seed` the initial states are the 50 that MT1 draws with that seed, in order. Success ends the episode
     unless `ends_on_success` is False.
     """
 
@@ -66,15 +66,15 @@ class MetaWorld(SimulatorEnv):
         ends_on_success: bool = True,
         camera_positions: Mapping[str, Sequence[float]] | None = None,
     ) -> None:
-        """Make the environment; raises the errors of `make_env`. Other options are those of most `SimulatorEnv`s.
+        """Make the environment; raises the errors of `make_env`. Other options are described in `SimulatorEnv`.
 
         Args:
             task: Meta-World's name.
             cameras: MuJoCo's names, e.g. "corner2", "gripperPOV".
-            instruction: None is the task's name in words.
+            instruction: None selects the task's name in words.
             max_steps: 500 at most.
-            goals_seed: Seed of MT1, whose 50 initial states are then the task's; None: each episode's seed draws one.
-            camera_positions: Name -> (x, y, z) m, of cameras that stand elsewhere than in Meta-World.
+            goals_seed: The seed of MT1, whose 50 initial states are used; None: the seed of each episode draws one.
+            camera_positions: Name -> (x, y, z) m, of cameras that are moved from their place in Meta-World.
         """
         if max_steps > PROTOCOL.max_steps:
             raise ConfigError(f"metaworld: max_steps is {max_steps}, want at most {PROTOCOL.max_steps}: there it stops")
@@ -89,7 +89,7 @@ class MetaWorld(SimulatorEnv):
             self._resources.callback(env.close)
             # as Meta-World does for its classes with an observable goal, but with our seed
             env._partially_observable = False
-            del env.sawyer_observation_space  # cached, and clips the goal away
+            del env.sawyer_observation_space  # it is cached, and clips the goal away
             env._freeze_rand_vec = False
             env._set_task_called = True
             env.seeded_rand_vec = True
@@ -107,7 +107,7 @@ class MetaWorld(SimulatorEnv):
 
     @classmethod
     def known_contract(cls, arguments: Mapping[str, Any]) -> Contract:
-        """Return the contract without the control rate, which only the simulator has."""
+        """Return the contract without the control rate, which only the simulator knows."""
         return Contract(
             cameras={name: CameraSpec(arguments["height"], arguments["width"]) for name in arguments["cameras"]},
             state={"xyz": StateSpec(3, "m")},
@@ -135,7 +135,7 @@ class MetaWorld(SimulatorEnv):
 
     @classmethod
     def require_task(cls, task: str | None) -> None:
-        if cls.tasks():  # else Meta-World is not installed
+        if cls.tasks():  # empty if Meta-World is not installed
             super().require_task(task)
 
     def describe(self) -> dict[str, Any]:

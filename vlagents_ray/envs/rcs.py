@@ -1,7 +1,7 @@
 """RCS, the Robot Control Stack, in MuJoCo, and DuoBench, the benchmark for two arms that is built on it.
 
-Both need packages that contradict the simulators of this package's extras, and RCS is AGPL-3: they
-need a separate Python environment, requirements/rcs.txt. See docs/benchmarks/rcs.md.
+Both need a separate Python environment, requirements/rcs.txt: their packages conflict with the simulators of this
+package's extras, and RCS is AGPL-3. See docs/benchmarks/rcs.md.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ ControlMode = Literal["joints", "xyzrpy", "tquat"]
 
 @dataclass(frozen=True, slots=True)
 class RcsTask:
-    """The settings that make a task of a scene which RCS has registered with Gymnasium."""
+    """The settings that turn a scene registered by RCS with Gymnasium into a task."""
 
     id: str  # Gymnasium's id of the scene
-    module: str | None  # module that registers it; None if the user names it
+    module: str | None  # the module that registers it; None if the user names it
     protocol: BenchmarkProtocol | None = None  # None: the user sets `max_steps`
-    control_mode: ControlMode = "joints"  # of an action, absolute by default
+    control_mode: ControlMode = "joints"  # of an action; absolute by default
     control_hz: float = 30.0
     instruction: str = ""  # used if the simulator's info has none
-    prepare: Callable[[Any], None] = lambda _config: None  # puts the task into RCS's configuration of a scene without
+    prepare: Callable[[Any], None] = lambda _config: None  # adds the task to a scene without one
 
 
 def _pick(config: Any) -> None:
@@ -94,7 +94,7 @@ DUOBENCH_TASKS = {
 }
 
 
-# Where this one is not, `import rcs` and `import duobench` download all assets (rcs-core 0.7.3, rcs/__init__.py).
+# Without this file, `import rcs` and `import duobench` download all assets (rcs-core 0.7.3, rcs/__init__.py).
 _REQUIRED = Path("assets/scenes/empty_world/scene.xml")
 
 
@@ -102,7 +102,7 @@ _REQUIRED = Path("assets/scenes/empty_world/scene.xml")
 class _Assets:
     """The location of a package's assets, and their download."""
 
-    variable: str  # variable that names their folder
+    variable: str  # the environment variable that names the folder
     folder: str  # in the home folder, if the variable is not set
     cure: str = ""  # further steps beside `import`
 
@@ -118,7 +118,7 @@ _ASSETS = {
 
 
 def missing_packages(*packages: str) -> str | None:
-    """Say why the packages, "rcs" or "duobench", cannot be imported here without a download; None if they can."""
+    """Return why the packages, "rcs" or "duobench", cannot be imported here without a download; None if they can."""
     for package in packages:
         if importlib.util.find_spec(package) is None:
             return (
@@ -136,13 +136,13 @@ def missing_packages(*packages: str) -> str | None:
 
 
 def creator(task: RcsTask, name: str) -> Any:
-    """Return RCS's maker of a scene; raises `MissingDependency` where RCS would download."""
+    """Return RCS's factory of a scene; raises `MissingDependency` if RCS would download."""
     reason = missing_packages("rcs", *({"duobench"} & {task.id.partition("/")[0]}))
     if reason is not None:
         raise MissingDependency(f"{name}: {reason}")
     require(task.module or task.id.partition("/")[0])
     rcs = require("rcs")
-    # DuoBench registers another scene under this name when it is imported; no episode may depend on that
+    # DuoBench registers another scene under this name on import, and episodes must not depend on that
     rcs.SCENE_PATHS["empty_world"] = str(Path(rcs.RCS_PREFIX) / _REQUIRED)
     gymnasium = require("gymnasium")
     if task.id not in gymnasium.registry:
@@ -164,10 +164,17 @@ def configure(
     size: Size,
     cameras: Sequence[str] | None,
 ) -> None:
-    """Set up a scene's configuration for an evaluation; sizes are (height, width) in pixels.
+    """Configure a scene for an evaluation: without a window, and as fast as it can.
 
-    `env` is the env's name, for messages. The simulation runs without a window, as fast as it can, and for
-    1 / `control_hz` s a step, whether or not the arms have arrived.
+    Args:
+        config: RCS's configuration of the scene, which is changed.
+        env: The env's name, for errors.
+        control_mode: The quantity that an action commands.
+        delta: Whether commands are relative to the arm's current position.
+        control_hz: Steps per second of simulated time, whether or not the arms have reached their targets.
+        binary_gripper: Whether the gripper only opens or closes.
+        size: (height, width) of each image, pixels.
+        cameras: Cameras of the scene to render; None selects all.
     """
     base = require("rcs.envs.base")
     config.headless = True
@@ -180,7 +187,7 @@ def configure(
         "tquat": base.ControlMode.CARTESIAN_TQuat,
     }[control_mode]
     config.relative_to = base.RelativeTo.LAST_STEP if delta else base.RelativeTo.NONE
-    config.max_relative_movement = None  # RCS's own: none for absolute commands; 0.5 m, 90 degrees, 5 degrees a joint
+    config.max_relative_movement = None  # RCS's default: none for absolute; 0.5 m, 90 degrees, 5 degrees a joint
     config.wrapper_cfg.binary_gripper = binary_gripper
     have = config.camera_cfgs or {}
     require_cameras(env, cameras or (), have)
@@ -208,14 +215,14 @@ _COMMANDS: dict[ControlMode, tuple[str, Rotation]] = {
 class Rcs(SimulatorEnv):
     """One environment of one task: "pick", or the id of any scene with a task that RCS has registered.
 
-    Observation: the scene's cameras; of each arm `joints` rad, `tquat` and `xyzrpy`, the tool's pose
-    in the frame that all arms share; the gripper, 1 = open: see `Arms` for the names with several.
-    `info["objects"]` is {joint: (7,) float64}, the pose of each loose body in the world's frame, metres
-    and quaternion wxyz: for scripted experts only.
+    Observation: the scene's cameras; for each arm `joints` rad, `tquat` and `xyzrpy`, the tool's pose in the frame that
+    all arms share; the gripper, 1 = open. `Arms` describes the names for several arms. `info["objects"]` is {joint:
+    (7,) float64}, the pose of each loose body in the world frame, metres and quaternion wxyz: for scripted experts
+    only.
 
     Action: for each arm its command in `control_mode`, then its gripper, which closes at 0.5 and below.
 
-    Success is the simulator's, and ends the episode. The seed places the objects.
+    The simulator reports success, which ends the episode. The seed places the objects.
     """
 
     suite = "rcs"
@@ -238,16 +245,16 @@ class Rcs(SimulatorEnv):
         instruction: str | None = None,
         max_steps: int | None = None,
     ) -> None:
-        """Make the environment; raises the errors of `make_env`. Other options are those of most `SimulatorEnv`s.
+        """Make the environment; raises the errors of `make_env`. Other options are described in `SimulatorEnv`.
 
         Args:
             task: One of `tasks()`, or Gymnasium's id of a scene, "lab/shelf"; None is the first of `tasks()`.
-            module: Imported first, because it registers the id; by default the id's namespace.
-            control_mode: "joints", "tquat" or "xyzrpy"; None is the protocol's.
-            delta: Commands are relative to where the arm is.
-            control_hz: Steps a second; None is the protocol's.
-            binary_gripper: It opens or closes; False: the command is its opening.
-            cameras: Which of the scene's to give; None is all.
+            module: The module that registers the id, imported first; by default the id's namespace.
+            control_mode: "joints", "tquat" or "xyzrpy"; None selects the protocol's.
+            delta: Whether commands are relative to the arm's current position.
+            control_hz: Steps per second; None selects the protocol's.
+            binary_gripper: Whether the gripper only opens or closes; if not, the command is its opening.
+            cameras: Cameras of the scene to return; None selects all.
         """
         task = self.tasks()[0] if task is None else task
         self._task = self._find(task, module)
@@ -328,7 +335,7 @@ class Rcs(SimulatorEnv):
         raw, reward, terminated, _, info = self._env.step(self._arms.command(action))
         if "success" not in info:
             raise ConfigError(f"{self._name} does not say what success is: want a scene with a task")
-        task_info = {key: value for key, value in info.items() if key not in self._arms.names}  # without that of arms
+        task_info = {key: value for key, value in info.items() if key not in self._arms.names}  # drops entries of arms
         outcome = {**plain(task_info), "success": bool(info["success"])}
         return self._observe(raw), float(reward), bool(terminated), outcome
 
@@ -353,7 +360,7 @@ class Rcs(SimulatorEnv):
 class DuoBench(Rcs):
     """DuoBench's eleven tasks of two FR3 arms, "left" and "right", named without "duobench/".
 
-    An action has 16 numbers: the left arm's seven joints, rad, its gripper, then the right arm's. The
+    An action has 16 numbers: the left arm's seven joints, rad, and its gripper, then those of the right arm. The
     reward is the share of the task's stages reached; a step's info has `stage` and `max_stage`.
     """
 
@@ -368,15 +375,15 @@ def _loose_joints(model: Any) -> list[str]:
 
 
 class Arms:
-    """Translates between RCS's dicts, keyed by robot, and what policies see.
+    """Translates between RCS's dicts, keyed by robot, and the observations and actions of policies.
 
-    The parts of a single arm's state have plain names, `joints`; those of several begin with the
-    arm's, `left/joints`, and so does the gripper, which then is a part of the state, (1,). In a row of
-    the action each arm has its command, then its gripper, 1 = open; the arms follow each other.
+    The parts of a single arm's state have plain names, `joints`. With several arms, names begin with that of
+    the arm, `left/joints`, and the gripper is also a part of the state, (1,). A row of the action has the command and
+    then the gripper, 1 = open, of each arm in turn.
     """
 
     def __init__(self, actions: Mapping[str, Any], observations: Mapping[str, Any], mode: ControlMode) -> None:
-        """`actions` and `observations` are RCS's spaces: robot -> part -> Box (D,)."""
+        """Read RCS's spaces: `actions` and `observations` map robot -> part -> Box (D,)."""
         self.names = tuple(actions)
         self.single = len(self.names) == 1
         self._mode = mode
@@ -389,7 +396,7 @@ class Arms:
         }
         if not self.single:
             self.state |= {self._key(name, "gripper"): StateSpec(1) for name in self.names if name in self._grippers}
-        self.has_gripper = self.single and bool(self._grippers)  # that `Obs.gripper` can tell
+        self.has_gripper = self.single and bool(self._grippers)  # whether `Obs.gripper` can report it
 
     def action_spec(self, *, delta: bool) -> ActionSpec:
         space, rotation = _COMMANDS[self._mode]

@@ -1,7 +1,7 @@
-"""A probe whether this machine can render, which renders one frame in a child process.
+"""A probe that finds out whether this machine can render.
 
-A broken driver may hang or crash the process that loads it, so the attempt is made in a child with a
-time-out, and only once: the answers are cached for the life of the process.
+It renders one frame in a child process with a time-out, because a broken driver may hang or crash the process that
+loads it. The result is cached for the life of the process.
 
     probe = render_probe()                  # Vulkan, as SAPIEN (ManiSkill 3) uses it
     probe.ok, probe.device, probe.cure      # True, "llvmpipe (LLVM 15.0.6, 256 bits)", None
@@ -62,7 +62,7 @@ class RenderProbe:
     api: Literal["vulkan", "egl"]
     ok: bool
     seconds: float  # the child's run time, imports included
-    device: str | None = None  # the driver's name of it; "llvmpipe ..." is Mesa's software driver
+    device: str | None = None  # the driver's name of the device; "llvmpipe ..." is Mesa's software driver
     error: str | None = None
     cure: str | None = None
     devices: tuple[EglDevice, ...] = ()  # all devices of EGL, if EGL was tried
@@ -81,14 +81,14 @@ def egl_probe(timeout_s: float = TIMEOUT_S) -> RenderProbe:
 
 
 def without(modules: Sequence[str], cure: str) -> str | None:
-    """Say which of these modules is not installed, with the cure; None if all are."""
+    """Return which of these modules are not installed, with the cure; None if all are."""
     missing = next((module for module in modules if importlib.util.find_spec(module) is None), None)
     return None if missing is None else f"{missing} is not installed; {cure}"
 
 
 @contextlib.contextmanager
 def failing(env: str, doing: str) -> Iterator[None]:
-    """Turn the errors of a simulator that renders through EGL into `EnvFailed`; this package's own errors pass."""
+    """Turn errors of a simulator that renders through EGL into `EnvFailed`; errors of this package pass unchanged."""
     try:
         yield
     except VLAgentsError:
@@ -100,25 +100,26 @@ def failing(env: str, doing: str) -> Iterator[None]:
 
 
 def vulkan_cure() -> str:
-    """Return the cure on this machine if SAPIEN finds no rendering device."""
+    """Return the cure for this machine if SAPIEN finds no rendering device."""
     nvidia = Path("/dev/nvidiactl").exists() or shutil.which("nvidia-smi") is not None
     return VULKAN_CURE_NVIDIA if nvidia else VULKAN_CURE
 
 
 def vulkan_device(*, on_gpu: bool) -> tuple[str, int | None] | None:
-    """Return the device on which SAPIEN renders in this process, as `usable_devices` does."""
+    """Return the name and CUDA number of the device on which SAPIEN renders in this process; see `usable_devices`."""
     import sapien.render
 
     usable = usable_devices(sapien.render.get_device_summary())
-    usable.sort(key=lambda device: (device[1] is not None) != on_gpu)  # stable: otherwise SAPIEN's order
+    usable.sort(key=lambda device: (device[1] is not None) != on_gpu)  # a stable sort keeps SAPIEN's order otherwise
     return usable[0] if usable else None
 
 
 def usable_devices(summary: str) -> list[tuple[str, int | None]]:
     """List the devices that SAPIEN's `summary` calls supported, in its order.
 
-    Of each the name, "llvmpipe (LLVM 15.0.6, 256 bits)", and its number among the CUDA devices of this process; None if
-    CUDA does not know it.
+    Returns:
+        For each device its name, such as "llvmpipe (LLVM 15.0.6, 256 bits)", and its number among the CUDA devices of
+        this process; None if CUDA does not know it.
     """
     found = []
     for block in summary.split("GPU:")[1:]:
@@ -131,7 +132,7 @@ def usable_devices(summary: str) -> list[tuple[str, int | None]]:
 
 
 def _probed(api: Literal["vulkan", "egl"], module: str, extra: str, cure: str, timeout_s: float) -> RenderProbe:
-    """Render one frame in a child by `module`, which an extra installs."""
+    """Render one frame in a child process with `module`, which the extra `extra` installs."""
     if importlib.util.find_spec(module) is None:
         error, cure = f"{module} is not installed", f"pip install 'vlagents-ray[{extra}]'"
         return RenderProbe(api, ok=False, seconds=0.0, error=error, cure=cure)

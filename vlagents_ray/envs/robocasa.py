@@ -26,7 +26,7 @@ from vlagents_ray.interface import Obs
 from vlagents_ray.registry import require
 
 CONTROL_HZ = 20.0
-SIZE = 256  # of each image, pixels: the datasets', and those that RoboCasa's own Gymnasium environments render
+SIZE = 256  # px, of each image, as in the datasets and in RoboCasa's own Gymnasium environments
 CAMERAS = ("robot0_agentview_left", "robot0_agentview_right", "robot0_eye_in_hand")
 
 Split = Literal["target", "pretrain"]
@@ -35,8 +35,8 @@ SPLITS: tuple[Split, ...] = get_args(Split)
 ActionOrder = Literal["base_first", "arm_first"]
 ACTION_ORDERS: tuple[ActionOrder, ...] = get_args(ActionOrder)
 
-# RoboCasa's three sets of tasks with their horizons in steps, from version 1.0.1, dataset_registry.py: those of 1.0.0
-# times one and a half.
+# RoboCasa's three sets of tasks with their horizons in steps, from dataset_registry.py of version 1.0.1: 1.5 times
+# those of 1.0.0.
 ATOMIC_SEEN: Mapping[str, int] = {
     "CloseBlenderLid": 900,
     "CloseFridge": 900,
@@ -100,20 +100,20 @@ _KITCHENS: Mapping[str, str] = {
     "pretrain": "one of the 2500 pretraining kitchens, with the pretraining objects",
 }
 
-REGISTRIES = ("objaverse", "lightwheel")  # of objects, those that RoboCasa draws from
+REGISTRIES = ("objaverse", "lightwheel")  # sets of objects from which RoboCasa draws
 TYPES = {"textures": "tex", "fixtures/stoves": "fixtures_lw"} | {
     "objects/objaverse": "objs_objaverse",
     "objects/lightwheel": "objs_lw",
 }  # folder -> RoboCasa's name of the download that fills it
 
-# robosuite's hand, gripper, base, torso and mode, in the datasets' order
+# hand, gripper, base, torso, mode: robosuite's order, from the order of the datasets
 _FROM_BASE_FIRST = [*range(5, 12), *range(5)]
 _GRIPPER, _MODE = 6, 11  # in robosuite's order
-_ON = 0.5  # the threshold of RoboCasa's own Gymnasium environments, so that -1 and 1 serve as well as 0 and 1
+_ON = 0.5  # the threshold of RoboCasa's own Gymnasium environments: both {-1, 1} and {0, 1} work
 
 
 def protocol(task: str, split: Split) -> BenchmarkProtocol:
-    """Return the protocol of a task in the kitchens of a split; both splits are published."""
+    """Return the protocol of a task in the kitchens of `split`; results are published for both splits."""
     return BenchmarkProtocol(
         name=f"RoboCasa365, split {split}",
         source="Nasiriany et al. 2026, arXiv 2603.04356; robocasa 1.0.1, docs/benchmarking and dataset_registry.py",
@@ -122,7 +122,7 @@ def protocol(task: str, split: Split) -> BenchmarkProtocol:
         control="pose of the hand, delta, by OSC_POSE: 0.05 m and 0.5 rad a unit; velocity of the base",
         success="RoboCasa's own check of the task holds after a step",
         begins=f"{_KITCHENS[split]}, and where everything stands and lies in it: the seed's",
-        ends_on_success=True,  # as openpi's evaluation; GR00T's looks at the end of each chunk of 16 steps
+        ends_on_success=True,  # as in openpi's evaluation; GR00T's checks success at the end of each chunk of 16 steps
         episodes=50,
     )
 
@@ -131,13 +131,13 @@ class RoboCasa(RobosuiteEnv):
     """One environment of one of RoboCasa365's tasks, e.g. "OpenDrawer": a Panda arm on an Omron base, in a kitchen.
 
     Observation: cameras by RoboCasa's names, upright; in `state`, by the names of its datasets, `base_position` (3,) m
-    and `base_rotation` (4,) xyzw in the world's frame, `end_effector_position_relative` (3,) m and
-    `end_effector_rotation_relative` (4,) xyzw of the hand in the base's frame, `gripper_qpos` (2,) m of the fingers.
+    and `base_rotation` (4,) xyzw in the world frame, `end_effector_position_relative` (3,) m and
+    `end_effector_rotation_relative` (4,) xyzw of the hand in the base frame, `gripper_qpos` (2,) m of the fingers.
 
-    Action: (12,) in [-1, 1]: the base's velocity forward and to the left (1 m/s a unit) and about its axis (1.5 rad/s a
-    unit), the torso's height; the mode, at least 0.5 where the base moves and the hand shall move with it; the hand's
-    target, which moves by 0.05 m a unit along the base's axes, and turns by 0.5 rad a unit about them, axis-angle; the
-    gripper, which closes at 0.5 or more, and opens below that.
+    Action: (12,) in [-1, 1]: the base's velocity forward and to the left (1 m/s per unit) and about its axis (1.5 rad/s
+    per unit); the torso's height; the mode, at least 0.5 to move the base together with the hand; the hand's target,
+    which moves by 0.05 m per unit along the base's axes and turns by 0.5 rad per unit about them, axis-angle; the
+    gripper, which closes at 0.5 or more and opens below that.
     """
 
     suite, title = "robocasa", "RoboCasa"
@@ -164,15 +164,15 @@ class RoboCasa(RobosuiteEnv):
         max_steps: int | None = None,
         ends_on_success: bool = True,
     ) -> None:
-        """Make the environment; raises the errors of `make_env`. Other options are those of most `SimulatorEnv`s.
+        """Make the environment; raises the errors of `make_env`. Other options are described in `SimulatorEnv`.
 
         Args:
             task: RoboCasa's name, one of `tasks()`.
             split: The kitchens and objects: "target" or "pretrain".
-            cameras: RoboCasa's names; None are the protocol's three.
+            cameras: RoboCasa's names; None selects the protocol's three cameras.
             action_order: "base_first", the order of an action in RoboCasa365's datasets, or "arm_first": hand,
-                gripper, base, torso, mode, as RoboCasa's `convert_action` and LeRobot's environment have it.
-            object_registries: The sets of objects that are drawn from; the protocol has both.
+                gripper, base, torso, mode, the order of RoboCasa's `convert_action` and of LeRobot's environment.
+            object_registries: The sets of objects to draw from; the protocol uses both.
         """
         self.require_task(task)
         super().__init__(f"robocasa/{task}", width=width, height=height, max_steps=max_steps)
@@ -202,7 +202,7 @@ class RoboCasa(RobosuiteEnv):
                 camera_widths=width or SIZE,
                 renderer="mujoco",  # as in envs/robosuite
             )
-            made.use_camera_obs = made.has_offscreen_renderer = bool(images)  # before the first reset, which loads it
+            made.use_camera_obs = made.has_offscreen_renderer = bool(images)  # before the first reset loads the model
             self._use(made)
         self._versions = {"robocasa": simulator.__version__, "robosuite": simulator.robosuite.__version__}
 
@@ -219,10 +219,10 @@ class RoboCasa(RobosuiteEnv):
 
     @classmethod
     def known_contract(cls, arguments: Mapping[str, Any]) -> Contract:
-        """Return the contract; names of the state are those of RoboCasa365's datasets."""
+        """Return the contract; the state has the names of RoboCasa365's datasets."""
         chosen = CAMERAS if arguments["cameras"] is None else arguments["cameras"]
         size = CameraSpec(arguments["height"] or SIZE, arguments["width"] or SIZE)
-        last = arguments["action_order"] == "base_first"  # where the gripper is last, as it is in other envs
+        last = arguments["action_order"] == "base_first"  # the gripper is the last number, as in other envs
         return Contract(
             cameras=dict.fromkeys(chosen, size),
             state={
@@ -263,7 +263,7 @@ class RoboCasa(RobosuiteEnv):
     def _begin(self, seed: int, state: int) -> tuple[Obs, dict[str, Any]]:
         obs, _ = super()._begin(seed, state)
         facts = self._env.get_ep_meta()
-        self._instruction = str(facts["lang"])  # it names this kitchen's things
+        self._instruction = str(facts["lang"])  # mentions objects of this kitchen
         return obs, {"layout": int(facts["layout_id"]), "style": int(facts["style_id"])}
 
     @classmethod
@@ -282,9 +282,9 @@ class RoboCasa(RobosuiteEnv):
 
 
 def require_assets(registries: Sequence[str] = REGISTRIES) -> None:
-    """Raise `EnvFailed` if textures, appliances or the objects of one of `registries` are not there, with the cure."""
+    """Raise `EnvFailed`, with the cure, if textures, appliances or the objects of one of `registries` are missing."""
     spec = importlib.util.find_spec("robocasa")
-    if spec is None or spec.origin is None:  # `require` raises the better error
+    if spec is None or spec.origin is None:  # `require` raises a better error
         return
     folder = Path(spec.origin).parent / "models" / "assets"
     wanted = ["textures", "fixtures/stoves", *(f"objects/{name}" for name in registries)]

@@ -1,4 +1,4 @@
-"""robosuite's tasks of the robomimic study: Panda arms over a table in MuJoCo.
+"""robosuite's tasks of the robomimic study: Panda arms at a table in MuJoCo.
 
 with Robosuite("Lift") as env:
     obs, _ = env.reset(seed=0)
@@ -26,17 +26,17 @@ from vlagents_ray.errors import ConfigError, EnvFailed
 from vlagents_ray.interface import Obs
 from vlagents_ray.registry import require
 
-_OPEN_M = 0.04  # a finger's travel from closed to open
+_OPEN_M = 0.04  # m, travel of a finger from closed to open
 
 
 class RobosuiteEnv(SimulatorEnv):
-    """One environment of robosuite's; a subclass makes the simulator and hands it to `_use`.
+    """One environment of robosuite; a subclass makes the simulator and passes it to `_use`.
 
     `info["sim_state"]`, for scripted experts only, has the positions and quaternions xyzw of objects.
     """
 
     _raw: Mapping[str, str] = {}
-    """What robosuite calls parts of the contract's state, of those that it calls otherwise."""
+    """Names in the contract's state -> robosuite's names, where they differ."""
 
     def _use(self, simulator: Any) -> None:
         self._env, self._renderer = simulator, CameraRenderer(simulator)
@@ -45,15 +45,15 @@ class RobosuiteEnv(SimulatorEnv):
 
     def _begin(self, seed: int, state: int) -> tuple[Obs, dict[str, Any]]:
         with seeded(seed):
-            if hasattr(self._env, "rng"):  # robosuite 1.5 has its own generator, which its parts share
+            if hasattr(self._env, "rng"):  # robosuite 1.5 has its own generator, shared by its components
                 self._env.rng.bit_generator.state = np.random.default_rng(seed).bit_generator.state
-            self._renderer.make_current()  # the last episode's rendering resources are freed in their own context
+            self._renderer.make_current()  # frees the rendering resources of the last episode in their own context
             self._renderer.open = True
             raw = self._env.reset()
         return self._observe(raw), {}
 
     def _advance(self, action: np.ndarray) -> tuple[Obs, float, bool, dict[str, Any]]:
-        """The reward is 1 if the task is solved, else 0."""
+        """Execute an action; the reward is 1 if the task is solved, else 0."""
         self._renderer.open = self.looked_at
         raw, *_ = self._env.step(self._command(action.astype(np.float64)))
         success = bool(self._env._check_success())
@@ -93,10 +93,10 @@ def _upright(image: np.ndarray) -> np.ndarray:
 
 
 class CameraRenderer:
-    """Renders the cameras while it is `open`; otherwise they show black and cost nothing.
+    """Renders the cameras while `open` is set; otherwise they return black images and cost nothing.
 
-    robosuite renders each camera for every observation, 14 times from the beginning of a reset to the policy's
-    first observation. It samples a step's observation, images included, after the first 2 ms of the step's 50.
+    robosuite renders each camera for every observation, 14 times from the beginning of a reset to the first observation
+    of the policy. It samples the observation of a step, images included, after the first 2 ms of the step's 50.
     """
 
     def __init__(self, domain: Any) -> None:
@@ -106,9 +106,9 @@ class CameraRenderer:
         domain._create_camera_sensors = self._sensors  # called again in each reset
 
     def make_current(self) -> None:
-        """Render in this simulator's OpenGL context: the process may have others."""
+        """Activate this simulator's OpenGL context; the process may have others."""
         sim = self._domain.sim
-        if sim is not None and sim._render_context_offscreen is not None:  # after a failed reset there is none
+        if sim is not None and sim._render_context_offscreen is not None:  # missing after a failed reset
             sim._render_context_offscreen.gl_ctx.make_current()
 
     def _sensors(self, cam_name: str, cam_w: int, cam_h: int, **rest: Any) -> tuple[list[Any], list[str]]:
@@ -128,7 +128,7 @@ class CameraRenderer:
 
 @contextmanager
 def seeded(seed: int) -> Iterator[None]:
-    """robosuite 1.4 and LIBERO draw from numpy's global generator, whose state is restored."""
+    """Seed numpy's global generator, from which robosuite 1.4 and LIBERO draw, and restore its state afterwards."""
     before = np.random.get_state()  # noqa: NPY002
     np.random.seed(seed)  # noqa: NPY002
     try:
@@ -139,14 +139,14 @@ def seeded(seed: int) -> Iterator[None]:
 
 @contextmanager
 def importing_robosuite(env: str) -> Iterator[None]:
-    """Surround the first import of robosuite; `env` is named in errors."""
+    """Guard the first import of robosuite; `env` is named in errors."""
     with _no_log_file(), _egl_number(env):
         yield
 
 
 @contextmanager
 def _no_log_file() -> Iterator[None]:
-    """Keep robosuite from its log file, one for the machine, which another user may own, and from its advice."""
+    """Suppress robosuite's advice and its log file, whose path is the same for all users of the machine."""
 
     def nowhere(_filename: object) -> logging.Handler:
         return logging.NullHandler()
@@ -164,10 +164,11 @@ def _no_log_file() -> Iterator[None]:
 
 @contextmanager
 def _egl_number(env: str) -> Iterator[None]:
-    """Correct robosuite, which takes EGL's numbers for CUDA's and refuses those not in CUDA_VISIBLE_DEVICES.
+    """Make robosuite render on the chosen EGL device.
 
-    It reads them when it is imported. Where no EGL device was chosen it would draw on the one with CUDA's number, and
-    fail on "": the worker finds out on which.
+    When it is imported, robosuite reads EGL's device number as CUDA's, and refuses numbers that CUDA_VISIBLE_DEVICES
+    does not list. If no EGL device was chosen, it would render on the one with CUDA's number, and fail on an empty
+    CUDA_VISIBLE_DEVICES; the worker finds out which device was used.
     """
     chosen, visible = os.environ.get(EGL_DEVICE), os.environ.get(GPUS)
     if visible == "" and chosen is None and os.environ.get("MUJOCO_GL") == "egl":
@@ -203,7 +204,7 @@ class RobosuiteTask:
     instruction: str
     max_steps: int = 400  # robomimic's horizon for demonstrations of proficient humans
     cameras: tuple[str, ...] = ("agentview", "robot0_eye_in_hand")
-    size: int = 84  # of each image, pixels
+    size: int = 84  # px, of each image
     arms: tuple[str, ...] = ("robot0",)
 
     @property
@@ -231,12 +232,12 @@ class Robosuite(RobosuiteEnv):
     """One environment of one of robosuite's tasks, e.g. "Lift".
 
     Observation: cameras by robosuite's names, upright; in `state`, by robomimic's names, for each arm
-    `robot0_eef_pos` (3,) m and `robot0_eef_quat` (4,) xyzw of the hand in the world's frame, `robot0_gripper_qpos`
+    `robot0_eef_pos` (3,) m and `robot0_eef_quat` (4,) xyzw of the hand in the world frame, `robot0_gripper_qpos`
     (2,) m of the fingers, and `robot0_joint_pos` (7,) rad. In `info["sim_state"]`, for scripted experts only: the
-    positions and quaternions xyzw of objects, and `target_pos`, where one of them belongs.
+    positions and quaternions xyzw of objects, and `target_pos`, the target position of one of them.
 
-    Action: (7,) in [-1, 1] for each arm: the hand's target moves by 0.05 m a unit along the base's axes, and turns by
-    0.5 rad a unit about them, axis-angle; the last is the gripper, -1 opens, 1 closes, and only its sign counts.
+    Action: (7,) in [-1, 1] for each arm: the hand's target moves by 0.05 m per unit along the base's axes and turns by
+    0.5 rad per unit about them, axis-angle; the last is the gripper: -1 opens, 1 closes, and only its sign counts.
     """
 
     suite = title = "robosuite"
@@ -254,11 +255,11 @@ class Robosuite(RobosuiteEnv):
         max_steps: int | None = None,
         ends_on_success: bool = True,
     ) -> None:
-        """Make the environment; raises the errors of `make_env`. Other options are those of most `SimulatorEnv`s.
+        """Make the environment; raises the errors of `make_env`. Other options are described in `SimulatorEnv`.
 
         Args:
             task: robosuite's name, one of `tasks()`.
-            cameras: MuJoCo's names; None are robomimic's for the task.
+            cameras: MuJoCo's names; None selects robomimic's cameras for the task.
         """
         self.require_task(task)
         super().__init__(f"robosuite/{task}", width=width, height=height, max_steps=max_steps)
@@ -282,13 +283,13 @@ class Robosuite(RobosuiteEnv):
                 ignore_done=True,
                 has_renderer=False,
                 has_offscreen_renderer=bool(images),
-                renderer="mujoco",  # with 1.5's own, a reset leaves the last episode's to a garbage collection
+                renderer="mujoco",  # with 1.5's own renderer, a reset leaves the last one to garbage collection
                 use_camera_obs=bool(images),
                 camera_names=list(images) or "agentview",
                 camera_heights=[spec.height for spec in images.values()] or 1,
                 camera_widths=[spec.width for spec in images.values()] or 1,
             )
-            for arm in self._task.arms:  # which robosuite leaves out, and robomimic has
+            for arm in self._task.arms:  # left out by robosuite, but part of robomimic's observations
                 made.modify_observable(f"{arm}_joint_pos", "active", modifier=True)
             self._use(made)
 
@@ -338,7 +339,7 @@ class Robosuite(RobosuiteEnv):
 
 
 def _controllers(simulator: Any) -> Any:
-    """Return OSC_POSE with robosuite's own settings, which are robomimic's."""
+    """Return the settings of OSC_POSE that robosuite ships, which robomimic also uses."""
     if hasattr(simulator, "load_composite_controller_config"):  # 1.5
         return simulator.load_composite_controller_config(robot="Panda")
     return simulator.load_controller_config(default_controller="OSC_POSE")

@@ -1,8 +1,8 @@
 """SIMPLER's Bridge tasks in ManiSkill 3: digital twins of a real table with a WidowX.
 
-Li et al. 2024, "Evaluating Real-World Robot Manipulation Policies in Simulation",
-https://arxiv.org/abs/2405.05941: visual matching, that is photographs of the real scene behind the
-simulated robot and objects, and a fixed list of initial configurations.
+Li et al. 2024, "Evaluating Real-World Robot Manipulation Policies in Simulation", https://arxiv.org/abs/2405.05941.
+Visual matching: photographs of the real scene behind the simulated robot and objects, and a fixed list of initial
+configurations.
 """
 
 from __future__ import annotations
@@ -44,12 +44,12 @@ class SimplerProtocol:
     """The protocol of SIMPLER's own script for ManiSkill 3, real2sim_eval_maniskill3.py."""
 
     setting: str = "visual matching"
-    success: str = "at the end"  # of the last state; success at any step is reported as well
+    success: str = "at the end"  # in the last state; success at any step is also reported
     initial_states: str = "by episode id"
     control_mode: str = "arm_pd_ee_target_delta_pose_align2_gripper_pd_joint_pos"
     obs_mode: str = "rgb+segmentation"
     shader: str = "default"
-    gripper_open_above: float = 0.5  # the command becomes open or closed, nothing in between
+    gripper_open_above: float = 0.5  # the command is binarised at this value
     sticky_gripper_steps: int = 1  # 15 only for the Google robot, whose scenes ManiSkill 3 does not have
 
 
@@ -59,19 +59,17 @@ PROTOCOL = SimplerProtocol()
 class Simpler(SimulatorEnv):
     """One Bridge task with its WidowX 250 S, at 5 Hz.
 
-    Observation: "3rd_view_camera", (480, 640, 3), as the policies of the paper had it and resized it
-    themselves; `state`: the arm's `joints` (6,) rad, and `tquat` and `xyzrpy`, the pose of the
-    gripper's link in the robot's base frame; `gripper`; and in `info["sim_state"]`, (13,) float32 in
-    that frame, the positions in m of object, target, gripper and of where the gripper is commanded
-    to, and the object's yaw in rad, for scripted experts only.
+    Observation: "3rd_view_camera", (480, 640, 3), the size that the policies of the paper received and resized
+    themselves; `state`: the arm's `joints` (6,) rad, and `tquat` and `xyzrpy`, the pose of the gripper's link in the
+    robot's base frame; `gripper`. For scripted experts only, `info["sim_state"]`, (13,) float32 in that frame: the
+    positions in m of object, target, gripper and commanded gripper, and the object's yaw in rad.
 
-    Action, (7,), as policies trained on Bridge give it: the gripper's change of position in m along
-    the base's axes, its change of roll, pitch and yaw in rad, and the gripper, 1 open, 0 closed. It
-    is relative to the last command, not to the measured pose. Rotations reach the
-    controller as in SIMPLER's script, as the numbers of a rotation vector.
+    Action, (7,), as policies trained on Bridge give it: the gripper's change of position in m along the base's axes,
+    its change of roll, pitch and yaw in rad, and the gripper, 1 open, 0 closed. It is relative to the last command, not
+    to the measured pose. As in SIMPLER's script, the controller reads the rotation as the numbers of a rotation vector.
 
     The initial state is `options["init_state"]`, SIMPLER's episode id; without it the seed modulo
-    `init_states`. The seed draws nothing else. The env continues after success, and never reports
+    `init_states`. The seed has no other effect. The env continues after success, and never reports
     `terminated`.
     """
 
@@ -88,16 +86,16 @@ class Simpler(SimulatorEnv):
         render_backend: str = "auto",
         shader: str = PROTOCOL.shader,
     ) -> None:
-        """Make the environment; raises the errors of `make_env`. Other options are those of most `SimulatorEnv`s.
+        """Make the environment; raises the errors of `make_env`. Other options are described in `SimulatorEnv`.
 
         Args:
             task: ManiSkill's id, one of `Simpler.tasks()`.
-            assets: The folder that holds `data/`; None is `MS_ASSET_DIR`, or ~/.maniskill. ManiSkill
-                reads it once, so a process has one.
-            max_steps: None is the task's own limit, 60, or 120 for the eggplant.
+            assets: The folder that holds `data/`; None selects `MS_ASSET_DIR`, or ~/.maniskill. ManiSkill
+                reads the variable once, so all environments of a process share one folder.
+            max_steps: None selects the task's own limit, 60, or 120 for the eggplant.
             sim_backend: "physx_cpu" or "physx_cuda".
             render_backend: "cpu", "gpu", or "auto": the GPU if both SAPIEN and torch can use it.
-            shader: ManiSkill's name; that of the protocol is "default".
+            shader: ManiSkill's name of the shader; the protocol uses "default".
         """
         self.require_task(task)
         super().__init__(f"simpler/{task}")
@@ -177,7 +175,7 @@ _ACTION = ActionSpec(
 
 
 def _command(action: np.ndarray) -> np.ndarray:
-    """Convert an action to that of ManiSkill's controller, (7,) each: rotation vector, gripper -1 closed, 1 open."""
+    """Convert an action to ManiSkill's controller, both (7,): rotation vector, gripper -1 closed, 1 open."""
     roll, pitch, yaw = action[3:6].tolist()
     axis, angle = require("transforms3d.euler").euler2axangle(roll, pitch, yaw)
     gripper = 1.0 if action[6] > PROTOCOL.gripper_open_above else -1.0
@@ -187,8 +185,8 @@ def _command(action: np.ndarray) -> np.ndarray:
 def _own_lists() -> Any:
     """Return the base class of the digital twins, with lists that are not shared with other twins of this process.
 
-    ManiSkill keeps the photographs, and the objects that they must not hide, in lists of the class: a second twin would
-    use those of the first one.
+    ManiSkill keeps the photographs, and the objects that they must not hide, in lists of the class. A second twin would
+    otherwise use the lists of the first one.
     """
     twins = require("mani_skill.envs.tasks.digital_twins.base_env").BaseDigitalTwinEnv
     twins._objects_to_remove_from_greenscreen, twins._rgb_overlay_images = [], {}

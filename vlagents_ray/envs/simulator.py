@@ -1,4 +1,4 @@
-"""The base of the environments of simulators, MuJoCo's cameras, and the protocol of a benchmark."""
+"""The base class of simulator environments, MuJoCo cameras, and the protocol of a benchmark."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class BenchmarkProtocol:
     success: str  # the condition under which an episode counts as solved
     begins: str  # the effect of an episode's seed and initial state
     ends_on_success: bool
-    episodes: int | None = None  # episodes of a task in published tables; None if they differ
+    episodes: int | None = None  # episodes per task in published tables; None if they differ
 
     def describe(self, **played: Any) -> dict[str, Any]:
         """Return the protocol as plain values; `deviations` lists the fields of `played` that differ from it."""
@@ -50,19 +50,19 @@ class BenchmarkProtocol:
 class SimulatorEnv(EvalEnv):
     """One environment of a simulator in this process.
 
-    A subclass states the names below, makes its simulator in the constructor within `_making`, and registers with
-    `_resources` what `close` calls. `_begin` begins an episode and `_advance` executes a step; both are called with a
-    simulator that is open, and their errors become `EnvFailed`.
+    A subclass sets the class variables below, makes its simulator in the constructor within `_making`, and registers
+    its clean-up with `_resources`. `_begin` begins an episode and `_advance` executes a step; both are only called
+    while the simulator is open, and their errors become `EnvFailed`.
 
-    Most constructors have these options, of which None is the task's or the protocol's own value: `width` and `height`
-    of each image, pixels; `instruction`, the task in words; `max_steps`, the step limit; `ends_on_success`, whether
-    success ends the episode (without that, success at the end can also be measured).
+    Most constructors have the following options; None selects the default of the task or the protocol: `width` and
+    `height` of each image, pixels; `instruction`, the task in words; `max_steps`, the step limit; `ends_on_success`,
+    whether success ends the episode (if not, success at the end can also be measured).
     """
 
     suite: ClassVar[str]
-    title: ClassVar[str]  # the name in sentences
-    packages: ClassVar[tuple[str, ...]]  # the modules that it imports
-    distributions: ClassVar[tuple[str, ...]] = ("mujoco",)  # the packages whose versions results state
+    title: ClassVar[str]  # the name as used in sentences
+    packages: ClassVar[tuple[str, ...]]  # the modules that the subclass imports
+    distributions: ClassVar[tuple[str, ...]] = ("mujoco",)  # the packages whose versions are recorded in results
     cure: ClassVar[str]  # the command that installs the packages
 
     _contract: Contract
@@ -70,13 +70,13 @@ class SimulatorEnv(EvalEnv):
     _protocol: BenchmarkProtocol | None = None
     _ends_on_success: bool = True
     _env: Any = None  # the simulator; None before it is made and after `close`
-    _steps: int | None = None  # of the episode; None before the first reset
+    _steps: int | None = None  # steps of the current episode; None before the first reset
 
     def __init__(self, name: str, **sizes: int | None) -> None:
-        """Check the options, of which `sizes` are at least 1 or None; set what drivers read when they are loaded."""
+        """Check that each of `sizes` is at least 1 or None, and set the variables that drivers read when they load."""
         self._name = name
         require_sizes(name, **sizes)
-        self._resources = ExitStack()  # what `close` calls, the last first
+        self._resources = ExitStack()  # called by `close`, last in first out
         prepare_rendering()
 
     @property
@@ -94,7 +94,7 @@ class SimulatorEnv(EvalEnv):
 
     @classmethod
     def missing(cls) -> str | None:
-        """Say why the simulator cannot run here; the first call in a process renders one frame in a child."""
+        """Return why the simulator cannot run here; the first call in a process renders one frame in a child."""
         if lacks := without(cls.packages, cls.cure) or cls._missing_assets():
             return lacks
         probe = egl_probe()
@@ -103,8 +103,8 @@ class SimulatorEnv(EvalEnv):
     def reset(self, *, seed: int, options: Options | None = None) -> tuple[Obs, dict[str, Any]]:
         """Begin the episode of `seed`, taken modulo 2^32.
 
-        Where the task has fixed initial states, it begins in `options["init_state"]`, or in the one that the seed
-        chooses. There are no other options.
+        If the task has fixed initial states, the episode begins in state `options["init_state"]`, or in one that the
+        seed selects. There are no other options.
         """
         self._alive()
         state = self._initial_state(seed, options or {})
@@ -144,10 +144,11 @@ class SimulatorEnv(EvalEnv):
 
         Args:
             seed: The seed, 0 to 2^32 - 1.
-            state: The number of the initial state; 0 if the task has none that are fixed.
+            state: The number of the initial state; 0 if the task has no fixed ones.
 
         Returns:
-            The first observation, and what `info` has beside `init_state` and `success`, which is False by default.
+            The first observation, and further entries of `info`; `init_state` and `success` (False) are added if
+            missing.
         """
 
     @abstractmethod
@@ -156,11 +157,11 @@ class SimulatorEnv(EvalEnv):
 
     @classmethod
     def _missing_assets(cls) -> str | None:
-        """Say which files of the simulator are not there, with the cure."""
+        """Return which files of the simulator are missing, with the cure; None if none is."""
         return None
 
     def _solved(self, success: bool) -> tuple[bool, dict[str, Any]]:
-        """Return `terminated` and `info` of a step after which the task is solved, or is not."""
+        """Return `terminated` and `info` for a step, given whether the task is solved after it."""
         return success and self._ends_on_success, {"success": success}
 
     def _initial_state(self, seed: int, options: Options) -> int:
@@ -181,7 +182,7 @@ class SimulatorEnv(EvalEnv):
 
     @contextmanager
     def _making(self) -> Iterator[None]:
-        """Make the simulator within this: an error becomes `EnvFailed`, and frees what was made."""
+        """Guard the construction of the simulator: turn an error into `EnvFailed`, and free what was made."""
         try:
             with failing(self._name, "make"):
                 yield
@@ -196,7 +197,15 @@ class MujocoCameras:
     def __init__(
         self, env: str, model: Any, cameras: Sequence[str], size: Size, *, upside_down: Collection[str] = ()
     ) -> None:
-        """Make the renderer, for which the model's frame buffer grows; images of `upside_down` cameras are turned."""
+        """Make the renderer, and grow the model's frame buffer if needed.
+
+        Args:
+            env: The name of the env, for errors.
+            model: The `mujoco.MjModel`.
+            cameras: The names of the cameras.
+            size: (height, width) of each image, pixels.
+            upside_down: Cameras whose images are turned by 180 degrees.
+        """
         require_cameras(env, cameras, camera_names(model))
         self._cameras, self._upside_down = list(cameras), upside_down
         buffer = model.vis.global_

@@ -1,4 +1,4 @@
-"""Image codecs for the cameras of a message: raw pixels, PNG or JPEG, in several threads where that is faster."""
+"""Image codecs for the cameras of a message: raw pixels, PNG or JPEG, in several threads if that is faster."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ T = TypeVar("T")
 NAMES = ("raw", "lossless", "jpeg")
 SUBSAMPLINGS = ("444", "422", "440", "420")
 
-_JPEG_S, _PNG_S = 1.7e-9, 7e-9  # s of one core for a byte of pixels, to encode or to decode it: 1 to 2, and 6 to 12 ns
+_JPEG_S, _PNG_S = 1.7e-9, 7e-9  # s per byte of pixels on one core, either way: 1 to 2, and 6 to 12 ns
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,14 +53,14 @@ class ImageCodec:
 
 
 DecodedFiles = dict[int, tuple[np.ndarray, "bytes | memoryview"]]
-"""The image and the file that it was decoded from, by the `id` of the image."""
+"""Each image with the file from which it was decoded, by the `id` of the image."""
 
 
 class PixelBudget(Protocol):
     """The limits of a message; see `vlagents_ray.protocol.messages`."""
 
     serial: bool
-    files: DecodedFiles | None  # gets the files of decoded images; None if not needed
+    files: DecodedFiles | None  # receives the files of decoded images; None if not needed
 
     @property
     def pixels(self) -> int:
@@ -86,7 +86,7 @@ def encode_files(cameras: Sequence[np.ndarray], codec: ImageCodec) -> list[bytes
 def decode_files(
     files: Sequence[bytes | memoryview], budget: PixelBudget, names: Sequence[str] = ()
 ) -> list[np.ndarray]:
-    """Decode JPEG or PNG files, after the memory for all of them is reserved; return (H, W, 3) uint8 RGB images.
+    """Decode JPEG or PNG files to (H, W, 3) uint8 RGB images, after reserving memory for all of them.
 
     Args:
         files: The files.
@@ -116,7 +116,7 @@ def decode_files(
     if budget.serial or not files:
         images = [decode(file) for file in files]
     else:
-        is_jpeg = bytes(files[0][:3]) == jpeg_png.JPEG_MAGIC  # as are the others, usually
+        is_jpeg = bytes(files[0][:3]) == jpeg_png.JPEG_MAGIC  # usually, so are the others
         images = thread_map(decode, files, (_JPEG_S if is_jpeg else _PNG_S) * size)
     if budget.files is not None:
         budget.files.update((id(image), (image, file)) for image, file in zip(images, files, strict=True))

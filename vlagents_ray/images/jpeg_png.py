@@ -3,7 +3,7 @@
 A decoder reads the header first: an image that declares more pixels than the caller allows is refused before memory is
 allocated for it.
 
-PNG files are written with numpy and zlib alone: all rows have the filter "Up" (the difference to the row above), and
+PNG files are written with only numpy and zlib: all rows have the filter "Up" (the difference to the row above), and
 zlib uses its run-length strategy. A search for better filters or longer matches takes several times as long and saves a
 few per cent on camera images with noise. Files of this form are read in the same way; others need Pillow.
 """
@@ -29,7 +29,7 @@ JPEG_MAGIC = b"\xff\xd8\xff"
 _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 _PNG_HEADER = struct.Struct(">2I5B")  # width, height, depth, colour type, compression, filter, interlace
 _RGB8 = (8, 2, 0, 0, 0)
-_DATA_AT = len(_PNG_MAGIC) + 12 + _PNG_HEADER.size  # where the chunk after the header begins
+_DATA_AT = len(_PNG_MAGIC) + 12 + _PNG_HEADER.size  # start of the chunk after the header
 _UP = 2
 
 
@@ -141,7 +141,7 @@ def _decode_own_png(view: memoryview, height: int, width: int) -> np.ndarray | N
 
 
 def _chunk_name(view: memoryview, at: int) -> bytes:
-    """Return the name of the chunk that begins at a position."""
+    """Return the name of the chunk that starts at a position."""
     return bytes(view[at + 4 : at + 8])
 
 
@@ -151,7 +151,7 @@ def _chunk(kind: bytes, data: bytes) -> bytes:
 
 
 def _rgb(file: Image) -> np.ndarray:
-    """Convert to (H, W, 3) uint8 by the upper 8 of 16 bits, as Pillow does for colours; it would clip greys."""
+    """Convert to (H, W, 3) uint8, using the upper 8 of 16 bits, as Pillow does for colours; it would clip greys."""
     if file.mode.startswith("I"):  # "I;16", or "I" before Pillow 11
         grey = (np.asarray(file) >> 8).astype(np.uint8)
         return np.repeat(grey[:, :, None], 3, axis=2)

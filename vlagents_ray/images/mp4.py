@@ -1,4 +1,4 @@
-"""An encoder of videos, H.264 in MP4, which browsers play."""
+"""An encoder of H.264 videos in MP4, which browsers play."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vlagents_ray.registry import require
 
 
 class Mp4:
-    """The running video of one camera; encoding a frame of 224x224 takes about 0.3 ms."""
+    """The video in progress of one camera; encoding a frame of 224x224 takes about 0.3 ms."""
 
     def __init__(
         self,
@@ -32,8 +32,8 @@ class Mp4:
             target: The file, or a buffer in memory.
             shape: The shape of its images, (H, W, 3).
             fps: The rate of the frames, Hz.
-            key_frames: The number of frames from one key frame to the next; None is x264's default.
-            lossless: Whether each pixel is kept, in RGB: some ten times larger, and not for browsers.
+            key_frames: The number of frames from one key frame to the next; None selects x264's default.
+            lossless: Whether to keep each pixel, in RGB: about ten times larger, and unsuitable for browsers.
         """
         self._av: Any = require("av")
         self._shape = shape

@@ -1,4 +1,4 @@
-"""A map over the images of a message, in several threads where there is enough work for them.
+"""A map over the images of a message, in several threads if there is enough work for them.
 
 JPEG and PNG coding release Python's global lock, so threads help.
 """
@@ -29,11 +29,11 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 _LEAST_WORK_S = 0.4e-3  # s; two cameras of 224 x 224 in JPEG gain a fifth of a round trip
-_MOST_HELPERS = 3  # most threads beside the caller's; robots have few cameras
+_MOST_HELPERS = 3  # largest number of threads beside the caller's; robots have few cameras
 
 
 def thread_map(function: Callable[[Item], Result], items: Sequence[Item], work_s: float) -> list[Result]:
-    """Compute `[function(item) for item in items]`, in several threads if the work is worth it: `work_s` on one core.
+    """Compute `[function(item) for item in items]`, in several threads if the time on one core, `work_s`, is long.
 
     The function does not wait for other calls of itself. An exception is that of the first item that raised one.
     """
@@ -59,7 +59,7 @@ def thread_map(function: Callable[[Item], Result], items: Sequence[Item], work_s
             helping.append(helpers.submit(work))
     work()
     for helper in helping:
-        if not helper.cancel():  # it began: `items` are used until it ends
+        if not helper.cancel():  # it has begun: `items` are in use until it ends
             helper.result()
     if errors:
         raise errors.pop(min(errors))  # popped, so that no reference cycle keeps the items
@@ -67,23 +67,23 @@ def thread_map(function: Callable[[Item], Result], items: Sequence[Item], work_s
 
 
 class _Helpers(ThreadPoolExecutor):
-    """Threads that keep off the core of their caller.
+    """Threads that avoid the core of their caller.
 
-    Wake-affine scheduling would often put them there, where they wait for the caller: on two cores, two to four cameras
-    took 20 to 50 % longer.
+    Wake-affine scheduling would often place them there, where they wait for the caller: on two cores, two to four
+    cameras took 20 to 50 % longer.
     """
 
     def __init__(self) -> None:
         super().__init__(_MOST_HELPERS, "vlagents-ray-images", initializer=self._started)
         self._ids: list[int] = []
-        self._cores: set[int] = set()  # on which they may run
+        self._cores: set[int] = set()  # on which the threads may run
 
     def _started(self) -> None:
         self._ids.append(threading.get_native_id())
         self._cores = set()
 
     def keep_off(self, core: int) -> None:
-        """Exclude a core from the affinity of the threads; -1 is none."""
+        """Exclude a core from the affinity of the threads; -1 excludes none."""
         if core < 0:
             return
         cores = os.sched_getaffinity(0) - {core}
@@ -96,5 +96,5 @@ class _Helpers(ThreadPoolExecutor):
 
 @cache
 def _helpers(_process: int) -> _Helpers:
-    """Return the helpers of this process; a forked one has its own, since threads do not survive a fork."""
+    """Return the helpers of this process; a forked process has its own, since threads do not survive a fork."""
     return _Helpers()

@@ -1,4 +1,4 @@
-"""LeRobotDatasets as observations: those that a server recorded, and public ones (v3.0, v2.1 and v2.0)."""
+"""LeRobotDatasets as observations: those recorded by a server, and public ones (v3.0, v2.1 and v2.0)."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Names:
     """The policy's names for the cameras and state of a dataset without a contract of ours."""
 
     cameras: Mapping[str, str] = field(default_factory=dict)  # policy's camera -> camera or feature of the dataset
-    state: Sequence[str] | None = None  # parts side by side in `observation.state`; "gripper" is `Obs.gripper`
+    state: Sequence[str] | None = None  # concatenated parts of `observation.state`; "gripper" is `Obs.gripper`
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +39,7 @@ class RecordedStep:
 
     frame: int
     obs: Obs
-    expected: np.ndarray  # (H, D): the answer that was recorded, or the actions from here on to the end of the episode
+    expected: np.ndarray  # (H, D): the recorded answer, or the actions from here to the end of the episode
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,14 +55,14 @@ class RecordedEpisode:
 
 @dataclass(frozen=True, slots=True)
 class RecordedSession:
-    """The episodes of one session in their order; of a public dataset, one episode."""
+    """The episodes of one session in order; in a public dataset, a single episode."""
 
     parts: tuple[RecordedEpisode, ...]
     options: Mapping[str, Any]  # of the reset
 
 
 class RecordedDataset:
-    """A dataset that is read, not written."""
+    """A dataset that is only read."""
 
     def __init__(self, root: Path) -> None:
         """Open a dataset; raises `ConfigError` if it cannot be read."""
@@ -108,12 +108,12 @@ class RecordedDataset:
         ]
 
     def gaps(self, part: RecordedEpisode) -> int:
-        """Return the number of acts that are missing within an episode that was traced."""
+        """Return the number of missing acts within a traced episode."""
         ticks = np.array(self._rows(part, ["tick"])["tick"]) if self.traced else np.zeros(0, np.int64)
         return int((np.diff(ticks) - 1).clip(0).sum())
 
     def steps(self, part: RecordedEpisode, names: Names, policy: Contract | None) -> Iterator[RecordedStep]:
-        """Yield the frames of an episode, as a policy with that contract names its inputs."""
+        """Yield the frames of an episode, with the input names of a policy with that contract."""
         pictures = [name for name, one in self.features.items() if one["dtype"] in _PICTURES]
         images = [name for name in pictures if self.features[name]["dtype"] == "image"]
         traced = [CHUNK, ROWS, "request", "captured_at"] if self.traced else []
@@ -182,7 +182,7 @@ class RecordedDataset:
         raise ConfigError(f"{file}: has fewer than the {part.length} frames of episode {part.index}")
 
     def _cameras(self, pictures: Sequence[str], names: Names) -> dict[str, str]:
-        """Return the policy's name of each feature that holds pictures."""
+        """Return the policy's name of each feature that contains images."""
         known = {} if self.contract is None else self.contract.cameras
         own = {feature: known.get(feature, feature.removeprefix(IMAGES)) for feature in pictures}
         if not names.cameras:
@@ -196,7 +196,7 @@ class RecordedDataset:
         return {found[name]: camera for camera, name in names.cameras.items()}
 
     def _states(self, names: Names, policy: Contract | None) -> dict[str, list[tuple[str, int]]]:
-        """Return the parts, and their widths, of each feature that is a state."""
+        """Return the parts, and their widths, of each state feature."""
         widths = {name: int(self.features[name]["shape"][0]) for name in (STATE, ENVIRONMENT) if name in self.features}
         about = self.contract
         if about is not None and names.state is None:
@@ -214,7 +214,7 @@ class RecordedDataset:
         return found
 
     def _cropped(self, image: np.ndarray, camera: str) -> np.ndarray:
-        """Return the image without the row and the column that made the size of its video even."""
+        """Return the image without the row and the column that were added to make the size of its video even."""
         spec = None if self.contract is None else (self.contract.contract.cameras or {}).get(camera)
         if spec is None or spec.height is None or spec.width is None:
             return image
@@ -222,12 +222,12 @@ class RecordedDataset:
 
 
 def find_datasets(folder: Path) -> list[Path]:
-    """Return the dataset that a folder is, or those in it."""
+    """Return the datasets in a folder, or the folder itself if it is a dataset."""
     return [path.parents[1] for pattern in ("", "*/") for path in sorted(folder.glob(f"{pattern}meta/info.json"))]
 
 
 def _image(value: Mapping[str, Any]) -> np.ndarray:
-    """Decode a picture that lies in the table."""
+    """Decode an image that is stored in the table."""
     if not value.get("bytes"):
         raise ConfigError(f"a picture is at {value.get('path')!r}, want its bytes in the table; LeRobot embeds them")
     return jpeg_png.decode(value["bytes"], DEFAULT_LIMITS.pixels)

@@ -1,4 +1,4 @@
-"""Playing datasets to a policy, several sessions at once, so that it computes them in batches."""
+"""Replays datasets to a policy, with several sessions at once, so that it computes them in batches."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from vlagents_ray.serve.requests import PendingRequest, Rank
 from vlagents_ray.serve.weights import OPTION
 
 Sessions = Callable[[], Agent]
-"""Opens a session; each is closed by who asked for it."""
+"""Opens a session; the caller closes it."""
 
 FILE = "open_loop.json"
 _WORST = 10
@@ -73,10 +73,10 @@ class LocalAgent(Agent):
 
 @contextmanager
 def candidate(source: str) -> Iterator[Sessions]:
-    """Load a policy for the time of the context.
+    """Load a policy for the duration of the context.
 
     Yields:
-        Opens its sessions, which share its batches.
+        A function that opens sessions, which share the policy's batches.
     """
     if "://" in source:
         yield partial(RemoteAgent, source, rank="simulation", codec="exact")
@@ -104,9 +104,9 @@ class ErrorTable:
     """Sums over the frames so far, for each step of the horizon (H) and each number of an action (D)."""
 
     dim: int
-    absolute: np.ndarray = field(init=False)  # (H, D), of the errors' absolute values
-    square: np.ndarray = field(init=False)  # (H, D), of their squares
-    largest: np.ndarray = field(init=False)  # (H, D), of their absolute values
+    absolute: np.ndarray = field(init=False)  # (H, D), of the absolute errors
+    square: np.ndarray = field(init=False)  # (H, D), of the squared errors
+    largest: np.ndarray = field(init=False)  # (H, D), largest absolute error
     frames: np.ndarray = field(init=False)  # (H,)
 
     def __post_init__(self) -> None:
@@ -133,7 +133,7 @@ class ErrorTable:
         return np.asarray(self.absolute / self.frames[:, np.newaxis])
 
     def to_json(self, joints: list[str]) -> dict[str, Any]:
-        """Return the errors in all, by joint, by step, and by both, in the units of the actions."""
+        """Return the errors overall, by joint, by step, and by both, in the units of the actions."""
         total = max(1, int(self.frames.sum()))
         mae, rms = self.absolute.sum(0) / total, np.sqrt(self.square.sum(0) / total)
         largest = self.largest.max(0, initial=0)
@@ -171,9 +171,9 @@ class ReplayPlan:
     """The settings of a replay."""
 
     episodes: Sequence[int] | None = None  # of each dataset; None: all
-    horizon: int | None = None  # most rows of a chunk that are compared; None: all that both have
+    horizon: int | None = None  # largest number of compared rows of a chunk; None: all rows that both have
     every: int = 1  # stride of the queried frames in a dataset without recorded answers
-    at_once: int = 8  # sessions
+    at_once: int = 8  # number of concurrent sessions
     names: Names = field(default_factory=Names)
 
 
@@ -183,10 +183,10 @@ class OpenLoopResult:
 
     datasets: list[str]
     joints: list[str]
-    against: str  # "answers" that a server recorded, or "actions" of the dataset
+    against: str  # "answers" recorded by a server, or "actions" of the dataset
     table: ErrorTable
     sessions: int = 0
-    missing: int = 0  # acts that the recording lacks, so that a policy with a history saw less
+    missing: int = 0  # acts that the recording lacks, so that a policy with a history received less
     frames: list[FrameError] = field(default_factory=list)
 
     def to_json(self) -> dict[str, Any]:
@@ -213,11 +213,11 @@ def replay(
 ) -> OpenLoopResult:
     """Query a policy at each frame, and compare its actions with the dataset's.
 
-    A session is reset with its first recorded observation, its instruction and its options, and then gets each of its
-    observations in order, whatever it answers.
+    A session is reset with its first recorded observation, its instruction and its options, and then receives each of
+    its observations in order, whatever its answers are.
 
     Raises:
-        ConfigError: There is no dataset, its actions are not the policy's, or a name is unknown.
+        ConfigError: There is no dataset, its actions do not fit the policy's, or a name is unknown.
         PolicyFailed: The policy raised an error, or refused an observation.
     """
     datasets = [RecordedDataset(root) for root in find_datasets(folder)]
@@ -296,12 +296,12 @@ class _Replaying:
 
 
 def _options(play: RecordedSession) -> dict[str, Any]:
-    """Return the options of the reset that are the policy's, not the choice of its weights."""
+    """Return the reset's options for the policy, without those that choose its weights."""
     return {name: value for name, value in play.options.items() if name not in (CHOICE, STEP, OPTION)}
 
 
 def write_result(result: OpenLoopResult, policy: str, folder: Path) -> Path:
-    """Write `open_loop.json` into a folder, which is made; return its path."""
+    """Write `open_loop.json` into a folder, which is created if needed; return its path."""
     with storing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         with whole(folder / FILE) as part:

@@ -1,9 +1,9 @@
-"""LoRA adapters of one network, of which each row of a batch may have another.
+"""LoRA adapters of one network, with a separate adapter for each row of a batch.
 
-The weights of the network stay those of the base. After each linear layer that an adapter changes, a hook adds
+The weights of the network remain those of the base. After each linear layer that an adapter changes, a hook adds
 B[i] A[i] x to the layer's result, where i is the adapter of x's row: two small products for all rows of the batch, with
-A and B of all adapters in one tensor each. Adapters of a smaller rank are padded with zeros, and rows without one have
-one of zeros. S-LoRA (arXiv 2311.03285) and Punica (arXiv 2310.18547) serve language models in this way.
+the A and B of all adapters in one tensor each. Adapters of a smaller rank are padded with zeros, and rows without an
+adapter use one of zeros. S-LoRA (arXiv 2311.03285) and Punica (arXiv 2310.18547) serve language models in this way.
 """
 
 from __future__ import annotations
@@ -32,21 +32,21 @@ from vlagents_ray.weights.safetensors import PART_BYTES, ValuesReader, read_head
 from vlagents_ray.weights.trainable import converted
 
 ADAPTER = "adapter"  # option of a reset: the name of the session's adapter
-_DIGITS = 16  # of a fingerprint, hexadecimal
+_DIGITS = 16  # hexadecimal digits of a fingerprint
 
 
 @dataclass(frozen=True, slots=True)
 class Adapter:
-    """An adapter of a session: by default none."""
+    """The adapter of a session; by default, no adapter."""
 
-    source: str = ""  # path or hub id, as the settings name it
+    source: str = ""  # path or hub id, as in the settings
     weights: str = ""  # digest of the base's files and the adapter's
-    fingerprint: str = ""  # the beginning of that; empty: none, the session acts with the base alone
+    fingerprint: str = ""  # the beginning of that digest; empty: the session acts with the base alone
     revision: str | None = None  # the hub's commit of the adapter
 
     @classmethod
     def of(cls, source: str, base: str, own: str, revision: str | None = None) -> Adapter:
-        """Return the adapter with that source and commit, on a base and with files of these digests."""
+        """Make an adapter from its source and commit, and from the digests of the base and of its own files."""
         digest = hashlib.sha256(f"{base} {own}".encode()).hexdigest()
         return cls(source, f"{own.partition(':')[0]}:{digest}", digest[:_DIGITS], revision)
 
@@ -63,8 +63,8 @@ class Adapters:
 
     def __init__(self) -> None:
         self._named: dict[str, Adapter] = {}
-        self._places: dict[str, int] = {"": 0}  # by fingerprint: the place in the tensors of all adapters
-        self._chosen: Any = None  # the places of the rows of the running pass, int64; None if no row has an adapter
+        self._places: dict[str, int] = {"": 0}  # by fingerprint: the index in the tensors of all adapters
+        self._chosen: Any = None  # indices of the rows of the running pass, int64; None if no row has an adapter
         self._device: Any = None
 
     @property
@@ -78,10 +78,20 @@ class Adapters:
         find: Callable[[str], tuple[Adapter, Path]],
         adapt: Callable[[str, Path], None],
     ) -> None:
-        """Read adapters by name, and have the network's layers apply them; raises `ConfigError` if one does not fit."""
+        """Read adapters, and make the network's layers apply them.
+
+        Args:
+            network: The torch module.
+            sources: The path or hub id of each adapter, by its name in resets.
+            find: Returns the adapter at a source, and its folder.
+            adapt: Called with the fingerprint and the folder of each adapter that was read.
+
+        Raises:
+            ConfigError: An adapter does not fit the network.
+        """
         import torch
 
-        layers: dict[str, dict[int, tuple[Any, Any]]] = {}  # A and B by layer and place
+        layers: dict[str, dict[int, tuple[Any, Any]]] = {}  # A and B by layer and index
         for name, source in sources.items():
             try:
                 adapter, folder = find(source)
@@ -104,7 +114,7 @@ class Adapters:
             self._device = weight.device
 
     def named(self, name: object) -> Adapter:
-        """Return the adapter of that name, or None for None; raises `UnknownCheckpoint` for an unknown name."""
+        """Return the adapter with this name, or no adapter for None; raises `UnknownCheckpoint` for an unknown name."""
         if name is None:
             return Adapter()
         if not isinstance(name, str) or name not in self._named:
@@ -114,7 +124,7 @@ class Adapters:
         return self._named[name]
 
     def example(self, number: int) -> str:
-        """Return the fingerprint of an adapter for an example row, so that some of them have different ones."""
+        """Return an adapter's fingerprint for example row `number`; successive rows have different ones."""
         return list(self._places)[(number + 1) % len(self._places)]
 
     def require(self, fingerprint: str) -> str:
@@ -124,7 +134,7 @@ class Adapters:
         return fingerprint
 
     def stated(self, fingerprint: str) -> dict[str, Any]:
-        """Return the info of an act about the weights that computed it, if these are not the base's alone."""
+        """Return the info of an act about the weights that computed it; empty if they are the base's alone."""
         return {POLICY: {"version": 0, "fingerprint": fingerprint}} if fingerprint else {}
 
     @contextmanager
@@ -145,7 +155,7 @@ class Adapters:
         return torch.tensor(places, device=self._device)
 
     def _add(self, downs: Any, ups: Any, module: Any, inputs: tuple[Any, ...], output: Any) -> Any:
-        """Return the output of a layer, with N entries, with the change of each row's adapter added."""
+        """Return the output of a layer, with N entries, after adding the change of each row's adapter."""
         chosen, [x] = self._chosen, inputs
         if chosen is None:
             return output
@@ -160,7 +170,7 @@ class Adapters:
 
 
 def _convolved(module: Any, x: Any, downs: Any, ups: Any, chosen: Any) -> Any:
-    """Return ups (n, out, r) after convolutions downs (n, r, in, h, w) of x (N, in, H, W), those chosen for each entry.
+    """Return ups (n, out, r) after convolutions downs (n, r, in, h, w) of x (N, in, H, W), as chosen for each entry.
 
     The entries are groups of one convolution, whose other settings are those of the module.
     """
@@ -184,17 +194,17 @@ CONFIG, WEIGHTS = "adapter_config.json", "adapter_model.safetensors"
 FILES = (CONFIG, WEIGHTS)
 _PREFIX = "base_model.model."  # of all names in the file
 _DOWN, _UP = ".lora_A.weight", ".lora_B.weight"
-_BASE = ".base_layer."  # in names of the values of a layer that has an adapter
+_BASE = ".base_layer."  # in the names of values of a layer with an adapter
 _LISTED = 5
-# Settings that change nothing about how a saved LoRA acts, or that are used below. All others must be unset: they stand
-# for other methods, or for parts of the fine-tune that are no low-rank change of a linear layer.
+# Settings that do not change how a saved LoRA acts, or that are used below. All others must be unset: they select other
+# methods, or parts of the fine-tune that are not a low-rank change of a linear layer.
 _KNOWN = {
     *("auto_mapping", "base_model_name_or_path", "revision", "peft_type", "task_type", "inference_mode"),
     *("peft_version", "r", "lora_alpha", "use_rslora", "rank_pattern", "lora_dropout", "target_modules"),
     *("exclude_modules", "layers_to_transform", "layers_pattern", "megatron_core", "runtime_config", "eva_config"),
     "qalora_group_size",
 }
-_INITIAL = (True, False, None, "gaussian", "orthogonal", "eva")  # others change the weights of the base as well
+_INITIAL = (True, False, None, "gaussian", "orthogonal", "eva")  # other values also change the weights of the base
 
 
 def base_of(folder: Path) -> str | None:
@@ -219,7 +229,8 @@ def read_adapter(folder: Path, network: Any) -> dict[str, tuple[Any, Any]]:
         convolution, and scale * B (out, r), in the type and on the device of the layer's weights.
 
     Raises:
-        ConfigError: It is no LoRA of linear layers and convolutions, is damaged, or does not fit the network.
+        ConfigError: The adapter is not a LoRA of linear layers and convolutions, is damaged, or does not fit the
+            network.
     """
     config = _config(folder)
     saved = _tensors(folder / WEIGHTS)
@@ -269,7 +280,7 @@ def _tensors(file: Path) -> Mapping[str, Any]:
 def _require_complete(folder: Path, saved: Mapping[str, Any], network: Any) -> None:
     """Raise `ConfigError` unless the file holds pairs of A and B, and otherwise only unchanged values of the network.
 
-    PEFT saves the whole last layer of a language model as well if that has an adapter.
+    If the last layer of a language model has an adapter, PEFT also saves the whole layer.
     """
     stems = {key.removesuffix(end) for key in saved for end in (_DOWN, _UP) if key.endswith(end)}
     wanted = {stem + end for stem in stems for end in (_DOWN, _UP)}
@@ -296,7 +307,7 @@ def _require_adaptable(folder: Path, names: list[str], modules: Mapping[str, Any
             f"{folder / WEIGHTS}: {len(unknown)} of its {len(names)} layers are not in the network: "
             f"{unknown[:_LISTED]}; want an adapter that was trained on this checkpoint, with this version of its code"
         )
-    # not of a class derived from it: some, as in attention of torch, are never called, and only their weights are used
+    # no derived classes: some, as in torch's attention, are never called, and only their weights are used
     other = {
         name: type(module).__name__
         for name, module in ((name, modules[name]) for name in sorted(names))
@@ -316,12 +327,12 @@ def _layer(
     from torch import float32, isfinite
 
     raw = [saved[f"{_PREFIX}{name}{end}"] for end in (_DOWN, _UP)]
-    if not all(one.dtype.kind in "fV" for one in raw):  # V: bfloat16, which numpy does not have
+    if not all(one.dtype.kind in "fV" for one in raw):  # V: bfloat16, which numpy lacks
         raise ConfigError(
             f"{folder / WEIGHTS}: {name}: got A {raw[0].dtype} and B {raw[1].dtype}, want real numbers; save the "
             f"adapter without quantization"
         )
-    # scaled before they are rounded to the type of the weights
+    # scaled before rounding to the type of the weights
     down, up = (converted(one, weight.new_empty(0, dtype=float32)) for one in raw)
     (outputs, *inputs), rank = weight.shape, down.shape[0] if down.ndim else 0
     wanted = (rank, *inputs), (outputs, rank, *(1 for _ in inputs[1:]))

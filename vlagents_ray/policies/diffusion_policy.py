@@ -34,7 +34,7 @@ from vlagents_ray.registry import require
 
 
 class DiffusionPolicyConfig(ModelConfig):
-    """Settings of Diffusion Policy, beside those of all models."""
+    """Settings of Diffusion Policy, in addition to those of all models."""
 
     checkpoint: str = Field(
         min_length=1,
@@ -64,7 +64,7 @@ class DiffusionPolicyConfig(ModelConfig):
     steps: int | None = Field(default=None, ge=1, description="denoising steps; unset: those of the checkpoint")
 
 
-USUAL_CAMERAS = {  # those of the authors' tasks
+USUAL_CAMERAS = {  # of the authors' tasks
     "image": "front",
     "agentview_image": "front",
     "robot0_eye_in_hand_image": "wrist",
@@ -145,7 +145,7 @@ class DiffusionPolicy(ModelPolicy):
 
 
 def _resized(image: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Scale an image, and crop its centre to the model's aspect ratio, as the authors' get_real_obs_dict does."""
+    """Scale an image, and crop its centre to the model's aspect ratio, as in the authors' get_real_obs_dict."""
     if image.shape[:2] == (height, width):
         return image.copy()
     transform = require("diffusion_policy.common.cv2_util").get_image_transform
@@ -153,7 +153,7 @@ def _resized(image: np.ndarray, height: int, width: int) -> np.ndarray:
 
 
 def _action(dim: int, *, absolute: bool) -> ActionSpec:
-    """Describe the actions; those of `abs_action` are one or two poses in the base frame, with 6D rotations."""
+    """Describe the actions; with `abs_action` they are one or two poses in the base frame, with 6D rotations."""
     if not absolute or dim % _POSE_NUMBERS:
         return ActionSpec(dim=dim)
     return ActionSpec(dim=dim, space="ee_pose", delta=False, rotation="rot6d", frame="base")
@@ -171,7 +171,7 @@ class DiffusionNetwork:
     device: Any
     images: dict[str, tuple[int, int]]  # height and width, by the checkpoint's name
     vectors: dict[str, int]  # length, by the checkpoint's name, in its order
-    absolute: bool  # poses with rotations in six numbers, as in the robomimic tasks with `abs_action`
+    absolute: bool  # poses with 6D rotations, as in the robomimic tasks with `abs_action`
 
     @classmethod
     def load(cls, config: DiffusionPolicyConfig) -> DiffusionNetwork:
@@ -206,7 +206,7 @@ class DiffusionNetwork:
 
 
 def checkpoint_file(config: DiffusionPolicyConfig) -> Path:
-    """Find the .ckpt file; raises `ConfigError` also for a hub id without the commit, whose pickle may change."""
+    """Find the .ckpt file; raises `ConfigError` also for a hub id without a commit, whose pickle may change."""
     path = find_checkpoint(config.checkpoint, config.checkpoint_step)
     commit = revision(path)
     if commit is not None and commit not in config.checkpoint:
@@ -278,7 +278,7 @@ _CONDITIONS = {"obs_as_cond": "cond", "obs_as_local_cond": "local_cond", "obs_as
 
 
 def compile_with(network: DiffusionNetwork, compilation: Compilation) -> None:
-    """Compile a module's denoising network and the encoder of its images, which `predict_action` calls."""
+    """Compile a module's denoising network and its image encoder, both of which `predict_action` calls."""
     module = network.module
     _without_branches_on_values(module, network.device)
     condition = next((name for flag, name in _CONDITIONS.items() if getattr(module, flag, False)), "")
@@ -289,7 +289,7 @@ def compile_with(network: DiffusionNetwork, compilation: Compilation) -> None:
 
 
 def _denoising(forward: Callable[..., Any], condition: str, compilation: Compilation) -> Callable[..., Any]:
-    """Return the denoising network as its loop calls it; `condition` is its argument for observations."""
+    """Return the denoising network as its loop calls it; `condition` is the name of its argument for observations."""
 
     def denoise(sample: Any, times: Any, *seen: Any) -> Any:
         return forward(sample, times, **dict(zip([condition], seen, strict=False)))
@@ -306,7 +306,7 @@ def _denoising(forward: Callable[..., Any], condition: str, compilation: Compila
 def _looking(
     forward: Callable[..., Any], names: list[str], steps: int, compilation: Compilation
 ) -> Callable[[Mapping[str, Any]], Any]:
-    """Return the encoder of frames (B * steps, …) by their names, whose core has rows of all their frames."""
+    """Return the encoder of frames (B * steps, …) by name, whose compiled core takes rows of `steps` frames."""
 
     def encode_images(*frames: Any) -> Any:
         seen = {name: frame.flatten(0, 1) for name, frame in zip(names, frames, strict=True)}
@@ -321,13 +321,13 @@ def _looking(
 
 
 def _without_branches_on_values(module: Any, device: Any) -> None:
-    """Have parts of torch compute without a look at numbers, which no program can branch on."""
+    """Replace parts of torch that branch on values of tensors, which compiled programs cannot do."""
     torch, transforms = require("torch"), require("torchvision.transforms")
     for part in module.modules():
         if isinstance(part, transforms.Normalize):  # refuses a std of 0
             mean, std = (torch.tensor(numbers, device=device).view(-1, 1, 1) for numbers in (part.mean, part.std))
             part.forward = partial(_normalised, mean, std)
-        elif isinstance(part, torch.nn.TransformerDecoder):  # compares its mask with a causal one, for a faster kernel
+        elif isinstance(part, torch.nn.TransformerDecoder):  # tests whether its mask is causal, for a faster kernel
             part.forward = partial(part.forward, tgt_is_causal=False)
         elif isinstance(part, torch.nn.TransformerEncoder):
             part.forward = partial(part.forward, is_causal=False)
@@ -348,7 +348,7 @@ def noise_of(rows: Sequence[Row]) -> Any:
 
 @functools.cache
 def _mode() -> type[Any]:
-    """Return the class of that context, one for all: programs are compiled for the class of the context around them."""
+    """Return the class of that context, always the same, since programs are compiled for the class of their context."""
     torch = require("torch")
     uniform = (torch.rand, torch.randint, torch.rand_like, torch.randn_like)
 

@@ -46,22 +46,22 @@ _CURE = "save the checkpoint's processor with its dataset's statistics, as GR00T
 class Embodiment:
     """The inputs and the actions of one robot of a checkpoint."""
 
-    value: str  # its name, by which GR00T's code finds it, like its own `EmbodimentTag`
+    value: str  # its name, by which GR00T's code finds it, like an `EmbodimentTag`
     cameras: tuple[str, ...]
     state: Mapping[str, int]  # groups and their widths, in the model's order
     action: Mapping[str, int]
-    moments: Mapping[str, tuple[int, ...]]  # of "video" and "state": the observations read, 0 the newest, -1 before it
+    moments: Mapping[str, tuple[int, ...]]  # of "video" and "state": offsets of the observations read, 0 for the newest
     horizon: int  # rows of a chunk
     spec: ActionSpec
 
     @property
     def history(self) -> int:
-        """The number of consecutive observations that the model reads from."""
+        """The number of consecutive observations that the model reads."""
         return 1 - min(min(moments, default=0) for moments in self.moments.values())
 
     @classmethod
     def of(cls, folder: Path, name: str | None) -> Embodiment:
-        """Read an embodiment, by default the only one, from a processor's folder; raises `ConfigError`."""
+        """Read an embodiment from a processor's folder, by default the only one; raises `ConfigError`."""
         try:
             settings = json.loads((folder / CONFIG).read_text(encoding="utf-8"))["processor_kwargs"]
             statistics = json.loads((folder / STATISTICS).read_text(encoding="utf-8"))
@@ -105,7 +105,7 @@ class Embodiment:
         )
 
     def require_fits(self, config: Any) -> None:
-        """Raise `ConfigError` unless a model of this `config` has room for the state, the actions and their rows."""
+        """Raise `ConfigError` unless the model of `config` has room for the state, the actions and the chunk's rows."""
         for what, got, most in (
             ("state", sum(self.state.values()), config.max_state_dim),
             ("action", sum(self.action.values()), config.max_action_dim),
@@ -134,7 +134,7 @@ def _width(folder: Path, numbers: Mapping[str, Any], kind: str, group: str, name
 def _action(groups: Any, dim: int, *, converted: bool) -> ActionSpec:
     """Describe the actions by their relative groups.
 
-    Checkpoints call everything else absolute, even displacements such as LIBERO's, so the contract does not state it.
+    Checkpoints call all other groups absolute, even displacements such as LIBERO's, so the contract does not state it.
     GR00T converts relative groups to absolute ones if the processor has `use_relative_action`.
     """
     stated = [group for group in groups if converted and group["rep"] in _CONVERTED]
@@ -150,7 +150,7 @@ def _action(groups: Any, dim: int, *, converted: bool) -> ActionSpec:
 
 
 class Gr00tConfig(ModelConfig):
-    """Settings of GR00T, beside those of all models."""
+    """Settings of GR00T, in addition to those of all models."""
 
     checkpoint: str = Field(
         min_length=1,
@@ -188,17 +188,17 @@ class Gr00tNetwork:
     model: Any
     processor: Any
     embodiment: Embodiment
-    # Held while the processor reads an observation, as several threads do: its transforms keep their parameters, and
-    # it changes the filters of warnings of the whole process.
+    # Held while a thread's processor reads an observation: its transforms store their parameters, and it changes the
+    # warning filters of the whole process.
     reading: threading.Lock = field(default_factory=threading.Lock, repr=False, compare=False)
 
     @classmethod
     def load(cls, config: Gr00tConfig) -> Gr00tNetwork:
-        """Read a checkpoint; raises `ConfigError` if a part of it is missing, unknown or random."""
+        """Read a checkpoint; raises `ConfigError` if a part of it is missing, unknown or randomly initialised."""
         code = _use_checkout(config.source_dir)
         folder = find_checkpoint(config.checkpoint, config.checkpoint_step, needs=[_MODEL, "*.safetensors"])
         _require_version(folder)
-        beside = folder / "processor"  # where training of N1.7 puts it
+        beside = folder / "processor"  # where N1.7's training saves it
         about = folder if (folder / CONFIG).is_file() or not beside.is_dir() else beside
         embodiment = Embodiment.of(about, config.embodiment)
         device = torch_device(config.device)
@@ -239,7 +239,7 @@ class Gr00tNetwork:
 
     @cached_property
     def masks_padding(self) -> bool:
-        """Whether all layers over the language model leave out padding, as those of N1.6's usual transformer do."""
+        """Whether all layers above the language model mask padding, as N1.6's usual transformer does."""
         over = getattr(self.model.action_head, "vl_self_attention", None)
         plain = over is None or not list(over.parameters())
         return plain and bool(self.model.config.use_alternate_vl_dit)
@@ -247,11 +247,11 @@ class Gr00tNetwork:
     def inputs(
         self, images: Sequence[dict[str, np.ndarray]], states: Sequence[dict[str, np.ndarray]], instruction: str
     ) -> dict[str, Any]:
-        """Return the model's inputs of one row, for `chunks`.
+        """Return the model's inputs for one row, to be passed to `chunks`.
 
         Args:
-            images: Of each moment of the embodiment's video, oldest first, (H, W, 3) uint8 by camera.
-            states: Of each moment of its state, (D,) float32 by group.
+            images: For each moment of the embodiment's video, oldest first, (H, W, 3) uint8 by camera.
+            states: For each moment of its state, (D,) float32 by group.
             instruction: The task in words.
         """
         types, robot = require("gr00t.data.types"), self.embodiment
@@ -272,7 +272,7 @@ class Gr00tNetwork:
 
         Args:
             rngs: The generator of each row's noise.
-            inputs: What `inputs` returned for each of them.
+            inputs: The result of `inputs` for each row.
         """
         whole = self._collated(inputs)
         lengths = whole["inputs"]["attention_mask"].sum(1).tolist()
@@ -309,7 +309,7 @@ def _use_checkout(source_dir: str | None) -> Path:
             f"{source_dir or os.environ.get(SOURCE) or 'gr00t'}: is GR00T's code of N1.5 or before, want that of N1.6 "
             f"or N1.7; serve N1.5 by its own server, and the policy `upstream` in front of it"
         )
-    os.environ.setdefault("NO_ALBUMENTATIONS_UPDATE", "1")  # on import it queries PyPI for a newer version
+    os.environ.setdefault("NO_ALBUMENTATIONS_UPDATE", "1")  # otherwise its import queries PyPI for a newer version
     ensure_torchvision()
     return Path(str(require("gr00t.model").__file__)).parent
 
@@ -326,7 +326,7 @@ def _converted(model: Any, saved: SavedTensors, device: Any, dtype: Any) -> Any:
 
 
 def _require_version(folder: Path) -> None:
-    """Raise `ConfigError` unless the checkout has the class of a checkpoint's model."""
+    """Raise `ConfigError` unless the checkout has the class of the checkpoint's model."""
     try:
         kind = json.loads((folder / _MODEL).read_text(encoding="utf-8")).get("model_type")
     except (ValueError, AttributeError) as error:
@@ -344,21 +344,21 @@ def _require_version(folder: Path) -> None:
 
 
 _FLASH, _PACKED = "flash_attention_2", "packed_sdpa"
-_CHECK = "_check_and_enable_flash_attn_2"  # of transformers' models, up to 4.5
+_CHECK = "_check_and_enable_flash_attn_2"  # a method of transformers' models, up to 4.5
 
 
 def flash_attention_is_here(device: Any, dtype: Any) -> bool:
-    """Return whether flash-attention is installed, and computes on a device in a dtype: on CUDA, in 16 bits."""
+    """Return whether flash-attention is installed and supports the device and dtype: CUDA, 16 bits."""
     computes = device.type == "cuda" and dtype.itemsize == 2
     return computes and bool(require("transformers.utils").is_flash_attn_2_available())
 
 
 @contextlib.contextmanager
 def built_without_flash_attention() -> Iterator[None]:
-    """Allow models that insist on flash-attention to be built in this context without it, such as N1.6's backbone."""
+    """Allow models that require flash-attention, such as N1.6's backbone, to be built without it in this context."""
     base: Any = require("transformers").PreTrainedModel
     check = vars(base).get(_CHECK)
-    if check is None:  # newer: N1.7's, which takes another attention by itself
+    if check is None:  # newer: N1.7's, which falls back to another attention
         yield
         return
     setattr(base, _CHECK, classmethod(lambda _, config, *__, **___: config))
@@ -382,12 +382,12 @@ def use_torch_attention(model: Any) -> None:
 def packed_attention(
     _: Any, query: Any, key: Any, value: Any, __: Any = None, *, scaling: float, seq_len_list: Sequence[int], **___: Any
 ) -> tuple[Any, None]:
-    """Attend within each of several sequences that follow each other.
+    """Attend within each of several concatenated sequences.
 
     Args:
         query: (1, heads, tokens, D).
-        key: As `query`.
-        value: As `query`.
+        key: (1, heads, tokens, D).
+        value: (1, heads, tokens, D).
         scaling: The factor of the products of queries and keys.
         seq_len_list: The number of tokens of each sequence.
 
@@ -395,20 +395,20 @@ def packed_attention(
         (1, tokens, heads, D), and None in place of the weights.
     """
     attention = require("torch.nn.functional").scaled_dot_product_attention
-    if len(set(seq_len_list)) == 1:  # in one call, each sequence a row
+    if len(set(seq_len_list)) == 1:  # equal lengths: one call, with a row for each sequence
         rows = [one[0].unflatten(1, (-1, seq_len_list[0])).transpose(0, 1) for one in (query, key, value)]
         return attention(*rows, scale=scaling).transpose(1, 2).flatten(0, 1)[None], None
     parts = zip(*(one.split(list(seq_len_list), dim=2) for one in (query, key, value)), strict=True)
     return require("torch").cat([attention(*part, scale=scaling) for part in parts], dim=2).transpose(1, 2), None
 
 
-USUAL_CAMERAS = {"image": "front", "wrist_image": "wrist"}  # of LIBERO; others have the checkpoint's names
-GRIPPER_QPOS = "gripper_qpos"  # the part that a group `gripper` of several numbers is, as in LIBERO
+USUAL_CAMERAS = {"image": "front", "wrist_image": "wrist"}  # of LIBERO; other embodiments use the checkpoint's names
+GRIPPER_QPOS = "gripper_qpos"  # the part of the state for a group `gripper` with several numbers, as in LIBERO
 
 
 @dataclass(frozen=True)
 class SeenByGr00t:
-    """An observation by the embodiment's names, and the model's inputs of it if it is all that the model reads."""
+    """An observation by the embodiment's names, and the model's inputs if they need no other observation."""
 
     images: dict[str, np.ndarray]  # (H, W, 3) uint8
     state: dict[str, np.ndarray]  # (D,) float32
@@ -501,7 +501,7 @@ class Gr00t(ModelPolicy):
             return error
 
     def _parts(self, robot: Embodiment) -> dict[str, int | None]:
-        """Return the parts of the state that make up the model's, with their widths where these are known."""
+        """Return the parts of our state that form the model's, with their widths if known."""
         if self.config.state is not None:
             return dict.fromkeys(self.config.state)
         return {

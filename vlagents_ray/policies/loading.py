@@ -1,4 +1,4 @@
-"""The report of a policy that loads, and the batch sizes for which it is compiled.
+"""The report of a policy that is being loaded, and the batch sizes for which it is compiled.
 
 A server opens a `loading_report` around `Agent.initialize`; without one, progress is only logged.
 """
@@ -14,19 +14,19 @@ from typing import Any
 
 logger = logging.getLogger(__name__)
 
-COMPILED_SIZES = (1, 2, 4, 8, 16)  # without a server's batch size
+COMPILED_SIZES = (1, 2, 4, 8, 16)  # used if no server sets its batch sizes
 
 
 @dataclass(slots=True)
 class LoadingReport:
     """The report of one policy."""
 
-    on_progress: Callable[[str], None]  # called with each step, on the thread that loads
+    on_progress: Callable[[str], None]  # called with each step, on the loading thread
     batch_sizes: Sequence[int]  # the server's, ascending
-    uncompiled: list[str] = field(default_factory=list)  # what runs without compilation, although `compile` is set
+    uncompiled: list[str] = field(default_factory=list)  # parts that run without compilation, although `compile` is set
     devices: list[dict[str, Any]] = field(default_factory=list)  # of the models, see `accelerator.described`
-    most_rows: int | None = None  # of a forward pass, if memory was found to hold no more
-    on_out_of_memory: Callable[[], None] = lambda: None  # called each time that a forward pass does not fit, also later
+    most_rows: int | None = None  # of a forward pass, if memory limits it
+    on_out_of_memory: Callable[[], None] = lambda: None  # called whenever a forward pass does not fit, even later
 
 
 _report: ContextVar[LoadingReport | None] = ContextVar("_report", default=None)
@@ -49,7 +49,7 @@ def loading_report(
 
 @contextmanager
 def current_report() -> Iterator[LoadingReport]:
-    """Yield the report of this context, or a new one if no server has opened any."""
+    """Yield the report of this context, or a new one if no server has opened one."""
     if (report := _report.get()) is not None:
         yield report
         return
@@ -58,7 +58,7 @@ def current_report() -> Iterator[LoadingReport]:
 
 
 def report_progress(step: str) -> None:
-    """Log the step of a long start, such as "compiling for 4 rows (3 of 5)", and report it."""
+    """Log and report a step of a long start, such as "compiling for 4 rows (3 of 5)"."""
     logger.info("%s", step)
     if (report := _report.get()) is not None:
         report.on_progress(step)

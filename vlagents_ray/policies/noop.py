@@ -23,7 +23,7 @@ class NoopConfig(BaseModel, extra="forbid"):
 
 
 class Noop(Agent):
-    """Zeros, (D,) or (chunk, D). A batch of B takes `base_ms + per_item_ms * B`, slept once."""
+    """Returns zeros, (D,) or (chunk, D). A batch of B takes `base_ms + per_item_ms * B`, in a single sleep."""
 
     Config: ClassVar[type] = NoopConfig
     shared: ClassVar[tuple[str, ...]] = ("config",)

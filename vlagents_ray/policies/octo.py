@@ -36,7 +36,7 @@ from vlagents_ray.registry import require
 
 
 class OctoConfig(ModelConfig):
-    """Settings of Octo, beside those of all models."""
+    """Settings of Octo, in addition to those of all models."""
 
     checkpoint: str = Field(
         min_length=1,
@@ -154,7 +154,7 @@ class Octo(ModelPolicy):
         return seen
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction]:
-        """Compute the chunks, with one pass of the transformer for each window and of the action head for each row."""
+        """Compute the chunks, with one pass of the transformer per window and one of the action head per row."""
         network: OctoNetwork = self.model
         windows = {id(row.frames): row for row in rows}  # the samples of a session share its window
         place = {window: i for i, window in enumerate(windows)}
@@ -168,7 +168,7 @@ class Octo(ModelPolicy):
         return [Prediction(real_actions(chunk, statistics, self.config.normalization)) for chunk in actions]
 
     def _observations(self, rows: Sequence[Row]) -> dict[str, np.ndarray]:
-        """Return windows (B, W, ...), padded by the first frame, which is masked there."""
+        """Return windows (B, W, ...), padded with the first frame, which is masked there."""
         length = self.history
         histories = [row.history(length) for row in rows]
         observations = {
@@ -211,12 +211,12 @@ class Octo(ModelPolicy):
     def _cameras(self, network: OctoNetwork) -> dict[str, str]:
         chosen, known = self.config.cameras, list(network.cameras)
         if chosen and set(chosen) <= set(known):
-            return chosen  # Octo was trained with missing cameras, for which it has no tokens
+            return chosen  # Octo was trained with missing cameras, whose tokens it omits
         return choose_cameras(chosen, {name: ours for name, ours in USUAL_CAMERAS.items() if name in known}, known)
 
 
 def _action(dim: int, dataset: str | None) -> ActionSpec:
-    """Describe the actions of a pretraining dataset, in its standard form; fine-tuned checkpoints do not state them.
+    """Describe the actions of a pretraining dataset in its standard form; fine-tuned checkpoints do not state theirs.
 
     octo/data/oxe: change of the end effector's position and of its roll, pitch and yaw, then the gripper, 1 = open.
     """
@@ -235,11 +235,11 @@ def octo_model_class(source_dir: str | None) -> Any:
     """Import `octo.model.octo_model.OctoModel`, from a checkout if one is given."""
     use_source("octo", "OCTO_SRC", source_dir)
     if "dlimp" not in sys.modules and importlib.util.find_spec("dlimp") is None:
-        # Octo's data loaders import it; the model uses only a constant of their module.
+        # Octo's data loaders import it; the model only uses a constant of their module.
         stub: Any = types.ModuleType("dlimp")
         stub.DLataset = object
         sys.modules["dlimp"] = stub
-    require("tensorflow").config.set_visible_devices([], "GPU")  # it resizes images only, and the memory is for JAX
+    require("tensorflow").config.set_visible_devices([], "GPU")  # it only resizes images, and JAX needs the memory
     return require("octo.model.octo_model").OctoModel
 
 
@@ -291,13 +291,13 @@ class OctoNetwork:
 
     @cached_property
     def cameras(self) -> dict[str, tuple[int, int]]:
-        """Return the height and width of each image that a tokenizer reads, by Octo's name."""
+        """The height and width of each image that a tokenizer reads, by Octo's name."""
         found = self._read_by("ImageTokenizer", "obs_stack_keys", ("image_.*",))
         return {name: (shape[0], shape[1]) for name, shape in found.items() if name.startswith("image_")}
 
     @cached_property
     def proprio_dim(self) -> int | None:
-        """Return the length of the state vector; None if no tokenizer reads it."""
+        """The length of the state vector; None if no tokenizer reads it."""
         found = self._read_by("LowdimObsTokenizer", "obs_keys", ())
         return found[PROPRIO][0] if PROPRIO in found else None
 
@@ -342,7 +342,7 @@ class OctoNetwork:
         return require("jax").vmap(alone)(tokens, mask, keys)[..., :dim]
 
     def _read_by(self, tokenizer: str, setting: str, usual: tuple[str, ...]) -> dict[str, tuple[int, ...]]:
-        """Return the shapes of the parts of an observation that match the patterns of a kind of tokenizers."""
+        """Return the shapes of the parts of an observation that match the patterns of one kind of tokenizer."""
         specs = [s for s in self.model.config["model"]["observation_tokenizers"].values() if s["name"] == tokenizer]
         patterns = [pattern for spec in specs for pattern in spec["kwargs"].get(setting, usual)]
         return {
@@ -359,7 +359,7 @@ def normalised_state(vector: np.ndarray, statistics: Mapping[str, np.ndarray]) -
 
 
 def real_actions(actions: np.ndarray, statistics: Mapping[str, np.ndarray], normalization: str) -> np.ndarray:
-    """Convert normalised actions (..., D) to the units of the data, float32, except those that the mask leaves out."""
+    """Convert normalised actions (..., D) to the units of the data, float32; masked-out numbers stay unchanged."""
     if normalization == "normal":
         scaled = actions * statistics["std"] + statistics["mean"]
     else:
@@ -378,7 +378,7 @@ def _folder_and_step(checkpoint: str, step: int | None) -> tuple[Path, int]:
     if not steps:
         raise ConfigError(f"checkpoint {folder}: has no step, a folder with a number for a name; copy all of it")
     step = steps[-1] if step is None else step
-    for part in (*_FILES, str(step)):  # the files of the weights; training adds other steps
+    for part in (*_FILES, str(step)):  # the files of the weights; training adds further steps
         find_checkpoint(str(folder / part))
     return folder, step
 
@@ -390,7 +390,7 @@ _TEXT = "octo.data.utils.text_processing"
 def require_own_classes(file: Path) -> None:
     """Raise `ConfigError` unless a config.json names only classes of Octo's components and text processors.
 
-    Others are not imported, as Octo accepts any callable of any module, `os.system` as well.
+    Other classes are not imported, since Octo accepts any callable of any module, including `os.system`.
     """
     try:
         config = json.loads(file.read_text(encoding="utf-8"))
@@ -398,7 +398,7 @@ def require_own_classes(file: Path) -> None:
     except (ValueError, KeyError, TypeError) as error:
         raise ConfigError(f"{file}: not a configuration of Octo's ({type(error).__name__}: {error})") from error
     named = [(spec["module"], spec["name"]) for spec in _specs(loaded)]
-    for is_own in (_is_own_name, _is_own_class):  # check all names before anything is imported
+    for is_own in (_is_own_name, _is_own_class):  # check all names before importing anything
         for module, name in named:
             if not is_own(module, name):
                 raise ConfigError(
@@ -425,7 +425,7 @@ def _is_own_name(module: object, name: object) -> bool:
 
 
 def _is_own_class(module: str, name: str) -> bool:
-    """Return whether a class is defined by Octo, and not imported into its module."""
+    """Return whether Octo defines a class itself, rather than importing it into its module."""
     try:
         found = getattr(importlib.import_module(module), name, None)
     except ImportError as error:
@@ -435,11 +435,11 @@ def _is_own_class(module: str, name: str) -> bool:
     return inspect.isclass(found) and found.__module__.startswith("octo.")
 
 
-_CROPPED = np.sqrt(np.float32(0.9))  # share of each side, by the average area of the training's random crops
+_CROPPED = np.sqrt(np.float32(0.9))  # share of each side, from the average area of training's random crops
 
 
 def resized(image: np.ndarray, height: int, width: int, *, crop: bool) -> np.ndarray:
-    """Resize an (H, W, 3) uint8 image to (height, width, 3) by Lanczos, with a crop of its centre if `crop`; a copy."""
+    """Resize an (H, W, 3) uint8 image to (height, width, 3) by Lanczos, from its centre if `crop`; returns a copy."""
     if not crop and image.shape[:2] == (height, width):
         return image.copy()  # the filter would change nothing
     tf = require("tensorflow")

@@ -49,7 +49,7 @@ class RobotConvention:
     optional: tuple[str, ...] = ()  # cameras that openpi masks if they are missing
 
     def read(self, obs: Obs) -> dict[str, Any]:
-        """Return openpi's observation without the prompt: copies of the images, uint8, and states, float32."""
+        """Convert an observation to openpi's, without the prompt: copies of the images, uint8, and states, float32."""
         data: dict[str, Any] = {}
         for key, image in camera_images(obs, self.cameras).items():
             _put(data, key, np.array(image if self.layout == "hwc" else image.transpose(2, 0, 1)))
@@ -73,9 +73,9 @@ _ALOHA = RobotConvention(
     optional=("images.cam_left_wrist", "images.cam_right_wrist"),
 )
 
-# As in openpi's examples/{libero,droid,aloha_real,aloha_sim}. In LIBERO's actions a gripper closes at 1, in DROID's too
-# (and its reading is 0 when open); ALOHA's two are in [0, 1], at 6 and 13, 1 = open, and pass as they are.
-ROBOTS: Mapping[str, RobotConvention] = {  # by the class of openpi's transform of observations
+# As in openpi's examples/{libero,droid,aloha_real,aloha_sim}. The gripper closes at 1 in actions of LIBERO and DROID
+# (DROID's observed value is 0 when open); ALOHA's two, at 6 and 13, are in [0, 1], 1 = open, and stay unchanged.
+ROBOTS: Mapping[str, RobotConvention] = {  # by the class of openpi's observation transform
     "LiberoInputs": RobotConvention(
         {"observation/image": "front", "observation/wrist_image": "wrist"},
         {"observation/state": {"xyz_axis_angle": 6, "gripper_qpos": 2}},
@@ -98,7 +98,7 @@ def choose_robot(
     state: Mapping[str, Mapping[str, int]] | None,
     layout: Layout | None,
 ) -> RobotConvention:
-    """Return the convention of a config's robot with the settings that override it; raises `ConfigError` if unknown."""
+    """Return the convention of a config's robot, overridden by the settings; raises `ConfigError` if it is unknown."""
     usual = ROBOTS.get(transform)
     if usual is None:
         if cameras is None or state is None:
@@ -125,8 +125,8 @@ class Transforms:
     inputs: Any  # a dict of unbatched arrays -> such a dict
     outputs: Any
     forward: Any  # the part of `inputs` for actions, before the model's own transforms
-    robot: str  # the class of its first transform of observations, e.g. "LiberoInputs"
-    prompt: bool  # whether one is needed; otherwise the config has its own
+    robot: str  # the class of its first observation transform, e.g. "LiberoInputs"
+    prompt: bool  # whether a prompt is needed; if not, the config has one
 
     @classmethod
     def of(cls, config: Any, folder: Path) -> Transforms:
@@ -165,19 +165,19 @@ class Transforms:
         return np.asarray(self.outputs({"state": state, "actions": output})["actions"], np.float32)
 
     def plan(self, observation: dict[str, Any], instruction: str, actions: np.ndarray) -> np.ndarray:
-        """Convert a robot's actions (H, D) to the model's units, relative to the observation if it is trained so."""
+        """Convert a robot's actions (H, D) to the model's units, relative to the observation if the model's are."""
         data = _with(observation, instruction) | {"actions": np.array(actions)}
         return np.asarray(self.forward(data)["actions"], np.float32)
 
 
 def _with(observation: dict[str, Any], instruction: str) -> dict[str, Any]:
-    """Copy an observation as deeply as openpi's transforms change it."""
+    """Copy an observation as deeply as openpi's transforms modify it."""
     data: dict[str, Any] = require("jax").tree.map(np.array, observation)
     return data | {"prompt": instruction} if instruction else data
 
 
 def _data_config(config: Any, folder: Path) -> Any:
-    """Return the config's data config with the checkpoint's statistics; openpi would first look for others online."""
+    """Return the config's data config with the checkpoint's statistics; openpi itself would first look online."""
     factory = config.data
     here = dataclasses.replace(factory.assets, assets_dir=str(folder / "assets"))
     return dataclasses.replace(factory, assets=here).create(config.assets_dirs, config.model)
@@ -201,7 +201,7 @@ def _statistics(folder: Path, asset: str | None) -> Any:
 
 
 class OpenPiConfig(ModelConfig):
-    """Settings of openpi's policies, beside those of all models."""
+    """Settings of openpi's policies, in addition to those of all models."""
 
     config: str = Field(
         min_length=1, description="the training config: one of openpi's names, such as pi05_libero, or 'module:NAME'"
@@ -246,32 +246,32 @@ class SampleBatch:
     """The inputs of a model for B chunks."""
 
     inputs: dict[str, Any]  # of P observations
-    noise: np.ndarray  # of each row
-    guide: Guide | None  # of the rows, if any follows a plan
+    noise: np.ndarray  # one array for each row
+    guide: Guide | None  # of the rows, if any of them follows a plan
     owners: Sequence[int]  # the observation of each row; 0, 1, … unless the model `shares`
     random: RandomSteps | None  # the result of `random_steps` for the rows
 
 
 class OpenPiModel(abc.ABC):
-    """The interface of a model for the policy."""
+    """The interface between a model and the policy."""
 
     noise_shape: tuple[int, int] | None = None  # (H, action_dim) of a row's noise; None for a model without noise
-    shares = False  # whether several rows can be of one observation
+    shares = False  # whether several rows can share one observation
 
     @abc.abstractmethod
     def sample(self, batch: SampleBatch) -> np.ndarray:
         """Compute actions (B, H, action_dim), or tokens (B, T)."""
 
     def random_steps(self, rows: Sequence[Row], noise_level: float) -> RandomSteps | None:
-        """Return the random steps of rows with requested values; None without any."""
+        """Return the random steps of rows for which outputs are requested; None if there are none."""
         return None
 
 
 class JaxFlow(OpenPiModel):
-    """π0 and π0.5 in JAX, in two programs, each compiled once for each number of its rows.
+    """π0 and π0.5 in JAX, as two programs, each compiled once per number of rows.
 
-    The first computes the keys and values of images and instruction, once for each observation. The second follows the
-    flow of each row from them, with the steps of openpi's `sample_actions`.
+    The first computes the keys and values of images and instruction, once for each observation. From these the second
+    follows the flow of each row, with the steps of openpi's `sample_actions`.
     """
 
     shares = True
@@ -354,7 +354,7 @@ class JaxTokens(OpenPiModel):
 
     @staticmethod
     def ended(tokens: np.ndarray) -> np.ndarray:
-        """Replace the tokens (B, T) after each row's end by zeros: openpi decodes until all rows have ended."""
+        """Set the tokens (B, T) after each row's end to zero: openpi decodes until all rows have ended."""
         ends = tokens == _END
         return np.where(np.cumsum(ends, axis=1) - ends > 0, 0, tokens)
 
@@ -442,7 +442,7 @@ def _observation(batch: dict[str, Any]) -> Any:
 
 
 def _require_used(params: Any, network: Any, folder: Path, name: str) -> None:
-    """Raise `ConfigError` if the model drops tensors of LoRA; other unused tensors of base checkpoints are logged."""
+    """Raise `ConfigError` if the model drops LoRA tensors; other unused tensors, as in base checkpoints, are logged."""
     flatten = require("flax.traverse_util").flatten_dict
     own = set(flatten(require("flax.nnx").state(network).to_pure_dict(), sep="/"))
     extra = sorted(set(flatten(params, sep="/")) - own)
@@ -470,7 +470,7 @@ class LoadedOpenPi:
 
 @dataclass(frozen=True)
 class SeenObs:
-    """An observation in openpi's form, without the prompt, and the model's inputs of it."""
+    """An observation in openpi's form, without the prompt, and the model's inputs made from it."""
 
     raw: dict[str, Any]
     inputs: dict[str, Any]
@@ -546,7 +546,7 @@ class OpenPi(ModelPolicy):
         spare = next((one for one in read if not isinstance(one, Exception)), None)
         if spare is None:
             return read  # type: ignore[return-value]  # errors all
-        # A valid row replaces an invalid one, so that the number of rows stays a compiled one.
+        # A valid row replaces an invalid one, so that the number of rows stays one that is compiled.
         spare = replace(spare, row=replace(spare.row, want=()))
         flows, stated = self._sample([spare if isinstance(one, Exception) else one for one in read])
         actions = self.loaded().transforms.actions
@@ -558,7 +558,7 @@ class OpenPi(ModelPolicy):
         ]
 
     def _shared(self, rows: Sequence[Row]) -> tuple[list[int], list[int]]:
-        """Return `shared_frames`, or each row by itself for a model whose rows cannot share an observation.
+        """Return `shared_frames`, or one observation per row if the model's rows cannot share one.
 
         The observations are padded to one of `batch_sizes`, as rows are.
         """
@@ -577,7 +577,7 @@ class OpenPi(ModelPolicy):
         return TransformedRow(seen.inputs, row, row.noise(*loaded.model.noise_shape or ()))
 
     def _sample(self, ready: Sequence[TransformedRow]) -> tuple[np.ndarray, dict[int, dict[str, Any]]]:
-        """Return the model's output for rows, and the extra outputs requested of them, by their places."""
+        """Return the model's output for rows, and the requested extra outputs by the index of the row."""
         model, rows = self.loaded().model, [one.row for one in ready]
         firsts, owners = self._shared(rows)
         batch = require("jax").tree.map(lambda *leaves: np.stack(leaves), *(ready[i].inputs for i in firsts))
@@ -596,12 +596,12 @@ class OpenPi(ModelPolicy):
         return find_checkpoint(str(require("openpi.shared.download").maybe_download(name.replace(STEP, str(step)))))
 
 
-SOURCE = "OPENPI_SRC"  # the variable that names a checkout; PyPI's "openpi" is another project
+SOURCE = "OPENPI_SRC"  # the variable that names a checkout; "openpi" on PyPI is another project
 FOLDERS = ("src", "packages/openpi-client/src")
 
 
 def train_config(name: str) -> Any:
-    """Return openpi's `TrainConfig` of a name, or the one at "module:NAME"."""
+    """Return openpi's `TrainConfig` named `name`, or the one at "module:NAME"."""
     configs = require("openpi.training.config")
     module, colon, attribute = name.partition(":")
     if not colon:

@@ -43,7 +43,7 @@ _STATISTICS = ("state_mean", "state_std", "actions_mean", "actions_std")
 
 
 class Pi0Config(ModelConfig):
-    """Settings of π0, beside those of all models."""
+    """Settings of π0, in addition to those of all models."""
 
     cameras: dict[str, str] | None = Field(
         default=None,
@@ -133,7 +133,7 @@ class Pi0(ModelPolicy):
         return LoadedPi0(network, _processor(path), device, dtype, passes)
 
     def adapt(self, adapter: str, folder: Path) -> None:
-        """Refuse an adapter beside which other statistics lie than those of the base."""
+        """Refuse an adapter whose folder has statistics that differ from the base's."""
         file = folder / _PROCESSOR
         try:
             saved = dict(json.loads(file.read_text(encoding="utf-8"))) if file.is_file() else {}
@@ -150,7 +150,7 @@ class Pi0(ModelPolicy):
     def perceive(self, obs: Obs) -> dict[str, Any]:
         """Return the model's inputs for one row, on the CPU: images, state, and the episode's tokens.
 
-        It is called on several threads, and so never uses the tokenizer: padding is a state of that.
+        Several threads call it, so it never uses the tokenizer, whose padding is mutable state.
         """
         processor = self.loaded().processor
         torch, side = require("torch"), processor.image_processor.pad_size
@@ -167,7 +167,7 @@ class Pi0(ModelPolicy):
         }
 
     def _begin(self, instruction: str, seed: int, adapter: str = "") -> None:
-        """Begin an episode, with its tokens; an instruction longer than in training is refused, not truncated."""
+        """Begin an episode and tokenize its instruction; one longer than in training is refused, not truncated."""
         super()._begin(instruction, seed, adapter)
         if self.model is None:
             return
@@ -264,7 +264,7 @@ def _processor(path: Path) -> Any:
 class Pi0HfPasses(FlowPasses):
     """The passes of a `PI0ForConditionalGeneration`.
 
-    The actions are kept in float32 between the steps, also if the model computes in another type, as in openpi.
+    As in openpi, actions stay in float32 between the steps even if the model computes in another type.
     """
 
     def encode(self, tokens: Any, mask: Any, cameras: Any, state: Any, *images: Any) -> tuple[Any, Any]:
@@ -283,7 +283,7 @@ def flow_velocity(
         network: The `PI0ForConditionalGeneration`.
         inputs: Tokens, images and states of P observations, as `PI0Processor` returns them, on the network's device.
         dtype: The type in which the network computes.
-        owners: The observation of each of the B rows; None: row i is of observation i.
+        owners: The observation of each of the B rows; None: row i belongs to observation i.
 
     Returns:
         The function, whose result is (B, H, D) float32.
@@ -303,16 +303,16 @@ def flow_velocity(
 
 
 def encode(network: Any, tokens: Any, images: Any, cameras: Any, mask: Any) -> Any:
-    """Return the keys and values (P, layers, 2, heads, L, E) of tokens (P, L) and images, of which `mask` is not 0.
+    """Return the keys and values (P, layers, 2, heads, L, E) of tokens (P, L) and images where `mask` is not 0.
 
     Args:
         network: The `PI0ForConditionalGeneration`.
         tokens: (P, L) int64.
         images: (P, cameras, 3, S, S).
-        cameras: (P, cameras) bool, which of the images are there.
+        cameras: (P, cameras) bool, which images are present.
         mask: (P, L), 0 for padding.
     """
-    import torch  # the compiler follows a statement, and not `require`
+    import torch  # the compiler follows an import statement, but not `require`
 
     cache = network.model.vlm(
         inputs_embeds=network.model.embed_prefix(tokens, images, cameras),

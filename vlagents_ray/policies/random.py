@@ -31,7 +31,7 @@ class RandomConfig(BaseModel, extra="forbid"):
 
 
 class Random(Agent):
-    """Returns actions that are uniform in [low, high] and depend on the seeds of the config and the episode only.
+    """Returns actions that are uniform in [low, high] and depend only on the seeds of the config and the episode.
 
     For an observation with `info["samples"] = N` it also returns its distribution, as RL fine-tuning needs.
     """
@@ -42,7 +42,7 @@ class Random(Agent):
     def __init__(self, config: RandomConfig | None = None) -> None:
         self.config = config or RandomConfig()
         self._rng: np.random.Generator | None = None
-        self._draws: np.random.Generator | None = None  # of samples, so that asking for them changes no action
+        self._draws: np.random.Generator | None = None  # of samples, so that requesting them changes no action
 
     @property
     def contract(self) -> Contract:
@@ -51,7 +51,7 @@ class Random(Agent):
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         """Begin the episode of `kwargs["seed"]` (an int, 0 if not given)."""
-        # numpy takes no negative seed; each int64 has its own number modulo 2**64
+        # numpy accepts no negative seed; each int64 has a distinct number modulo 2**64
         seed = [self.config.seed, int(kwargs.get("seed") or 0) % 2**64]
         self._rng, self._draws = np.random.default_rng(seed), np.random.default_rng([*seed, 1])
         return {}

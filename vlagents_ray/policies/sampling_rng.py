@@ -14,7 +14,7 @@ _SEEDS = 2**63
 
 
 def generator_of(rng: np.random.Generator) -> Any:
-    """Make a torch generator with a seed from `rng`; it is on the CPU, so that draws are the same on every device."""
+    """Make a torch generator seeded from `rng`, on the CPU so that draws are the same on every device."""
     return torch.Generator().manual_seed(int(rng.integers(_SEEDS)))
 
 
@@ -29,7 +29,7 @@ def seeded(rng: np.random.Generator, device: Any) -> Iterator[None]:
 class RowDraws(TorchFunctionMode):  # type: ignore[misc]
     """A context in which `torch.randn` and `torch.multinomial` draw each row of a batch from that row's generator.
 
-    The batch must be the first dimension of every draw, alone or as the outer part of it. Draws of other threads are
+    The batch must be the first dimension of every draw, or the outer part of that dimension. Draws of other threads are
     not affected.
     """
 

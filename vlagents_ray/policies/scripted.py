@@ -14,7 +14,7 @@ from vlagents_ray.registry import named_class
 
 
 class ScriptedConfig(BaseModel, extra="forbid"):
-    """Settings of `Scripted`: the env to assume if a client does not name its own, and an expert of the user."""
+    """Settings of `Scripted`: the env to assume if a client names none, and an expert of the user."""
 
     task: str | None = Field(default=None, description="an env's full name, e.g. 'tabletop' or 'maniskill/PushCube-v1'")
     expert: str | None = Field(default=None, description="'module:Class' of an expert, in place of the env's own one")

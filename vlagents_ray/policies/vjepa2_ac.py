@@ -34,7 +34,7 @@ from vlagents_ray.registry import require
 
 
 class VJepa2AcConfig(ModelConfig):
-    """Settings of V-JEPA 2-AC, beside those of all models: its checkpoint, and the search for plans."""
+    """Settings of V-JEPA 2-AC: its checkpoint and the search for plans, in addition to the settings of all models."""
 
     encoder: str | None = Field(
         default=None,
@@ -66,7 +66,7 @@ class VJepa2AcConfig(ModelConfig):
 
     @property
     def plans_a_pass(self) -> int:
-        """The largest number of plans in a forward pass of the predictor; compiled, every full pass has as many."""
+        """The largest number of plans in a forward pass of the predictor; compiled, full passes have this number."""
         return min(self.samples, self.pass_size) if self.compile else self.pass_size
 
     @model_validator(mode="after")
@@ -83,7 +83,7 @@ _PATCHES = "encoder.embeddings.patch_embeddings.proj.weight"
 
 
 def to_pixels(image: np.ndarray, side: int) -> np.ndarray:
-    """Crop, resize and normalise an (H, W, 3) uint8 image as upstream, to (3, side, side) float32."""
+    """Crop, resize and normalise an (H, W, 3) uint8 image as upstream does, to (3, side, side) float32."""
     torch = require("torch")
     height, width = image.shape[:2]
     edge = min(height, width)
@@ -95,7 +95,7 @@ def to_pixels(image: np.ndarray, side: int) -> np.ndarray:
 
 
 class Encoder:
-    """Computes features of still images, which are repeated for the two frames of one step of the encoder."""
+    """Computes features of still images; each is repeated as the two frames of one step of the encoder."""
 
     def __init__(self, model: Any, normalize: bool, compilation: Compilation) -> None:
         self._model = model
@@ -113,13 +113,13 @@ class Encoder:
 
 
 def normalizer(normalize: bool) -> Callable[[Any], Any]:
-    """Return a function that normalises features (..., F), or else returns them as they are."""
+    """Return a function that normalises features (..., F), or returns them unchanged if not `normalize`."""
     layer_norm = require("torch").nn.functional.layer_norm
     return lambda features: layer_norm(features, features.shape[-1:]) if normalize else features
 
 
 def load_encoder(config: VJepa2AcConfig, saved: Mapping[str, Any] | None) -> Any:
-    """Load the `VJEPA2Model` of `config.encoder`, or make one with upstream's weights `saved`."""
+    """Load the `VJEPA2Model` of `config.encoder`, or make one from upstream's weights `saved`."""
     ensure_torchvision()
     transformers = require("transformers")
     if config.encoder is not None:
@@ -167,7 +167,7 @@ def from_upstream(saved: Mapping[str, Any], config: VJepa2AcConfig) -> Any:
 
 
 def _renamed(saved: Mapping[str, Any]) -> dict[str, Any]:
-    """Rename upstream's tensors to transformers' names; query, key and value are one matrix upstream."""
+    """Rename upstream's tensors to transformers' names; upstream stores query, key and value in one matrix."""
     tensors: dict[str, Any] = {}
     for name, tensor in saved.items():
         new = (
@@ -190,13 +190,13 @@ _PREFIXES = ("module.", "backbone.")  # added by distributed training and upstre
 
 
 def read_checkpoint(config: VJepa2AcConfig) -> dict[str, dict[str, Any]]:
-    """Read the tensors of the parts of upstream's file, "encoder" and "predictor"; nothing is unpickled."""
+    """Read the tensors of the parts "encoder" and "predictor" of upstream's file; nothing is unpickled."""
     torch = require("torch")
     path = find_checkpoint(config.checkpoint, config.checkpoint_step, needs=("*.pt",))
     file = path if path.is_file() else _only(path)
     try:
         parts = torch.load(file, map_location="cpu", weights_only=True)
-    except Exception as error:  # it may not be a zip file, or a pickle of other types
+    except Exception as error:  # the file may not be a zip file, or may be a pickle of other types
         raise ConfigError(
             f"checkpoint {file}: not a file of tensors ({type(error).__name__}); want upstream's .pt"
         ) from error
@@ -209,7 +209,7 @@ def read_checkpoint(config: VJepa2AcConfig) -> dict[str, dict[str, Any]]:
 
 
 def load_predictor(config: VJepa2AcConfig, saved: Mapping[str, Any], width: int) -> Any:
-    """Load the predictor; raises `ConfigError` if its code or a weight is missing, or the encoder does not fit."""
+    """Load the predictor; raises `ConfigError` if its code or a weight is missing, or if the encoder does not fit."""
     use_source("src", "VJEPA2_SRC", config.source_dir)
     try:
         module = importlib.import_module("src.models.ac_predictor")
@@ -227,7 +227,7 @@ def load_predictor(config: VJepa2AcConfig, saved: Mapping[str, Any], width: int)
         )
     model = module.vit_ac_predictor(
         img_size=(config.image_size, config.image_size),
-        num_frames=2 * config.rollout,  # tubelets have two frames; this sets the mask's size only
+        num_frames=2 * config.rollout,  # tubelets have two frames; this sets only the size of the mask
         tubelet_size=2,
         embed_dim=width,
         predictor_embed_dim=embedding.shape[0],
@@ -246,7 +246,7 @@ def load_predictor(config: VJepa2AcConfig, saved: Mapping[str, Any], width: int)
 
 @contextmanager
 def usual_attention() -> Iterator[None]:
-    """Have upstream's attention use torch's choice of a kernel, which it sets by a function that cannot be compiled."""
+    """Make upstream's attention use torch's choice of a kernel; upstream's own switch cannot be compiled."""
     backend = require("torch").backends.cuda
     setter, backend.sdp_kernel = backend.sdp_kernel, nullcontext
     try:
@@ -273,9 +273,9 @@ def _clean(part: Mapping[str, Any]) -> dict[str, Any]:
 
 Tensor = Any  # torch's
 World = Callable[[Tensor, Tensor, Tensor], Tensor]
-"""A function of features (M, T, N, F), actions (M, T, 7) and poses (M, T, 7): the next frame's features, (M, N, F)."""
+"""Predicts the next frame's features (M, N, F) from features (M, T, N, F), actions (M, T, 7) and poses (M, T, 7)."""
 
-DRAWN = 4  # numbers of an action that are sampled: x, y, z and the gripper
+DRAWN = 4  # sampled components of an action: x, y, z and the gripper
 _GRIPPER_RANGE = 0.75  # largest change of the gripper in a step
 _GRIPPER_REST = 0.25  # smaller changes become zero
 
@@ -290,7 +290,16 @@ class Plans:
 
 
 def plan(world: World, features: Tensor, poses: Tensor, goals: Tensor, noise: Tensor, config: VJepa2AcConfig) -> Plans:
-    """Search plans from `features` (B, N, F) and `poses` (B, 7) to `goals` (B, N, F), with `noise` (B, I, H, S, 4)."""
+    """Search for plans by the cross-entropy method, with I iterations of S samples of H actions.
+
+    Args:
+        world: The predictor.
+        features: (B, N, F), of the current images.
+        poses: (B, 7), the current poses.
+        goals: (B, N, F), features of the goal images.
+        noise: (B, I, H, S, 4), standard normal.
+        config: The settings of the search.
+    """
     torch = require("torch")
     mean = torch.zeros(len(poses), config.rollout, DRAWN, device=poses.device)
     std = torch.ones_like(mean)
@@ -348,34 +357,34 @@ def _energies(world: World, features: Tensor, poses: Tensor, goals: Tensor, acti
 
 
 def moved(poses: Tensor, actions: Tensor) -> Tensor:
-    """Apply actions (M, 7), of which none rotates, to poses (M, 7): x, y, z, Euler angles, closedness."""
+    """Apply actions (M, 7) without rotation to poses (M, 7): x, y, z, Euler angles, closedness."""
     torch = require("torch")
     closedness = (poses[:, 6:] + actions[:, 6:]).clip(0, 1)
     return torch.cat([poses[:, :3] + actions[:, :3], poses[:, 3:6], closedness], -1)
 
 
-CAMERA = "front"  # the model has one camera, without a name
+CAMERA = "front"  # the model has one unnamed camera
 _STATE = ["xyzrpy"]
 _GOAL, _GOAL_FEATURES = "goal", "goal_features"  # keys in a session's memory: pixels, and their features
 
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """The parts of an observation that the session keeps."""
+    """The parts of an observation that the session stores."""
 
     pixels: np.ndarray  # (3, side, side) float32
     pose: np.ndarray  # (7,) float32: x, y, z m, roll, pitch, yaw rad, closedness
 
 
 class WorldModel:
-    """The encoder and the predictor; weights and features are float32, computations may be in another type."""
+    """The encoder and the predictor; weights and features are float32, but computations may use another type."""
 
     def __init__(
         self, encoder: Any, predictor: Any, config: VJepa2AcConfig, dtype: Any, compilation: Compilation
     ) -> None:
         self.encode = Encoder(encoder, config.normalize, compilation)
         self._predictor = predictor
-        self._following = [  # by the number of frames that are known
+        self._following = [  # by the number of known frames
             compilation.core(f"predict frame {frames + 1}", self._predict, config.plans_a_pass)
             for frames in range(1, config.rollout + 1)
         ]
@@ -383,12 +392,12 @@ class WorldModel:
         self._device, self._dtype = encoder.device.type, dtype
 
     def autocast(self) -> Any:
-        """Return a context that computes in `dtype`, as upstream trains; its attention needs weights of one type."""
+        """Return a context that computes in `dtype`, as in upstream's training; attention needs weights of one type."""
         torch = require("torch")
         return torch.autocast(self._device, self._dtype, enabled=self._dtype != torch.float32)
 
     def __call__(self, features: Tensor, actions: Tensor, poses: Tensor) -> Tensor:
-        """Predict the next frame's features (see `planner.World`)."""
+        """Predict the next frame's features (see `World`)."""
         return self._following[features.shape[1] - 1](features, actions, poses)
 
     def _predict(self, features: Tensor, actions: Tensor, poses: Tensor) -> Tensor:
@@ -399,7 +408,7 @@ class WorldModel:
 class VJepa2Ac(ModelPolicy):
     """Moves the gripper so that the camera's image becomes `info["goal_image"]`.
 
-    The goal image is in the `reset`'s observation or any later one, and holds until there is another one.
+    The goal image is in the observation of `reset` or any later one, and remains valid until the next one.
     """
 
     Config: ClassVar[type] = VJepa2AcConfig
@@ -437,7 +446,7 @@ class VJepa2Ac(ModelPolicy):
         return WorldModel(encoder.to(device).eval(), predictor.to(device).eval(), self.config, dtype, self.compilation)
 
     def notice(self, obs: Obs) -> None:
-        """Set the goal to that of an observation, if it has one; features of the same image are kept."""
+        """Set the goal to that of an observation, if it has one; the features of an unchanged image are kept."""
         image = obs.info.get(GOAL_IMAGE)
         if image is None:
             return

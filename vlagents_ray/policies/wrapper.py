@@ -14,7 +14,7 @@ from vlagents_ray.settings import wrong_settings
 
 
 class Wrapper(Agent, abc.ABC):
-    """An agent that passes changed observations to another one.
+    """An agent that passes changed observations to an inner agent.
 
     `Config` and `shared` are those of any agent. A session has its own copy of the wrapper and of the inner agent.
 
@@ -29,7 +29,7 @@ class Wrapper(Agent, abc.ABC):
 
     @classmethod
     def around(cls, agent: Agent, settings: Mapping[str, Any]) -> Wrapper:
-        """Wrap an agent, with the wrapper's settings in the deployment file; raises `ConfigError` for wrong ones."""
+        """Wrap an agent with the wrapper's settings from the deployment file; raises `ConfigError` if any is wrong."""
         try:
             return cls(agent) if cls.Config is None and not settings else cls(agent, cls.Config(**settings))  # type: ignore[misc]
         except (TypeError, ValueError) as error:
@@ -97,7 +97,8 @@ def build_agent(
 ) -> Agent:
     """Make a policy, named or "module:Class", with its wrappers; raises `ConfigError` for a wrong name or setting.
 
-    Wrappers are names, or {name: settings}; the first one gets the robot's observations, and is returned.
+    Wrappers are names, or {name: settings}; the first is the outermost one, which receives the robot's observations and
+    is returned.
     """
     agent: Agent = policy_class(policy).from_config(config)
     for entry in reversed(wrappers):

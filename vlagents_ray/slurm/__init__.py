@@ -1,4 +1,4 @@
-"""Evaluations and servers as Slurm jobs, and the hook for training scripts, which needs the light install only."""
+"""Evaluations and servers as Slurm jobs, and the hook for training scripts, which only needs the light install."""
 
 from vlagents_ray.slurm.training_hook import submit_evaluation
 

@@ -1,6 +1,6 @@
 """The programs of a job, which `job.sh` starts.
 
-    python -m vlagents_ray.slurm.job address               print the address of this node, where Ray's head will be
+    python -m vlagents_ray.slurm.job address               print the address of this node, where Ray's head will run
     python -m vlagents_ray.slurm.job node                  run Ray on this node until the step ends
     python -m vlagents_ray.slurm.job eval [--fill CPUS] -- WORDS
     python -m vlagents_ray.slurm.job serve [--key] --app NAME=ROUTE... -- WORDS
@@ -40,13 +40,13 @@ _FIRST_PORT, _PORTS, _JOBS = 10_000, 4, 2_500  # below the ports that the packag
 _REST = ("--block", "--disable-usage-stats", "--log-color=false")
 _OBJECTS = 0.25  # share of the memory for Ray's object store, in /dev/shm; Ray's default is 0.3 of the machine's
 _SHORT = "/tmp"  # noqa: S108 - the names of Ray's sockets are limited to 107 bytes
-_AT_ONCE = {"RAY_GRACEFUL_SHUTDOWN_DRAIN_TIMEOUT_S": "0"}  # Ray would drain for 30 s, without use here
+_AT_ONCE = {"RAY_GRACEFUL_SHUTDOWN_DRAIN_TIMEOUT_S": "0"}  # Ray would drain for 30 s, which is useless here
 _HEAD_S = 120.0  # time limit for the head to listen
 _NODES_S = 300.0  # time limit for all nodes to join
 _COMMAND = "from vlagents_ray.cli import main; main()"  # runs with this Python, independent of PATH
 FILE = "server.json"
 _POLL_S = 0.5
-_MOST_S = 3600.0  # limit for loading the policies
+_MOST_S = 3600.0  # time limit for loading the policies
 _TEXT = """\
 serving {names} in job {job}, until it ends; all of this, and the key, is in {file}
 on the cluster's network:   {url}
@@ -113,7 +113,7 @@ class Allocation:
         if self.memory is not None:
             objects = int(self.memory * _OBJECTS)
             given += [f"--object-store-memory={objects}", f"--memory={self.memory - objects}"]
-        # The other listeners use free ports, as Ray's defaults are the same numbers for every cluster.
+        # The other listeners use free ports, since Ray's defaults are the same numbers for every cluster.
         free = ["--min-worker-port=0", "--max-worker-port=0", "--dashboard-agent-listen-port=0"]
         return ["ray", "start", *where, *given, *free, f"--temp-dir={folder}/{FILES}", *_REST]
 
@@ -125,7 +125,7 @@ def _gpus(environ: Mapping[str, str]) -> int:
 
 
 def _memory(environ: Mapping[str, str], cpus: int) -> int | None:
-    """Return the memory in bytes; Slurm counts MiB, and 0 is all of the node's."""
+    """Return the memory in bytes; Slurm counts MiB, and 0 means all of the node's."""
     mebibytes = int(environ.get("SLURM_MEM_PER_NODE", "0")) or int(environ.get("SLURM_MEM_PER_CPU", "0")) * cpus
     return mebibytes * 2**20 or None
 
@@ -137,7 +137,7 @@ def print_address() -> None:
 
 
 def run_node() -> int:
-    """Run Ray and remove its files; the exit status of the head's Ray is that of the step."""
+    """Run Ray, then remove its files; return the exit status of the step, which is that of Ray on the head."""
     allocation = Allocation.here()
     head = os.environ[HEAD]
     if allocation.node:
@@ -156,7 +156,7 @@ def run_node() -> int:
     if asked.is_set():
         return 0
     sys.stdout.write(f"Ray ended with {status}\n")
-    return 0 if allocation.node else status  # the job continues without a node that is not the head
+    return 0 if allocation.node else status  # the job continues without a node other than the head
 
 
 def wait_for_head(host: str, port: int, timeout_s: float = _HEAD_S) -> None:
@@ -251,7 +251,7 @@ def _server_options(given: argparse.Namespace, allocation: Allocation) -> list[s
     key = ""
     if given.key:
         keys = folder / "keys.json"
-        keys.unlink(missing_ok=True)  # keys of the same job before it was requeued
+        keys.unlink(missing_ok=True)  # keys from before the job was requeued
         key = new_key(keys, f"job-{allocation.job}")
         words.append(f"--keys={keys}")
     announcing = [sys.executable, "-m", "vlagents_ray.slurm.job", "announce", str(folder), str(port), *given.app]
@@ -297,7 +297,7 @@ def connection_info(apps: Mapping[str, str], port: int, environ: Mapping[str, st
 
 
 def as_text(found: Mapping[str, Any], file: Path) -> str:
-    """Return the connection's information as text for people, without the key: logs are read by others."""
+    """Return the connection info as text without the key, since other people may read the log."""
     url = next(iter(found["apps"].values()))
     key = f"export {KEY_VARIABLE}=(the key that you were given; none, if the server is --insecure)"
     if found["key"]:
@@ -308,7 +308,7 @@ def as_text(found: Mapping[str, Any], file: Path) -> str:
 
 
 def write(file: Path, found: Mapping[str, Any]) -> None:
-    """Write the file, which contains a key, atomically and readable by its owner only."""
+    """Write the file, which contains a key, atomically and readable only by its owner."""
     part = file.with_suffix(".part")
     part.touch(mode=0o600)
     part.write_text(json.dumps(found, indent=2) + "\n")

@@ -1,4 +1,4 @@
-"""The submission of jobs: the command line's options of sbatch, the script, and sbatch."""
+"""The submission of jobs: sbatch's options on the command line, the script, and the call of sbatch."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _OURS = {
 BODY = Path(__file__).with_name("job.sh")
 _LINE_ENDS = "\x7f\x85\u2028\u2029"
 UNFINISHED = 75  # exit status of `vlagents-ray eval` when its time is over (EX_TEMPFAIL of sysexits.h)
-_KEPT = {"SLURM_CONF", "SLURM_CLUSTERS"}  # the location of Slurm; the others belong to this process's own job
+_KEPT = {"SLURM_CONF", "SLURM_CLUSTERS"}  # the location of Slurm; other variables belong to this process's own job
 _SBATCH_S = 120.0
 
 
@@ -45,8 +45,7 @@ def split(words: Sequence[str], known: Mapping[str, bool]) -> tuple[list[str], d
     """Split a command line.
 
     Returns:
-        The command's own arguments, and sbatch's options by their long names; the value of an option without one is
-        None.
+        The command's own arguments, and sbatch's options by their long names, with None for options without a value.
     """
     own: list[str] = []
     sbatch: dict[str, str | None] = {}
@@ -68,7 +67,7 @@ def split(words: Sequence[str], known: Mapping[str, bool]) -> tuple[list[str], d
 
 
 def _sbatch(word: str, name: str, value: str | None) -> tuple[str, str | None]:
-    """Return the long name of an option of sbatch, and its value in the same argument."""
+    """Return the long name of an option of sbatch, and its value if the same argument contains it."""
     option = name[2:]
     if not word.startswith("--"):
         letter = word[1]
@@ -105,8 +104,8 @@ class Script:
     folder: Path  # for the script and the job's logs, on a file system that all nodes share
     arguments: Sequence[str]  # of `vlagents_ray.slurm.job`
     options: Mapping[str, str | None]  # of sbatch; they override the defaults
-    resubmit: int = 0  # how often the job is submitted again when its time is over
-    setup: Path | None = None  # a file of shell lines that run first
+    resubmit: int = 0  # how often to submit the job again when its time is over
+    setup: Path | None = None  # a file of shell lines to run first
 
     @property
     def file(self) -> Path:
@@ -204,7 +203,7 @@ def write(script: Script) -> Path:
 
 
 def outside_of_jobs(environ: Mapping[str, str]) -> dict[str, str]:
-    """Return the environment without the variables of the job to which this process belongs, such as a training.
+    """Return the environment without the variables of this process's own job, such as a training.
 
     sbatch passes its environment on, and steps of the new job would read these variables as their options.
     """

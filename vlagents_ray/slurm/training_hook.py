@@ -19,7 +19,7 @@ from vlagents_ray.errors import VLAgentsError
 log = logging.getLogger(__name__)
 
 _SUBMISSION_S = 300.0
-_ABANDONED_S = _SUBMISSION_S + 60.0  # age at which a claim without a job is that of a process that was killed
+_ABANDONED_S = _SUBMISSION_S + 60.0  # age at which a claim without a job counts as abandoned by a killed process
 
 
 class HookFailed(VLAgentsError):
@@ -35,18 +35,18 @@ def submit_evaluation(
     python: str | os.PathLike[str] = sys.executable,
     raise_errors: bool = False,
 ) -> str | None:
-    """Submit a job that evaluates a checkpoint which has just been written, while the training continues.
+    """Submit a job that evaluates a newly written checkpoint, while the training continues.
 
-    A checkpoint is submitted once, by the first process that calls this, also after a restart of the training. If a
+    A checkpoint is submitted once, by the first process that calls this, even after a restart of the training. If a
     call fails, a later one tries again. If the training is killed during a call, the first call after 6 minutes, for
-    any checkpoint, submits the interrupted one as well.
+    any checkpoint, also submits the interrupted one.
 
     Args:
         words: The arguments of `vlagents-ray slurm eval`, in which `{checkpoint}` and `{step}` are replaced.
         checkpoint: The checkpoint.
         step: Its training step.
         record: A folder in which each submission writes a file.
-        python: An interpreter with `vlagents-ray[serve]`, if the training's has the light install only.
+        python: An interpreter with `vlagents-ray[serve]`, if the training's only has the light install.
         raise_errors: Raise an error instead of logging it.
 
     Returns:
@@ -75,7 +75,7 @@ def _submit_once(words: list[str], checkpoint: str, step: int, record: Path, pyt
 
 
 def _is_claimed(mark: Path, claim: dict[str, Any]) -> bool:
-    """Return whether this process submits the checkpoint: the first to claim it, or another one if that was killed."""
+    """Return whether this process submits the checkpoint: the first to claim it, or another if the first was killed."""
     try:
         mark.open("x").close()
     except FileExistsError:
@@ -91,7 +91,7 @@ def _is_claimed(mark: Path, claim: dict[str, Any]) -> bool:
 
 
 def _abandoned_since(mark: Path) -> int | None:
-    """Return the time of a claim whose process was killed, ns since 1970; None if it was submitted, or may be yet."""
+    """Return the time of a claim whose process was killed, ns since 1970; None if it was or may still be submitted."""
     try:
         since = mark.stat().st_mtime_ns
     except FileNotFoundError:
@@ -100,7 +100,7 @@ def _abandoned_since(mark: Path) -> int | None:
 
 
 def _submit_abandoned(record: Path, mark: Path, python: str) -> None:
-    """Submit other checkpoints, claimed by processes that were killed, as no other call may follow for them."""
+    """Submit other checkpoints whose claiming processes were killed, since no other call may follow for them."""
     for other in sorted(record.glob("step-*.json")):
         claim = _read(other)
         if other == mark or "words" not in claim or _abandoned_since(other) is None:

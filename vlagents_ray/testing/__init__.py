@@ -1,4 +1,4 @@
-"""Test suites for policies and environments, which all those of this package pass and yours can use as well.
+"""Test suites for policies and environments, which all those of this package pass and yours can also use.
 
     from vlagents_ray.testing import check_agent, check_env
 

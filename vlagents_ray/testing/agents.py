@@ -20,14 +20,14 @@ from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.testing.comparing import ContractViolation, check_close, require_same, require_wireable
 from vlagents_ray.validation import check_action
 
-_SIDE = 64  # px, of a random image whose size no contract states
-_DIM = 7  # of such a part of the state
+_SIDE = 64  # px, of a random image whose size the contract does not state
+_DIM = 7  # length of a part of the state whose size the contract does not state
 _SESSIONS = 3
-_THREADS = 4  # as many prepare observations in a server
-_ROUNDS = 20  # acts beside those threads, each after `_RESETS` resets
+_THREADS = 4  # number of threads that prepare observations in a server
+_ROUNDS = 20  # acts concurrent with those threads, each after `_RESETS` resets
 _RESETS = 15  # since a reset is short, few of them coincide with a preparation
-_LONGEST_S = 5.0  # time after which a slow agent, whose other threads compete with it, makes no further act
-_SWITCH_S = 1e-5  # time after which Python lets another thread run, so that more of them interleave
+_LONGEST_S = 5.0  # time after which no further act begins, since other threads slow down the agent
+_SWITCH_S = 1e-5  # Python's switch interval, short so that threads interleave more often
 
 
 def check_agent(
@@ -41,18 +41,18 @@ def check_agent(
 ) -> None:
     """Check that an agent implements the interface of `Agent`; initializes and closes it.
 
-    Three sessions, copies of the initialized agent, run with an observation, an instruction and a seed each: one after
-    the other, then in turn, with prepared observations, then in batches of 1, 2 and 3. Their actions must not depend on
-    the other sessions, nor on whether `prepare` was called. If the agent defines `prepare`, several threads call it
-    while sessions are reset and acted on, as in a server, and every result must be that of one thread.
+    Three sessions, copies of the initialized agent, run with an observation, an instruction and a seed each: first in
+    sequence, then interleaved, with prepared observations, then in batches of 1, 2 and 3. Their actions must not depend
+    on the other sessions, nor on whether `prepare` was called. If the agent defines `prepare`, several threads call it
+    while sessions are reset and acted on, as in a server, and every result must equal that of a single thread.
 
     Args:
         agent: The agent, not initialized yet.
         obs: The observations of the sessions, in turn; by default random values that fit the contract.
-        instructions: The instructions of the sessions, in turn; give valid ones, if the policy parses them.
+        instructions: The instructions of the sessions, in turn; pass valid ones if the policy parses them.
         reset_kwargs: Further arguments of each `reset`, beside `seed`.
         steps: The number of calls of `act` in a session.
-        atol: The largest difference between an action in a batch and the same action of a session alone.
+        atol: The largest difference between an action in a batch and the same action of a single session.
 
     Raises:
         ContractViolation: The agent does not implement the interface; the message names the place.
@@ -95,7 +95,7 @@ def check_agent(
 
 
 def _check_threads(suite: _Suite, first: list[Act]) -> None:
-    """Check that threads may prepare observations while sessions are reset and acted on, whose acts are `first`."""
+    """Check that threads can prepare observations while sessions, with the acts `first`, are reset and acted on."""
     sessions = [suite.begin(i) for i in range(_SESSIONS)]
     serial = [suite.prepare(i, session) for i, session in enumerate(sessions)]
     ended = threading.Event()
@@ -237,10 +237,13 @@ class _Suite:
 def random_observation(
     contract: Contract | None, seed: int, *, side: int = _SIDE, dims: Mapping[str, int] | None = None
 ) -> Obs:
-    """Make a random observation that fits a contract.
+    """Make a random observation that fits a contract; equal seeds give equal observations.
 
-    Returns:
-        The observation; equal seeds give equal observations.
+    Args:
+        contract: The contract; None for one camera and one state.
+        seed: The seed.
+        side: Height and width of images whose size the contract does not state, pixels.
+        dims: Sizes of parts of the state that the contract does not state.
     """
     rng = np.random.default_rng(seed)
     cameras: Mapping[str, CameraSpec] = {"front": CameraSpec()}

@@ -66,7 +66,7 @@ def difference(a: object, b: object, where: str, atol: float = 0.0) -> str | Non
 
 
 def _plain(value: object) -> object:
-    """Return arrays for tensors and images, and dictionaries for objects that have attributes but no equality."""
+    """Convert tensors and images to arrays, and objects that have attributes but no equality to dictionaries."""
     if isinstance(value, Act):  # without its info, which may contain times
         return {"action": value.action, "done": value.done}
     if isinstance(value, Obs):

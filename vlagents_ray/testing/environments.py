@@ -35,8 +35,8 @@ def check_env(
         steps: The number of actions in an episode.
         seeds: The seeds of two different episodes.
         options: The options of each `reset`.
-        same_steps: Whether the same actions must lead to the same observations, and not only the same seed to the same
-            first observation; False for a simulator that is not reproducible to the bit.
+        same_steps: Whether the same actions must also lead to the same observations; if False, only the first
+            observation of a seed must be the same, as for a simulator that is not reproducible bit for bit.
         step_limit: Whether one episode runs until `env.max_steps`; False if that takes too long.
 
     Raises:
@@ -69,7 +69,7 @@ def check_env(
 class _Rollout:
     instruction: str
     given: list[Obs]  # the env's own objects
-    seen: list[Obs]  # copies of them, made at once
+    seen: list[Obs]  # copies of them, made immediately
     outcomes: list[Any]
 
 
@@ -89,7 +89,7 @@ def _check_static(env: EvalEnv) -> Contract:
 
 @dataclass(slots=True)
 class _Suite:
-    """Plays episodes, and checks what the environment returns."""
+    """Plays episodes, and checks the results of the environment."""
 
     _env: EvalEnv
     _contract: Contract
@@ -131,7 +131,7 @@ class _Suite:
         return obs
 
     def step(self, action: np.ndarray) -> tuple[Obs, list[Any]]:
-        """Return the observation, and reward, terminated, truncated and success."""
+        """Execute an action; return the observation, and reward, terminated, truncated and success."""
         sent = action.copy()
         result = self._env.step(Act(sent))
         require_same(action, sent, "the action", "step must leave the caller's array as it is")

@@ -1,7 +1,7 @@
-"""The safetensors format: a header in JSON, with type, shape and place of each value, and then their bytes.
+"""The safetensors format: a header in JSON, with type, shape and place of each value, followed by their bytes.
 
-It holds numbers only, so that reading it executes nothing. A reader checks the whole header before it allocates memory
-for any value. See https://huggingface.co/docs/safetensors for the format.
+It contains only numbers, so that reading it executes nothing. A reader checks the whole header before it allocates
+memory for any value. See https://huggingface.co/docs/safetensors for the format.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ import numpy as np
 
 from vlagents_ray.errors import InvalidWeights, MalformedMessage, shown
 
-MESSAGE_BYTES = 2**22  # longest message with weights: a header (some 40,000 values), or a part of their bytes
-PART_BYTES = 2**20  # of a part that is sent: while a replica takes a longer one, its acts wait for Python's lock
+MESSAGE_BYTES = 2**22  # longest message with weights: a header (about 40,000 values), or a part of their bytes
+PART_BYTES = 2**20  # bytes of a part; while a replica reads longer parts, its acts wait for Python's lock
 _LENGTH = struct.Struct("<Q")
 _NAME_LENGTH = 512  # characters
 _DIMENSIONS = 32  # as in the oldest supported numpy
 _DIGITS = 15  # of a number in the header
-_METADATA = "__metadata__"  # the one name that is not a value's
+_METADATA = "__metadata__"  # the only name that is not a value's
 _TYPES = {
     "BOOL": np.dtype(np.bool_),
     "BF16": np.dtype("V2"),  # see `vlagents_ray.weights.trainable.portable`
@@ -37,19 +37,19 @@ _CODES = {dtype: code for code, dtype in _TYPES.items()}
 
 @dataclass(frozen=True, slots=True)
 class ValueSpec:
-    """Type and shape of one value, which takes the bytes after those of the one before."""
+    """Type and shape of one value, whose bytes follow those of the previous value."""
 
     dtype: np.dtype[Any]
     shape: tuple[int, ...]
 
     @property
     def size(self) -> int:
-        """Number of bytes."""
+        """The number of bytes."""
         return math.prod(self.shape) * self.dtype.itemsize
 
 
 def header_of(named: Mapping[str, np.ndarray]) -> bytes:
-    """Return the beginning of a file with these values; raises `InvalidWeights` for a type that it cannot have."""
+    """Return the header of a file with these values; raises `InvalidWeights` for a type that the format lacks."""
     document, begin = {}, 0
     for name, value in named.items():
         if value.dtype not in _CODES:
@@ -63,7 +63,7 @@ def header_of(named: Mapping[str, np.ndarray]) -> bytes:
 
 
 def parts_of(named: Mapping[str, np.ndarray], length: int = PART_BYTES) -> Iterator[bytes]:
-    """Return the bytes of the values, in the order of the header, in parts of that length; the last may be shorter."""
+    """Yield the bytes of the values, in the header's order, in parts of `length` bytes; the last may be shorter."""
     part = bytearray()
     for value in named.values():
         data = memoryview(np.ascontiguousarray(value).reshape(-1).view(np.uint8).data)
@@ -79,10 +79,11 @@ def parts_of(named: Mapping[str, np.ndarray], length: int = PART_BYTES) -> Itera
 
 
 def read_header(data: bytes) -> dict[str, ValueSpec]:
-    """Return the values that a header of `header_of` announces, by name, in the order of their bytes.
+    """Return the values that a header made by `header_of` announces, by name, in the order of their bytes.
 
     Raises:
-        MalformedMessage: It is no header, or is too long, or its places leave gaps, overlap or do not fit the shapes.
+        MalformedMessage: The data are not a header or too long, or the places overlap, leave gaps or do not fit the
+            shapes.
     """
     announced = _LENGTH.unpack_from(data)[0] if len(data) >= _LENGTH.size else -1
     if announced != len(data) - _LENGTH.size or len(data) > MESSAGE_BYTES:
@@ -143,7 +144,7 @@ def _without_doubles(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 class ValuesReader:
-    """Values whose bytes arrive in parts. The memory of a value is allocated when its first byte has arrived."""
+    """Values whose bytes arrive in parts. The memory of a value is allocated when its first byte arrives."""
 
     def __init__(self, specs: Mapping[str, ValueSpec]) -> None:
         """Read the values that a header announces, see `read_header`."""
@@ -154,7 +155,7 @@ class ValuesReader:
         self.size = sum(spec.size for spec in specs.values())  # bytes
 
     def add(self, part: bytes) -> None:
-        """Take the next bytes; raises `MalformedMessage` if there are more than the header announced."""
+        """Append the next bytes; raises `MalformedMessage` if there are more than the header announced."""
         if self.received + len(part) > self.size:
             raise MalformedMessage(
                 f"safetensors: got {self.received + len(part)} bytes of values, the header announced {self.size}"
@@ -175,7 +176,7 @@ class ValuesReader:
             MalformedMessage: A truth value is neither 0 nor 1.
         """
         while self._left:
-            self._begin_next()  # one without elements
+            self._begin_next()  # needed for values without elements
         for name, value in self._values.items():
             if value.dtype == np.bool_ and value.size and value.view(np.uint8).max() > 1:
                 raise MalformedMessage(f"safetensors: {name!r}: got other bytes than 0 and 1 for truth values")

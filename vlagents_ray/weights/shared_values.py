@@ -1,8 +1,8 @@
-"""Values on a GPU that another process copies from where they are, by CUDA's handles for memory of other processes.
+"""Values on a GPU that another process copies in place, by CUDA's handles for memory of other processes.
 
-A handle is bytes and numbers, and `SharedValues` holds just these. It is good in processes of the same node that use
-the same GPU, while the process that made it keeps the memory: see the part on interprocess communication of
-https://docs.nvidia.com/cuda/cuda-c-programming-guide/. Torch is never imported here, as in `trainable`.
+A handle consists of bytes and numbers, which `SharedValues` contains. It is valid in processes of the same node that
+use the same GPU, while the process that made it keeps the memory: see the section on interprocess communication of
+https://docs.nvidia.com/cuda/cuda-c-programming-guide/. As in `trainable`, torch is never imported here.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from vlagents_ray.weights.trainable import dtype_name, is_array, portable
 
 
 class NotShared(PolicyUnavailable):
-    """The memory cannot be handed to the other process; the values must be sent instead."""
+    """The memory cannot be shared with the other process; the values must be sent instead."""
 
 
 @dataclass(frozen=True, slots=True)
 class StorageHandle:
     """The memory of one or more values."""
 
-    allocation: bytes  # CUDA's handle of the allocation in which it is
+    allocation: bytes  # CUDA's handle of the allocation that contains it
     size: int  # bytes
-    begin: int  # byte of the allocation at which it begins
+    begin: int  # its first byte in the allocation
     counters: bytes  # torch's shared file with the counts of readers
-    counter: int  # place of its count in that file
+    counter: int  # index of its count in that file
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +38,7 @@ class ValueView:
 
     storage: int  # its key in `SharedValues.storages`
     dtype: str  # of torch: "float32", "bfloat16", …
-    begin: int  # element of the storage at which it begins
+    begin: int  # first element in the storage
     shape: tuple[int, ...]
     stride: tuple[int, ...]  # elements
 
@@ -50,7 +50,7 @@ class SharedValues:
     gpu: str  # UUID
     storages: dict[int, StorageHandle]  # by their addresses in the learner's process
     views: dict[str, ValueView]
-    others: dict[str, Any]  # those that are not on a GPU, as `portable` returns them
+    others: dict[str, Any]  # values that are not on a GPU, as returned by `portable`
 
 
 def gpu_of(named: Mapping[str, Any]) -> str:
@@ -61,10 +61,12 @@ def gpu_of(named: Mapping[str, Any]) -> str:
 
 @contextmanager
 def shared(named: Mapping[str, Any]) -> Iterator[SharedValues]:
-    """Yield values by name for another process, those on the GPU on one (`gpu_of`); they stay unchanged meanwhile.
+    """Yield values by name for another process, those on the GPU as handles; they must not change meanwhile.
+
+    All values on a GPU must be on one, see `gpu_of`.
 
     Raises:
-        NotShared: The memory is of a kind that CUDA does not hand over.
+        NotShared: CUDA cannot share this kind of memory.
     """
     with ExitStack() as stack:
         values, devices = SharedValues(gpu_of(named), {}, {}, {}), set()
@@ -85,7 +87,11 @@ def shared(named: Mapping[str, Any]) -> Iterator[SharedValues]:
 
 @contextmanager
 def opened(values: SharedValues) -> Iterator[Mapping[str, Any]]:
-    """Yield another process's values by name, those on a GPU where they are; copy them. Raises `NotShared`."""
+    """Yield another process's values by name, without copying those on a GPU: copy them within the context.
+
+    Raises:
+        NotShared: The memory of the other process cannot be opened.
+    """
     torch = sys.modules["torch"]
     try:
         storages = {address: _MEMORY.opened(values.gpu, handle) for address, handle in values.storages.items()}
@@ -102,14 +108,14 @@ def opened(values: SharedValues) -> Iterator[Mapping[str, Any]]:
         for device in devices:
             _MEMORY.finish(device)
     finally:
-        named.clear()  # an error has frames that refer to it
+        named.clear()  # frames of an error may refer to it
 
 
 class _GpuMemory:
-    """Hands over memory of GPUs. Tests replace it, to share memory of the CPU where there is no GPU."""
+    """Shares memory of GPUs. Tests replace it, to share memory of the CPU if there is no GPU."""
 
     def gpu(self, value: Any) -> str:
-        """Return the UUID of the GPU on which a value is; empty if it is on none."""
+        """Return the UUID of the GPU that holds a value; empty if none does."""
         torch = sys.modules.get("torch")
         if torch is None or type(value) not in (torch.Tensor, torch.nn.Parameter):
             return ""
@@ -118,9 +124,9 @@ class _GpuMemory:
         return self._uuid(value.device) if on_gpu else ""
 
     def finish(self, device: Any) -> None:
-        """Wait until what this thread began on a GPU is done, for which another process does not wait.
+        """Wait for the work that this thread has queued on a GPU, since another process does not wait for it.
 
-        It waits for the current stream, not for the device, which would end the captures of other threads.
+        It waits for the current stream; waiting for the device would abort graph captures of other threads.
         """
         sys.modules["torch"].cuda.current_stream(device).synchronize()
 
@@ -128,8 +134,8 @@ class _GpuMemory:
     def handed_over(self, storage: Any) -> Iterator[StorageHandle]:
         """Yield a handle of a torch storage for another process."""
         torch = sys.modules["torch"]
-        # Each call of `_share_cuda_` wraps the memory of the storage once more, for good. So it gets another storage of
-        # the same memory, and the learner's own stays as it is, however often it is pushed.
+        # Each call of `_share_cuda_` permanently wraps the memory of the storage once more. It is therefore called on
+        # another storage of the same memory, and the learner's own stays unchanged, however often it is pushed.
         whole = torch.empty(0, dtype=torch.uint8, device=storage.device).set_(storage)
         alias = torch.from_dlpack(whole).untyped_storage()
         try:
@@ -139,7 +145,7 @@ class _GpuMemory:
         try:
             yield StorageHandle(allocation, size, begin, counters, counter)
         finally:
-            # Torch keeps memory that it has sent until a reader has let go of it, and maybe there was none.
+            # Torch keeps memory that it has sent until a reader has released it, and there may have been no reader.
             torch.UntypedStorage._release_ipc_counter_cuda(counters, counter)
 
     def opened(self, gpu: str, handle: StorageHandle) -> Any:
@@ -149,7 +155,7 @@ class _GpuMemory:
         if not devices:
             raise RuntimeError("this process does not use that GPU")
         # The last two are an event to wait for, which torch would never free here, and whether there is one. The sender
-        # has waited, see `finish`.
+        # has already waited, see `finish`.
         return torch.UntypedStorage._new_shared_cuda(
             devices[0], handle.allocation, handle.size, handle.begin, handle.counters, handle.counter, b"", False
         )

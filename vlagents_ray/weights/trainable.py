@@ -1,7 +1,7 @@
-"""The named values of a trainable object: a torch module, or dicts and lists of numpy or JAX arrays, nested at will.
+"""The named values of a trainable object: a torch module, or nested dicts and lists of numpy or JAX arrays.
 
-A value's name in a torch module is that in its `state_dict`; in nested dicts it is the keys, joined with "/". Torch and
-JAX are never imported here: an object of theirs exists only where they have been imported.
+The name of a value in a torch module is that in its `state_dict`; in nested dicts it is the keys, joined with "/".
+Torch and JAX are never imported here: their objects exist only if they have been imported.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from vlagents_ray.errors import InvalidWeights, NotTrainable, UnchangedWeights
 
 _BFLOAT16 = np.dtype("V2")
 _SHOWN = 5  # faults in a message
-_THREADS = 4  # that compute a fingerprint: hashing releases Python's lock
+_THREADS = 4  # threads that compute a fingerprint: hashing releases Python's lock
 _KINDS = (("float", "bfloat"), ("int", "uint"), ("bool",), ("complex",))
 
 
 def named_values(trainable: Any) -> dict[str, Any]:
     """Return references to the values of a torch module or nested dicts and lists, by name; raises `NotTrainable`."""
     if _is_module(trainable):
-        # A module may add state that is no tensor (`get_extra_state`), which a learner does not train.
+        # A module may add state other than tensors (`get_extra_state`), which a learner does not train.
         return {name: value for name, value in trainable.state_dict().items() if is_array(value)}
     return {name: container[key] for name, container, key in _leaves(trainable)}
 
@@ -35,8 +35,8 @@ def named_values(trainable: Any) -> dict[str, Any]:
 def set_values(trainable: Any, named: Mapping[str, Any]) -> None:
     """Replace values of a trainable object by those of the same shapes, types and devices; other names keep theirs.
 
-    Values on a GPU are copied to where the old ones are, since a CUDA graph may have recorded these addresses. All
-    others are replaced by reference, which takes no time and no memory; so `named` must not be changed afterwards.
+    Values on a GPU are copied to the addresses of the old ones, which a CUDA graph may have recorded. All
+    others are replaced by reference, which takes no time and no memory; `named` must not be changed afterwards.
     """
     if _is_module(trainable):
         _set_tensors(trainable, named)
@@ -48,7 +48,7 @@ def set_values(trainable: Any, named: Mapping[str, Any]) -> None:
 
 @contextmanager
 def evaluation_mode(trainable: Any) -> Iterator[None]:
-    """Within this a torch module evaluates: no dropout, no statistics of batches. Each part returns to its own mode."""
+    """Put a torch module into evaluation mode (no dropout, no batch statistics), and restore the mode of each part."""
     parts = list(trainable.modules()) if _is_module(trainable) else []
     modes = [part.training for part in parts]
     try:
@@ -66,9 +66,9 @@ def is_copied(trainable: Any) -> bool:
 
 
 def portable(value: Any) -> np.ndarray:
-    """Return a value as a numpy array that every process can read, without a copy where it is on the CPU.
+    """Convert a value to a numpy array that every process can read, without a copy if it is on the CPU.
 
-    A bfloat16, which numpy does not have, becomes two bytes of type `V2`; `converted` and `dtype_name` know them.
+    A bfloat16, which numpy does not have, becomes two bytes of type `V2`, as `converted` and `dtype_name` expect.
     """
     if _is_tensor(value):
         value = value.detach().cpu().contiguous()
@@ -87,9 +87,9 @@ def own_copy(value: Any) -> Any:
 
 
 def converted(value: Any, held: Any) -> Any:
-    """Return `value` as the type, precision and device of `held`, in memory that is not shared.
+    """Convert `value` to the type, precision and device of `held`, in memory that is not shared.
 
-    Read-only numpy arrays that own read-only memory, such as Ray's objects, are not copied where `held` is on the CPU.
+    Read-only numpy arrays that own read-only memory, such as Ray's objects, are not copied if `held` is on the CPU.
     """
     if _is_tensor(held):
         torch = sys.modules["torch"]
@@ -152,7 +152,7 @@ def _leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any, Any]]:
 
 
 def _unchanging(array: np.ndarray) -> np.ndarray:
-    """Return the array, or a copy if its memory can be written into."""
+    """Return the array, or a copy if its memory is writable."""
     array = np.asarray(array, order="C")
     owner: Any = array
     while isinstance(owner, np.ndarray):
@@ -163,7 +163,7 @@ def _unchanging(array: np.ndarray) -> np.ndarray:
 
 
 def _to_numpy(value: Any) -> np.ndarray:
-    """Return an array of a type that numpy has: a bfloat16 is the upper half of a float32."""
+    """Convert an array to a type that numpy has: a bfloat16 is the upper half of a float32."""
     array = portable(value)
     if array.dtype != _BFLOAT16:
         return array
@@ -180,16 +180,16 @@ def _is_module(value: Any) -> bool:
     return torch is not None and isinstance(value, torch.nn.Module)
 
 
-# Whether pushed values fit those that a policy holds, and a digest of these.
+# Checks that pushed values fit those of a policy, and a digest of values.
 
 
 def fitted(
     held: Mapping[str, Any], pushed: Mapping[str, Any], *, partial: bool = False, allow_same: bool = False
 ) -> dict[str, Any]:
-    """Return the values of a new version, as the types and on the devices held; where names miss, those held.
+    """Return the values of a new version with the types and devices of those held; missing names keep those held.
 
     Args:
-        held: The values that the policy has now, by name.
+        held: The current values of the policy, by name.
         pushed: The new values, by name: numpy or JAX arrays or torch tensors, on any device.
         partial: Whether names may be missing, as in a push of adapters alone.
         allow_same: Whether all values may equal those held.
@@ -226,7 +226,7 @@ def require_fit(held: Mapping[str, Any], pushed: Mapping[str, Any], *, partial: 
 def fingerprint(named: Mapping[str, Any]) -> str:
     """Return a digest of 32 hexadecimal characters over names, shapes, types and all bytes of values on any device.
 
-    A sample would be faster, and the same for weights that differ elsewhere.
+    A digest of a sample would be faster, but would not detect differences elsewhere.
     """
     found = hashlib.blake2b(digest_size=16)
     names = sorted(named)

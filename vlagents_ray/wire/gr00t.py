@@ -1,6 +1,6 @@
 """The messages of GR00T's `PolicyClient` and `PolicyServer` over ZMQ, each of which is one msgpack map.
 
-The facts come from Isaac-GR00T's `gr00t/eval/service.py` (N1.5) and `gr00t/policy/server_client.py` (N1.6 and newer). A
+Sources: Isaac-GR00T's `gr00t/eval/service.py` (N1.5) and `gr00t/policy/server_client.py` (N1.6 and newer). A
 request is `{"endpoint", "data"?, "api_token"?}`. An array is `{"__ndarray_class__": True, "as_npy": <.npy file>}` or,
 in newer clients, has the format of `msgpack_numpy`: `{b"nd": True, b"type", b"kind", b"shape", b"data"}`; the reply has
 the format of the request.
@@ -24,7 +24,7 @@ from vlagents_ray.registry import require
 from vlagents_ray.wire import msgpack
 
 ENDPOINTS = ("get_action", "reset", "ping", "get_modality_config")
-TEXT_KEY = "task"  # our key in "language", in place of the client's
+TEXT_KEY = "task"  # our key in "language", which replaces the client's
 _FLAT_TEXT_KEY = "annotation.human.task_description"  # the key of most of N1.5's robots
 _MODALITIES = ("video", "state", "language")
 _BATCH = 256  # maximum number of observations in one message
@@ -47,11 +47,11 @@ class Observations:
     each: tuple[dict[str, Any], ...]  # {"video": {name: (T, H, W, 3)}, "state": {name: (T, D)}, "language": {...}}
     batched: bool  # whether the arrays had a batch dimension
     flat: bool  # whether keys are like "video.front" instead of {"video": {"front": ...}}
-    paired: bool  # whether the reply is [action, info], as in N1.6 and newer, or the action alone, as in N1.5
+    paired: bool  # whether the reply is [action, info], as in N1.6 and newer, or only the action, as in N1.5
 
 
 def read_token(payload: bytes | memoryview, limits: Limits) -> str | None:
-    """Return the API key in a message, whose other fields are skipped without decoding; None if it has none."""
+    """Return the API key in a message without decoding the other fields; None if it has none."""
     if len(payload) > limits.body_bytes:
         raise MessageTooLarge(f"gr00t: a message of {len(payload)} bytes, the limit is {limits.body_bytes}")
     package = require("msgpack")
@@ -134,12 +134,12 @@ def read_observations(data: Mapping[str, Any]) -> Observations:
 
 
 def is_flat(observation: Mapping[str, Any]) -> bool:
-    """Return whether keys are like "video.front", and not "front" in a map "video"."""
+    """Return whether keys have the form "video.front" instead of "front" in a map "video"."""
     return not any(isinstance(observation.get(kind), dict) for kind in _MODALITIES)
 
 
 def nested(flat: Mapping[str, Any]) -> dict[str, Any]:
-    """Return {"video": {"front": …}} for {"video.front": …}; keys other than video and state belong to the language."""
+    """Return {"video": {"front": …}} for {"video.front": …}; keys other than video and state become language."""
     found: dict[str, Any] = {kind: {} for kind in _MODALITIES}
     for key, value in flat.items():
         kind, _, name = key.partition(".") if isinstance(key, str) else ("", "", "")
@@ -158,7 +158,10 @@ def newest(observation: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def write_actions(actions: Sequence[Mapping[str, np.ndarray]], asked: Observations, info: Mapping[str, Any]) -> Any:
-    """Return the reply to `get_action`: the actions of B sessions by name, each (H, D), become (B, H, D) by name."""
+    """Return the reply to `get_action` with the actions of B sessions by name, each (H, D), as (B, H, D) by name.
+
+    If the request `asked` has no batch dimension, the reply has none. `info` is only sent to N1.6 and newer.
+    """
     shapes = {name: {one[name].shape for one in actions} for name in actions[0]}
     if any(len(found) > 1 for found in shapes.values()):
         raise InvalidObservation(f"the batch's actions differ in length ({shapes}); send its observations one by one")
@@ -173,7 +176,7 @@ def write_actions(actions: Sequence[Mapping[str, np.ndarray]], asked: Observatio
 def modality_config(
     modalities: Mapping[str, tuple[Sequence[str], Sequence[int]]], *, flat: bool = False
 ) -> dict[str, Any]:
-    """Return the reply to `get_modality_config`: keys and time steps by modality; modalities without keys are left out.
+    """Return the reply to `get_modality_config`: keys and time steps by modality, except for modalities without keys.
 
     Args:
         modalities: The keys and time steps of each modality.
@@ -191,7 +194,7 @@ def modality_config(
 
 
 def _flat(modality: str, key: str) -> str:
-    """Return N1.5's name of a key, "modality.key"; the key of an action without named parts is "action" alone."""
+    """Return N1.5's name of a key, "modality.key"; the key of an action without named parts is just "action"."""
     return key if key == modality else f"{modality}.{key}"
 
 
@@ -227,7 +230,7 @@ def _texts(language: Any, number: int) -> list[str | None]:
 
 
 def _text(key: Any, value: Any) -> str:
-    while isinstance(value, list) and value:  # of a list by time, the newest text counts
+    while isinstance(value, list) and value:  # in a list over time, the newest text counts
         value = value[-1]
     if not isinstance(value, str):
         raise InvalidObservation(f"{shown(key)}: got {type(value).__name__}, want text")
@@ -237,12 +240,12 @@ def _text(key: Any, value: Any) -> str:
 # Arrays in the format of most of GR00T's clients: .npy files.
 #
 # A file's header is matched, not evaluated, and must agree with the size of the content, so that no memory is allocated
-# for a false shape. Arrays of text become lists; objects and structures are refused.
+# for a false shape. Arrays of text become lists; arrays of objects and structures are refused.
 
 
 _NPY = b"\x93NUMPY"
-# The header that numpy writes for every plain array; anything else (structures, objects) is refused. Each text matches
-# in one way only, so that matching is fast.
+# The header that numpy writes for every plain array; any other (structures, objects) is refused. Each text has only one
+# match, so that matching is fast.
 _HEADER = re.compile(
     rb"\{'descr': '([<|]?[a-zA-Z]\d{1,5})', 'fortran_order': (True|False), "
     rb"'shape': \(((?:\d{1,15}, ?)*(?:\d{1,15})?)\), \}\s*"
@@ -297,7 +300,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "state": {"*": "state/*"},
         "instruction": "language/*",
     },
-    # N1.5 has the same with flat keys
+    # N1.5 has the same content with flat keys
     "gr00t-n1.5": {
         "cameras": {"*": "video.*"},
         "state": {"*": "state.*"},
@@ -306,12 +309,12 @@ PRESETS: dict[str, dict[str, Any]] = {
 }
 
 
-# The client's side of GR00T's protocol: requests that are written, and replies that are read within bounds.
+# The client's side of GR00T's protocol: writing requests, and reading replies within limits.
 #
-# N1.5's clients send flat keys and get the action alone; those of N1.6 and newer send
-# `{"observation": {...}, "options": None}` and get `[action, info]`. The observation is nested, or flat for servers
-# that run with `--use-sim-policy-wrapper`. A server that marks its modalities with `__ModalityConfig__` reads arrays
-# of `msgpack_numpy`.
+# N1.5's clients send flat keys and receive only the action; those of N1.6 and newer send `{"observation": {...},
+# "options": None}` and receive `[action, info]`. The observation is nested, or flat for servers that run with
+# `--use-sim-policy-wrapper`. A server that marks its modalities with `__ModalityConfig__` reads arrays of
+# `msgpack_numpy`.
 
 
 _KEYS_AT_MOST = 64
@@ -328,10 +331,10 @@ class Modality:
 
 
 def batch(observations: Sequence[Mapping[str, Any]], text_key: str) -> dict[str, Any]:
-    """Return observations of one moment each as one batch.
+    """Stack observations of one moment each into a batch.
 
     Args:
-        observations: {"video": {name: (H, W, 3)}, "state": {name: (D,)}, "language": {"task": text}} of each.
+        observations: For each, {"video": {name: (H, W, 3)}, "state": {name: (D,)}, "language": {"task": text}}.
         text_key: The server's name of the instruction.
 
     Returns:
@@ -353,13 +356,13 @@ def batch(observations: Sequence[Mapping[str, Any]], text_key: str) -> dict[str,
 
 
 def flat(batched: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a batch with flat keys: `video.NAME`, `state.NAME`, and the instruction's own key with B texts."""
+    """Convert a batch to flat keys: `video.NAME`, `state.NAME`, and the instruction's own key with B texts."""
     named = {f"{kind}.{name}": array for kind in _ARRAYS for name, array in batched[kind].items()}
     return named | {key: [text for [text] in texts] for key, texts in batched["language"].items()}
 
 
 def write(endpoint: str, data: Any, api_token: str | None, *, packed: bool = False) -> bytes:
-    """Return the message of a request; `data` is left out if it is None; `packed` is that of `reads_packed`."""
+    """Return the message of a request; `data` is omitted if it is None; `packed` is the result of `reads_packed`."""
     array = msgpack.write_packed if packed else write_npy
     message = {"endpoint": endpoint} | ({} if data is None else {"data": data})
     return msgpack.pack(message | ({"api_token": api_token} if api_token else {}), array)
@@ -397,12 +400,12 @@ def read_actions(reply: Any, number: int) -> list[dict[str, np.ndarray]]:
 
 
 def reads_packed(reply: Any) -> bool:
-    """Return whether what `get_modality_config` answered is of a server that reads arrays of `msgpack_numpy`."""
+    """Return whether the reply to `get_modality_config` is from a server that reads arrays of `msgpack_numpy`."""
     return isinstance(reply, dict) and any(isinstance(one, dict) and _PACKED in one for one in reply.values())
 
 
 def read_modalities(reply: Any) -> dict[str, Modality]:
-    """Return the answer to `get_modality_config`, by modality; keys have no prefix such as `video.`."""
+    """Return the modalities in the reply to `get_modality_config`; keys have no prefix such as `video.`."""
     if not isinstance(reply, dict):
         raise MalformedMessage(f"gr00t: got {type(reply).__name__} for modalities, want a map")
     return {str(name): _modality(str(name), value) for name, value in list(reply.items())[:_KEYS_AT_MOST]}

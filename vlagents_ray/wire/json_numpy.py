@@ -19,7 +19,7 @@ _KEYS = {"__numpy__", "dtype", "shape"}
 
 
 def loads(text: str | bytes, limits: Limits, levels: int = 0) -> Any:
-    """Return the value of a document, nested up to `levels` more than the limit; arrays are read-only."""
+    """Return the value of a document, nested up to `levels` deeper than the limit; arrays are read-only."""
     if len(text) > limits.body_bytes:
         raise MessageTooLarge(f"document: got {len(text)} bytes, the limit is {limits.body_bytes}")
     marks: tuple[Any, ...] = (",", "[", "{") if isinstance(text, str) else (b",", b"[", b"{")
@@ -36,12 +36,12 @@ def loads(text: str | bytes, limits: Limits, levels: int = 0) -> Any:
 
 
 def dumps(value: Any) -> str:
-    """Return the document of a value; raise `InvalidInput` for a type that it cannot hold."""
+    """Return the document of a value; raise `InvalidInput` for an unsupported type."""
     return json.dumps(value, default=_plain)
 
 
 def decode_base64(data: object, what: str) -> bytes:
-    """Return the bytes of base64 in the standard or the URL-safe alphabet; `what` names it in errors."""
+    """Decode base64 in the standard or the URL-safe alphabet; `what` is the name of the data in errors."""
     if not isinstance(data, str):
         raise MalformedMessage(f"{what}: got {type(data).__name__}, want base64")
     try:

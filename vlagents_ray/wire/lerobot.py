@@ -1,8 +1,8 @@
 """The pickled messages of LeRobot's asynchronous inference: policy instructions, observations and chunks of actions.
 
-The facts come from LeRobot 0.4.4's `async_inference/helpers.py` and `robot_client.py`; those of 0.6.1 are the same. A
-client pickles its data classes. They are read as data, see `pickles`, and the chunk is written as a pickle in which the
-client finds its own `TimedAction` and `torch.tensor`.
+Sources: `async_inference/helpers.py` and `robot_client.py` of LeRobot 0.4.4, which are equivalent in 0.6.1. A
+client pickles its data classes. They are read as data, see `pickles`, and the chunk is written as a pickle that refers
+to the client's own `TimedAction` and `torch.tensor`.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ _REQUESTS: Mapping[Name, Sequence[str]] = {
     OBSERVATION: ("timestamp", "timestep", "observation", "must_go"),
 }  # fmt: skip
 _STEPS = 2**31  # time steps fit into a pickle's plain integers
-_SHOWN = 40  # maximum number of a client's keys in an error, and of characters of each
+_SHOWN = 40  # largest number of a client's keys in an error, and of characters of each
 
 
 @dataclass(frozen=True, slots=True)
 class PolicyInstructions:
-    """A client's settings of itself and of the policy, before its first observation."""
+    """A client's settings of itself and of the policy, sent before its first observation."""
 
     policy_type: str
     checkpoint: str  # the checkpoint that LeRobot's own server would load
@@ -58,7 +58,7 @@ class RobotObservation:
     timestamp: float  # the client's clock, s since 1970
     timestep: int  # number of the last action that the client executed
     values: Mapping[str, Any]  # numbers, texts and arrays by the robot's names
-    must_go: bool  # whether the client has no action left
+    must_go: bool  # whether the client has no actions left
 
 
 def read_instructions(data: Buffer, limits: Limits) -> PolicyInstructions:
@@ -94,7 +94,7 @@ def read_instructions(data: Buffer, limits: Limits) -> PolicyInstructions:
 
 
 def read_observation(data: Buffer, budget: Budget) -> RobotObservation:
-    """Return the observation in a pickle, whose arrays view the pickle, and are counted in `budget`."""
+    """Return the observation in a pickle; its arrays are views of the pickle, and count in `budget`."""
     stated = _pickled_fields(data, budget.limits, OBSERVATION)
     timestamp, timestep, values, must_go = (stated[name] for name in _REQUESTS[OBSERVATION])
     if not is_number(timestamp) or not math.isfinite(timestamp):
@@ -116,14 +116,14 @@ def read_observation(data: Buffer, budget: Budget) -> RobotObservation:
 
 
 def frame(observation: RobotObservation, robot: PolicyInstructions) -> dict[str, Any]:
-    """Return an observation by LeRobot's names, as LeRobot's own server does before it calls a policy.
+    """Convert an observation to LeRobot's names, as LeRobot's own server does before it calls a policy.
 
     Returns:
         `observation.state`, (D,) float32, in the order of the robot's features, `observation.images.NAME`, and `task`.
 
     Raises:
         MissingState, MissingCamera: The observation lacks a feature that the policy instructions state.
-        InvalidObservation: A number of the state is none.
+        InvalidObservation: A value of the state is not a number.
     """
     values = observation.values
     have = [name[:_SHOWN] for name in values][:_SHOWN]
@@ -139,7 +139,7 @@ def frame(observation: RobotObservation, robot: PolicyInstructions) -> dict[str,
             if not is_number(value):
                 raise InvalidObservation(f"{name[:_SHOWN]!r}: got {_shown(value)}, want a number")
             numbers.append(value)
-        with np.errstate(over="ignore"):  # becomes infinite, as at LeRobot's own server
+        with np.errstate(over="ignore"):  # becomes infinite, as in LeRobot's own server
             found[STATE] = np.array(numbers, np.float64).astype(np.float32)
     for name in robot.cameras:
         if name not in values:
@@ -154,12 +154,12 @@ def write_chunk(rows: np.ndarray, timestamp: float, timestep: int, period_s: flo
     """Return the pickle of a chunk: a list of `TimedAction`, which the client unpickles.
 
     The pickle has the form that LeRobot's server writes, except that each tensor is a call of `torch.tensor` with its
-    numbers, of float32's values: that needs no torch here, and no archive within the pickle.
+    float32 numbers, which needs neither torch here nor an archive within the pickle.
 
     Args:
         rows: The chunk, (H, D) float32.
-        timestamp: Time of the observation, s, which is that of the first action.
-        timestep: Number of the first action, that of the observation.
+        timestamp: Time of the observation and of the first action, s.
+        timestep: Number of the observation and of the first action.
         period_s: Time between two actions, s.
     """
     if timestep + len(rows) > _STEPS:
@@ -183,7 +183,7 @@ def _text_opcodes(value: str) -> bytes:
 
 
 def _global(memo: int, module: str, name: str) -> bytes:
-    """Return the opcodes that put a class or function into the memo."""
+    """Return the opcodes that store a class or function in the memo."""
     return f"c{module}\n{name}\n".encode() + bytes([ord("q"), memo, ord("0")])
 
 
@@ -199,7 +199,7 @@ def _text(stated: Mapping[str, Any], name: str) -> str:
 
 
 def _shown(value: object) -> str:
-    """Return a client's value as an error shows it: a number, or the type of anything else, whatever its size."""
+    """Return a client's value for an error message: a number, or the type of anything else, whatever its size."""
     return repr(value) if is_number(value) else type(value).__name__
 
 
@@ -212,17 +212,17 @@ def _names(feature: Mapping[str, Any]) -> tuple[str, ...]:
 
 # The protobuf messages of LeRobot's `AsyncInference` service, read and written by hand.
 #
-# The facts come from LeRobot 0.4.4's `transport/services.proto`, and 0.6.1 has the same: `Observation` has the field 1,
-# `transfer_state`, and the field 2, `data`; `PolicySetup` and `Actions` have the field 1, `data`; `Empty` has none.
+# Source: `transport/services.proto` of LeRobot 0.4.4 and 0.6.1. `Observation` has the field 1, `transfer_state`, and
+# the field 2, `data`; `PolicySetup` and `Actions` have the field 1, `data`; `Empty` has none.
 
 
 SERVICE = "transport.AsyncInference"
-_VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5  # types of a field
-_VARINT_BYTES = 10  # maximum length of a number
+_VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5  # types of fields
+_VARINT_BYTES = 10  # largest length of a number
 
 
 class TransferState(enum.IntEnum):
-    """The place of a part in its message."""
+    """The position of a part in its message."""
 
     BEGIN = 1
     MIDDLE = 2
@@ -238,7 +238,7 @@ class ObservationPart:
 
 
 def read_observation_part(message: bytes) -> ObservationPart:
-    """Return the content of an `Observation`; raise `MalformedMessage` if it is none."""
+    """Return the content of an `Observation`; raise `MalformedMessage` for anything else."""
     number, data = 0, memoryview(b"")
     for field, value in _protobuf_fields(message):
         if field == 1 and isinstance(value, int):
@@ -280,7 +280,7 @@ def _head(number: int, length: int) -> bytes:
 
 
 def _protobuf_fields(message: bytes) -> Iterator[tuple[int, int | memoryview]]:
-    """Yield the number and the value of each field that is a number or bytes; others are skipped."""
+    """Yield the number and the value of each field that is a number or bytes; other fields are skipped."""
     view, at = memoryview(message), 0
     while at < len(view):
         key, at = _varint(view, at)
@@ -309,7 +309,7 @@ def _varint(view: memoryview, at: int) -> tuple[int, int]:
     raise MalformedMessage("protobuf: a number that ends too early")
 
 
-# The mapping of LeRobot's robots: the names of its datasets, which its own server makes of a robot's.
+# The mapping of LeRobot's robots: the names of its datasets, to which its own server converts a robot's names.
 
 
 STATE, IMAGES, TASK = "observation.state", "observation.images.", "task"

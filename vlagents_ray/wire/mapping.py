@@ -1,7 +1,7 @@
 """Conversion of another system's observation to an `Obs`, and of our action to theirs: keys, layouts, grippers.
 
-A deployment file states a mapping as a preset's name (`presets`), as an object, or as an
-object that names a preset and changes some of its fields:
+A deployment file states a mapping as a preset's name (`presets`), as an object, or as an object that names a preset and
+overrides some of its fields:
 
     {"cameras": {"front": "observation/image", "wrist": {"key": "images/wrist", "layout": "chw"}},
      "state": {"joints": {"key": "state", "stop": 6}, "pose": ["position", "rotation"]},
@@ -12,10 +12,10 @@ object that names a preset and changes some of its fields:
      "action_gripper": {"index": 6, "open": -1, "closed": 1}}
 
 The client's keys are paths: `images/wrist` is either that key itself or `wrist` within `images`. `states|state` is the
-first of the two that exists. A name and a key that end with `*` stand for all keys that match: `"*": "video/*"`. Left
-sides are our names, right sides the client's, except in `action`, whose left sides are the names that the client reads,
-and in `instructions`, which has the text of each integer that a client sends in place of an instruction. Unknown fields
-are errors; a text stands for an entry with that key and no other field.
+first of the two that exists. A name and a key that end with `*` match all keys with that beginning: `"*": "video/*"`.
+Left sides are our names, right sides the client's, except in `action`, whose left sides are the names that the client
+reads, and in `instructions`, which has the text of each integer that a client sends instead of an instruction. Unknown
+fields are errors; a text is short for an entry with that key and no other field.
 
 An observation is refused if the mapping reads nothing of it, or none of the cameras or none of the states in it.
 """
@@ -54,7 +54,7 @@ class CameraKey:
     """The location of an image, (H, W, 3) or (3, H, W) RGB; of (1, T, H, W, 3) the newest image is used, the last of T.
 
     Pixels are uint8, or floats in [0, 1]. The layout `any` means channels first if the length of the first axis is 3;
-    of `rgba`, (H, W, 4), the alpha is left out.
+    of `rgba`, (H, W, 4), alpha is dropped.
     """
 
     key: str
@@ -74,7 +74,7 @@ class StateKey:
 
 @dataclass(frozen=True, slots=True)
 class GripperKey:
-    """The location of the gripper's opening, and its readings when open and closed; it is linear between them."""
+    """The location of the gripper's opening, and its readings when open and closed, with linear interpolation."""
 
     key: str
     index: int = 0
@@ -120,7 +120,7 @@ def each(top: Mapping[str, Any], name: str, read: Callable[[Any, str], T]) -> di
 
 
 def entry(cls: type[T], value: Any, where: str) -> T:
-    """Return an entry of a mapping, the dataclass `cls`; a text is its key."""
+    """Return an entry of a mapping as the dataclass `cls`; a text is its key."""
     values = closed(cls, {"key": value} if isinstance(value, str) else value, where)
     known = {one.name: str(one.type) for one in fields(cls)}  # type: ignore[arg-type]
     for name, got in values.items():
@@ -147,7 +147,7 @@ _FITS: dict[str, Callable[[Any], bool]] = {
 
 
 def parts(value: Any, where: str) -> tuple[StateKey, ...]:
-    """Return the keys of one state, whose values are joined."""
+    """Return the keys of one state, whose values are concatenated."""
     values = value if isinstance(value, list) else [value]
     if not values:
         raise ConfigError(f"{where}: got an empty list, want one key at least")
@@ -171,10 +171,10 @@ def stated(value: Any) -> Any:
 
 # Paths into nested observations, such as `images/wrist`: either that key itself, or `wrist` within `images`.
 #
-# `states|state` stands for the first of the two that exists.
+# `states|state` means the first of the two that exists.
 
 
-_SHOWN = 40  # maximum number of keys that an error lists, and of characters of a key
+_SHOWN = 40  # largest number of keys that an error lists, and of characters of a key
 _LONGEST = 200  # characters of a client's key that are compared
 
 
@@ -201,7 +201,7 @@ def keys(nested: Mapping[Any, Any]) -> list[str]:
 
 
 def short_path(path: str) -> str:
-    """Return a path as an error may list it, each key cut to 40 characters."""
+    """Return a path for an error message, each key cut to 40 characters."""
     return "/".join(key[:_SHOWN] for key in path.split("/"))
 
 
@@ -224,24 +224,24 @@ def reads(key: str, path: str) -> bool:
 
 
 def matches(name: str, pattern: str) -> bool:
-    """Return whether `pattern`, which may end with `*`, stands for `name`."""
+    """Return whether `pattern`, which may end with `*`, matches `name`."""
     return name.startswith(pattern[:-1]) if pattern.endswith("*") else name == pattern
 
 
 def pick(
     flat: Mapping[str, Any], name: str, key: str, optional: bool, missing: Callable[..., InvalidObservation]
 ) -> list[tuple[str, str, Any]]:
-    """Return the values that a key of a mapping stands for.
+    """Return the values that a key of a mapping matches.
 
     Args:
         flat: The client's observation.
-        name: Our name of the value; its `*` stands for the same text as that of `key`.
+        name: Our name of the value; its `*` is replaced by the text that the `*` of `key` matches.
         key: The client's key.
         optional: Whether the value may be missing.
-        missing: Creates the error that is raised if the value is missing.
+        missing: Creates the error for a missing value.
 
     Returns:
-        Our name, the client's key and the value, of each.
+        For each value, our name, the client's key and the value.
     """
     if "*" not in key:
         value = lookup(flat, key)
@@ -261,7 +261,7 @@ def pick(
     return there
 
 
-# The values that a mapping finds in another system's observation, as ours.
+# Conversion of values in another system's observation to ours.
 
 
 def read_image(key: str, value: Any, layout: str, limits: Limits) -> np.ndarray:
@@ -280,8 +280,8 @@ def read_image(key: str, value: Any, layout: str, limits: Limits) -> np.ndarray:
 
 
 def _eight_bits(key: str, image: np.ndarray) -> np.ndarray:
-    """Convert floats in [0, 1] to uint8, rounded down as openpi's own server does (`_parse_image` in its policies)."""
-    if image.size and not (image.min() >= 0 and image.max() <= 1):  # true for NaN, too
+    """Convert floats in [0, 1] to uint8, rounded down as in openpi's own server (`_parse_image` in its policies)."""
+    if image.size and not (image.min() >= 0 and image.max() <= 1):  # also true for NaN
         raise InvalidObservation(
             f"camera {key!r}: got {image.dtype} from {image.min():g} to {image.max():g}, want uint8, or floats "
             f"in [0, 1]; scale it"
@@ -303,7 +303,7 @@ def may_be_state(value: Any) -> bool:
 def read_state(
     flat: Mapping[str, Any], name: str, sources: tuple[StateKey, ...], limits: Limits
 ) -> dict[str, np.ndarray]:
-    """Return the state `name`, whose parts are joined, (D,) float32; several states if the name ends with `*`."""
+    """Return the state `name`, its parts concatenated, (D,) float32; several states if the name ends with `*`."""
     joined: dict[str, list[np.ndarray]] = {}
     for part in sources:
         found = pick(flat, name, part.key, part.optional, MissingState)
@@ -326,7 +326,7 @@ def read_vector(key: str, value: Any, limits: Limits) -> np.ndarray:
 
 
 def _newest(key: str, value: np.ndarray, ndim: int) -> np.ndarray:
-    """Remove the batch axis, of length 1, and the time axis that some clients add in front; keep the last time."""
+    """Remove the batch axis, of length 1, and the time axis that some clients add in front; keep the last time step."""
     if value.ndim > ndim and value.shape[0] != 1:
         raise InvalidObservation(
             f"{key!r}: got {value.shape}, a batch of {value.shape[0]}, want one; send each by itself"
@@ -342,12 +342,12 @@ def read_text(key: str, value: Any, texts: Mapping[str, str], limits: Limits, *,
     Args:
         key: The client's key, for errors.
         value: A text, a list or array of one text, or an array of one integer.
-        texts: The text that each integer stands for.
+        texts: The text for each integer.
         limits: The limits of a request.
         needed: Whether an integer without a text is an error; if not, there is no instruction.
 
     Raises:
-        InvalidObservation: `value` is none of these, or an integer without a text that is needed.
+        InvalidObservation: `value` has another type, or is an integer without a text that is needed.
         MessageTooLarge: The text is too long.
     """
     while isinstance(value, (list, tuple)) and len(value) == 1:  # some clients send a batch of one
@@ -367,15 +367,15 @@ def read_text(key: str, value: Any, texts: Mapping[str, str], limits: Limits, *,
     return value
 
 
-_OVERSHOOT = 0.25  # share of a gripper's range by which a sensor may read beyond its ends
+_OVERSHOOT = 0.25  # share of a gripper's range by which a reading may exceed its ends
 
 
 @dataclass(frozen=True, slots=True)
 class KeyMapping:
-    """The key mapping of one system; the module describes its fields."""
+    """The key mapping of one system; the module's docstring describes its fields."""
 
     cameras: Mapping[str, CameraKey] = field(default_factory=dict)
-    state: Mapping[str, tuple[StateKey, ...]] = field(default_factory=dict)  # joined in this order
+    state: Mapping[str, tuple[StateKey, ...]] = field(default_factory=dict)  # concatenated in this order
     gripper: GripperKey | None = None
     instruction: str | None = None
     instructions: Mapping[str, str] = field(default_factory=dict)  # by the integer that is sent in their place
@@ -418,10 +418,10 @@ class KeyMapping:
         Args:
             flat: The client's observation.
             limits: The limits of a request.
-            contract: The policy's contract: a gripper that it does not need is left out if its reading is invalid.
+            contract: The policy's contract: an invalid gripper reading is dropped if the policy does not need it.
 
         Returns:
-            Our observation, whose arrays may view those of `flat`, and its instruction; None if there is none.
+            Our observation, whose arrays may be views of those of `flat`, and its instruction; None if there is none.
 
         Raises:
             MissingCamera, MissingState: A key is missing.
@@ -449,8 +449,8 @@ class KeyMapping:
     def rows(self, action: np.ndarray, spec: ActionSpec | None = None) -> np.ndarray:
         """Return our action, (D,) or (H, D), as (H, D) float32 with the gripper's commands in the client's convention.
 
-        `spec`, the action of the policy's contract, states the policy's own convention; without it, the commands are
-        not changed.
+        `spec`, the action of the policy's contract, states the policy's own convention; without it, the commands stay
+        unchanged.
         """
         rows = np.atleast_2d(np.asarray(action, np.float32))
         if spec is None or spec.gripper_open is None or spec.gripper_closed is None:
@@ -474,7 +474,7 @@ class KeyMapping:
         return {name: rows[:, one.start : one.stop] for name, one in self.action.items()}
 
     def lacks(self, contract: Contract | None) -> list[str]:
-        """Return the policy's inputs that no observation of this mapping has, one sentence each with its remedy."""
+        """Return the policy's inputs that no observation of this mapping has, each as a sentence with the cure."""
         if contract is None:
             return []
         found = [
@@ -500,16 +500,16 @@ class KeyMapping:
         return found
 
     def warn_of_unread_cameras(self, flat: Mapping[str, Any], dialect: str) -> None:
-        """Log the cameras of a client's observation that the mapping does not read, which the policy never sees.
+        """Log the cameras of a client's observation that the mapping does not read, and the policy never receives.
 
-        It is logged once for all clients of a dialect that send the same ones. This looks at each key: call it when a
-        session begins, not for each observation.
+        A message is logged once for all clients of a dialect with the same cameras. This looks at each key: call it
+        when a session begins, not for each observation.
         """
         if unread := self._unread(flat, may_be_camera):
             _log_unread(dialect, tuple(unread), tuple(camera.key for camera in self.cameras.values()))
 
     def _unread(self, flat: Mapping[str, Any], is_one: Callable[[Any], bool]) -> list[str]:
-        """Return the paths of the values for which `is_one` holds and which no key of the mapping stands for."""
+        """Return the paths of the values for which `is_one` is true and which no key of the mapping matches."""
         known = [one.key for one in self.cameras.values()] + [one.key for all_ in self.state.values() for one in all_]
         known += [*self.info.values(), *([] if self.gripper is None else [self.gripper.key])]
         return [
@@ -542,7 +542,7 @@ class KeyMapping:
                 )
 
     def _opening(self, flat: Mapping[str, Any], limits: Limits, *, needed: bool) -> float | None:
-        """Return the gripper's opening in [0, 1], 1 = open; None if there is none or it is invalid and not `needed`."""
+        """Return the gripper's opening in [0, 1], 1 = open; None if it is missing, or invalid and not `needed`."""
         if (gripper := self.gripper) is None:
             return None
         value = lookup(flat, gripper.key)
@@ -557,7 +557,7 @@ class KeyMapping:
             )
         reading = float(vector[gripper.index])
         opening = (reading - gripper.closed) / (gripper.open - gripper.closed)
-        if not -_OVERSHOOT <= opening <= 1 + _OVERSHOOT:  # true for NaN, too
+        if not -_OVERSHOOT <= opening <= 1 + _OVERSHOOT:  # also true for NaN
             if not needed:
                 return None
             raise InvalidObservation(
@@ -573,7 +573,7 @@ class KeyMapping:
         return read_text(self.instruction, found[0][2], self.instructions, limits, needed=needed)
 
 
-@lru_cache(maxsize=64)  # logs only what it did not log before
+@lru_cache(maxsize=64)  # each message is logged once
 def _log_unread(dialect: str, unread: tuple[str, ...], read: tuple[str, ...]) -> None:
     logger.warning(
         f"{dialect}: a client sends the cameras {list(unread)}, which the policy does not get: the mapping reads "
@@ -581,7 +581,7 @@ def _log_unread(dialect: str, unread: tuple[str, ...], read: tuple[str, ...]) ->
     )
 
 
-# Parts of mappings that the clients of several systems share: the layout of LIBERO's and ALOHA's vectors.
+# Parts of mappings that clients of several systems share: the layout of LIBERO's and ALOHA's vectors.
 
 
 # Six joints in rad and one gripper in [0, 1] per arm, the left arm first.
@@ -597,8 +597,8 @@ ALOHA_ACTION = [{"index": 6}, {"index": 13}]
 def libero_state(key: str) -> dict[str, Any]:
     """Return the mapping of LIBERO's state, which a client sends under `key`.
 
-    The state holds the end effector's pose in the robot's base frame (position in m, axis-angle in rad) and two finger
-    joints, 0.04 m when open.
+    The state contains the end effector's pose in the robot's base frame (position in m, axis-angle in rad) and two
+    finger joints, 0.04 m when open.
     """
     return {
         "state": {

@@ -1,6 +1,6 @@
-"""Reading of msgpack within limits, for the messages of other systems; ours are frames.
+"""A reader of msgpack with limits, for the messages of other systems; our own messages are frames.
 
-A short message can need much memory (each byte may be an empty list); therefore the values are counted while they are
+A short message can need much memory (each byte may be an empty list). Values are therefore counted while they are
 read, and reading stops at the limit.
 """
 
@@ -26,13 +26,13 @@ def unpack(data: bytes | memoryview, limits: Limits, hook: Hook, text: int | Non
     Args:
         data: The message.
         limits: The limits of its size, its number of values and their nesting.
-        hook: Gets each map, innermost first, and returns the value that replaces it. The values of a list that it
-            returns, such as an array of text, are counted too; the hook limits them to `limits.items` itself.
-        text: Maximum size of one text, bytes; None if the size of the message is limit enough.
+        hook: Receives each map, innermost first, and returns the value that replaces it. Values of a list that it
+            returns, such as an array of text, also count; the hook itself limits them to `limits.items`.
+        text: Largest size of one text, bytes; None if the limit of the message is enough.
 
     Raises:
-        MalformedMessage: It is not msgpack, or holds extension types.
-        MessageTooLarge: It is over a limit.
+        MalformedMessage: The message is not msgpack, or contains extension types.
+        MessageTooLarge: The message exceeds a limit.
         InvalidInput: The hook raised it.
     """
     if len(data) > limits.body_bytes:
@@ -69,7 +69,7 @@ def unpack(data: bytes | memoryview, limits: Limits, hook: Hook, text: int | Non
     except InvalidInput:
         raise
     except (msgpack.exceptions.UnpackException, ValueError, TypeError, OverflowError) as error:
-        if "exceeds max_" in str(error):  # msgpack has no error class for it
+        if "exceeds max_" in str(error):  # msgpack has no error class for this
             raise MessageTooLarge(f"message: {error}; send arrays instead of lists") from error
         raise MalformedMessage(f"message: no msgpack ({type(error).__name__}: {str(error)[:100]})") from error
     require_plain(value, limits.depth)

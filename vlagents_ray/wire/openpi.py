@@ -1,6 +1,6 @@
 """The messages of `openpi-client`: msgpack, in which a map with the key b"__ndarray__" is an array.
 
-The convention is that of `openpi_client.msgpack_numpy`, 0.1.2; RoboArena's client has a copy of it.
+The format is that of `openpi_client.msgpack_numpy`, 0.1.2; RoboArena's client has a copy of it.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ def decode(data: bytes, limits: Limits = DEFAULT_LIMITS) -> dict[str, Any]:
 
 
 def decode_any(data: bytes, limits: Limits = DEFAULT_LIMITS) -> Any:
-    """Return the value in a message, which need not be a map; else as `decode`."""
+    """Return the value in a message, which may be of any type; otherwise like `decode`."""
     return unpack(data, limits, lambda node: _array(node, limits.items))
 
 
 def encode(value: Any) -> bytes:
-    """Return the message with `value`, plain values and arrays, in the client's format."""
+    """Return the message for `value`, plain values and arrays, in the client's format."""
     return pack(value, _node)
 
 
@@ -56,7 +56,7 @@ def _array(node: dict[Any, Any], most: int) -> Any:
 
 
 def _texts(data: bytes, dtype: str, most: int) -> list[str]:
-    """Return an array of at most `most` texts as a flat list; some clients send a prompt in this way."""
+    """Return an array of at most `most` texts as a flat list; some clients send a prompt in this form."""
     length = dtype.removeprefix("<U")
     size = 4 * int(length) if length.isascii() and length.isdigit() and len(length) < 9 else 0
     if not size or len(data) % size:
@@ -101,7 +101,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "instruction": "prompt",
         "action_gripper": {"index": 6, "open": -1.0, "closed": 1.0},
     },
-    # openpi, examples/droid/main.py; DROID's gripper reads 0 when open
+    # openpi, examples/droid/main.py; DROID's observed gripper is 0 when open
     "openpi-droid": {
         "cameras": {
             "front": {"key": "observation/exterior_image_1_left", "layout": "any"},
@@ -126,7 +126,7 @@ PRESETS: dict[str, dict[str, Any]] = {
 }
 
 ROBOARENA: dict[str, dict[str, Any]] = {
-    # openpi's DROID keys, but the numbers of the cameras begin with 0
+    # openpi's DROID keys, but the camera numbers begin with 0
     "roboarena": {
         "cameras": {
             "front": {"key": "observation/exterior_image_0_left", "layout": "any"},

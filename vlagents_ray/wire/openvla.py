@@ -1,7 +1,7 @@
 """OpenVLA's REST bodies: JSON with arrays in the format of `json-numpy`, encoded once or twice.
 
 `{"__numpy__": base64, "dtype": "|u1", "shape": [H, W, 3]}` is an array. Clients that do not patch their json module
-encode twice: a request is `{"encoded": "<the JSON>"}` and its reply a JSON string that holds the JSON.
+encode twice: a request is `{"encoded": "<the JSON>"}` and its reply a JSON string that contains the JSON.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Conversion of our observation to another system's, and of its actions to ours: a `KeyMapping` read backwards.
+"""Conversion of our observation to another system's, and of its actions to ours: a `KeyMapping` in reverse.
 
 Each entry of a mapping is then the destination of a value. The vectors of several entries with one key are joined by
-their `start` and `stop`; of `a|b` the first key is used; the `*` of a name stands for all cameras or states that no
+their `start` and `stop`; of `a|b` the first key is used; the `*` of a name matches all cameras or states that no
 other entry names.
 """
 
@@ -18,17 +18,17 @@ from vlagents_ray.errors import ConfigError, InvalidAction, InvalidObservation, 
 from vlagents_ray.interface import Obs
 from vlagents_ray.wire.mapping import KeyMapping, StateKey
 
-_MOST = 4096  # numbers of a vector that is joined
+_MOST = 4096  # largest number of elements of a joined vector
 
 
 @dataclass(frozen=True, slots=True)
 class Outgoing:
-    """A mapping that is read backwards.
+    """A mapping in reverse.
 
     Attributes:
         mapping: The mapping.
-        is_nested: Whether a key `a/b` is the key `b` within `a`, and not one key.
-        text_key: The text in place of the `*` of the instruction's key.
+        is_nested: Whether a key `a/b` means the key `b` within `a`; if not, it is a single key.
+        text_key: The replacement of `*` in the instruction's key.
 
     Raises:
         ConfigError: A state has several parts without `stop`, so that their lengths are unknown.
@@ -44,7 +44,7 @@ class Outgoing:
                 raise ConfigError(f"mapping.state.{name}: got {open_ended} parts without `stop`, want one at most")
 
     def observation(self, obs: Obs, instruction: str | None) -> dict[str, Any]:
-        """Return an observation as the other system's server reads it; its arrays may view those of `obs`."""
+        """Convert an observation to the other system's; its arrays may be views of those of `obs`."""
         theirs: dict[str, Any] = {}
         for name, camera in self.mapping.cameras.items():
             for key, image in _matching(name, camera.key, obs.cameras, self.mapping.cameras):
@@ -61,7 +61,7 @@ class Outgoing:
         return theirs
 
     def rows(self, theirs: np.ndarray | Mapping[str, np.ndarray]) -> np.ndarray:
-        """Return their actions, (D,) or (H, D), or such by name, as one (D,) or (H, D) float32."""
+        """Convert their actions, (D,) or (H, D), or several such by name, to one (D,) or (H, D) float32."""
         if not isinstance(theirs, Mapping):
             return _numbers("action", theirs)
         named = {name: _numbers(name, value) for name, value in theirs.items()}
@@ -111,7 +111,7 @@ class Outgoing:
         )
 
     def _own_gripper(self) -> bool:
-        """Return whether the gripper's number is not one of a state's, which then sets it."""
+        """Return whether the gripper has its own number; if not, the number is part of a state, which then sets it."""
         gripper = self.mapping.gripper
         return gripper is not None and not any(
             _first(part.key) == _first(gripper.key)
@@ -177,14 +177,14 @@ def _matching(
 
 
 def _width(parts: tuple[StateKey, ...]) -> int | None:
-    """Return the length of a state, if the mapping states it."""
+    """Return the length of a state; None if the mapping does not state it."""
     widths = [None if part.stop is None else part.stop - (part.start or 0) for part in parts]
     known = [width for width in widths if width is not None]
     return sum(known) if len(known) == len(widths) else None
 
 
 def _split(name: str, vector: np.ndarray, keys: list[tuple[str, StateKey]]) -> list[tuple[str, StateKey, np.ndarray]]:
-    """Return the parts of a state's vector; the last one without `stop` has what the others leave."""
+    """Split a state's vector into its parts; the part without `stop` receives the rest."""
     widths = [_width((part,)) for _, part in keys]
     known = sum(width for width in widths if width is not None)
     if (vector.size < known) if None in widths else (vector.size != known):
@@ -202,7 +202,7 @@ def _split(name: str, vector: np.ndarray, keys: list[tuple[str, StateKey]]) -> l
 def _joined(
     key: str, pieces: list[tuple[int, np.ndarray]], error: type[InvalidObservation | InvalidAction]
 ) -> np.ndarray:
-    """Join vectors or columns at their places along the last axis, which they must fill without gaps."""
+    """Join vectors or columns at their positions along the last axis, which they must fill without gaps."""
     end = max(start + piece.shape[-1] for start, piece in pieces)
     if min(start for start, _ in pieces) < 0 or end > _MOST:
         raise ConfigError(f"mapping: {key!r}: got places up to {end}, want 0 to {_MOST}, counted from the front")

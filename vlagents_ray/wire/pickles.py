@@ -1,8 +1,8 @@
 """Pickles of a few known shapes, whose opcodes are read as data: nothing is unpickled, looked up or imported.
 
-A pickle is a program for a stack machine, and its dangerous opcodes import and call whatever it names. This reader has
-no such opcode: a pair of module and name is compared, as text, with the closed lists of its caller, whose entries stand
-for the caller's own functions. An opcode, a name or a shape that is not listed is refused.
+A pickle is a program for a stack machine, and its dangerous opcodes import and call any name in it. This reader has
+no such opcode: a pair of module and name is compared, as text, with the closed lists of its caller, whose entries
+represent the caller's own functions. An opcode, a name or a shape that is not listed is refused.
 
 The opcodes are those that Python's own pickler writes in protocol 4 and 5 for dicts, lists, tuples, texts, numbers,
 numpy's arrays and data classes. `Limits` bound the number of opcodes (`items`), the nesting (`depth`) and the texts.
@@ -22,8 +22,8 @@ from vlagents_ray.protocol.frame_layout import Buffer, read_array
 from vlagents_ray.protocol.messages import Limits
 
 _PROTOCOLS = (4, 5)
-_INTEGER = 9  # maximum number of bytes of an integer
-_SHOWN = 60  # maximum number of characters of a client's text in an error
+_INTEGER = 9  # largest number of bytes of an integer
+_SHOWN = 60  # largest number of characters of a client's text in an error
 
 
 class Name(NamedTuple):
@@ -34,27 +34,27 @@ class Name(NamedTuple):
 
 
 class Record:
-    """An object of a data class, of which only the name and the fields are known."""
+    """An object of a data class, known only by name and fields."""
 
     __slots__ = ("fields", "name")
 
     def __init__(self, name: Name) -> None:
         self.name = name
-        self.fields: dict[str, Any] | None = None  # None until they were read
+        self.fields: dict[str, Any] | None = None  # None until they are read
 
 
 class Reduced:
-    """An object that a pickle makes by a call, and may describe afterwards."""
+    """An object that a pickle creates by a call, and whose state may follow."""
 
     __slots__ = ("read_state", "value")
 
     def __init__(self, read_state: Callable[[Any], Any] | None = None, value: Any = None) -> None:
         self.read_state = read_state
-        self.value = value  # None until it was described
+        self.value = value  # None until its state is read
 
 
 Call = Callable[[tuple[Any, ...]], "Reduced | int | float"]
-"""Returns what a call in a pickle stands for, given its arguments; raises `MalformedMessage` for others."""
+"""Returns the value of a call in a pickle, given its arguments; raises `MalformedMessage` for invalid ones."""
 
 
 class _StackValue(NamedTuple):
@@ -68,16 +68,16 @@ class _StackValue(NamedTuple):
 def read_pickle(
     data: Buffer, limits: Limits, records: Mapping[Name, Sequence[str]], calls: Mapping[Name, Call | None]
 ) -> Any:
-    """Return the object that a pickle consists of; one of a data class may lack its fields.
+    """Return the object in a pickle; an object of a data class may lack some of its fields.
 
     Args:
-        data: The pickle. Arrays of the result view its memory.
+        data: The pickle. Arrays of the result are views of its memory.
         limits: Limits of the number of opcodes (`items`), of nesting (`depth`) and of texts (`text`).
         records: The data classes that may occur, with the names of their fields.
-        calls: The functions that may occur, with our own in their place; None for a class that is an argument only.
+        calls: The functions that may occur, with our replacements; None for a class that is only an argument.
 
     Raises:
-        MalformedMessage: The bytes are no pickle, or have another opcode, name or shape than those listed here.
+        MalformedMessage: The bytes are not a pickle, or contain an opcode, name or shape that is not listed.
         MessageTooLarge: The pickle exceeds a limit.
     """
     return _StackMachine(data, limits, records, calls).whole()
@@ -194,7 +194,7 @@ class _StackMachine:
         return group
 
     def name(self) -> None:
-        """Replace module and name by their entry of the closed list."""
+        """Replace module and name by their entry in the closed list."""
         name, module = self.pop(), self.pop()
         if not (type(module) is str and type(name) is str):
             raise MalformedMessage("pickle: a name that is no text")
@@ -250,7 +250,7 @@ class _StackMachine:
         return entry
 
     def _into(self, kind: type, entries: Sequence[_StackValue]) -> Any:
-        """Return the container below `entries`, which will contain them."""
+        """Return the container below `entries`, to which they are added."""
         container = self._entry()
         if type(container.value) is not kind:
             raise MalformedMessage(f"pickle: got {_kind(container.value)}, want a {kind.__name__}")
@@ -264,7 +264,7 @@ def _above(entries: Sequence[_StackValue]) -> int:
 
 
 def _finished(value: Any) -> Any:
-    """Return the value that a container keeps of one on the stack."""
+    """Return the value to store in a container for one on the stack."""
     if not isinstance(value, Reduced):
         return value
     if value.value is None:
@@ -330,14 +330,14 @@ _OPCODES: dict[int, Callable[[_StackMachine], Any]] = {
     ord("R"): _StackMachine.reduce,
     0x81: _StackMachine.new,
     ord("b"): _StackMachine.build,
-    0x95: lambda reader: reader.take(_U8.size),  # a frame, whose length is of no use here
+    0x95: lambda reader: reader.take(_U8.size),  # a frame, whose length is not needed
 }
 
 
-# numpy's arrays, types and numbers in a pickle: the calls by which numpy's own pickles state them.
+# numpy's arrays, types and numbers in a pickle: the calls in numpy's own pickles.
 #
-# The facts come from the pickles of numpy 1.26 and 2.4 in protocol 4 and 5. Arrays of objects, text, times or
-# structures, and big-endian ones, are refused.
+# Based on the pickles of numpy 1.26 and 2.4 in protocol 4 and 5. Arrays of objects, text, times or structures, and
+# big-endian ones, are refused.
 
 
 class _Dtype(str):
@@ -347,7 +347,7 @@ class _Dtype(str):
 
 
 def _dtype(arguments: tuple[Any, ...]) -> Reduced:
-    """`numpy.dtype`: ("f4", False, True), then (3, "<", None, None, None, -1, -1, 0)."""
+    """Read `numpy.dtype`: ("f4", False, True), then (3, "<", None, None, None, -1, -1, 0)."""
     match arguments:
         case (str(kind), bool() | int(), bool() | int()):
             return Reduced(lambda state: _ordered_dtype(kind, state))
@@ -362,7 +362,7 @@ def _ordered_dtype(kind: str, state: Any) -> _Dtype:
 
 
 def _array(arguments: tuple[Any, ...]) -> Reduced:
-    """`_reconstruct`: (numpy.ndarray, (0,), b"b"), then (1, shape, dtype, whether by columns, data)."""
+    """Read `_reconstruct`: (numpy.ndarray, (0,), b"b"), then (1, shape, dtype, whether by columns, data)."""
     match arguments:
         case (Name("numpy", "ndarray"), (int(0),), memoryview() as kind) if bytes(kind[:2]) == b"b":
             return Reduced(_content)
@@ -377,7 +377,7 @@ def _content(state: Any) -> np.ndarray:
 
 
 def _frombuffer(arguments: tuple[Any, ...]) -> Reduced:
-    """`_frombuffer`, of protocol 5: (data, dtype, shape, "C" or "F")."""
+    """Read `_frombuffer`, of protocol 5: (data, dtype, shape, "C" or "F")."""
     match arguments:
         case (memoryview() as data, _Dtype() as dtype, tuple(shape), str("C") | str("F") as order):
             return Reduced(value=_ordered(data, dtype, shape, order == "F"))
@@ -385,7 +385,7 @@ def _frombuffer(arguments: tuple[Any, ...]) -> Reduced:
 
 
 def _scalar(arguments: tuple[Any, ...]) -> int | float:
-    """`scalar`: (dtype, data)."""
+    """Read `scalar`: (dtype, data)."""
     match arguments:
         case (_Dtype() as dtype, memoryview() as data):
             number: int | float = read_array(data, str(dtype), ()).item()

@@ -1,4 +1,4 @@
-"""The mappings of known clients by name, and the reading of a mapping that may name one."""
+"""The mappings of known clients by name, and the reader of mappings that may name one of them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def read_mapping(
     """Read a mapping.
 
     Args:
-        value: A preset's name, or an object. The fields of an object with `preset` replace those of that preset.
+        value: A preset's name, or an object. The fields of an object with `preset` override those of that preset.
         preset: Returns the preset of a name; None if there is none.
 
     Raises:

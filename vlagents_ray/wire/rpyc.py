@@ -1,8 +1,8 @@
-"""The part of RPyC's protocol that a service with text as arguments and results needs; facts from rpyc 6.0.
+"""The part of RPyC's protocol for a service with text arguments and results; based on rpyc 6.0.
 
-RPyC lets a peer access attributes of the server's objects, call them, and pass objects that the server calls back. This
-reader supports none of that: it knows the root and its methods by number, and accepts only values without references.
-So a peer can call the methods that the server offers, and nothing else.
+RPyC allows a peer to access attributes of the server's objects, to call them, and to pass objects that the server calls
+back. This reader supports none of that: it knows the root and its methods by number, and accepts only values without
+references. A peer can therefore only call the methods that the server offers.
 
 A frame is a header (length, compressed?), a message and a newline. A message is its kind and one value, written
 in "brine": `(sequence number, content)`.
@@ -21,9 +21,9 @@ from vlagents_ray.errors import MalformedMessage, MessageTooLarge
 
 HEADER = struct.Struct("!LB")  # size of the message in bytes, and whether it is compressed
 END = b"\n"
-ROOT = 0  # the number of the root; its methods have the following numbers
-_ROOT_NAME = ("vlagents_ray.Policy", 1, 1)  # a peer's reference to it: its class, numbers of class and object
-_METHOD_CLASS = "builtins.method"  # a peer knows this class and does not inspect it
+ROOT = 0  # the number of the root; those of its methods follow
+_ROOT_NAME = ("vlagents_ray.Policy", 1, 1)  # a peer's reference to the root: its class, numbers of class and object
+_METHOD_CLASS = "builtins.method"  # peers know this class and do not inspect it
 _METHODS_AT_MOST = 64
 _COMPRESS_OVER = 3000  # bytes, RPyC's own threshold
 _REQUEST, _REPLY, _EXCEPTION = 1, 2, 3
@@ -31,7 +31,7 @@ _VALUE, _TUPLE, _LOCAL, _REMOTE = 1, 2, 3, 4  # labels of boxed values
 
 
 class Handler(IntEnum):
-    """The operations that a peer may request; RPyC's other ones would access objects."""
+    """The operations that a peer may request; all others of RPyC would access objects."""
 
     PING = 1
     CLOSE = 2
@@ -60,7 +60,7 @@ class RpycCall:
 
 
 def read_header(header: bytes | bytearray, limit: int) -> tuple[int, bool]:
-    """Return the number of bytes that follow, the newline included, and whether the message is compressed."""
+    """Return the number of bytes that follow, including the newline, and whether the message is compressed."""
     length, compressed = HEADER.unpack(header)
     if length > limit:
         raise MessageTooLarge(f"rpyc: a message of {length} bytes, the limit is {limit}")
@@ -97,7 +97,7 @@ def read_call(body: bytes | bytearray, compressed: bool, limit: int) -> RpycCall
 
 
 class Refused(MalformedMessage):
-    """A request that is decodable but refused; its sender gets the error as a reply."""
+    """A request that can be decoded but is refused; the reply to its sender is the error."""
 
     def __init__(self, sequence: int, text: str) -> None:
         super().__init__(text)
@@ -134,12 +134,12 @@ def boxed_tuple(*boxes: tuple[int, Any]) -> tuple[int, Any]:
 
 
 def boxed_reference(name: tuple[Any, ...]) -> tuple[int, Any]:
-    """Return the box of a reference to the peer's own object, by the name that the peer gave it."""
+    """Return the box of a reference to the peer's own object, by the peer's name for it."""
     return _LOCAL, name
 
 
 def read_reply(body: bytes | bytearray, compressed: bool, limit: int) -> tuple[int, bool, Any] | None:
-    """Return a reply's sequence number, whether it is one and no exception, and its content; None for a request."""
+    """Return a reply's sequence number, whether it is a result or an exception, and its content; None for a request."""
     message = _message(body, compressed, limit)
     if message[0] not in (_REPLY, _EXCEPTION):  # nothing is offered to a server, so its requests get no answer
         return None
@@ -150,7 +150,7 @@ def read_reply(body: bytes | bytearray, compressed: bool, limit: int) -> tuple[i
 
 
 def _message(body: bytes | bytearray, compressed: bool, limit: int) -> memoryview:
-    """Return the message in a frame's body, which has one byte at least."""
+    """Return the message in a frame's body, which has at least one byte."""
     message = memoryview(body)[: -len(END)]
     if compressed:
         message = memoryview(_inflate(message, limit))
@@ -200,24 +200,24 @@ def _is_int(value: object) -> bool:
     return isinstance(value, int) and not isinstance(value, bool)
 
 
-# Brine, RPyC's encoding of values: None, bool, int, float, text, bytes, and tuples of these; facts from rpyc 6.0.
+# Brine, RPyC's encoding of values: None, bool, int, float, text, bytes, and tuples of these; based on rpyc 6.0.
 #
-# Its other types (slices, sets, complex numbers, …) are refused, as no client needs them here.
+# Its other types (slices, sets, complex numbers, …) are refused, since no client needs them here.
 
 
 _DEPTH = 16
-_ITEMS = 1024  # maximum number of values in a message
-_DIGITS = 20  # maximum length of an integer, its sign included
+_ITEMS = 1024  # largest number of values in a message
+_DIGITS = 20  # largest length of an integer, including its sign
 _F8, _U4 = struct.Struct("!d"), struct.Struct("!L")
 
 
 def read_brine(data: memoryview) -> Any:
-    """Return the one value that `data` consists of; raise `MalformedMessage` or `MessageTooLarge` if it is invalid."""
+    """Return the only value in `data`; raise `MalformedMessage` or `MessageTooLarge` if it is invalid."""
     return _BrineReader(data).all()
 
 
 def write_brine(value: Any) -> bytes:
-    """Return a value in brine, the inverse of `read`; raise `TypeError` for a type that is not supported."""
+    """Return a value in brine, the inverse of `read_brine`; raise `TypeError` for an unsupported type."""
     parts: list[bytes] = []
     _write(value, parts)
     return b"".join(parts)

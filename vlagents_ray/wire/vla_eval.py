@@ -1,6 +1,6 @@
 """vla-eval's messages: msgpack maps of type, payload, seq and timestamp, protocol version 1.
 
-Arrays are maps with the key "__ndarray__"; images are maps with the key "__image__", raw, PNG or JPEG. The convention
+Arrays are maps with the key "__ndarray__"; images are maps with the key "__image__", raw, PNG or JPEG. The format
 is that of `vla_eval.protocol`, 0.8.0.
 """
 
@@ -125,8 +125,8 @@ def _node(value: Any) -> Any:
 
 
 PRESETS: dict[str, dict[str, Any]] = {
-    # The benchmark chooses the cameras' names. Most benchmarks call the state `states`, some `state`, as vla-eval's
-    # types.py recommends; its own servers prefer the former.
+    # The benchmark chooses the names of cameras. Most benchmarks call the state `states`, some `state`, as recommended
+    # in vla-eval's types.py; its own servers prefer the former.
     "vla-eval": {
         "cameras": {"*": "images/*"},
         "state": {"state": {"key": "states|state", "optional": True}},

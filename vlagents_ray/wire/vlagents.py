@@ -1,6 +1,6 @@
 """Observations and actions in the format of the package `vlagents`, versions 0.2 and 0.3: JSON with arrays.
 
-In 0.3 an observation holds named robots and the instruction; 0.2 has one robot without a name, and the instruction in
+In 0.3 an observation contains named robots and the instruction; 0.2 has one unnamed robot, and the instruction in
 its `reset`. A camera is an array, a JPEG file in base64, or the name of a shared-memory segment of the client.
 """
 
@@ -43,7 +43,7 @@ class Part:
 
     start: int | None = None
     stop: int | None = None
-    gripper: int | None = None  # the column that goes into `SingleAct.gripper` instead of `action`
+    gripper: int | None = None  # the column that becomes `SingleAct.gripper` instead of a part of `action`
     gripper_open: float = 1.0  # the column's value for an open gripper, which vlagents writes as 1
     gripper_closed: float = 0.0  # the column's value for a closed gripper, which vlagents writes as 0
 
@@ -67,7 +67,7 @@ class ObservationRequest:
 
     obs: Obs
     instruction: str | None
-    robots: tuple[str, ...]  # names in order; empty for vlagents 0.2, which has none
+    robots: tuple[str, ...]  # names in order; empty for vlagents 0.2, which has no names
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,7 +131,7 @@ def _read(document: Any, budget: Budget, segments: Segments) -> ObservationReque
         raise MessageTooLarge(f"observation.obs: got {len(robots)} robots, the limit is {limits.cameras}")
     views = [part.get("cameras") for part in robots.values() if isinstance(part, dict)]
     cameras = sum(len(view) for view in views if isinstance(view, dict))
-    if cameras > limits.cameras:  # counts those of all robots, before any is decoded
+    if cameras > limits.cameras:  # counts the cameras of all robots before decoding any
         raise MessageTooLarge(f"cameras: got {cameras}, the limit is {limits.cameras}")
     whole = Obs()
     for name, part in robots.items():
@@ -150,7 +150,7 @@ def _read(document: Any, budget: Budget, segments: Segments) -> ObservationReque
 
 
 def _robot(robot: Mapping[str, Any], prefix: str, budget: Budget, segments: Segments) -> Obs:
-    """Return one robot's observation; a `prefix` precedes all names, and moves the gripper into the state, (1,)."""
+    """Return one robot's observation; a `prefix` is added to all names, and moves the gripper into the state, (1,)."""
     limits = budget.limits
     cameras = _mapping(robot.get("cameras") or {}, "cameras")
     if len(cameras) > limits.cameras:
@@ -243,14 +243,14 @@ def _require_known(value: Mapping[str, Any], known: set[str], what: str) -> None
         raise MalformedMessage(f"{what}: unknown keys {shown(sorted(unknown))}, want some of {sorted(known)}")
 
 
-# The client's side of the package `vlagents`, 0.3: calls of a server's methods over RPyC, and what they return.
+# The client's side of the package `vlagents`, 0.3: calls of a server's methods over RPyC, and their results.
 #
-# A server's root is named by a reference that it sends once; its methods are called by that and their name. No object
-# of this process is offered to the server, and it returns text, a truth value, or an error.
+# The server sends a reference to its root once; calls consist of that reference and the name of a method. No object of
+# this process is offered to the server, which returns text, a truth value, or an error.
 
 
 _ACTION_LEVELS = 4  # levels of nesting above an action: reply, acts, step, robot
-_ERROR = 2000  # characters of an error
+_ERROR = 2000  # characters of an error that are kept
 
 
 @dataclass(frozen=True, slots=True)
@@ -265,7 +265,7 @@ def get_root(sequence: int) -> bytes:
 
 
 def call(sequence: int, root: tuple[Any, ...], method: str, *args: str) -> bytes:
-    """Return the frame that calls a method of the server's root with texts."""
+    """Return the frame that calls a method of the server's root with text arguments."""
     return rpyc.request(
         sequence,
         rpyc.Handler.CALLATTR,
@@ -274,7 +274,7 @@ def call(sequence: int, root: tuple[Any, ...], method: str, *args: str) -> bytes
 
 
 def read_result(body: bytes | bytearray, compressed: bool, limit: int) -> tuple[int, Any] | None:
-    """Return a reply's sequence number, and its value or `RemoteError`; None if the message is none."""
+    """Return a reply's sequence number, and its value or `RemoteError`; None if the message is not a reply."""
     message = rpyc.read_reply(body, compressed, limit)
     if message is None:
         return None

@@ -14,7 +14,7 @@ from vlagents_ray.protocol.messages import Reply, Request
 logger = logging.getLogger(__name__)
 
 CodecName = Literal["auto", "exact", "raw", "lossless", "jpeg"]
-_OVER_A_NETWORK = {"auto": JPEG, "exact": LOSSLESS}  # the codecs whose choice depends on where the server is
+_OVER_A_NETWORK = {"auto": JPEG, "exact": LOSSLESS}  # codecs that depend on the location of the server
 
 _ANSWER_S = 2.0  # s, time limit for the first byte of the first replica
 _SILENT_S = 2.0  # s after which an unfinished attempt to connect is reported
@@ -23,10 +23,13 @@ _SILENT_S = 2.0  # s after which an unfinished attempt to connect is reported
 class RequestChannel(Protocol):
     """Carries the requests of one frame at a time to one replica of a server.
 
-    A request names its session, which ends with its `close` request, or with the connection. Raises
-    `PolicyUnavailable` when the server cannot be reached or is not ready, `ConnectionLost` when the connection broke
-    after the request was sent, and `DeadlineExceeded` when no answer came in time. An error that the server replied
-    with is in `Reply.error`.
+    A request names its session, which ends with its `close` request, or with the connection. Errors that the server
+    replies with are in `Reply.error`.
+
+    Raises:
+        PolicyUnavailable: The server cannot be reached or is not ready.
+        ConnectionLost: The connection broke after the request was sent.
+        DeadlineExceeded: There was no answer in time.
     """
 
     @property
@@ -49,7 +52,7 @@ class RequestChannel(Protocol):
 
 
 class Transport(RequestChannel, Protocol):
-    """A channel that finds its replica itself; after `close`, `connect` may begin a connection to another replica."""
+    """A channel that finds its replica itself; after `close`, `connect` may choose another replica."""
 
     def connect(self, timeout_s: float) -> dict[str, Any]:
         """Try once to reach the server; return its metadata."""
@@ -57,16 +60,16 @@ class Transport(RequestChannel, Protocol):
 
 
 class ConnectReport:
-    """Logs once that a server is not ready and is tried again, when an attempt to connect has lasted for 2 s."""
+    """Logs once, after 2 s of failing to connect, that a server is not ready and that the client retries."""
 
     def __init__(self, url: str, timeout_s: float) -> None:
-        """Begin; the attempts to connect last for `timeout_s` in all."""
+        """Begin; the attempts to connect last for `timeout_s` in total."""
         self._url = url
         self._begun, self._timeout_s = time.monotonic(), timeout_s
         self._logged = False
 
     def failed(self, error: Exception) -> None:
-        """Note that an attempt failed, and that there will be another one."""
+        """Record that an attempt failed and will be repeated."""
         waited_s = time.monotonic() - self._begun
         left_s = self._timeout_s - waited_s
         if not self._logged and waited_s >= _SILENT_S and left_s > 0:
@@ -75,9 +78,9 @@ class ConnectReport:
 
 
 def first_timeout_s(timeout_s: float) -> float:
-    """Return how long, s, the first replica may take of `timeout_s` to send anything; the next gets twice that.
+    """Return the time limit, s, for the first byte of the first replica, out of `timeout_s`; the next gets twice that.
 
-    So every attempt to connect, however short, tries at least two replicas, of which the first may hang.
+    So every attempt to connect, however short, tries at least two replicas, the first of which may hang.
     """
     return min(_ANSWER_S, timeout_s / 3)
 
@@ -88,16 +91,16 @@ def left_s(deadline: float) -> float:
 
 
 class CodecChoice:
-    """The codec of a connection's cameras: the user's, or one that depends on the location of the server.
+    """The codec of a connection's cameras: the user's choice, or one that depends on the location of the server.
 
-    Within a machine, "auto" and "exact" take raw pixels; over a network, "auto" takes JPEG and "exact" PNG. On one core
-    of a server, JPEG costs 3 ns for a byte of pixels, encoded and decoded, and leaves 7 to 10 % of the bytes, so
-    that it is faster than raw pixels up to 300 MB/s (2.4 Gbit/s). PNG costs 18 ns and leaves about half.
+    Within a machine, "auto" and "exact" select raw pixels; over a network, "auto" selects JPEG and "exact" PNG. On one
+    core of a server, JPEG costs 3 ns per byte of pixels, encoded and decoded, and leaves 7 to 10 % of the bytes, so
+    it is faster than raw pixels up to 300 MB/s (2.4 Gbit/s). PNG costs 18 ns and leaves about half.
     """
 
     def __init__(self, requested: CodecName | ImageCodec) -> None:
         self._compressed = None if isinstance(requested, ImageCodec) else _OVER_A_NETWORK.get(requested)
-        self.codec: ImageCodec | None = None  # None until there is a connection by which to choose
+        self.codec: ImageCodec | None = None  # None until a connection determines the choice
         if isinstance(requested, ImageCodec):
             self.codec = requested
         elif self._compressed is None:
@@ -109,7 +112,7 @@ class CodecChoice:
             self.codec = RAW if near else self._compressed
 
     def codec_for(self, obs: Obs | None, most_bytes: float = float("inf")) -> ImageCodec:
-        """Return the codec for an observation; over `most_bytes` it is never raw, unless the user named that."""
+        """Return the codec for an observation; never raw for more than `most_bytes`, unless the user chose that."""
         codec = self.codec or RAW
         if codec == RAW and self._compressed is not None and obs is not None:
             size = sum(image.nbytes for image in obs.cameras.values())

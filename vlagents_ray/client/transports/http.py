@@ -41,7 +41,7 @@ _UNKNOWN_APP_S = 10.0  # a starting server has no path until its first replica e
 
 
 class HttpTransport:
-    """HTTP/1.1; a header names the session, by which all requests of this object reach one replica."""
+    """The HTTP/1.1 transport; a header names the session, and routes all requests of this object to one replica."""
 
     name = "http"
     holds_sessions = False
@@ -49,7 +49,7 @@ class HttpTransport:
     def __init__(self, url: str, codec: CodecChoice, credentials: Credentials = ANONYMOUS, machine: str = "") -> None:
         """Set the server.
 
-        With `machine` (see `MACHINE_HEADER`), ask for the least loaded replica on that machine, if any.
+        With `machine` (see `MACHINE_HEADER`), prefer the least loaded replica on that machine.
         """
         self._machine = machine
         self._credentials = credentials
@@ -59,7 +59,7 @@ class HttpTransport:
         self._connection: http.client.HTTPConnection | None = None
 
     def connect(self, timeout_s: float) -> dict[str, Any]:
-        """Return the server's metadata as soon as it answers; retries while it is not ready."""
+        """Return the server's metadata once it answers; retries while it is not ready."""
         begun, report = time.monotonic(), ConnectReport(self._url.geturl(), timeout_s)
         unknown_since: float | None = None
         pause_s, attempt_s = 0.05, first_timeout_s(timeout_s)
@@ -86,8 +86,8 @@ class HttpTransport:
             pause_s = min(1.0, pause_s * 1.5)
 
     def _metadata(self, timeout_s: float) -> dict[str, Any]:
-        # The session id selects the replica by its hash: the load balancer's round robin is left to WebSockets, which
-        # spread by it.
+        # The session id selects the replica by its hash, since WebSockets rely on the load balancer's round robin for
+        # their distribution.
         headers = {SESSION_HEADER: self._session} | ({MACHINE_HEADER: self._machine} if self._machine else {})
         metadata = self.get("/v1/metadata", timeout_s, headers)
         if "protocol" not in metadata:
@@ -105,7 +105,7 @@ class HttpTransport:
         return document
 
     def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
-        """Send one POST; a response that is not a frame of replies becomes the error of the server or the proxy."""
+        """Send one POST; a response that is not a frame of replies becomes an error of the server or the proxy."""
         headers = {
             SESSION_HEADER: self._session,
             REQUEST_ID_HEADER: requests[0].request_id,
@@ -192,7 +192,7 @@ def _closed_by_peer(sock: socket.socket | None) -> bool:
 
 
 def refusal(status: int, kind: str, body: bytes) -> VLAgentsError:
-    """Return the error for an HTTP response of the server, or of a proxy before it, that is not a frame."""
+    """Return the error for an HTTP response of the server, or of a proxy in front of it, that is not a frame."""
     if "json" in kind and isinstance(document := _json(body), dict):
         return read_error(document)
     text = body[:200].decode(errors="replace").strip()

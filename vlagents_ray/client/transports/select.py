@@ -20,12 +20,12 @@ TransportName = Literal["auto", "shm", "plasma", "websocket", "http", "handle"]
 
 
 class AutoTransport:
-    """Shared memory if the policy runs on this machine for this user; else a WebSocket.
+    """Uses shared memory if the policy runs on this machine for this user; else a WebSocket.
 
     Inside the cluster: shared memory, else a plasma channel on the replica's node, else the Serve handle. Shared memory
     comes first because it is faster, without Ray's locks and framing; plasma reaches a replica on this node whose
-    socket is in another network namespace. Where the object store has no room for a channel, the handle is used
-    instead: its frames lie in the store for a moment, or on disk if the store has no room for them.
+    socket is in another network namespace. If the object store has no room for a channel, the handle is used
+    instead: its frames are in the store for a moment, or on disk if the store has no room for them.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class AutoTransport:
         left_s = max(1.0, deadline - time.monotonic())
         local = metadata.get("local")
         if handle is not None and not self._only_shm and local and local["keyed"] and not self._credentials.api_key:
-            local = None  # a client in the cluster needs a key for this endpoint only
+            local = None  # a client in the cluster only needs a key for this endpoint
         shm = self._shm(local, left_s)
         if shm is not None or handle is None:
             metadata_source.close()
@@ -112,7 +112,7 @@ class AutoTransport:
         transport = ShmTransport(local, self._credentials)
         try:
             transport.connect(timeout_s)
-        except PolicyUnavailable:  # the server is another user's, or in a container with its own network
+        except PolicyUnavailable:  # the server belongs to another user, or is in a container with its own network
             if self._only_shm:
                 raise
             return None
@@ -120,7 +120,7 @@ class AutoTransport:
 
 
 def select_transport(url: str, transport: str, codec: CodecChoice, credentials: Credentials = ANONYMOUS) -> Transport:
-    """Return the transport for a URL; raises `ConfigError` if the two do not go together."""
+    """Return the transport for a URL; raises `ConfigError` if the URL does not support it."""
     inside = urlsplit(url).scheme == "serve"
     if transport not in get_args(TransportName):
         raise ConfigError(f"transport: got {transport!r}, want one of {list(get_args(TransportName))}")

@@ -1,7 +1,7 @@
 """`serve://APP`, from inside the Ray cluster: a Serve handle, or a plasma channel to a replica on this node.
 
-The Serve handle picks a replica once; from then on the session's requests go to that replica, since a handle may send
-each request to another one. `vlagents_ray.serve.endpoints.plasma` is the server's side of the channel.
+A Serve handle may send each request to another replica. This transport therefore picks a replica once, and sends
+all requests of the session to it. `vlagents_ray.serve.endpoints.plasma` is the server's side of the channel.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from vlagents_ray.ray_tools.private import (
     write_channel,
 )
 
-_PAUSE_S = 0.2  # s before another replica is requested in place of one that is gone
+_PAUSE_S = 0.2  # s before requesting another replica in place of a lost one
 _QUERY_S = 10.0  # s between two queries for the replicas' nodes, which change over time
 _FIRST_QUERY_S = 3.0  # s to wait for the first query; an application without a replica does not answer
 _CHUNK = 2**20  # bytes; Ray copies longer buffers in other threads
-_WRITE_MS = 1000  # the channel is free when a frame is written; if not, something is wrong with it
+_WRITE_MS = 1000  # the channel is free when a frame is written; a longer wait is a fault
 
 
 class ClientApi(Protocol):
@@ -87,12 +87,12 @@ class HandleTransport:
         while True:
             try:
                 return self._attach(max(0.0, min(attempt_s, deadline - time.monotonic())))
-            except ConnectionLost as error:  # Serve takes a while to notice that a node was lost
+            except ConnectionLost as error:  # Serve notices the loss of a node with a delay
                 if time.monotonic() + _PAUSE_S > deadline:
                     raise PolicyUnavailable(str(error)) from error
                 report.failed(error)
                 time.sleep(_PAUSE_S)
-            except DeadlineExceeded as error:  # for instance of a hung replica: the handle may choose another
+            except DeadlineExceeded as error:  # e.g. of a hung replica: the handle may choose another one
                 if time.monotonic() >= deadline:
                     raise PolicyUnavailable(f"serve://{self._app}: no replica within {timeout_s:g} s") from error
                 report.failed(error)
@@ -120,10 +120,10 @@ class HandleTransport:
         return found
 
     def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
-        """Make one actor call; the frame lies in plasma and is freed with the reply."""
+        """Make one actor call; the frame is in plasma until the reply."""
         import ray
 
-        # A bare buffer lies in plasma apart from its pickle; an array's pickle depends on the version of numpy.
+        # A bare buffer is stored in plasma apart from its pickle; an array's pickle depends on the version of numpy.
         content = pickle.PickleBuffer(encode_requests(requests, RAW))
         try:
             frame = ray.put(content)
@@ -137,13 +137,13 @@ class HandleTransport:
         except ray.exceptions.GetTimeoutError as error:
             ray.cancel(pending)
             raise DeadlineExceeded(f"serve://{self._app}: no answer within {timeout_s:g} s") from error
-        except ray.exceptions.RayTaskError as error:  # it is unknown whether the replica acted on the request
+        except ray.exceptions.RayTaskError as error:  # it is unknown whether the replica executed the request
             raise ConnectionLost(f"serve://{self._app}: the replica failed: {error.cause}; reset again") from error
         except ray.exceptions.RayError as error:  # the replica is gone, or its node with the frame or the answer
             raise self._lost(error) from error
 
     def lease(self, length: int, timeout_s: float) -> tuple[bytes, int]:
-        """Call `ClientApi.lease` of the chosen replica; errors of this package are raised here."""
+        """Call `ClientApi.lease` of the chosen replica; raises its errors if they are of this package."""
         import ray
 
         try:
@@ -167,7 +167,7 @@ class HandleTransport:
 
 
 class ReplicaNodes:
-    """The nodes on which an application has its replicas, queried without blocking the caller for long."""
+    """The nodes on which an application has its replicas, queried with little blocking of the caller."""
 
     def __init__(self, app: str) -> None:
         self._app = app
@@ -176,7 +176,7 @@ class ReplicaNodes:
         self._answer: Any = None  # the pending answer
 
     def query(self) -> dict[str, int]:
-        """Return the number of replicas on each node, by Ray's id, as of the last answer; {} if it is not known."""
+        """Return the number of replicas on each node, by Ray's id, from the last answer; {} if there is none yet."""
         import ray
         from ray import serve
         from ray.serve.exceptions import RayServeException
@@ -199,7 +199,7 @@ class ReplicaNodes:
 def call_replica(replica: Any, method: Callable[..., Any], *args: Any, request_id: str = "") -> Any:
     """Call a method of one replica, as Serve's own router does; a Serve handle cannot choose its replica.
 
-    `method` is one of `ClientApi`, or one that replicas call on each other.
+    `method` is one of `ClientApi`, or one of those between replicas.
     """
     header = replica_request(request_id or uuid.uuid4().hex, method.__name__)
     return replica.handle_request.remote(header, *args)
@@ -223,13 +223,13 @@ class PlasmaTransport(UnixTransport):
         self._handle = HandleTransport(app, must_be_near=True)
         self._channel: Any = None  # the ObjectRef of the channel
         self._capacity = 0
-        self._unread = False  # the replica may still have to read the last frame
+        self._unread = False  # whether the replica may not have read the last frame yet
 
     def connect(self, timeout_s: float) -> dict[str, Any]:
-        """Let the Serve handle choose a replica, connect to its socket, and return its metadata.
+        """Choose a replica with the Serve handle, connect to its socket, and return its metadata.
 
         Raises:
-            ConfigError: The replica runs on another node, or this process is not on a node itself.
+            ConfigError: The replica runs on another node, or this process does not run on a node of Ray.
         """
         deadline = time.monotonic() + timeout_s
         metadata = self._handle.connect(timeout_s)
@@ -237,7 +237,7 @@ class PlasmaTransport(UnixTransport):
         return metadata
 
     def connect_to(self, handle: HandleTransport, metadata: dict[str, Any], timeout_s: float) -> None:
-        """Connect like `connect`, to the replica that `handle` chose and whose metadata this is."""
+        """Connect like `connect`, but to the replica that `handle` chose and whose metadata is passed."""
         node = this_node()
         if node is None:
             raise ConfigError(
@@ -272,7 +272,7 @@ class PlasmaTransport(UnixTransport):
         return (message if written is None else message + written.message), None
 
     def _unsent(self) -> None:
-        self._unread = False  # the channel refuses a later frame if this one was not read
+        self._unread = False  # if this frame was not read, the channel refuses a later one
 
     def _answered(self, freed: int) -> None:
         self._unread = False
@@ -286,23 +286,22 @@ class PlasmaTransport(UnixTransport):
         import ray
 
         key, self._capacity = self._handle.lease(length, max(1e-3, deadline - time.monotonic()))
-        # The id is enough: the replica owns the object, and keeps it as long as the replica lives.
+        # The id is sufficient: the replica owns the object, and keeps it as long as it lives.
         self._channel = ray.ObjectRef(key)
         register_writer(self._channel)
 
 
 def _gather(parts: list[Buffer]) -> Any:
-    """Return the pieces of a frame in a form that Ray copies straight into the channel, one after the other.
+    """Return the pieces of a frame in a form that Ray copies straight into the channel, in sequence.
 
-    Ray copies longer buffers with six threads, which it starts for each copy and which takes longer than the copy:
-    hence the chunks.
+    Ray copies longer buffers with six threads, whose start takes longer than the copy: hence the chunks.
     """
     pieces = (memoryview(part)[at : at + _CHUNK] for part in parts for at in range(0, len(part), _CHUNK))
     return channel_content(PlasmaAddress.TAG, pieces)
 
 
 def this_node() -> str | None:
-    """Return the id of the Ray node that this process runs on; None for a Ray client, and without Ray."""
+    """Return the id of the Ray node of this process; None for a Ray client, and without Ray."""
     import ray
 
     if node_of_this_process() is None:

@@ -1,6 +1,7 @@
-"""Messages on a Unix socket with the place of the observations, which is shared memory.
+"""Messages on a Unix socket that refer to observations in shared memory.
 
-`vlagents_ray.serve.endpoints.shm` is the server's side. Plasma (`.serve_handle`) is the other place.
+`vlagents_ray.serve.endpoints.shm` is the server's side. With plasma (`.serve_handle`), the observations are in the
+object store instead.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from vlagents_ray.protocol.messages import LocalAddress, Reply, Request, boot_id
 _MESSAGE_BYTES = 128 * 1024  # the longest reply that fits in a message, and a margin
 _CONTROL = socket.CMSG_SPACE(4)
 _SPIN_S = 150e-6  # s to poll for an answer before sleeping
-_FAST_S = 600e-6  # s; after an answer that took less, wake-up included, the next one is polled for
+_FAST_S = 600e-6  # s; after an answer within this time, wake-up included, the next one is polled for
 _PAGE = mmap.PAGESIZE
 
 
@@ -41,7 +42,7 @@ class UnixTransport(ABC):
     holds_sessions = True
 
     def __init__(self) -> None:
-        self._server = ""  # the address of its socket
+        self._server = ""  # the address of the server's socket
         self._key: str | None = None  # the API key, sent first
         self._socket: socket.socket | None = None
         self._poller = select.poll()  # polls the socket
@@ -55,18 +56,18 @@ class UnixTransport(ABC):
 
     @abstractmethod
     def _write(self, requests: Sequence[Request], deadline: float) -> tuple[bytes, int | None]:
-        """Write requests where the server reads them; return the message about it, and a descriptor to send, if any.
+        """Write requests to memory that the server reads; return the message and any descriptor to send.
 
         Raises `TimeoutError` at the deadline, and `OSError` if writing fails.
         """
 
     @abstractmethod
     def _unsent(self) -> None:
-        """Handle that the message about the last requests was not sent."""
+        """Clean up after a message about the last requests that was not sent."""
 
     @abstractmethod
     def _answered(self, freed: int) -> None:
-        """Handle a reply. Bit n of `freed` is set if the server no longer reads memory n."""
+        """Process a reply. Bit n of `freed` is set if the server no longer reads memory n."""
 
     def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
         """Write requests for the server, send it a message and return its replies; late replies are discarded."""
@@ -89,7 +90,7 @@ class UnixTransport(ABC):
         self._writer = shm_layout.ShmWriter()
 
     def _send(self, connection: socket.socket, requests: Sequence[Request], deadline: float) -> None:
-        """Write requests where the server reads them, and send the message.
+        """Write requests to memory that the server reads, and send the message.
 
         Raises `TimeoutError` or `OSError` on failure.
         """
@@ -106,19 +107,19 @@ class UnixTransport(ABC):
                 self._unsent()
                 raise
         except BaseException:
-            self._writer = shm_layout.ShmWriter()  # the server may not know a layout
+            self._writer = shm_layout.ShmWriter()  # the server may not have received a layout
             raise
 
     def _await(self, connection: socket.socket, requests: Sequence[Request], deadline: float) -> list[Reply]:
-        """Return the replies to these requests, and to no earlier ones.
+        """Return the replies to these requests, skipping those to earlier ones.
 
-        If the last answer was immediate, poll for a moment before sleeping: waking up takes as long as all the rest.
+        If the last answer was immediate, poll for a moment before sleeping: waking up takes as long as everything else.
         Other processes can still use the core.
         """
         begun = time.perf_counter()
         spin_until = begun + (_SPIN_S if self._answers_fast else 0.0)
         while True:
-            while not self._poller.poll(0):  # polling costs a fraction of the exception that reading raises
+            while not self._poller.poll(0):  # a poll costs a fraction of the exception that an empty read raises
                 if time.perf_counter() < spin_until:
                     os.sched_yield()
                 else:
@@ -171,7 +172,7 @@ class UnixTransport(ABC):
 
 
 def _send_message(connection: socket.socket, message: bytes, deadline: float, descriptor: int | None = None) -> None:
-    """Send a message, with a descriptor that is then closed here; waits while the server reads none."""
+    """Send a message and a descriptor, which is then closed; wait while the server does not read."""
     try:
         while True:
             try:
@@ -198,7 +199,7 @@ def _wait(connection: socket.socket, event: int, deadline: float) -> None:
 
 
 def _require_same_user(connection: socket.socket) -> None:
-    """Raise `PermissionError` if the server is another user's: any user may take the name of an ended server."""
+    """Raise `PermissionError` if the server belongs to another user: any user may reuse the name of an ended server."""
     if (uid := peer_uid(connection)) != os.getuid():
         raise PermissionError(f"it belongs to the user with the number {uid}, want {os.getuid()}, this process's own")
 
@@ -213,7 +214,7 @@ class _Memory:
 
 
 def reaches(local: dict[str, Any]) -> bool:
-    """Whether the server that states `local` in its metadata is on this machine and can be used by this process."""
+    """Return whether the server with `local` in its metadata is on this machine and usable by this process."""
     return hasattr(os, "memfd_create") and local["boot_id"] == boot_id() != ""
 
 
@@ -229,7 +230,7 @@ class ShmTransport(UnixTransport):
         self._server = f"\0{address.socket}"
         self._key = (credentials.api_key or "-") if address.keyed else None
         self._memories: list[_Memory] = []
-        # The memory of the last request, and the descriptor of it that the server was sent.
+        # The memory of the last request, and the descriptor sent for it, if any.
         self._written: tuple[_Memory, int | None] | None = None
 
     def connect(self, timeout_s: float) -> None:
@@ -267,7 +268,7 @@ class ShmTransport(UnixTransport):
         return message, descriptor
 
     def _unsent(self) -> None:
-        """Drop the memory file of the last request, which the server did not get: another file takes its number."""
+        """Drop the memory file of the last request, which the server did not receive, to reuse its number."""
         if self._written is not None:
             memory, descriptor = self._written
             memory.busy = False
@@ -282,7 +283,7 @@ class ShmTransport(UnixTransport):
                 self._memories[number].busy = False
 
     def _memory(self, length: int) -> tuple[_Memory, int | None]:
-        """Return free memory for `length` bytes, with its descriptor if the server has yet to get it."""
+        """Return free memory for `length` bytes, with its descriptor if the server has not received it yet."""
         for memory in self._memories:
             if not memory.busy and len(memory.map) >= length:
                 return memory, None

@@ -1,7 +1,7 @@
 """The WebSocket transport: binary frames to a replica's own port, or through the proxy.
 
 Sessions end with the connection. The metadata has the replica's port. If that port cannot be reached (because of a
-firewall, a tunnel of one port, or TLS, which ends at the proxy), `WS /v1/stream` on the server's port does the same, a
+firewall, a tunnel of one port, or TLS, which ends at the proxy), `WS /v1/stream` on the server's port replaces it, a
 little slower.
 """
 
@@ -49,13 +49,13 @@ from vlagents_ray.protocol.messages import (
 
 logger = logging.getLogger(__name__)
 
-# Statuses of a proxy that are worth a retry; HAProxy sends 500 for its own 502 to 504, and 404 while it restarts.
+# Transient statuses of a proxy; HAProxy sends 500 for its own 502 to 504, and 404 while it restarts.
 _TRANSIENT = (404, 408, 500, 502, 503, 504)
 _PAUSE_S = 0.2
-_DIRECT_S = 1.0  # s for a replica's own port to answer: a firewall may drop the packets
+_DIRECT_S = 1.0  # s to wait for a replica's own port: a firewall may drop the packets
 _READ_BYTES = 256 * 1024
-_KEPT_BYTES = 1024 * 1024  # holds a message with two or three raw images
-_HEAD_BYTES = 16  # most bytes before the message in its frame, and two
+_KEPT_BYTES = 1024 * 1024  # fits a message with two or three raw images
+_HEAD_BYTES = 16  # largest header of the frame before the message, plus 2
 
 
 class ProxiedSocket:
@@ -87,16 +87,16 @@ class ProxiedSocket:
         self._connection.send(message)
 
     def send_pieces(self, pieces: Sequence[Buffer], timeout_s: float) -> None:
-        """Send a message, given one piece after the other, within a time limit."""
+        """Send a message, given as consecutive pieces, within a time limit."""
         self.send(b"".join(pieces), timeout_s)
 
     def recv(self, timeout_s: float) -> bytes:
-        """Return the next message, also if it is a text."""
+        """Return the next message as bytes, even if it is text."""
         return self._connection.recv(timeout=timeout_s, decode=False)
 
 
 def open_websocket(url: str, credentials: Credentials, timeout_s: float) -> ProxiedSocket:
-    """Connect to a path of a server's port; raises `NoReplica`, `PolicyUnavailable`, or the refusal of the API key."""
+    """Connect to a path of a server's port; raises `NoReplica`, `PolicyUnavailable`, or a rejection of the key."""
     try:
         return ProxiedSocket(url, credentials, timeout_s)
     except ssl.SSLError as error:
@@ -113,10 +113,9 @@ def open_websocket(url: str, credentials: Credentials, timeout_s: float) -> Prox
 
 
 class _FrameMemory:
-    """Memory for the frames that one connection sends.
+    """Reusable memory for the frames that one connection sends.
 
-    It is used again and again: fresh memory, which the kernel clears page by page, costs more than all other work on a
-    frame with images.
+    Fresh memory, which the kernel clears page by page, costs more than all other work on a frame with images.
     """
 
     def __init__(self) -> None:
@@ -164,7 +163,7 @@ class Stream:
         self._messages: list[bytes] = []
         self._frames = _FrameMemory()
         self._read_memory = memoryview(bytearray(_READ_BYTES))
-        self._silent = False  # whether the server did not answer, or not take, the last message in time
+        self._silent = False  # whether the server failed to read or answer the last message in time
         self._socket = socket.create_connection((host, port), timeout_s)
         try:
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -182,13 +181,13 @@ class Stream:
             raise
 
     def send(self, message: bytes, timeout_s: float) -> None:
-        """Send a binary message; raises what `send_pieces` raises."""
+        """Send a binary message; raises the errors of `send_pieces`."""
         self.send_pieces([message], timeout_s)
 
     def send_pieces(self, pieces: Sequence[Buffer], timeout_s: float) -> None:
-        """Send a binary message, given one piece after the other.
+        """Send a binary message, given as consecutive pieces.
 
-        Raises what `recv` raises, and `OSError` if the server does not take all of it in time.
+        Raises the errors of `recv`, and `OSError` if the server does not read all of it in time.
         """
         self._check_open()
         try:
@@ -214,9 +213,8 @@ class Stream:
     def close(self) -> None:
         """Close the connection, so that the server notices.
 
-        A message that was not answered in time is of no use any more. Over a lost link the kernel would keep sending it
-        for minutes, and the server would act on it and hold the sessions until then; a reset of the connection ends
-        both.
+        A message that was not answered in time is useless. Over a lost link the kernel would resend it for minutes, and
+        the server would then execute it and hold the sessions until then; a reset of the connection prevents both.
         """
         with contextlib.suppress(OSError):
             if self._silent:
@@ -227,7 +225,7 @@ class Stream:
         self._socket.close()
 
     def _check_open(self) -> None:
-        """Raise `ConnectionClosed` or `OSError` if the connection is closed, or the server closes it."""
+        """Raise `ConnectionClosed` or `OSError` if the connection is closed, or is being closed by the server."""
         if self._protocol.state is State.CLOSED:
             raise self._protocol.close_exc
         if self._protocol.state is not State.OPEN:
@@ -273,7 +271,7 @@ class WebSocketTransport:
         self._codec = codec
         self._socket: ProxiedSocket | Stream | None = None
         self._address: StreamAddress | None = None  # the address of the replica that answered
-        self._unreachable = False  # whether replicas' own ports cannot be reached from this client
+        self._unreachable = False  # whether this client cannot reach the replicas' own ports
 
     def connect(self, timeout_s: float) -> dict[str, Any]:
         """Return the server's metadata, once it answers and has accepted the stream."""
@@ -287,7 +285,7 @@ class WebSocketTransport:
         return metadata
 
     def connect_to(self, metadata: dict[str, Any], timeout_s: float) -> None:
-        """Connect like `connect`, to the replica with this metadata."""
+        """Connect like `connect`, but to the replica with this metadata."""
         stream = metadata.get("stream")
         self._address = StreamAddress(**stream) if stream and self._base.scheme == "http" else None
         self._stream(timeout_s)
@@ -296,7 +294,7 @@ class WebSocketTransport:
         """Send one frame and return its replies; replies to earlier requests that timed out are discarded."""
         deadline = time.monotonic() + timeout_s
         pieces = request_parts(requests, self._codec.codec_for(requests[0].obs, STREAM_BYTES))
-        if (size := sum(map(len, pieces))) > STREAM_BYTES:  # the server would only close the connection
+        if (size := sum(map(len, pieces))) > STREAM_BYTES:  # the server would just close the connection
             raise MessageTooLarge(
                 f"{self._url}: got {size} bytes, the limit of a WebSocket message is {STREAM_BYTES}; "
                 f"send JPEG, or use transport='http'"
@@ -340,7 +338,7 @@ class WebSocketTransport:
     def _proxied(self, timeout_s: float) -> ProxiedSocket:
         """Connect through the proxy; retry while the proxy reports that a replica is starting or stopping.
 
-        Also retries without an answer: the replica that the proxy chose may hang while the next one works.
+        A missing answer is also retried: the replica that the proxy chose may hang while the next one works.
         """
         deadline = time.monotonic() + timeout_s
         attempt_s = first_timeout_s(timeout_s)

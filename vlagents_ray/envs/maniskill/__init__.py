@@ -1,4 +1,4 @@
-"""ManiSkill 3: eleven table-top tasks that need no downloads, and any other task registered there.
+"""ManiSkill 3: eleven table-top tasks that need no downloads, and any other task registered with ManiSkill.
 
     with ManiSkill("PushCube-v1", width=224, height=224) as env:
         obs, _ = env.reset(seed=0)

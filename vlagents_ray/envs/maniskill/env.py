@@ -22,12 +22,12 @@ ON_GPU = ("gpu", "cuda", "physx_cuda")
 
 @dataclass(frozen=True, slots=True)
 class ManiSkillProtocol:
-    """The section "Evaluation" of ManiSkill 3's guide to its set-up for reinforcement learning."""
+    """The protocol in the section "Evaluation" of ManiSkill 3's guide to reinforcement learning."""
 
     ignore_terminations: bool = True  # an episode continues to the step limit after success or failure
-    reconfiguration_freq: int = 1  # the scene is rebuilt for each episode, with other objects where a task draws them
+    reconfiguration_freq: int = 1  # the scene is rebuilt for each episode, with other objects if the task draws them
     metrics: tuple[str, ...] = ("success_once", "success_at_end")
-    seeds: str = "one an environment"  # each episode has its own seed, which determines all that is random in it
+    seeds: str = "one an environment"  # each episode has its own seed, which determines all its random draws
 
 
 PROTOCOL = ManiSkillProtocol()
@@ -37,15 +37,14 @@ class ManiSkill(SimulatorEnv):
     """One environment of one ManiSkill task.
 
     Observation: the task's cameras; in `state` the arm's `joints` (without the fingers), `tquat` and
-    `xyzrpy`, the pose of the tool centre point in the robot's base frame; `gripper`; and in
-    `info["sim_state"]`, (D,) float32, ManiSkill's flat state observation, which knows where the
-    objects are: for scripted experts only. Some goals, such as PickCube's, are hidden from cameras.
+    `xyzrpy`, the pose of the tool centre point in the robot's base frame; `gripper`; and, for scripted experts only,
+    `info["sim_state"]`, (D,) float32, ManiSkill's flat state observation, which includes the positions of
+    objects. Some goals, such as PickCube's, are hidden from cameras.
 
-    Action, in the default control mode `pd_ee_delta_pose`: (7,) in [-1, 1], of which the first three
-    move the tool by 0.1 m a unit along the base's axes; the next three turn it about the base's axes
-    by **minus** 0.1 rad a unit, since ManiSkill scales them by their lower bound; the last is the
-    gripper, 1 open, -1 closed. A robot without gripper takes (6,). The arm lags behind its commands:
-    a constant 1.0 moves it some 0.03 m a step.
+    Action, in the default control mode `pd_ee_delta_pose`: (7,) in [-1, 1], of which the first three move the tool by
+    0.1 m per unit along the base's axes; the next three turn it about the base's axes by **minus** 0.1 rad per unit,
+    since ManiSkill scales them by their lower bound; the last is the gripper, 1 open, -1 closed. A robot without
+    gripper takes (6,). The arm lags behind its commands: a constant 1.0 moves it by about 0.03 m per step.
 
     The env continues after success, so that success once and success at the end can both be measured,
     and never reports `terminated`.
@@ -69,19 +68,19 @@ class ManiSkill(SimulatorEnv):
         reward_mode: str | None = None,
         reconfigure: bool = True,
     ) -> None:
-        """Make the environment; raises the errors of `make_env`. Other options are those of most `SimulatorEnv`s.
+        """Make the environment; raises the errors of `make_env`. Other options are described in `SimulatorEnv`.
 
         Args:
             task: ManiSkill's id.
-            cameras: Which of the task's cameras to give; None is all.
-            control_mode: None is `pd_ee_delta_pose`, or the robot's own default if it lacks that.
-            instruction: None is the task's, see `instruction_for`.
-            sim_backend: "physx_cpu", the faster for a single environment, or "physx_cuda".
+            cameras: Cameras of the task to return; None selects all.
+            control_mode: None selects `pd_ee_delta_pose`, or the robot's own default if it lacks that.
+            instruction: None selects the task's, see `instruction_for`.
+            sim_backend: "physx_cpu", which is faster for a single environment, or "physx_cuda".
             render_backend: "cpu", "gpu", or "auto": the GPU if both SAPIEN and torch can use it.
-            shader: ManiSkill's name, e.g. "minimal", "default"; None is the task's own.
-            reward_mode: ManiSkill's name; None is the task's own.
-            reconfigure: Rebuild the scene for each episode. Without it some tasks' dynamics
-                (PlugCharger, PushT) depend on the episode before; it saves about 15 ms a reset.
+            shader: ManiSkill's name, e.g. "minimal", "default"; None selects the task's own.
+            reward_mode: ManiSkill's name; None selects the task's own.
+            reconfigure: Rebuild the scene for each episode. Without it the dynamics of some tasks
+                (PlugCharger, PushT) depend on the previous episode; it saves about 15 ms per reset.
         """
         super().__init__(f"maniskill/{task}")
         self._own_limit = registered_limit(task)
@@ -107,7 +106,7 @@ class ManiSkill(SimulatorEnv):
         return self._alive().instructions()[0] if self._given_instruction is None else self._given_instruction
 
     def reset(self, *, seed: int, options: Options | None = None) -> tuple[Obs, dict[str, Any]]:
-        """Begin the episode of `seed`, taken modulo 2^32; `options` go to ManiSkill's own reset."""
+        """Begin the episode of `seed`, taken modulo 2^32; `options` are passed to ManiSkill's own reset."""
         self._options = options or {}
         return super().reset(seed=seed)
 
@@ -117,11 +116,11 @@ class ManiSkill(SimulatorEnv):
 
     @classmethod
     def require_task(cls, task: str | None) -> None:
-        """Do nothing, since the registered ids are only known to ManiSkill."""
+        """Do nothing, since only ManiSkill knows the registered ids."""
 
     @classmethod
     def missing(cls) -> str | None:
-        """Say why ManiSkill cannot run here; the first call in a process renders one frame in a child."""
+        """Return why ManiSkill cannot run here; the first call in a process renders one frame in a child process."""
         if missing := without(("mani_skill", "sapien", "gymnasium", "torch"), "pip install 'vlagents-ray[maniskill]'"):
             return missing
         probe = render_probe()
@@ -152,7 +151,7 @@ class ManiSkill(SimulatorEnv):
 class ManiSkillBatch(BatchEnv):
     """`num_envs` environments of one ManiSkill task; observations and actions are those of `ManiSkill`.
 
-    Physics on the GPU is not that on the CPU to the bit: results of the two do not mix.
+    Physics on the GPU and on the CPU are not bit-identical: do not mix their results.
     """
 
     def __init__(
@@ -168,7 +167,7 @@ class ManiSkillBatch(BatchEnv):
     ) -> None:
         """Make the environments with the options of `ManiSkill`, whose errors this raises.
 
-        `sim_backend` "physx_cpu" simulates a single environment.
+        `sim_backend` "physx_cpu" can only simulate a single environment.
         """
         if sim_backend not in ON_GPU and num_envs > 1:
             raise ConfigError(
@@ -194,7 +193,7 @@ class ManiSkillBatch(BatchEnv):
         return own[: self._playing]
 
     def reset(self, *, seeds: Sequence[int], options: Sequence[Options | None] | None = None) -> list[Obs]:
-        """Begin the episodes of `seeds`, taken modulo 2^32; the options go to ManiSkill's own reset."""
+        """Begin the episodes of `seeds`, taken modulo 2^32; the options are passed to ManiSkill's own reset."""
         self._playing, self._steps = episodes_of(seeds, self.num_envs), 0
         spare = self.num_envs - self._playing
         every = [*seeds, *[seeds[-1]] * spare]

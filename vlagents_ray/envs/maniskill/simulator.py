@@ -53,7 +53,7 @@ def instruction_for(task: str) -> str:
 
 
 def registered_limit(task: str) -> int | None:
-    """Return the step limit that ManiSkill registers for `task`; imports ManiSkill and readies the process for it."""
+    """Return the step limit that ManiSkill registers for `task`; imports ManiSkill and prepares the process for it."""
     prepare_rendering()
     require("sapien")
     require("mani_skill.envs")
@@ -66,7 +66,7 @@ def registered_limit(task: str) -> int | None:
 
 
 def step_limit(env: str, wanted: int | None, own: int | None) -> int:
-    """`wanted`, or `own`, which is the task's; `ConfigError` if there is none."""
+    """Return `wanted`, or else `own`, the task's limit; raises `ConfigError` if both are None."""
     limit = own if wanted is None else wanted
     if limit is None:
         raise ConfigError(f"{env} has no step limit of its own; set max_steps")
@@ -75,21 +75,29 @@ def step_limit(env: str, wanted: int | None, own: int | None) -> int:
 
 
 def chosen_backend(wanted: str) -> str:
-    """`wanted`, or for "auto" the GPU if SAPIEN can render there and torch can wait for it, else the CPU."""
+    """Resolve the render backend: "auto" is the GPU if SAPIEN can render and torch can wait there, else the CPU."""
     if wanted != "auto":
         return wanted
     try:
         require("sapien").Device("cuda")
-    except RuntimeError:  # SAPIEN's error without a device
+    except RuntimeError:  # raised by SAPIEN if there is no device
         return "cpu"
     return "gpu" if require("torch").cuda.is_available() else "cpu"
 
 
 def make_bare(task: str, control_mode: str | None, *, sim_backend: str, render_backend: str, **options: Any) -> Any:
-    """Return the bare environment, without Gymnasium's wrappers; options that are None are left to ManiSkill.
+    """Make the bare environment, without Gymnasium's wrappers.
 
-    `control_mode` None is the default one, or the robot's own if it lacks that. Raises `ConfigError`
-    for a control mode that the robot lacks, else `EnvFailed`.
+    Args:
+        task: ManiSkill's id.
+        control_mode: None selects the default mode, or the robot's own if the robot lacks that.
+        sim_backend: "physx_cpu" or "physx_cuda".
+        render_backend: "cpu" or "gpu".
+        options: Further options of `gymnasium.make`; ManiSkill's defaults replace those that are None.
+
+    Raises:
+        ConfigError: The robot lacks the control mode.
+        EnvFailed: The environment cannot be made for another reason.
     """
     given = {name: value for name, value in options.items() if value is not None}
     given |= {"sim_backend": sim_backend, "render_backend": render_backend}
@@ -122,7 +130,7 @@ def _named_errors(task: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _no_prompts(task: str) -> Iterator[None]:
-    """ManiSkill asks on stdin whether to download missing assets, and exits when the answer is no."""
+    """Turn ManiSkill's prompt on stdin, which offers to download missing assets, into `EnvFailed`."""
     output = io.StringIO()
     stdin, sys.stdin = sys.stdin, io.StringIO("n\n")
     try:
@@ -142,9 +150,9 @@ def _no_prompts(task: str) -> Iterator[None]:
 
 @functools.cache
 def _prepare_process() -> None:
-    """Once a process: make rebuilding a scene cheap, and keep repeated warnings out of the log."""
-    # ManiSkill collects garbage at each reconfiguration. Most of that time, 150 ms, goes into
-    # looking at the modules just imported, which are not garbage.
+    """Make rebuilding a scene cheap, and keep repeated warnings out of the log; once per process."""
+    # ManiSkill collects garbage at each reconfiguration. Most of that time, 150 ms, is spent on modules just imported,
+    # which are not garbage.
     gc.collect()
     gc.freeze()
     logging.getLogger("mani_skill ").addFilter(_not_about_its_own_code)  # the name ends with a space
@@ -154,8 +162,8 @@ def _prepare_process() -> None:
 def _keep_renderer(sim_backend: str, render_backend: str) -> object:
     """Hold one renderer for the life of the process.
 
-    SAPIEN gives its device and compiled shaders back with the last scene that uses them; making the
-    next environment would cost 5 s again, instead of 0.1 s.
+    SAPIEN frees its device and compiled shaders with the last scene that uses them; making the next environment would
+    then take 5 s instead of 0.1 s.
     """
     import sapien.render
 
@@ -165,12 +173,12 @@ def _keep_renderer(sim_backend: str, render_backend: str) -> object:
 
 
 def _not_about_its_own_code(record: logging.LogRecord) -> bool:
-    """Some tasks and robots warn so in each reconfiguration: nothing a user could change."""
+    """Drop warnings that some tasks and robots repeat at each reconfiguration, and that no user can act on."""
     return not record.getMessage().startswith(("No initial pose set for ", "Mimic targets dictionary is missing"))
 
 
-# Where a finger's joint stands when closed and when open, in metres, by ManiSkill's name of the robot. In the
-# action, their controllers take the last component as -1 closed, 1 open. Other robots state no gripper.
+# Position of a finger's joint when closed and when open, m, by ManiSkill's name of the robot. The last component of an
+# action for their controllers is -1 closed, 1 open. Other robots have no gripper in the contract.
 _FINGER_M = {
     "panda": (0.0, 0.04),
     "panda_wristcam": (0.0, 0.04),
@@ -179,8 +187,8 @@ _FINGER_M = {
 }
 _TOOL_LINK = "ee_gripper_link"  # of robots for which ManiSkill names no tool centre point
 
-# The part of the action that moves the arm, as written in mani_skill/agents/controllers. The
-# rotation of "pd_ee_*pose" is intrinsic XYZ Euler in the base frame; see `ManiSkill` for its sign.
+# The part of the action that moves the arm, from mani_skill/agents/controllers. The rotation of "pd_ee_*pose" is
+# intrinsic XYZ Euler in the base frame; see `ManiSkill` for its sign.
 _EE_POSE = {"space": "ee_pose", "rotation": "euler_xyz", "frame": "base"}
 _EE_POSITION = {"space": "ee_position", "rotation": "none", "frame": "base"}
 _JOINT: dict[str, Any] = {"space": "joint", "rotation": "none"}
@@ -198,7 +206,7 @@ CONTROL_MODES: dict[str, dict[str, Any]] = {
 
 
 class ManiSkillRobot:
-    """Reads proprioception from ManiSkill's `agent`, which is a new object after each reconfiguration."""
+    """Reads proprioception from ManiSkill's `agent`, which each reconfiguration replaces."""
 
     def __init__(self, agent: Any) -> None:
         names = [joint.name for joint in agent.robot.active_joints]
@@ -257,14 +265,15 @@ def action_spec(control_mode: str, space: Any, *, has_gripper: bool) -> ActionSp
     )
 
 
-_LOCKED = 1e-4  # of the cosine of a pitch
+_LOCKED = 1e-4  # bound on the cosine of the pitch
 
 
 def tool_in_base(base: np.ndarray, tool: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two (7,) world poses, metres and quaternion wxyz, as SAPIEN writes them, to the tool's pose in the base frame.
+    """Convert two (7,) world poses, metres and quaternion wxyz, as in SAPIEN, to the tool's pose in the base frame.
 
-    Returns `tquat` (7,), metres and quaternion xyzw with w >= 0, and `xyzrpy` (6,), metres and
-    radians, where R = Rz(yaw) Ry(pitch) Rx(roll); both float32.
+    Returns:
+        `tquat` (7,), metres and quaternion xyzw with w >= 0, and `xyzrpy` (6,), metres and radians, where
+        R = Rz(yaw) Ry(pitch) Rx(roll); both float32.
     """
     bw, bx, by, bz = (float(v) for v in base[3:])
     tw, tx, ty, tz = (float(v) for v in tool[3:])
@@ -279,7 +288,7 @@ def tool_in_base(base: np.ndarray, tool: np.ndarray) -> tuple[np.ndarray, np.nda
     # the offset turned by conj(base): v + 2 u x (u x v - bw v) with u the base's vector part
     cx, cy, cz = by * pz - bz * py - bw * px, bz * px - bx * pz - bw * py, bx * py - by * px - bw * pz
     px, py, pz = px + 2 * (by * cz - bz * cy), py + 2 * (bz * cx - bx * cz), pz + 2 * (bx * cy - by * cx)
-    rolls = 2 * (w * x + y * z), 1 - 2 * (x * x + y * y)  # the sine and the cosine of it, times the pitch's cosine
+    rolls = 2 * (w * x + y * z), 1 - 2 * (x * x + y * y)  # sine and cosine of the roll, times the cosine of the pitch
     pitch = math.asin(min(max(2 * (w * y - z * x), -1.0), 1.0))
     if math.hypot(*rolls) < _LOCKED:  # gimbal lock: only the sum or the difference of roll and yaw is determined
         roll, yaw = 0.0, math.copysign(2.0, -pitch) * math.atan2(x, w)
@@ -363,7 +372,7 @@ class Simulator:
         env = self.alive()
         with failing(self.name, "reset"):
             raw, info = env.reset(seed=[seed % 2**32 for seed in seeds], options=dict(options))
-            if env.num_envs == 1:  # rendering is most of a step's time, so only the requested cameras are rendered
+            if env.num_envs == 1:  # rendering dominates the time of a step, so only the requested cameras are rendered
                 for name in set(env.scene.sensors) - set(self.cameras):
                     del env.scene.sensors[name]
             return self.moment(raw, info)
@@ -371,12 +380,12 @@ class Simulator:
     def reset_each(self, seeds: Sequence[int], options: Sequence[Mapping[str, Any]]) -> Moment:
         """Begin the episode of each environment separately, in the existing scenes.
 
-        ManiSkill seeds torch once for all environments that it resets together, by the first one's seed. What a task
-        draws by torch would then depend on the other environments.
+        ManiSkill seeds torch once for all environments that it resets together, with the seed of the first. Draws of a
+        task by torch would then depend on the other environments.
         """
         env = self.alive()
         with failing(self.name, "reset"):
-            with self._observing("none"):  # nothing is rendered before all episodes have begun
+            with self._observing("none"):  # render nothing before all episodes have begun
                 for i, (seed, option) in enumerate(zip(seeds, options, strict=True)):
                     only = require("torch").tensor([i], device=env.device)
                     env.reset(seed=[seed % 2**32] * env.num_envs, options={**option, "env_idx": only})
@@ -384,10 +393,10 @@ class Simulator:
             return self.moment(env.get_obs(info), info)
 
     def step(self, actions: np.ndarray, *, look: bool = True) -> Moment:
-        """Execute one action in each environment, (N, D) float32; without `look` nothing is rendered."""
+        """Execute one action in each environment, (N, D) float32; without `look`, render nothing."""
         env = self.alive()
         with failing(self.name, "step"), contextlib.nullcontext() if look else self._observing("state_dict"):
-            # a copy: torch shares the memory, and warns of read-only arrays, such as those of Ray
+            # a copy, since torch shares the memory, and warns of read-only arrays, such as Ray's
             raw, rewards, _, _, info = env.step(actions.copy())
             return replace(self.moment(raw, info), rewards=rewards.cpu().numpy().astype(float).tolist())
 
@@ -438,7 +447,7 @@ class Simulator:
             env.close()
 
     def _check_usable(self) -> None:
-        if not hasattr(self.env.agent, "robot"):  # it has no robot, or several
+        if not hasattr(self.env.agent, "robot"):  # no robot, or several
             raise ConfigError(f"{self.name}: want a task with exactly one robot")
         if "success" not in self.env.get_info():
             raise ConfigError(f"{self.name} does not say what success is: there is nothing to evaluate")
@@ -452,7 +461,7 @@ class Simulator:
 
     @contextlib.contextmanager
     def _observing(self, mode: str) -> Iterator[None]:
-        """Have ManiSkill observe in another mode; what tasks add to the state, they decide by the own one."""
+        """Switch the observation mode; tasks still choose their additions to the state by their original mode."""
         env = self.alive()
         own, env._obs_mode = env._obs_mode, mode
         try:

@@ -19,23 +19,22 @@ MIXED = "mixed"
 _TASKS: tuple[Task, ...] = get_args(Task)
 _VERSION = 1  # of the scenes and the physics; results of different versions are not comparable
 _CONTROL_HZ = 10.0
-_POINTING_DOWN = (math.pi, 0.0, 0.0)  # roll, pitch, yaw of the gripper in rad, always
+_POINTING_DOWN = (math.pi, 0.0, 0.0)  # roll, pitch, yaw of the gripper in rad, constant
 
 
 class Tabletop(EvalEnv):
     """Four pucks, three pads and one instruction about them, e.g. "put the red puck on the blue pad".
 
-    Tasks: `pick_place`, `slide` (never lift the puck), `stack`, `lift`, and `mixed`, the default,
-    which draws one of them for each episode.
+    Tasks: `pick_place`, `slide` (never lift the puck), `stack`, `lift`, and `mixed`, the default, which draws one of
+    them for each episode.
 
-    Observation: camera "front" (height, width, 3); `state["xyzrpy"]` (6,), the fingertips' position
-    in m and the gripper's constant orientation in rad, in the base frame of the package's docstring;
-    `gripper` in [0, 1], 1 = open, about 0.58 around a puck. With `object_state`, also `state["puck"]` (3,),
-    where the underside of the instruction's puck is, and `state["target"]` (3,), where it is to be; m, in
-    the base frame.
+    Observation: camera "front" (height, width, 3); `state["xyzrpy"]` (6,), the fingertips' position in m and the
+    gripper's constant orientation in rad, in the base frame of the package's docstring; `gripper` in [0, 1], 1 = open,
+    about 0.58 around a puck. With `object_state`, also `state["puck"]` (3,), the position of the underside of the
+    instruction's puck, and `state["target"]` (3,), its target; m, in the base frame.
 
-    Action (4,): `dx, dy, dz` in units of 0.03 m a step along the base frame's axes, and the gripper,
-    1 = open, -1 = closed. Components outside [-1, 1] are clipped, as a robot's controller would.
+    Action (4,): `dx, dy, dz` in units of 0.03 m per step along the base frame's axes, and the gripper, 1 = open, -1 =
+    closed. Components outside [-1, 1] are clipped, as by a robot's controller.
 
     The reward is 1.0 in each step that ends in success, else 0.0. Nothing terminates an episode.
     """
@@ -53,12 +52,12 @@ class Tabletop(EvalEnv):
         """Make the environment of a task.
 
         Args:
-            task: One of `tasks()`; `mixed` if None.
-            width: Of the image, at least 32 pixels.
-            height: Of the image, at least 32 pixels.
+            task: One of `tasks()`; None selects `mixed`.
+            width: The width of the image, at least 32 pixels.
+            height: The height of the image, at least 32 pixels.
             max_steps: Steps until truncation.
-            pucks: Pucks on the table, 1 to 4. A policy that takes no instruction can only know its puck if it is alone.
-            object_state: Whether the state has the places of the instruction's puck and of its target.
+            pucks: Pucks on the table, 1 to 4. A policy without instructions can identify its puck only if it is alone.
+            object_state: Whether the state has the positions of the instruction's puck and of its target.
 
         Raises:
             ConfigError: There is no such task, or a number is out of its range.
@@ -142,7 +141,7 @@ class Tabletop(EvalEnv):
         unknown = sorted(set(options or {}) - {"instruction"})
         if unknown:
             raise ConfigError(f"tabletop: unknown reset options {unknown}, want none or 'instruction'")
-        rng = np.random.default_rng(seed % 2**64)  # numpy takes no negative seed
+        rng = np.random.default_rng(seed % 2**64)  # numpy accepts no negative seed
         task = _TASKS[rng.integers(len(_TASKS))] if self._task == MIXED else self._task_in_scene()
         world, goal = draw_episode(task, rng, self._pucks)
         if options:

@@ -1,6 +1,6 @@
-"""Renders the table for the camera "front".
+"""A renderer of the table for the camera "front".
 
-Objects at rest are drawn once; a step copies that image and adds the gripper, the object that it holds, and their
+Objects at rest are drawn once; a step copies that image and adds the gripper, the held object, and their
 shadows. The camera's geometry is in the package's docstring.
 """
 
@@ -32,13 +32,13 @@ PALETTE: dict[str, Colour] = {
     "yellow": (244, 196, 32),
     "purple": (128, 48, 190),
 }
-# Everything that is not named in an instruction is nearly grey.
+# Objects that no instruction names are nearly grey.
 _FLOOR, _TABLE, _TABLE_EDGE = (58, 59, 62), (227, 225, 221), (168, 165, 160)
 _FINGER, _PALM, _PALM_FRONT, _WRIST = (150, 152, 156), (86, 88, 92), (62, 63, 66), (118, 120, 124)
 _TABLE_HALF = (0.315, 0.255)  # m
 _TABLE_THICKNESS = 0.04  # m
 _FINGER_LENGTH = 0.07  # m
-_SHADOW = (0.35, -0.22)  # m of offset along x and y per m of height
+_SHADOW = (0.35, -0.22)  # m, shadow offset along x and y per m of height
 
 
 class TabletopRenderer:
@@ -150,10 +150,10 @@ class TabletopRenderer:
         return canvas.sprite()
 
     def _draw_gripper(self, gap: float) -> Sprite:
-        """Two fingers `gap` pixels off the middle, the palm above them and the wrist on top."""
+        """Draw two fingers `gap` pixels off the middle, the palm above them and the wrist on top."""
         s = self._scale
         finger, length = FINGER_RADIUS * s, _FINGER_LENGTH * s * self._deep
-        half, tall = 0.052 * s, 0.016 * s  # the palm's
+        half, tall = 0.052 * s, 0.016 * s  # of the palm
         front, above = 0.022 * s * self._deep, -length - 0.022 * s * self._deep
         canvas = Canvas(half + finger, half + finger, length + front + 2 * tall + 0.03 * s, finger)
         for side in (-1.0, 1.0):
@@ -183,7 +183,7 @@ Colour = tuple[float, float, float]  # RGB, 0 to 255
 
 @dataclass(frozen=True, slots=True)
 class Sprite:
-    """A picture with transparency; pixel (`left`, `top`) of it lies at the anchor's (0, 0) plus these."""
+    """A picture with transparency; its pixel (`left`, `top`) is at the anchor's (0, 0) plus these offsets."""
 
     paint: np.ndarray  # (h, w, 3) uint16, colour times opacity, opacity in [0, 256]
     keep: np.ndarray  # (h, w, 1) uint16, 256 minus the opacity
@@ -191,7 +191,7 @@ class Sprite:
     top: int  # px
 
     def blend(self, image: np.ndarray, u: int, v: int) -> None:
-        """Draw into `image`, (H, W, 3) uint8, with the anchor at column `u`, row `v`; cut at the edges."""
+        """Draw into `image`, (H, W, 3) uint8, with the anchor at column `u`, row `v`; clip at the edges."""
         x, y = u + self.left, v + self.top
         height, width = self.keep.shape[:2]
         x0, y0 = max(x, 0), max(y, 0)
@@ -200,7 +200,7 @@ class Sprite:
             return
         inside = (slice(y0 - y, y1 - y), slice(x0 - x, x1 - x))
         region = image[y0:y1, x0:x1]
-        mixed = region * self.keep[inside]  # at most 255 * 256, which uint16 holds, as it does the sum
+        mixed = region * self.keep[inside]  # at most 255 * 256, and so is the sum: both fit in uint16
         mixed += self.paint[inside]
         mixed >>= 8
         region[...] = mixed
@@ -210,7 +210,7 @@ class Canvas:
     """Paints layers over each other; `u` and `v` are pixel centres relative to the anchor."""
 
     def __init__(self, left: float, right: float, up: float, down: float) -> None:
-        """A canvas that reaches this many pixels from the anchor to each side."""
+        """Make a canvas that extends by this many pixels from the anchor to each side."""
         self._left, self._top = -int(np.ceil(left)) - 1, -int(np.ceil(up)) - 1
         width = int(np.ceil(right)) + 2 - self._left
         height = int(np.ceil(down)) + 2 - self._top
@@ -220,7 +220,7 @@ class Canvas:
         self._alpha = np.zeros((height, width, 1), np.float32)
 
     def paint(self, colour: Colour | np.ndarray, coverage: FloatArray) -> None:
-        """Paint a colour, one or (h, w, 3), over the canvas, with `coverage` in [0, 1]."""
+        """Paint a colour, one for all pixels or (h, w, 3), over the canvas, with `coverage` in [0, 1]."""
         amount = np.clip(coverage, 0.0, 1.0)[..., None]
         self._rgb = self._rgb * (1 - amount) + np.asarray(colour, np.float32) * amount
         self._alpha = self._alpha * (1 - amount) + amount
@@ -241,7 +241,7 @@ class Canvas:
         return np.clip(0.5 - (outside + np.minimum(np.maximum(across, down), 0) - corner), 0, 1)
 
     def glow(self, u: float, v: float, radius_u: float, radius_v: float) -> FloatArray:
-        """Return a soft blob around (u, v): 1 in the middle, 0 from the radii on."""
+        """Return a soft blob around (u, v): 1 in the middle, 0 beyond the radii."""
         distance = np.clip(np.hypot((self.u - u) / radius_u, (self.v - v) / radius_v), 0, 1)
         fade: FloatArray = 1 - distance * distance * (3 - 2 * distance)
         return fade

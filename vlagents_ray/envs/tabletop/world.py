@@ -1,7 +1,7 @@
 """The physics of the table, and the goals of its episodes.
 
-Quasi-static: a puck goes where it is carried or pushed and otherwise rests or falls. Plain floats rather than arrays:
-for a handful of bodies that is several times faster.
+Quasi-static: a puck moves where it is carried or pushed and otherwise rests or falls. Plain floats replace arrays:
+for a handful of bodies they are several times faster.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ PUCK_HEIGHT = 0.03  # m
 PAD_HALF = 0.045  # m, half the side of the square
 FINGER_RADIUS = 0.007  # m
 GAP_OPEN = 0.038  # m, from the gripper's centre to the inner face of a finger; closed it is 0
-REACH = ((-0.30, 0.30), (-0.23, 0.23), (0.0, 0.18))  # m, of the fingertips
-HOME = (0.0, 0.20, 0.16)  # m, where they are when an episode begins
+REACH = ((-0.30, 0.30), (-0.23, 0.23), (0.0, 0.18))  # m, reach of the fingertips
+HOME = (0.0, 0.20, 0.16)  # m, initial position of the fingertips
 STEP_LIMIT = 0.03  # m, travel of one control step along each axis
 
 _TABLE = (0.30, 0.24)  # m, half extents; a rim keeps the pucks on it
-_SUBSTEPS = 3  # so that a finger moves at most 1 cm, less than it is wide, between contact checks
-_OPENING_RATE = 0.5 / _SUBSTEPS  # of the whole opening
+_SUBSTEPS = 3  # so that between contact checks a finger moves at most 1 cm, less than its width
+_OPENING_RATE = 0.5 / _SUBSTEPS  # share of the whole opening
 _CONTACT_PASSES = 4  # enough for a puck cradled by two fingers to come to rest
 _FALL = 0.06 / _SUBSTEPS  # m
-_GRASP_DEPTH = 0.012  # m, how far off the fingers' line a puck's centre may be and still be grasped
+_GRASP_DEPTH = 0.012  # m, largest distance of a grasped puck's centre from the line between the fingers
 _LIFTED = 0.01  # m
 _EPSILON = 1e-6  # m
 
@@ -104,7 +104,7 @@ class TabletopWorld:
         reach = PUCK_RADIUS + FINGER_RADIUS
         offset = self.gap + FINGER_RADIUS
         for _ in range(_CONTACT_PASSES):
-            # both fingers push at once: one after the other they would drive a centred puck aside
+            # both fingers push at once: in sequence they would push a centred puck aside
             pushes = [_overlap(puck, self.x + side * offset, self.y, reach) for side in (-1.0, 1.0)]
             if not any(pushes):
                 return
@@ -207,13 +207,13 @@ class TabletopWorld:
 
 
 def _overlap(puck: Puck, x: float, y: float, distance: float) -> tuple[float, float] | None:
-    """Return the shift (dx, dy) of a puck away from (x, y) to a distance; None if it is far enough."""
+    """Return the shift (dx, dy) that moves a puck to `distance` from (x, y); None if it is far enough away."""
     dx, dy = puck.x - x, puck.y - y
     have = math.hypot(dx, dy)
     if have >= distance - _EPSILON:
         return None
     if have < _EPSILON:
-        return 0.0, -distance  # at the centre any direction is right, if it is always the same
+        return 0.0, -distance  # at the centre any direction is valid, as long as it is always the same
     return dx * (distance / have - 1), dy * (distance / have - 1)
 
 
@@ -240,7 +240,7 @@ _AREA = (0.22, 0.13)  # m, half extents of the area in which objects are placed
 _CLEARANCE = 0.09  # m between centres: a puck's own radius, an open finger, and the neighbour
 _PAD_CLEARANCE = 0.125  # m between the centres of two pads
 _CORRIDOR = 0.065  # m on both sides of a slide that no other puck may be in
-_AT_PAD = PAD_HALF - 0.008  # m, how far off the pad's centre a puck's may be, along each axis
+_AT_PAD = PAD_HALF - 0.008  # m, largest distance of a puck's centre from the pad's, along each axis
 _LIFT_HEIGHT = 0.08  # m
 
 
@@ -272,7 +272,7 @@ class Goal:
         return at_pad and not (self.task == "slide" and puck.lifted)
 
     def place(self, world: TabletopWorld) -> tuple[float, float, float]:
-        """Where the middle of the puck's underside is to be: x, y, z in m, in the base frame."""
+        """Return the target of the centre of the puck's underside: x, y, z in m, in the base frame."""
         if self.target is None:
             puck = world.puck(self.puck)
             return puck.x, puck.y, _LIFT_HEIGHT
@@ -293,7 +293,7 @@ def goals(world: TabletopWorld, task: Task) -> list[Goal]:
 
 
 def draw_episode(task: Task, rng: np.random.Generator, pucks: int = PUCKS) -> tuple[TabletopWorld, Goal]:
-    """Draw a scene with so many pucks, and a goal; a slide is drawn only if no puck is in its way."""
+    """Draw a scene with `pucks` pucks, and a goal; a slide is drawn only if no puck is in its way."""
     while True:
         world = _draw_scene(rng, pucks)
         wanted = [goal for goal in goals(world, task) if task != "slide" or _is_clear(world, goal)]
@@ -303,7 +303,7 @@ def draw_episode(task: Task, rng: np.random.Generator, pucks: int = PUCKS) -> tu
 
 def _draw_scene(rng: np.random.Generator, count: int) -> TabletopWorld:
     while True:
-        places: list[tuple[float, float, float]] = []  # x, y, and the clearance from another of its kind
+        places: list[tuple[float, float, float]] = []  # x, y, and the clearance from objects of the same kind
         for _ in range(200):
             if len(places) == _PADS + count:
                 break

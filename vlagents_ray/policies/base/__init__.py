@@ -1,4 +1,4 @@
-"""The common parts of the model families' adapters: settings, checkpoints, sessions of chunked actions."""
+"""The common parts of model families: settings, checkpoints, sessions with chunked actions."""
 
 from vlagents_ray.policies.base.config import ModelConfig
 from vlagents_ray.policies.base.model_inputs import Row, shared_frames

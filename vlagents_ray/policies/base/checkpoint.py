@@ -1,4 +1,4 @@
-"""Finds checkpoints, and checks that a model holds all tensors of its checkpoint."""
+"""Functions to find checkpoints, and to check that a model holds all tensors of its checkpoint."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _used: ContextVar[list[Path] | None] = ContextVar("_used", default=None)
 
 @contextmanager
 def used_checkpoints() -> Iterator[list[Path]]:
-    """Yield a list of the paths that `find_checkpoint` finds in this context; a path within one replaces it."""
+    """Yield a list of the paths that `find_checkpoint` finds in this context; a path within another replaces it."""
     found: list[Path] = []
     token = _used.set(found)
     try:
@@ -50,8 +50,8 @@ def find_checkpoint(name: str, step: int | None = None, needs: Iterable[str] = (
     """Return the folder or file of a checkpoint: a path on this machine, or a hub id, downloaded if it is not cached.
 
     Args:
-        name: The path, or a hub id; a hub id takes a commit, a tag or a branch: `org/name@REVISION`.
-        step: Replaces `{step}` in `name`, with leading zeros to six digits where only that path exists.
+        name: The path, or a hub id, optionally with a commit, a tag or a branch: `org/name@REVISION`.
+        step: Replaces `{step}` in `name`, with leading zeros to six digits if only that path exists.
         needs: Files (or glob patterns) that a folder must hold.
 
     Raises:
@@ -77,16 +77,29 @@ def find_checkpoint(name: str, step: int | None = None, needs: Iterable[str] = (
 
 
 def _holds(folder: Path, path: Path) -> bool:
-    """Return whether `path` is in the folder, or the folder itself under another name, as behind a link `last`."""
+    """Return whether `path` is in the folder, or is the folder under another name, as behind a link `last`."""
     if not folder.is_dir():
         return False
-    # A file of the hub's cache is a link out of its folder.
+    # A file in the hub's cache is a link to a place outside of its folder.
     places = (path.resolve(), path.parent.resolve() / path.name)
     return any(folder.resolve() in (place, *place.parents) for place in places)
 
 
 def find_adapter(source: str, checkpoint: str, base: Sequence[Path], digest_of_base: str) -> tuple[Adapter, Path]:
-    """Return a LoRA adapter and its folder; raises `ConfigError` if it was trained on another base."""
+    """Find a LoRA adapter.
+
+    Args:
+        source: The adapter's path or hub id.
+        checkpoint: The name of the policy's checkpoint, the base.
+        base: The files and folders of the base.
+        digest_of_base: Their digest.
+
+    Returns:
+        The adapter, and its folder.
+
+    Raises:
+        ConfigError: The adapter is missing, or was trained on another base.
+    """
     folder = find_checkpoint(source, needs=FILES)
     if not folder.is_dir():
         raise ConfigError(f"{folder}: got a file, want the folder with {', '.join(FILES)}, as PEFT saves it")
@@ -100,9 +113,9 @@ def find_adapter(source: str, checkpoint: str, base: Sequence[Path], digest_of_b
 
 
 def _is_other(trained_on: str, checkpoint: str, base: Sequence[Path], digest_of_base: str) -> bool:
-    """Whether the base that an adapter names is known to be another one than `checkpoint`, at the paths `base`."""
-    path = Path(os.path.expanduser(trained_on))  # unlike a Path's own, these raise nothing, neither for a user nor
-    if os.path.exists(path):  # for a folder of the trainer that is not visible here
+    """Return whether the base that an adapter names is known to differ from `checkpoint`, at the paths `base`."""
+    path = Path(os.path.expanduser(trained_on))  # unlike Path's own methods, os.path raises neither for
+    if os.path.exists(path):  # unknown users nor for folders that are not visible here
         ours = {parent for one in base for parent in (one.resolve(), *one.resolve().parents)}
         return path.resolve() not in ours and digest([path]) != digest_of_base
     names = [name.partition("@")[0] for name in (trained_on, checkpoint)]
@@ -151,7 +164,7 @@ def _revisions(hub: Any, repository: str) -> str:
 
 
 class SavedTensors:
-    """The tensors of a checkpoint on disk by name, each read when it is accessed."""
+    """The tensors of a checkpoint on disk by name; a tensor is read when it is accessed."""
 
     def __init__(self, readers: Mapping[str, Callable[[], Any]]) -> None:
         self._readers = readers
@@ -170,7 +183,7 @@ class SavedTensors:
         return self._readers[name]()
 
     def renamed(self, rename: Callable[[str], str | None]) -> SavedTensors:
-        """Return the tensors under other names; those that `rename` maps to None are left out."""
+        """Return the tensors under other names; those that `rename` maps to None are dropped."""
         named = {rename(key): reader for key, reader in self._readers.items()}
         return SavedTensors({key: reader for key, reader in named.items() if key is not None})
 
@@ -192,7 +205,7 @@ def require_loaded(model: Any, saved: SavedTensors | Mapping[str, Any]) -> None:
     """Raise `ConfigError` unless every parameter and saved buffer of `model` has the checkpoint's value.
 
     Names and shapes are compared, and 64 elements of each tensor, up to the model's dtype. A parameter that is tied to
-    another one may be missing itself. Some libraries continue with random weights if they could not load the
+    another one may be absent. Some libraries continue with random weights if they cannot load the
     checkpoint's: the result looks like a bad policy, and is hard to diagnose.
     """
     torch = require("torch")
@@ -219,12 +232,12 @@ def require_loaded(model: Any, saved: SavedTensors | Mapping[str, Any]) -> None:
 def from_pretrained(cls: Any, path: Path, **options: Any) -> Any:
     """Return `cls.from_pretrained(path, **options)`; raises `ConfigError` if a parameter is not in the checkpoint.
 
-    From version 5 on transformers renames parameters as it reads them, so that `require_loaded`, which compares names,
-    cannot check its models; but it reports the parameters for which it found no values.
+    From version 5 on transformers renames parameters as it reads them, so `require_loaded`, which compares names,
+    cannot check its models; but transformers reports the parameters without values.
     """
     try:
         model, said = cls.from_pretrained(path, output_loading_info=True, **options)
-    except (OSError, RuntimeError, ValueError) as error:  # raised for files of another format, and for incomplete ones
+    except (OSError, RuntimeError, ValueError) as error:  # raised for files that are incomplete or in another format
         raise ConfigError(f"checkpoint {path}: {cls.__name__} does not load: {str(error).strip()[:500]}") from error
     lacks = {key: sorted(map(str, said[key]))[:_LISTED] for key in ("missing_keys", "mismatched_keys") if said[key]}
     if lacks:
@@ -237,7 +250,7 @@ def from_pretrained(cls: Any, path: Path, **options: Any) -> Any:
 def require_filled(params: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
     """Raise `ConfigError` unless the nested `params` are arrays with exactly the names and shapes in `wanted`.
 
-    For JAX, whose loaders return what they read: an array in `params` comes from the checkpoint.
+    This check is for JAX, whose loaders return only values from the checkpoint.
     """
     have, want = dict(_leaves(params)), dict(_leaves(wanted))
     absent = sorted(name for name in want if not hasattr(have.get(name), "__array__"))

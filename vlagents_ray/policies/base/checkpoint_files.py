@@ -1,6 +1,6 @@
-"""Checks of a checkpoint's files, without a model: whether they are complete, and which weights they hold.
+"""Checks of a checkpoint's files without a model: whether they are complete, and which weights they hold.
 
-`unfinished` judges by the files alone, and in doubt reports nothing. `weights_of` distinguishes weights by a digest
+`unfinished` examines only the files, and reports nothing in doubt. `weights_of` identifies weights by a digest
 that takes seconds, and by the commit on the hub.
 """
 
@@ -18,17 +18,17 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import BinaryIO
 
-# The names that trainers give to files in progress: orbax' folders, and the usual suffixes.
+# Names that trainers give to files in progress: orbax' folders, and the usual suffixes.
 TEMPORARY = ("*.orbax-checkpoint-tmp*", "*.tmp", "*.tmp-*", "*.part", "*.partial", "*.incomplete", "tmp-*", ".tmp*")
 
-_TEXT = (".json", ".yaml", ".yml", ".txt", ".md", ".jinja")  # written beside weights, and often before them
+_TEXT = (".json", ".yaml", ".yml", ".txt", ".md", ".jinja")  # written along with weights, and often before them
 
 METHOD = "sampled-sha256"
 _WHOLE = 2**20  # bytes; a file up to this size is read in full
 _BLOCK, _BLOCKS = 4096, 256
 _LONGEST_HEADER = 10**8  # bytes; the limit of safetensors
 _COMMIT = re.compile(r"[0-9a-f]{40}")
-_BESIDE = (".md", ".gitattributes", ".log")  # files about a checkpoint, which do not change what it does
+_BESIDE = (".md", ".gitattributes", ".log")  # files about a checkpoint, which do not affect its behaviour
 
 
 def is_temporary(name: str) -> bool:
@@ -40,7 +40,7 @@ def unfinished(path: Path) -> str | None:
     """Return the sign that a checkpoint, a file or a folder, is incomplete; None if there is no sign.
 
     A .safetensors file must have the length in its header, an index may name only existing files, JSON must be valid,
-    and a zip file, as torch.save writes it, must end with its directory. Files of other kinds show nothing: the caller
+    and a zip file, as written by torch.save, must end with its directory. Files of other kinds give no sign: the caller
     must also check that they no longer grow. A folder without weights is incomplete.
     """
     try:
@@ -66,7 +66,7 @@ def _trouble(file: Path) -> str | None:
     check = next((check for suffix, check in _CHECKS.items() if file.name.endswith(suffix)), None)
     try:
         return None if check is None else check(file)
-    # truncated, or not of its name's format
+    # truncated, or not in the format of its name
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         return f"cannot be read ({error})"
 
@@ -83,9 +83,9 @@ def _safetensors(file: Path) -> str | None:
 
 
 def _places(header: bytes) -> list[tuple[int, int]]:
-    """Return begin and end of each tensor's bytes behind the header (JSON) of a .safetensors file.
+    """Return start and end of each tensor's bytes after the header (JSON) of a .safetensors file.
 
-    The file begins with 8 bytes, the header's length.
+    The file begins with 8 bytes, the length of the header.
     """
     tensors = json.loads(header)
     return [tuple(one["data_offsets"]) for name, one in tensors.items() if name != "__metadata__"]
@@ -124,8 +124,8 @@ _CHECKS: dict[str, Callable[[Path], str | None]] = {
 def weights_of(paths: Sequence[Path]) -> dict[str, str | None] | None:
     """Return `Agent.weights_id` of files and folders, of which the first is the policy's own; None if there are none.
 
-    The digest is that of all of them, the revision that of the first: those after it, as an encoder's, may be another
-    repository's.
+    The digest covers all of them, the revision only the first: later ones, such as an encoder's, may come from another
+    repository.
     """
     return {"digest": digest(paths), "revision": revision(paths[0])} if paths else None
 
@@ -133,11 +133,11 @@ def weights_of(paths: Sequence[Path]) -> dict[str, str | None] | None:
 def digest(paths: Iterable[Path]) -> str:
     """Return `sampled-sha256:` and 64 hexadecimal digits, which are equal for equal files with equal names.
 
-    The digest covers the name and the size of each file, those of a folder in the order of their names, and part of its
-    content: up to 1 MiB all of it; of a larger .safetensors file the header and 4 KiB in the middle of each tensor; of
-    a zip file, as torch.save writes it, the directory with the CRC-32 of each part; of any other file 256 blocks of 4
-    KiB at equal distances. So other weights have another digest, and so have other statistics and settings beside them;
-    a deliberate change of a few bytes may go unnoticed. Hidden files and READMEs do not count.
+    The digest covers the name and the size of each file, in a folder sorted by name, and part of its
+    content: all of it up to 1 MiB; of a larger .safetensors file the header and 4 KiB in the middle of each tensor; of
+    a zip file, as written by torch.save, the directory with the CRC-32 of each part; of any other file 256 blocks of 4
+    KiB at equal distances. Different weights, statistics or settings therefore have different digests, but a deliberate
+    change of a few bytes may go unnoticed. Hidden files and READMEs do not count.
     """
     found = hashlib.sha256()
     for path in paths:
@@ -167,7 +167,7 @@ def files_in(path: Path) -> list[Path]:
 
 
 def _below(folder: Path, above: frozenset[str]) -> Iterator[Path]:
-    """Yield the files of a folder that count, also behind links, which loaders follow; `above` are its parents."""
+    """Yield the files of a folder that count, following links as loaders do; `above` are the folder's parents."""
     within = above | {os.path.realpath(folder)}
     with contextlib.suppress(OSError):  # unreadable or gone
         for entry in list(folder.iterdir()):

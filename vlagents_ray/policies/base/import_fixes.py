@@ -1,11 +1,11 @@
-"""Fixes for torchvision and LeRobot where their wheels do not fit this machine, applied when they are imported.
+"""Fixes for torchvision and LeRobot if their wheels do not fit this machine, applied when they are imported.
 
-PyPI's torchvision for Linux is compiled against CUDA, so beside a CPU-only torch its operators do not load, and `import
+PyPI's torchvision for Linux is compiled against CUDA. Its operators do not load beside a CPU-only torch, and `import
 torchvision` fails. LeRobot 0.4.4 reads videos with torchcodec, which needs an installed FFmpeg, or with torchvision's
-`VideoReader`, which newer versions lack. Where the wheels fit, nothing is changed.
+`VideoReader`, which newer versions lack. If the wheels fit, nothing is changed.
 
 `vlagents-ray env make` copies this file, which imports nothing of this package, into the environments that it makes,
-with a `.pth` file that calls `install`, so that LeRobot's own commands work there as well.
+with a `.pth` file that calls `install`, so that LeRobot's own commands also work there.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from typing import Any
 Execute = Callable[[ModuleType], None]
 
 log = logging.getLogger(__name__)
-_operators: list[Any] = []  # operators exist as long as the object that defined them
+_operators: list[Any] = []  # operators live as long as the object that defined them
 
 
 def install() -> None:
@@ -33,7 +33,7 @@ def install() -> None:
 
 
 class _Finder:
-    """Finds the modules of `_FIXES` as Python does, and lets their entries execute them."""
+    """Finds the modules of `_FIXES` as Python does, and executes them with the fixes."""
 
     def find_spec(
         self, name: str, path: Sequence[str] | None = None, target: ModuleType | None = None
@@ -47,7 +47,7 @@ class _Finder:
 
 
 def _torchvision(execute: Execute, module: ModuleType) -> None:
-    """Declare the missing operators that the import looks up; calls of them still fail, as they must."""
+    """Declare the missing operators that the import looks up; calls of them still raise an error."""
     torch = importlib.import_module("torch")
     try:
         execute(module)
@@ -67,7 +67,7 @@ def _torchvision(execute: Execute, module: ModuleType) -> None:
 
 
 def _video_utils(execute: Execute, module: Any) -> None:
-    """Read videos with PyAV, which includes FFmpeg, where LeRobot's own decoders are missing."""
+    """Read videos with PyAV, which includes FFmpeg, if LeRobot's own decoders are missing."""
     execute(module)
     if importlib.util.find_spec("torchcodec") is not None:
         try:

@@ -22,13 +22,13 @@ CURE = "if you trust everyone with write access to it, set trust_remote_code: tr
 def use_source(package: str, variable: str, source_dir: str | None = None, within: Sequence[str] = (".",)) -> None:
     """Make `package` importable: from `source_dir`, from the checkout that `variable` names, or from an installation.
 
-    A named checkout goes first, since Python would import any folder with the package's name, such as a checkout in the
-    working directory.
+    A named checkout has priority, since Python would import any folder with the package's name, such as a checkout in
+    the working directory.
 
     Args:
         package: The name of the package.
         variable: The environment variable that names a checkout.
-        source_dir: A checkout, in place of the variable's.
+        source_dir: A checkout that replaces the variable's.
         within: The folders of the checkout to import from; the first one holds `package`.
 
     Raises:
@@ -51,8 +51,8 @@ def use_source(package: str, variable: str, source_dir: str | None = None, withi
 def remote_code(*, allowed: bool, source: Path | None = None) -> Iterator[None]:
     """Keep transformers from importing code of a checkpoint or hub repository in this context, unless it is allowed.
 
-    That holds also if a library requests such code: some pass `trust_remote_code=True` with a name that they read from
-    the checkpoint. A model that needs it fails with a `ConfigError`.
+    This also holds if a library requests such code: some pass `trust_remote_code=True` with a name that they read from
+    the checkpoint. A model that needs the code fails with a `ConfigError`.
 
     Args:
         allowed: Whether all code may be imported.
@@ -62,8 +62,8 @@ def remote_code(*, allowed: bool, source: Path | None = None) -> Iterator[None]:
         yield
         return
     dynamic: Any = require("transformers.dynamic_module_utils")
-    # All imports of such code pass through these three: the first finds it, and calls the second, which copies it to
-    # the cache; the third executes it.
+    # All imports of such code pass through these three: the first finds it and calls the second, which copies it to the
+    # cache; the third executes it.
     names = ("get_cached_module_file", "create_dynamic_module", "get_class_in_module")
     find, create, execute = ways = [getattr(dynamic, name) for name in names]
     own: set[str] = set()  # copies of the source's files

@@ -19,30 +19,30 @@ from vlagents_ray.registry import require
 T = TypeVar("T")
 
 GRIPPER = "gripper"  # the part of the state that is `Obs.gripper`
-CLOSED = "gripper_closed"  # the part that is its closedness: 1 - `Obs.gripper`
-KEPT = 256  # instructions of which a policy keeps the tokens: more than a server has tasks
-KEPT_CHARACTERS = 1000  # of the longest such instruction, as clients choose it: all together take some 10 MB at most
+CLOSED = "gripper_closed"  # the part that is the closedness: 1 - `Obs.gripper`
+KEPT = 256  # cached instructions with their tokens: more than a server has tasks
+KEPT_CHARACTERS = 1000  # characters of a cached instruction, which clients choose: the cache takes at most about 10 MB
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One chunk to compute: a session's own, or a sample of its distribution."""
+    """One chunk to compute: the session's own, or a sample of its distribution."""
 
     frames: tuple[Any, ...]  # the results of `ModelPolicy.perceive` for the last observations, oldest first
     instruction: str
-    rng: np.random.Generator  # the session's own, so that other rows do not matter
+    rng: np.random.Generator  # of the session, so that other rows have no influence
     leftover: np.ndarray | None = None  # (H', D) float32, real-time chunking: see LEFTOVER in the interface
-    delay: int = 0  # DELAY: the first rows of the chunk, so many, are the leftover's
+    delay: int = 0  # DELAY: the number of first rows of the chunk that are the leftover's
     info: Mapping[str, Any] = field(default_factory=dict)  # the observation's info
-    # the session's memory, for families that keep more than frames
+    # the session's memory, for families that store more than frames
     memory: dict[str, Any] = field(default_factory=dict)
-    want: tuple[str, ...] = ()  # requested values of the chunk, out of the contract's `behaviour`
-    # drawn from the distribution, for samples and requested values; else the likeliest chunk
+    want: tuple[str, ...] = ()  # requested outputs of the chunk, from the contract's `behaviour`
+    # whether to draw from the distribution, for samples and requested outputs; if not, the likeliest chunk
     sample: bool = False
-    adapter: str = ""  # fingerprint of the session's adapter, see `ModelPolicy.adapters`; empty: none
+    adapter: str = ""  # fingerprint of the session's adapter, see `ModelPolicy.adapters`; empty: no adapter
 
     def noise(self, *shape: int) -> np.ndarray:
-        """Draw standard normal numbers, float32, the same on every device."""
+        """Draw standard normal numbers, float32, which are the same on every device."""
         return self.rng.standard_normal(shape, dtype=np.float32)
 
     def history(self, length: int) -> tuple[Any, ...]:
@@ -56,7 +56,7 @@ def drawn(row: Row, draws: np.random.Generator) -> Row:
 
 
 def shared_frames(rows: Sequence[Row]) -> tuple[list[int], list[int]]:
-    """Return the rows to encode, since the samples of a session share its row's observations.
+    """Return the rows to encode: the samples of a session share the observations of its row.
 
     Returns:
         The indices of rows with distinct observations, and for each row the index of its observations among them.
@@ -73,7 +73,7 @@ def shared_frames(rows: Sequence[Row]) -> tuple[list[int], list[int]]:
 def choose_cameras(chosen: Mapping[str, str] | None, usual: Mapping[str, str], known: Sequence[str]) -> dict[str, str]:
     """Map the model's name of each camera to the observation's: `chosen`, or the family's usual mapping.
 
-    `known` are the model's cameras. An unknown or missing camera raises `ConfigError`; it never becomes zeros.
+    `known` are the model's cameras. An unknown or missing camera raises `ConfigError`; it is never replaced by zeros.
     """
     mapping = dict(usual if chosen is None else chosen)
     if set(mapping) != set(known):
@@ -93,7 +93,16 @@ def camera_images(obs: Obs, cameras: Mapping[str, str]) -> dict[str, np.ndarray]
 
 
 def state_vector(obs: Obs, parts: Sequence[str], dim: int | None = None) -> np.ndarray:
-    """Return the parts in their order as one new (dim,) float32 vector."""
+    """Return parts of the proprioception as one new (dim,) float32 vector.
+
+    Args:
+        obs: The observation.
+        parts: The names of the parts in order; `GRIPPER` and `CLOSED` select `Obs.gripper`.
+        dim: The length of the vector; None accepts any.
+
+    Raises:
+        MissingState, InvalidObservation: A part is missing, or the length is wrong.
+    """
     found = []
     for part in parts:
         if part in (GRIPPER, CLOSED):
@@ -145,7 +154,7 @@ def wanted_samples(obs: Obs, config: ModelConfig) -> int:
 
 
 def wanted_behaviour(obs: Obs) -> tuple[str, ...]:
-    """Return the names of the values that the act returns beside its action."""
+    """Return the names of the extra outputs that an observation requests beside the action."""
     if WANT not in obs.info:
         return ()
     if obs.info.get(LEFTOVER) is not None:
@@ -157,13 +166,13 @@ def wanted_behaviour(obs: Obs) -> tuple[str, ...]:
 
 
 def leftover_plan(obs: Obs, contract: Contract | None) -> np.ndarray:
-    """Return a copy of the plan to continue from, (H, D) float32, of an observation that has one."""
+    """Return a copy of the plan to continue, (H, D) float32, from an observation with a plan."""
     given = obs.info[LEFTOVER]
     dim = None if contract is None else contract.action.dim
     try:
         left = np.array(given, np.float32)
     except (TypeError, ValueError):
-        left = np.zeros(0, np.float32)  # not numbers, which is refused below
+        left = np.zeros(0, np.float32)  # not numbers: refused below
     if left.ndim != 2 or dim not in (None, left.shape[1]) or not np.isfinite(left).all():
         got = given.shape if isinstance(given, np.ndarray) else type(given).__name__
         raise InvalidObservation(f"info[{LEFTOVER!r}]: got {got}, want (H, {dim or 'D'}) finite float32")
@@ -180,8 +189,8 @@ def count_in(obs: Obs, name: str) -> int:
 def resize_with_pad(image: np.ndarray, height: int, width: int) -> np.ndarray:
     """Scale the whole (H, W, 3) uint8 image and centre it on black (height, width, 3); always returns a copy.
 
-    Bilinear, by Pillow, and rounded like openpi's `image_tools.resize_with_pad`: its policies were trained on such
-    images.
+    Bilinear, by Pillow, and rounded as in openpi's `image_tools.resize_with_pad`, which produced the training images of
+    its policies.
     """
     have_height, have_width = image.shape[:2]
     if (have_height, have_width) == (height, width):
@@ -197,6 +206,6 @@ def resize_with_pad(image: np.ndarray, height: int, width: int) -> np.ndarray:
 
 
 def keeping_tokens(tokenize: Callable[[str], T]) -> Callable[[str], T]:
-    """Return `tokenize`, which keeps its results for the instructions used last, unless these are very long."""
+    """Return `tokenize` with a cache of its results for recent instructions, except for very long ones."""
     kept = lru_cache(maxsize=KEPT)(tokenize)
     return lambda text: kept(text) if len(text) <= KEPT_CHARACTERS else tokenize(text)

@@ -19,27 +19,27 @@ from typing import Any
 from vlagents_ray.policies.base.checkpoint import STEP, at_step
 from vlagents_ray.policies.base.checkpoint_files import METHOD, digest, files_in
 
-_PACKAGE = "vlagents_ray"  # its classes are identified by the version of this package, which the results have
+_PACKAGE = "vlagents_ray"  # its classes are identified by the version of this package, which results record
 _LIBRARIES = tuple(Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "platstdlib", "purelib", "platlib"))
 _SITES = {"site-packages", "dist-packages"}
-_LISTED = 32  # files of a folder that are named one by one; of a larger folder there is one digest
+_LISTED = 32  # largest number of files of a folder with their own digests; a larger folder has a single one
 _LONGEST = 4096  # characters of a path
 
 Program = dict[str, str]  # digest, or the version of an installed package, by name
 
 
 def code_of_class(target: str) -> Program:
-    """Return the digests of the module of "module:Class", and of all that it imports, directly or not.
+    """Return the digests of the module of "module:Class", and of all modules that it imports, directly or indirectly.
 
     Modules are found as Python's `import` would find them, but nothing is imported: import statements are read from the
-    source, those within functions included. Installed packages and the standard library do not count; a class in an
-    installed package is identified by the version of its distribution, one of this package by nothing.
+    source, including those within functions. Installed packages and the standard library do not count. A class in an
+    installed package is identified by the version of its distribution; a class of this package has no entry.
 
     Args:
         target: "module:Class" or "module".
 
     Returns:
-        `sha256:` and 64 digits for each file, by its path below the folder that Python imports it from.
+        `sha256:` and 64 digits for each file, by its path below the folder from which Python imports it.
     """
     module = target.partition(":")[0]
     top = module.partition(".")[0]
@@ -68,19 +68,19 @@ def code_of_class(target: str) -> Program:
     return found
 
 
-# Half a second, as it reads the list of files of each installed package; an evaluation looks for each of its envs.
+# Takes half a second, since it reads the list of files of each installed package, and runs for each env.
 _distributions = functools.cache(packages_distributions)
 
 
 loaded_code = functools.cache(code_of_class)
-"""`code_of_class` as it was at the first call in this process: later edits do not change the running code."""
+"""`code_of_class` with the result of the first call in this process: later edits do not change running code."""
 
 
 def files_named(settings: Mapping[str, Any], *, folders: bool = True) -> Program:
     """Return the digests of the files that settings name, by setting and path: "checkpoint: runs/a/w.npz".
 
     Args:
-        settings: Any text in them that is the path of an existing file or folder counts; `{step}` in it is replaced by
+        settings: Each text that is the path of an existing file or folder counts, with `{step}` replaced by
             the setting `checkpoint_step`.
         folders: Whether the files of folders count. A folder that holds the working directory never does.
     """
@@ -100,7 +100,7 @@ def files_named(settings: Mapping[str, Any], *, folders: bool = True) -> Program
 
 
 def digest_of(files: Program) -> str:
-    """Return one digest for all these files, whatever their paths are called on this machine."""
+    """Return one digest for all these files, independent of their paths on this machine."""
     parts = json.dumps(list(files.values())).encode()
     return f"{METHOD}:{hashlib.sha256(parts).hexdigest()}"
 
@@ -115,7 +115,7 @@ def with_defaults(cls: type[Any], settings: Mapping[str, Any]) -> dict[str, Any]
 
 
 def _file(name: str) -> Path | None:
-    """Return the file that `import name` would execute; None without one, or if it is installed."""
+    """Return the file that `import name` would execute; None if there is none, or if it is installed."""
     if name == "__main__":
         path = getattr(sys.modules[name], "__file__", None)
         return None if path is None else Path(path)
@@ -127,7 +127,7 @@ def _spec(name: str) -> ModuleSpec | None:
     parent, _, _ = name.rpartition(".")
     if not parent:
         try:
-            return find_spec(name)  # imports nothing, as the name has no parent
+            return find_spec(name)  # imports nothing, since the name has no parent
         except (ImportError, ValueError):  # a module without a spec
             return None
     above = _spec(parent)
@@ -139,17 +139,17 @@ def _spec(name: str) -> ModuleSpec | None:
 
 
 def _is_own(file: Path) -> bool:
-    """Return whether a file is in no installed package, nor in this one or the standard library."""
+    """Return whether a file is outside of installed packages, this package and the standard library."""
     path = file.resolve()
     here = Path(__file__).resolve().parents[2]
     return not _SITES & set(path.parts) and not any(path.is_relative_to(one) for one in (*_LIBRARIES, here))
 
 
 def _imports(source: bytes, package: str) -> Iterator[str]:
-    """Yield the full names of the modules that a source may import; `package` is the one that it is in."""
+    """Yield the full names of the modules that a source may import; `package` is the package of the source."""
     try:
         tree = ast.parse(source)
-    except (SyntaxError, ValueError):  # its import raises the same
+    except (SyntaxError, ValueError):  # importing it raises the same error
         return
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):

@@ -1,6 +1,6 @@
 """Scripted experts: small classes that solve simulated tasks without learning.
 
-`EXPERTS` maps an env's full name, or the suite alone, to "module:Class"; the full name wins. A
+`EXPERTS` maps the full name of an env, or of a suite, to "module:Class"; the full name has priority. A
 module is imported when the first of its experts is used. Experts for more simulators are in `examples/experts`.
 """
 

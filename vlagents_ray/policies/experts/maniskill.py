@@ -13,10 +13,10 @@ _CURE = "this expert is for the env's own robot, in the control mode pd_ee_delta
 
 
 class PushCube:
-    """Goes around and behind the cube, down to the table, and pushes it along x onto the target."""
+    """Moves around and behind the cube, down to the table, and pushes it along x onto the target."""
 
     _BEHIND_M = 0.12  # distance of the tool behind the cube before the push
-    _OVER_M = 0.15  # height of the tool on its way there, clear of the cube
+    _OVER_M = 0.15  # height of the tool on the way there, clear of the cube
     _LOW_M = 0.02  # height of the tool while pushing: the cube's middle
     _FAR_M = 0.28  # distance of the target from the centre of the table, along x
     _PLACED_M = 0.03  # distance of the cube from the target's centre; success needs 0.1
@@ -47,16 +47,16 @@ class PushCube:
         if self._phase == "down":
             return self._hand.move(tool, low, _CLOSED)
         if self._phase == "push":
-            # near the end of its reach the arm does not follow, so the cube has to slide the last centimetres
+            # near the end of its reach the arm lags behind, so the cube must slide the last centimetres
             speed = 0.8 if goal[0] > self._FAR_M else 0.5
             return self._hand.move(tool, np.array([goal[0], goal[1], self._LOW_M]), _CLOSED, limit=speed)
         return self._hand.move(tool, tool, _CLOSED)
 
 
 class PickCube:
-    """Goes over the cube, down, grasps it, moves it to the goal and holds it there."""
+    """Moves over the cube and down, grasps it, moves it to the goal and holds it there."""
 
-    _OVER_M = 0.08  # height of the tool over the cube before it goes down
+    _OVER_M = 0.08  # height of the tool over the cube before it descends
     _GRASP_STEPS = 3  # until the fingers hold the cube
     _GIVE_UP_STEPS = 8  # without contact on both fingers; then it tries again from above
 
@@ -97,7 +97,7 @@ class PickCube:
 class _Hand:
     """Converts remaining distances to actions, with shorter steps while the arm does not follow."""
 
-    _STUCK_M = 0.001  # the arm moved less than this, though a longer step was commanded
+    _STUCK_M = 0.001  # largest motion of an arm that counts as stuck after a longer command
 
     def __init__(self) -> None:
         self._at: np.ndarray | None = None  # (3,) m, position at the last step

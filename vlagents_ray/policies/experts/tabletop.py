@@ -1,7 +1,7 @@
-"""An expert for the tabletop from the camera image and the instruction alone.
+"""An expert for the tabletop that uses only the camera image, the gripper's proprioception and the instruction.
 
-Its knowledge is that of a calibrated robot cell: the pose of the camera (see `vlagents_ray.envs.tabletop`), the
-height of a puck, and the gripper's proprioception. It locates objects in the image.
+Like a calibrated robot cell, it knows the pose of the camera (see `vlagents_ray.envs.tabletop`) and the height of
+a puck. It locates objects in the image.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ _PUCK_HEIGHT = 0.03  # m
 _PUCK_REACH, _PAD_REACH = 0.034, 0.06  # m, largest distance of a puck's or a pad's pixels from its centre
 
 _TRAVEL_Z, _GRASP_Z = 0.10, 0.006  # m, of the fingertips
-_AWAY = (0.0, 0.20, 0.16)  # m, where the gripper does not occlude objects
-_ARRIVED = 0.003  # m
-_HOLDING = 0.4  # the opening of fingers that hold a puck is larger
+_AWAY = (0.0, 0.20, 0.16)  # m, a position in which the gripper occludes no objects
+_ARRIVED = 0.003  # m, tolerance of reached positions
+_HOLDING = 0.4  # fingers with a larger opening hold a puck
 _OPEN, _CLOSED = 1.0, -1.0
 
 _INSTRUCTIONS = {
@@ -46,8 +46,8 @@ class Waypoint:
     xyz: tuple[float, float, float]
     grip: float
     wait: int = 0
-    grasps: bool = False  # a puck must be held when this one is left
-    looks: bool = False  # at this waypoint it takes a new image and plans again
+    grasps: bool = False  # a puck must be held when this waypoint is left
+    looks: bool = False  # take a new image and plan again at this waypoint
 
 
 class TabletopExpert:
@@ -165,7 +165,7 @@ class _SeenObject:
         if np.count_nonzero(fits) < 3:
             raise InvalidObservation(f"tabletop expert: sees no {colour} {kind}; is this image the tabletop's 'front'?")
         u, v = self._u[fits], self._v[fits]
-        # the blurred edge of a puck looks like a pad: the median ignores such few pixels, the mean is finer
+        # the blurred edge of a puck looks like a pad: the median ignores these few pixels, the mean is more precise
         near = np.hypot(u - np.median(u), v - np.median(v)) < reach * self._scale
         x = (float(u[near].mean()) - self._centre[0]) / self._scale
         y = ((self._centre[1] - float(v[near].mean())) / self._scale - z * _DEEP) / _UP

@@ -21,9 +21,9 @@ from vlagents_ray.policies.lerobot.processors import PIPELINES, require_known_st
 from vlagents_ray.registry import require
 
 WEIGHTS = "model.safetensors"
-TRAINED = "pretrained_model"  # LeRobot's folder of the checkpoint within that of a training step
-_PATCHED = {"pi0", "pi05", "pi0_fast"}  # they need openpi's changes to transformers, in LeRobot 0.4
-_CHECK = "transformers.models.siglip.check"  # a module that these changes add
+TRAINED = "pretrained_model"  # LeRobot's checkpoint folder within the folder of a training step
+_PATCHED = {"pi0", "pi05", "pi0_fast"}  # types that need openpi's changes to transformers in LeRobot 0.4
+_CHECK = "transformers.models.siglip.check"  # a module added by these changes
 
 
 def find(config: LeRobotConfig) -> Path:
@@ -52,7 +52,7 @@ def load(folder: Path, config: LeRobotConfig, device: Any) -> Any:
     factory = require("lerobot.policies.factory")
     require_served(str(_config(folder / "config.json").get("type", "")), folder)
     settings = _settings(folder, config)
-    settings.pretrained_path = folder  # as LeRobot's factory does; without it EO-1 loads its backbone from the hub
+    settings.pretrained_path = folder  # as in LeRobot's factory; without it EO-1 loads its backbone from the hub
     as_saved = _prepare(settings, config, device)
     try:
         saved = SavedTensors.of(folder / WEIGHTS)
@@ -75,7 +75,7 @@ def load(folder: Path, config: LeRobotConfig, device: Any) -> Any:
 
 
 def _settings(folder: Path, config: LeRobotConfig) -> Any:
-    """Read the checkpoint's config.json, with `overrides`, as LeRobot's object."""
+    """Read the checkpoint's config.json, with `overrides`, as LeRobot's config object."""
     base = require("lerobot.configs.policies").PreTrainedConfig
     require("lerobot.utils.import_utils").register_third_party_plugins()
     try:
@@ -97,7 +97,7 @@ def _settings(folder: Path, config: LeRobotConfig) -> Any:
 
 
 def require_served(name: str, folder: Path) -> None:
-    """Raise `ConfigError` unless this environment can load LeRobot's policy of that type, saved in `folder`."""
+    """Raise `ConfigError` unless this environment can load LeRobot's policies of type `name`, saved in `folder`."""
     if reason := refusal(name):
         raise ConfigError(f"checkpoint {folder}: is a {name!r}, which is not served here: {reason}")
     if name in _PATCHED and not is_new():
@@ -113,7 +113,7 @@ def require_served(name: str, folder: Path) -> None:
 
 
 def _prepare(settings: Any, config: LeRobotConfig, device: Any) -> bool:
-    """Set the device and types of the policy; returns whether its parameters keep their saved types."""
+    """Set the device and types of the policy; return whether its parameters keep their saved types."""
     if settings.use_peft:
         raise ConfigError(
             "checkpoint: is a PEFT adapter, want whole weights; merge it (merge_and_unload) and save that, or "
@@ -121,8 +121,8 @@ def _prepare(settings: Any, config: LeRobotConfig, device: Any) -> bool:
         )
     settings.device = str(device)
     if hasattr(settings, "pretrained_backbone_weights"):
-        settings.pretrained_backbone_weights = None  # they would be downloaded, only to be replaced
-    if issubclass(KINDS.get(settings.type, object), (Diffusion, Flow)):  # which `compile` compiles
+        settings.pretrained_backbone_weights = None  # would be downloaded, only to be replaced
+    if issubclass(KINDS.get(settings.type, object), (Diffusion, Flow)):  # types that `compile` supports
         if config.overrides.get("compile_model"):
             raise ConfigError("overrides: got compile_model, want `compile: true` in its place, which is checked")
         settings.compile_model = False
@@ -135,15 +135,15 @@ def _prepare(settings: Any, config: LeRobotConfig, device: Any) -> bool:
     if hasattr(settings, "dtype") and config.dtype != "auto":
         settings.dtype = config.dtype
     if config.dtype == "float32" and hasattr(settings, "use_bf16"):
-        settings.use_bf16 = False  # GR00T would compute in bfloat16 all the same
+        settings.use_bf16 = False  # GR00T would otherwise still compute in bfloat16
     as_saved = bool(getattr(settings, "load_vlm_weights", False))
     if as_saved:
-        settings.load_vlm_weights = False  # they would be downloaded in bfloat16, only to be replaced
+        settings.load_vlm_weights = False  # would be downloaded in bfloat16, only to be replaced
     return as_saved
 
 
 def _said(error: BaseException | None) -> str:
-    """Return an error with those that it followed from, such as that of a config's own check."""
+    """Return the text of an error and of its causes, such as that of a config's own check."""
     said = []
     while error is not None:
         said.append(f"{type(error).__name__}: {error}")
@@ -152,7 +152,7 @@ def _said(error: BaseException | None) -> str:
 
 
 def _require_no_nvidia(file: Path) -> None:
-    """Raise `ConfigError` for a checkpoint of NVIDIA's own GR00T code, which LeRobot takes only as a base."""
+    """Raise `ConfigError` for a checkpoint of NVIDIA's own GR00T code, which LeRobot accepts only as a base."""
     if file.is_file() and "gr00t" in str(_config(file).get("model_type", "")).lower():
         raise ConfigError(
             f"checkpoint {file.parent}: is one of NVIDIA's own GR00T code, want one that LeRobot saved; serve it by "
@@ -162,7 +162,7 @@ def _require_no_nvidia(file: Path) -> None:
 
 
 def _config(file: Path) -> Mapping[str, Any]:
-    """Read a config.json, which need not be LeRobot's."""
+    """Read a config.json, which may be of another library."""
     try:
         found = json.loads(file.read_text(encoding="utf-8"))
     except ValueError as error:
@@ -171,10 +171,10 @@ def _config(file: Path) -> Mapping[str, Any]:
 
 
 def _as_loaded(policy: Any, saved: SavedTensors) -> SavedTensors | Mapping[str, Any]:
-    """Return the saved tensors by LeRobot's own names, as checkpoints of openpi and of LeRobot 0.4 have older ones."""
+    """Return the saved tensors by LeRobot's current names; checkpoints of openpi and LeRobot 0.4 have older names."""
     module = sys.modules[type(policy).__module__]
     names = list(saved)
-    older = getattr(module, "_is_vendored_florence_state_dict", None)  # X-VLA's, in LeRobot 0.6
+    older = getattr(module, "_is_vendored_florence_state_dict", None)  # of X-VLA in LeRobot 0.6
     if older is not None and older(dict.fromkeys(names)):
         renamed: Mapping[str, Any] = module._remap_vendored_florence_state_dict({name: saved[name] for name in names})
         return renamed
@@ -184,7 +184,7 @@ def _as_loaded(policy: Any, saved: SavedTensors) -> SavedTensors | Mapping[str, 
 
 
 def _renamed(policy: Any, name: str) -> list[str]:
-    """Return LeRobot's names of a saved tensor; none if it leaves it out."""
+    """Return LeRobot's names of a saved tensor; empty if it drops the tensor."""
     fix = getattr(policy, "_fix_pytorch_state_dict_keys", None)
     if fix is None:
         return [name]

@@ -1,4 +1,4 @@
-"""Settings of LeRobot policies, beside those in the checkpoint."""
+"""Settings of LeRobot policies, in addition to those in the checkpoint."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from vlagents_ray.policies.base.config import NoiseLevel
 class LeRobotConfig(ModelConfig):
     """A folder or hub id with `config.json`, `model.safetensors` and LeRobot's two processor pipelines.
 
-    The defaults of `actions`, `execute` and `ensemble_m` are the checkpoint's: its temporal ensemble, its
-    `n_action_steps`, a queue if it needs several observations. So is `dtype: auto`.
+    The defaults of `actions`, `execute` and `ensemble_m` come from the checkpoint: its temporal ensemble, its
+    `n_action_steps`, or a queue if it needs several observations. `dtype: auto` also selects the checkpoint's type.
     """
 
     overrides: dict[str, Any] = Field(
@@ -76,7 +76,7 @@ def is_new() -> bool:
 
 
 def refusal(name: str) -> str | None:
-    """Return why LeRobot's policies of that type are not served in this environment; None if they are."""
+    """Return why LeRobot's policies of that type cannot be served in this environment; None if they can."""
     ours = "0.6.1" if is_new() else "0.4.4"
     if reason := _REWARDS.get(name) or _REFUSED[ours].get(name):
         return reason
@@ -93,6 +93,6 @@ def reads(version: str) -> str:
 
 
 def other_version() -> str:
-    """Return the cure if a checkpoint is of the other version of LeRobot."""
+    """Return the cure for a checkpoint of the other version of LeRobot."""
     other = "0.4.4" if is_new() else "0.6.1"
     return f"the LeRobot here is {installed()}; if it was written by another, {reads(other)}"

@@ -1,7 +1,7 @@
-"""The types of LeRobot's policies, and how each one computes the chunks of many sessions.
+"""The types of LeRobot's policies, and how each computes the chunks of many sessions.
 
-LeRobot's `select_action` keeps observations, actions and plans in the policy object, for one robot. The classes here
-use its functions without state, and pass them the state of each session.
+LeRobot's `select_action` stores observations, actions and plans in the policy object, for one robot. The classes here
+call its stateless functions, and pass them the state of each session.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ FRAMES = (
 
 
 class Kind:
-    """The default for any type: one row at a time with a seed of its session, which is slow and exact."""
+    """The default for any type: one row at a time with a seed from its session, which is slow but exact."""
 
     batched = False
-    random: RandomSteps | None = None  # of the last chunks that were drawn
+    random: RandomSteps | None = None  # of the last sampled chunks
 
     def __init__(self, policy: Any, compilation: Compilation) -> None:
-        """Use a loaded policy, and mark its cores for compilation if its type has any."""
+        """Use a loaded policy, and mark its core functions for compilation if its type has any."""
         self.policy, self.config = policy, policy.config
         if type(self) is Kind and self.steps > 1:
             raise ConfigError(
@@ -46,12 +46,12 @@ class Kind:
 
     @property
     def steps(self) -> int:
-        """The number of observations that the policy gets."""
+        """The number of observations that the policy reads."""
         return int(self.config.n_obs_steps)
 
     @property
     def horizon(self) -> int:
-        """The number of rows of a chunk, from the current tick on."""
+        """The number of rows of a chunk, counted from the current tick."""
         return int(getattr(self.config, "chunk_size", 0) or self.config.n_action_steps)
 
     @property
@@ -61,7 +61,7 @@ class Kind:
 
     @property
     def usual(self) -> int:
-        """The number of rows that the policy executes before the next inference, by its config."""
+        """The number of rows that the policy executes before the next inference, from its config."""
         return min(int(getattr(self.config, "n_action_steps", self.horizon)), self.horizon)
 
     def observations(self, rows: Sequence[Row]) -> list[int]:
@@ -160,7 +160,7 @@ class MultiTaskDit(Kind):
 
         seen = stacked(batch, self.config, len(rows))
         for name in _TOKENS:
-            seen[name] = batch[name].unflatten(0, (len(rows), -1))[:, -1]  # the same for each step of a history
+            seen[name] = batch[name].unflatten(0, (len(rows), -1))[:, -1]  # the same in each step of a history
         condition = self.policy.observation_encoder.encode(seen)
         with RowDraws([row.rng for row in rows]):
             actions = self.policy.objective.conditional_sample(self.policy.noise_predictor, len(rows), condition)
@@ -181,7 +181,7 @@ class Flow(Kind):
             self.passes: FlowPasses = SmolVLAPasses(model, compilation)
         else:
             self.passes = Pi0Passes(model, compilation, stated=policy.name == "pi0")
-        # The policy calls it between its own preparation of inputs and actions.
+        # The policy calls it after preparing the inputs and before converting the actions.
         model.sample_actions = self.passes.sample
 
     @property
@@ -200,7 +200,9 @@ class Flow(Kind):
         def convert(array: np.ndarray) -> Any:
             return torch.from_numpy(array).to(self.config.device)
 
-        noise = convert(np.stack([row.noise(*shape) for row in rows]))  # before the steps', which only some rows draw
+        noise = convert(
+            np.stack([row.noise(*shape) for row in rows])
+        )  # before that of the steps, which only some rows draw
         self.random = RandomSteps.of(rows, (self.flow_steps, *shape), self.noise_level, convert)
         changes: list[Change] = []
         if any(left is not None for left in leftovers):
@@ -218,8 +220,8 @@ class Flow(Kind):
         )
 
     def _shared(self, rows: Sequence[Row]) -> tuple[list[int], list[int]]:
-        """Return the rows whose observations are read, and the place among these of that of each row."""
-        if getattr(self.config, "use_relative_actions", False):  # the state of each row is added to its actions
+        """Return the rows whose observations are read, and for each row the index of its observations among them."""
+        if getattr(self.config, "use_relative_actions", False):  # each row's state is added to its actions
             return list(range(len(rows))), list(range(len(rows)))
         return shared_frames(rows)
 
@@ -231,17 +233,17 @@ class Flow(Kind):
 
 
 class Guidance:
-    """Guides chunks as the `RTCProcessor` of a flow-matching policy of LeRobot does, whose settings it has."""
+    """Guides chunks like the `RTCProcessor` of a LeRobot flow-matching policy, with the settings of that processor."""
 
     def __init__(self, processor: Any) -> None:
-        self._processor = processor  # its settings and schedule are used
+        self._processor = processor  # supplies settings and schedule
 
     def towards(self, plans: Sequence[Any], delays: Sequence[int], shape: tuple[int, int], device: Any) -> Change:
         """Return the change of velocities that leads chunks to the leftovers of their sessions.
 
         Args:
             plans: The leftover of each of the B rows in the policy's units, (H', D'), or None.
-            delays: The number of rows of each that will have been executed.
+            delays: For each row, the number of actions that will have been executed.
             shape: Rows and numbers of a chunk, (H, D).
             device: The policy's device.
         """
@@ -266,7 +268,7 @@ class Guidance:
         return self._processor.get_prefix_weights(max(delay, 0), horizon, chunk)
 
     def _strength(self, time: float) -> float:
-        """Return g for LeRobot's time, which runs from 1 (noise) to 0."""
+        """Return the guidance strength g for LeRobot's time, which runs from 1 (noise) to 0."""
         most = float(self._processor.rtc_config.max_guidance_weight)
         done = 1 - time
         return most if done == 0 else min(most, time / done * (time**2 + done**2) / time**2)
@@ -276,17 +278,17 @@ class SmolVLAPasses(FlowPasses):
     """The passes of SmolVLA, whose images are encoded from their patches."""
 
     def __init__(self, model: Any, compilation: Compilation) -> None:
-        """Use the passes of a `VLAFlowMatching`, which from here on also takes patches in place of images."""
+        """Use the passes of a `VLAFlowMatching`, which then also accepts patches in place of images."""
         super().__init__(model, compilation)
         self._vlm = model.vlm_with_expert.get_vlm_model()
-        # LeRobot 0.4 keeps keys and values by name, (B, L, heads, D), later ones in a cache of transformers.
+        # LeRobot 0.4 stores keys and values by name, (B, L, heads, D); later versions in a cache of transformers.
         self._by_name = "fill_kv_cache" in inspect.signature(model.vlm_with_expert.forward).parameters
-        self._positions: dict[tuple[int, int], Any] = {}  # of the patches of an image, (L,), by its height and width
+        self._positions: dict[tuple[int, int], Any] = {}  # of an image's patches, (L,), by its height and width
         self._embed_image = model.vlm_with_expert.embed_image
         model.vlm_with_expert.embed_image = self._embed
 
     def encode_images(self, images: Sequence[Any]) -> list[Any]:
-        """Return the patches of images (P, 3, H, W) in the vision model's terms, (P, L, E)."""
+        """Return the patches of images (P, 3, H, W) in the format of the vision model, (P, L, E)."""
         vision = self._vlm.vision_model
         places = vision.embeddings.position_embedding
         found = []
@@ -296,7 +298,7 @@ class SmolVLAPasses(FlowPasses):
         return found
 
     def encode(self, tokens: Any, mask: Any, cameras: Any, state: Any, *patches: Any) -> tuple[Any, Any]:
-        import torch  # the compiler follows a statement, and not `require`
+        import torch  # the compiler follows an import statement, but not `require`
 
         embedded, seen, causal = self.model.embed_prefix(patches, cameras.unbind(1), tokens, mask, state=state)
         _, cache = self.model.vlm_with_expert.forward(
@@ -321,7 +323,7 @@ class SmolVLAPasses(FlowPasses):
         return self.model.denoise_step(prefix_pad_masks=seen.bool(), past_key_values=cache, x_t=actions, timestep=times)
 
     def _embed(self, patches: Any) -> Any:
-        if patches.ndim == 4:  # an image, of LeRobot's own training pass
+        if patches.ndim == 4:  # an image, in LeRobot's own training pass
             return self._embed_image(patches)
         vision = self._vlm.vision_model
         hidden = vision.encoder(inputs_embeds=patches, attention_mask=None).last_hidden_state
@@ -334,7 +336,7 @@ class SmolVLAPasses(FlowPasses):
             torch, vision = require("torch"), self._vlm.vision_model
             found: list[Any] = []
             hook = vision.embeddings.position_embedding.register_forward_pre_hook(lambda _, given: found.extend(given))
-            with hook, self.adapters.rows(()):  # this image is of no row
+            with hook, self.adapters.rows(()):  # the image belongs to no row
                 patches = [length // vision.patch_size for length in size]
                 vision.embeddings(
                     image[:1].to(vision.dtype), torch.ones(1, *patches, dtype=torch.bool, device=image.device)
@@ -344,14 +346,14 @@ class SmolVLAPasses(FlowPasses):
 
 
 STATE, ACTION = "observation.state", "action"
-_BOUNDS = ("min", "max")  # to which states and actions are scaled
+_BOUNDS = ("min", "max")  # statistics that scale states and actions
 
 
 class Groot(Kind):
-    """GR00T N1.7: flow matching, whose noise is drawn for each session.
+    """GR00T N1.7: flow matching from noise drawn for each session.
 
-    The layers over its language model do not mask padding, so that only observations with prompts of one length, in
-    tokens, share a pass.
+    The layers above its language model do not mask padding, so only observations whose prompts have the same number of
+    tokens share a pass.
     """
 
     batched = True
@@ -386,7 +388,7 @@ class Groot(Kind):
 def _part(batch: Mapping[str, Any], places: Sequence[int], length: int, rows: int) -> dict[str, Any]:
     """Return the inputs of some rows, whose prompts have `length` tokens, without the padding before them."""
     grid = batch["image_grid_thw"]
-    patches = batch["pixel_values"].split(grid.prod(1).tolist())  # of each image
+    patches = batch["pixel_values"].split(grid.prod(1).tolist())  # one for each image
     views = len(grid) // rows
     images = [place * views + view for place in places for view in range(views)]
     padded = batch["input_ids"].shape
@@ -399,7 +401,7 @@ def _part(batch: Mapping[str, Any], places: Sequence[int], length: int, rows: in
 
 
 def require_groot_statistics(before: Sequence[Any], after: Sequence[Any], settings: Any) -> None:
-    """Raise `ConfigError` unless GR00T's processors have usable bounds, for which LeRobot takes 0 and 1 if missing."""
+    """Raise `ConfigError` unless GR00T's processors have usable bounds; LeRobot replaces missing ones by 0 and 1."""
     torch = require("torch")
     pack, decode = _step(before, "embodiment_tag"), _step(after, "env_action_dim")
     if pack is None or decode is None:
@@ -426,7 +428,7 @@ def require_groot_statistics(before: Sequence[Any], after: Sequence[Any], settin
 
 
 def groot_dataset(before: Sequence[Any]) -> DatasetContract | None:
-    """Return the parts of the state that a checkpoint of NVIDIA's names; None if it names none that have a meaning."""
+    """Return the parts of the state that NVIDIA's checkpoint names; None if no name has a meaning."""
     pack = _step(before, "embodiment_tag")
     names = ((getattr(pack, "modality_config", None) or {}).get("state") or {}).get("modality_keys") or ()
     stats = (getattr(pack, "raw_stats", None) or {}).get("state") or {}
@@ -462,7 +464,7 @@ class ActPolicy(Kind):
 
 
 class Fast(Kind):
-    """π0-FAST, which decodes tokens only for the rows that are executed."""
+    """π0-FAST, which decodes only the tokens of rows that are executed."""
 
     @property
     def horizon(self) -> int:
@@ -470,7 +472,7 @@ class Fast(Kind):
 
 
 class Evo1(Kind):
-    """EVO-1, whose post-processor takes away what its actions are padded with."""
+    """EVO-1, whose post-processor removes the padding of actions."""
 
     @property
     def dim(self) -> int:
@@ -478,7 +480,7 @@ class Evo1(Kind):
 
 
 class XVla(Kind):
-    """X-VLA, which draws its noise itself and masks no padding, so that a batch needs instructions of one length."""
+    """X-VLA, which draws its noise itself and does not mask padding, so a batch needs instructions of one length."""
 
     @property
     def batched(self) -> bool:  # type: ignore[override]
@@ -503,7 +505,7 @@ class XVla(Kind):
 
 
 class VqBet(Kind):
-    """VQ-BeT, which samples the codes of its residual VQ; checkpoints of its first training phase have none."""
+    """VQ-BeT, which samples the codes of its residual VQ; checkpoints of its first training phase have no codes."""
 
     batched = True
 
@@ -524,7 +526,7 @@ class VqBet(Kind):
 
 
 class Tdmpc(Kind):
-    """TD-MPC, whose random trajectories and Q functions are shared by a batch, so that it runs one row at a time.
+    """TD-MPC, which runs one row at a time, since the rows of a batch would share random trajectories and Q functions.
 
     The plan of a session's last tick, from which the next one starts, is in `row.memory`.
     """
@@ -563,7 +565,7 @@ class Single(Kind):
         return self.policy.select_action(batch)[:, None]
 
 
-RESIZING = {"groot", "smolvla", "pi0", "pi05", "pi0_fast", "wall_x"}  # they resize images themselves
+RESIZING = {"groot", "smolvla", "pi0", "pi05", "pi0_fast", "wall_x"}  # types that resize images themselves
 MASKING = {"smolvla", "pi0", "pi05", "pi0_fast", "xvla"}
 
 KINDS: Mapping[str, type[Kind]] = {

@@ -41,15 +41,15 @@ from vlagents_ray.registry import require
 log = logging.getLogger(__name__)
 
 ENVIRONMENT = "observation.environment_state"
-JOINTS, ENVIRONMENT_STATE = "joints", "environment_state"  # parts of `Obs.state` that make these, if nothing is known
-_MATCHED = ("min", "max", "mean")  # statistics by which the parts of a state are found in it
+JOINTS, ENVIRONMENT_STATE = "joints", "environment_state"  # default parts of `Obs.state`
+_MATCHED = ("min", "max", "mean")  # statistics by which the parts of a state are located in it
 _FLOWS = sorted(name for name in KINDS if issubclass(KINDS[name], Flow))
 _EMPTY = "empty_camera_"  # prefix of cameras that were always masked in training
 
 
 @dataclass(frozen=True, slots=True)
 class LoadedLeRobot:
-    """A loaded checkpoint, which all sessions share."""
+    """A loaded checkpoint, shared by all sessions."""
 
     kind: Kind
     processors: Processors
@@ -57,13 +57,13 @@ class LoadedLeRobot:
     state: list[str]  # parts of the proprioception; empty if the policy has no state
     environment: list[str]  # parts of the environment's state; empty if the policy has none
     contract: Contract
-    trained: DatasetContract  # of the dataset; empty if it stated none
-    renames: dict[str, str]  # of the dataset's cameras, to the policy's observation keys
+    trained: DatasetContract  # of the dataset; empty if the dataset states none
+    renames: dict[str, str]  # from the dataset's cameras to the policy's observation keys
     own: dict[str, Processors] = field(default_factory=dict)  # of adapters that were trained with other statistics
 
 
 class LeRobot(ModelPolicy):
-    """A policy that the LeRobot of this environment loads, by the `type` in its checkpoint."""
+    """A policy that the environment's LeRobot loads, selected by the `type` in its checkpoint."""
 
     Config: ClassVar[type] = LeRobotConfig
     trainable = network = "model.kind.policy"
@@ -91,7 +91,7 @@ class LeRobot(ModelPolicy):
 
     @property
     def environment_dim(self) -> int | None:
-        """The length of the environment's state; None if the policy has none."""
+        """The length of the environment's state; None if the policy reads none."""
         feature = None if self.model is None else self.model.kind.config.env_state_feature
         return None if feature is None else int(feature.shape[0])
 
@@ -150,9 +150,10 @@ class LeRobot(ModelPolicy):
         return LoadedLeRobot(kind, processors, cameras, parts, environment, contract, trained, renames)
 
     def adapt(self, adapter: str, folder: Path) -> None:
-        """Keep the processors beside an adapter, if there are any, for the state and the actions of its rows.
+        """Keep the processors saved with an adapter, if any, for the state and the actions of its rows.
 
-        A base that does not describe its dataset, such as one of many robots, gets the contract of the adapter's.
+        A base that does not describe its dataset, such as one of many robots, gets the contract of the adapter's
+        dataset.
         """
         model: LoadedLeRobot = self.model
         own = own_processors(folder, model.kind.config, self.config, model.processors)
@@ -188,7 +189,7 @@ class LeRobot(ModelPolicy):
             except Exception as error:
                 if self.model.kind.batched:
                     raise
-                drawn.append(error)  # of that session alone
+                drawn.append(error)  # fails only that session
             predictions |= zip(members, drawn, strict=True)
         return [predictions[i] for i in range(len(rows))]
 
@@ -230,9 +231,9 @@ def _with_defaults(config: LeRobotConfig, kind: Kind) -> LeRobotConfig:
     """Return the settings, with the checkpoint's values as defaults."""
     coefficient = getattr(kind.config, "temporal_ensemble_coeff", None)
     defaults: dict[str, Any] = {} if config.actions == "ensemble" else {"execute": kind.usual}
-    if kind.steps > 1:  # trained on consecutive frames, so it needs those within a chunk as well
+    if kind.steps > 1:  # trained on consecutive frames, so it also needs those within a chunk
         defaults["actions"] = "queue"
-    if coefficient is not None:  # its n_action_steps is 1, as LeRobot then runs it at every tick
+    if coefficient is not None:  # its n_action_steps is 1, since LeRobot then runs it at every tick
         defaults = {"actions": "ensemble", "ensemble_m": coefficient, "execute": None}
     if (config.execute or 0) > kind.horizon:
         raise ConfigError(
@@ -261,8 +262,9 @@ def _trained(settings: Any, processors: Processors) -> DatasetContract:
 def _of_features(features: Iterable[str], processors: Processors) -> DatasetContract:
     """Infer the parts of the state, and its angles, from features and their statistics.
 
-    Copies that LeRobot's tools make without some episodes have no contract. The parts are features
-    beside `observation.state`; a comparison of their statistics with its own gives their order.
+    Copies that LeRobot's tools make without some episodes have no contract. The parts are the features
+    other than `observation.state`; their order follows from comparing their statistics with those of
+    `observation.state`.
     """
     keys = {key.removeprefix(f"{STATE}."): key for key in features if key.startswith(f"{STATE}.")}
     if f"observation.{GRIPPER}" in features:

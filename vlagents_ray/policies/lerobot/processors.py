@@ -25,11 +25,11 @@ _NAME = "tokenizer_name"  # a hub id, or a folder of the trainer's
 _DEVICE, _RENAME, _TOKENIZER = "device_processor", "rename_observations_processor", "tokenizer_processor"
 _GROOT_TOKENIZER = "groot_n1_7_vlm_encode_v1"
 _NORMALIZERS = ("normalizer_processor", "unnormalizer_processor")
-_ABSOLUTE = "AbsoluteActionsProcessorStep"  # of LeRobot 0.6: it adds the state to actions that are relative to it
+_ABSOLUTE = "AbsoluteActionsProcessorStep"  # of LeRobot 0.6: adds the state to relative actions
 _STATE_IN_PROMPT = ("pi05", "pi0_fast")  # their prompts differ at each act
-_TOKENIZING = ("eo1", "evo1", "fastwam", "molmoact2", "vla_jepa", "wall_x")  # types with a tokenizer in no such step
+_TOKENIZING = ("eo1", "evo1", "fastwam", "molmoact2", "vla_jepa", "wall_x")  # types that tokenize elsewhere
 _CONFIG = "config.json"
-# Settings of a policy, beside its cameras, that make another model of the same weights.
+# Settings of a policy, apart from its cameras, that change the network for the same weights.
 _NETWORK = (
     *("type", "n_obs_steps", "chunk_size", "empty_cameras", "tokenizer_max_length", "image_resolution"),
     *("resize_imgs_with_padding", "adapt_to_pi_aloha", "use_delta_joint_actions_aloha", "add_image_special_tokens"),
@@ -52,8 +52,8 @@ class Processors:
         unknown = sorted(set(config.processors) - set().union(*saved))
         if unknown:
             raise ConfigError(f"processors: got {unknown}, the checkpoint has {[sorted(steps) for steps in saved]}")
-        self.steps = [list(steps) for steps in saved]  # the registered names, of both pipelines
-        self.step_settings = {  # of those steps that do not depend on the dataset and the machine
+        self.steps = [list(steps) for steps in saved]  # the registered names, for both pipelines
+        self.step_settings = {  # without steps that depend on the dataset or the machine
             name: {key: value for key, value in step.items() if key not in (_NAME, *config.processors.get(name, ()))}
             for steps in saved
             for name, step in steps.items()
@@ -71,7 +71,7 @@ class Processors:
                 preprocessor_overrides={name: value for name, value in overrides.items() if name in saved[0]},
                 postprocessor_overrides={name: value for name, value in config.processors.items() if name in saved[1]},
             )
-            for step in self._before.steps:  # GR00T's loads its tokenizer when it is first used
+            for step in self._before.steps:  # GR00T's loads its tokenizer on first use
                 getattr(step, "proc", None)
         except Exception as error:
             raise ConfigError(
@@ -84,8 +84,8 @@ class Processors:
             self._keep_tokens()
         self._groot = settings.type == "groot"
         absolute = [step for step in self._after.steps if type(step).__name__ == _ABSOLUTE and step.enabled]
-        self._relative = absolute[0].relative_step if absolute else None  # it holds the states of the last batch
-        self.whole = self._groot or bool(absolute)  # whether actions are converted by chunks, and not row by row
+        self._relative = absolute[0].relative_step if absolute else None  # holds the states of the last batch
+        self.whole = self._groot or bool(absolute)  # whether actions are converted by whole chunks instead of rows
         self._back = self._inverse()
 
     def statistics(self, key: str) -> dict[str, list[float]]:
@@ -97,7 +97,7 @@ class Processors:
         return {}
 
     def normalises(self, feature: Any) -> bool:
-        """Return whether the pre-processor changes numbers of that feature by their statistics."""
+        """Return whether the pre-processor normalises that feature by its statistics."""
         maps = [step.norm_map for step in self._before.steps if hasattr(step, "norm_map")]
         return any(getattr(one.get(feature.type), "name", "IDENTITY") != "IDENTITY" for one in maps)
 
@@ -107,7 +107,7 @@ class Processors:
         return groot_dataset(self._before.steps) if numbers is None else DatasetContract.from_statistics(numbers)
 
     def require_statistics(self, settings: Any, inputs: Sequence[str]) -> None:
-        """Raise `ConfigError` unless all `inputs`, and the actions, have their statistics."""
+        """Raise `ConfigError` unless there are statistics for all `inputs` and the actions."""
         if self._groot:
             require_groot_statistics(self._before.steps, self._after.steps, settings)
             return
@@ -159,7 +159,7 @@ class Processors:
         if self._back is None or row.leftover is None:
             return None
         rows = require("torch").from_numpy(row.leftover)
-        if self._relative is not None:  # to the state in which the chunk that is drawn begins
+        if self._relative is not None:  # relative to the state in which the sampled chunk begins
             state = require("torch").from_numpy(row.frames[-1][STATE])
             mask = self._relative._build_mask(rows.shape[-1])
             rows = require("lerobot.processor").to_relative_actions(rows, state[None], mask)
@@ -170,7 +170,7 @@ class Processors:
         return dim if self.whole else int(self._after(require("torch").zeros(1, dim)).shape[-1])
 
     def _keep_tokens(self) -> None:
-        """Have the tokens of instructions kept, where they do not depend on the others of a batch."""
+        """Cache the tokens of instructions, if they do not depend on the other rows of a batch."""
         for step in self._before.steps:
             if type(step) is require("lerobot.processor").TokenizerProcessorStep and step.padding == "max_length":
                 step._tokenize_text = cached_tokenizer(
@@ -201,7 +201,7 @@ class Processors:
 
 
 def own_processors(folder: Path, settings: Any, config: LeRobotConfig, base: Processors) -> Processors | None:
-    """Return the processors beside an adapter, whose dataset may have had other statistics than the base's.
+    """Return the processors saved with an adapter, whose dataset may have other statistics than the base's.
 
     Args:
         folder: The adapter's folder.
@@ -248,7 +248,7 @@ def own_processors(folder: Path, settings: Any, config: LeRobotConfig, base: Pro
 
 
 def _require_same_network(file: Path, settings: Any, config: LeRobotConfig) -> None:
-    """Raise `ConfigError` if the policy's config beside an adapter has cameras or passes other than the base's."""
+    """Raise `ConfigError` if the policy's config in the adapter's folder has cameras or passes unlike the base's."""
     if not file.is_file():
         return
     try:
@@ -304,12 +304,13 @@ def _saved_steps(file: Path) -> dict[str, Mapping[str, Any]]:
 
 
 def cached_tokenizer(tokenizer: Any, **settings: Any) -> Callable[[list[str]], dict[str, Any]]:
-    """Return a function from texts to the tensors (B, L) of a tokenizer of transformers, which keeps their rows.
+    """Return a cached function from texts to a tokenizer's tensors (B, L).
 
-    All texts are padded to one length: a row that is padded to the longest text of its batch depends on the others.
+    All texts are padded to one length; otherwise a row, padded to the longest text of its batch, would depend on
+    the other rows.
 
     Args:
-        tokenizer: The tokenizer.
+        tokenizer: A tokenizer of transformers.
         settings: Further arguments of its calls, such as `max_length`.
     """
 

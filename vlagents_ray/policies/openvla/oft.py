@@ -41,13 +41,13 @@ from vlagents_ray.policies.openvla.prismatic import (
 from vlagents_ray.registry import require
 
 _PRIMARY = "full_image"
-_CAMERAS = (_PRIMARY, "wrist_image", "left_wrist_image", "right_wrist_image")  # in their order in training
+_CAMERAS = (_PRIMARY, "wrist_image", "left_wrist_image", "right_wrist_image")  # in the order of training
 _USUAL = {_PRIMARY: "front", "wrist_image": "wrist"}  # of LIBERO
 _STATE = ("xyz_axis_angle", "gripper_qpos")  # of LIBERO, 6 and 2 numbers
 
 
 class OpenVLAOFTConfig(PrismaticConfig):
-    """Settings of OpenVLA-OFT; they must state how a checkpoint was trained, as its files do not."""
+    """Settings of OpenVLA-OFT; they must state how a checkpoint was trained, since its files do not."""
 
     attention: Literal["sdpa", "eager"] = Field(default="sdpa", description="of the language model; has no causal mask")
     center_crop: bool = Field(default=True, description="trained with random crops (upstream's `image_aug`)")
@@ -70,7 +70,7 @@ class OpenVLAOFTConfig(PrismaticConfig):
 
 
 class OpenVLAOFT(PrismaticPolicy):
-    """The policy, which returns a chunk for each `act`."""
+    """The policy OpenVLA-OFT, which returns a chunk for each `act`."""
 
     Config = OpenVLAOFTConfig
     config: OpenVLAOFTConfig
@@ -99,11 +99,11 @@ class OpenVLAOFT(PrismaticPolicy):
 
     @property
     def state_dim(self) -> int | None:
-        """The length of the state vector, which is the projector's; None if there is none, or before it is loaded."""
+        """The length of the state vector, as read by the projector; None before loading, or without a projector."""
         return None if self.model is None or self.model.proprio is None else self.model.proprio.dim
 
     def load(self) -> Parallel:
-        """Read the checkpoint and its components; raises `ConfigError` for a missing one, and for an unused one."""
+        """Read the checkpoint and its components; raises `ConfigError` if one is missing or unused."""
         config = self.config
         base = load_prismatic(config, config.bounds)
         place = {"device": base.device, "dtype": base.dtype}
@@ -158,7 +158,7 @@ class OpenVLAOFT(PrismaticPolicy):
         return ModelInput(seen, base.tokens(row.instruction), proprio)
 
     def _compute(self, prepared: Sequence[PreparedRow]) -> list[DecodedChunk]:
-        """Run one forward pass, or one for each diffusion step. Regression has one answer, also for all samples."""
+        """Run one forward pass, or one per diffusion step. Regression gives a session's samples the same answer."""
         firsts, owners = shared_frames([entry.row for entry in prepared])
         inputs = [prepared[i].model_input for i in firsts]
         shape = (self.model.horizon, self.model.dim)
@@ -175,7 +175,7 @@ class OpenVLAOFT(PrismaticPolicy):
 
 
 def _action_dim(statistics: Statistics, unnorm_key: str | None, head: Mlp | None) -> int:
-    """Return the length of an action, which the head and all datasets that an episode may name must share."""
+    """Return the length of an action, which must be the same for the head and all datasets that episodes may select."""
     dims = statistics.action_dims(unnorm_key)
     if head is not None:
         dims.add(head.dim)
@@ -201,7 +201,7 @@ class ModelInput:
 
 @dataclass
 class Parallel:
-    """A checkpoint of OFT: OpenVLA's, and its components; components that it was trained without are None.
+    """A checkpoint of OFT: OpenVLA's, and its components; a component is None if training did not use it.
 
     `encode_images` and `hidden_states` are functions of tensors, which `compile_with` replaces by their compiled forms.
     """
@@ -224,9 +224,15 @@ class Parallel:
             return _numpy(self._heads(self._hidden(self._sequences(inputs))))
 
     def denoise(self, inputs: Sequence[ModelInput], owners: Sequence[int], noise: np.ndarray) -> np.ndarray:
-        """Return chunks (B, H, D) in [-1, 1] of the diffusion head, from noise of that shape.
+        """Denoise chunks with the diffusion head.
 
-        `owners` (B,) names the input of each chunk; its images are encoded once.
+        Args:
+            inputs: The inputs, whose images are encoded once.
+            owners: (B,), the index of each chunk's input.
+            noise: (B, H, D), standard normal.
+
+        Returns:
+            (B, H, D) in [-1, 1].
         """
         torch = require("torch")
         with torch.inference_mode():
@@ -236,10 +242,15 @@ class Parallel:
             return _numpy(denoise(start, lambda time, noisy: self._noise(seen, time, noisy), *self.steps))
 
     def choose(self, inputs: Sequence[ModelInput], owners: Sequence[int], draws: np.ndarray) -> tuple[Any, Any]:
-        """Return the tokens (B, H, D) of chunks, and the logits (B, H, D, V) by which they were chosen.
+        """Choose the tokens of chunks.
 
-        `owners` (B,) names the input of each chunk, which is computed once; `draws` (B, H, D) are those of
-        `ActionBins.choose`.
+        Args:
+            inputs: The inputs, each of which is computed once.
+            owners: (B,), the index of each chunk's input.
+            draws: (B, H, D), as for `ActionBins.choose`.
+
+        Returns:
+            The tokens (B, H, D), and the logits (B, H, D, V) from which they were chosen.
         """
         torch = require("torch")
         with torch.inference_mode():
@@ -269,7 +280,7 @@ class Parallel:
         return list(zip(seen, words, strict=True))
 
     def encode_images(self, pixels: Any, language: Any) -> Any:
-        """Return the embeddings (P, N, D) of images (P, views, C, S, S); `language` is the mean of words (P, D)."""
+        """Return the embeddings (P, N, D) of images (P, views, C, S, S); `language` (P, D) is the mean of the words."""
         views = pixels.shape[1]
         images = pixels.flatten(0, 1)
         if self.film is None:
@@ -279,8 +290,8 @@ class Parallel:
         return self.base.network.projector(patches).unflatten(0, (len(pixels), views)).flatten(1, 2)
 
     def hidden_states(self, embeddings: Any, lengths: Any) -> Any:
-        """Return hidden states (B, L, D) of sequences (B, L, D), each token attending to all of its row's length."""
-        import torch  # the compiler follows a statement, and not `require`
+        """Return hidden states (B, L, D) of sequences (B, L, D); each token attends to the whole length of its row."""
+        import torch  # the compiler follows an import statement, but not `require`
 
         model, length = self.base.network.language_model.model, embeddings.shape[1]
         places = lengths.new_ones(1, length).cumsum(1) - 1
@@ -305,7 +316,7 @@ class Parallel:
         embeddings = torch.nn.functional.pad(embeddings, (0, 0, 0, missing))
         lengths = torch.tensor([len(row) for row in rows], device=self.base.device)
         hidden = self.hidden_states(embeddings, lengths)
-        starts = lengths - count - 2  # the token before an action predicts it, as in training
+        starts = lengths - count - 2  # the preceding token predicts an action, as in training
         places = starts[:, None] + torch.arange(count, device=self.base.device)
         return hidden[torch.arange(len(rows))[:, None], places]
 
@@ -316,7 +327,17 @@ def _numpy(tensor: Any) -> np.ndarray:
 
 
 def denoise(noise: Any, predict: Callable[[int, Any], Any], trained: int, steps: int) -> Any:
-    """Return actions (B, H, D) in [-1, 1] from noise; `predict` returns the noise in them at a time of training."""
+    """Denoise actions by DDIM, without noise between steps.
+
+    Args:
+        noise: (B, H, D), standard normal.
+        predict: Returns the noise in actions (B, H, D) at a time of training.
+        trained: The number of diffusion steps in training.
+        steps: The number of diffusion steps at inference.
+
+    Returns:
+        (B, H, D) in [-1, 1].
+    """
     kept = _kept(trained)
     for time, before in _times(trained, steps):
         guessed = predict(time, noise)
@@ -327,7 +348,7 @@ def denoise(noise: Any, predict: Callable[[int, Any], Any], trained: int, steps:
 
 
 def time_embedding(time: int, dim: int, device: Any) -> Any:
-    """Return (dim,) float32, sines and then cosines."""
+    """Return the embedding of a time, (dim,) float32: sines, then cosines."""
     torch = require("torch")
     half = dim // 2
     rates = torch.exp(torch.arange(half, device=device) * -math.log(10000) / (half - 1))
@@ -372,7 +393,7 @@ def read_component(folder: Path, name: str) -> dict[str, Any]:
 
 
 def require_unused(folder: Path, names: Iterable[str]) -> None:
-    """Raise `ConfigError` if a component exists that the settings leave out."""
+    """Raise `ConfigError` if there is a component that the settings omit."""
     for name in names:
         if any(folder.glob(f"{name}--*")):
             raise ConfigError(
@@ -415,7 +436,7 @@ class Mlp:
 
 
 class Projector:
-    """Maps numbers to embeddings of the language model: two layers with GELU between them."""
+    """Maps numbers to embeddings of the language model, by two layers with GELU between them."""
 
     def __init__(self, saved: Weights, what: str) -> None:
         self._weights = _exactly(saved, ("fc1", "fc2"), what)
@@ -437,7 +458,7 @@ class Film:
     """Vision backbones whose blocks are scaled and shifted by the instruction (arXiv 1709.07871)."""
 
     def __init__(self, saved: Weights, backbone: Any) -> None:
-        """Take FiLM's tensors from `saved`, and load the others into the backbone."""
+        """Take FiLM's tensors from `saved`, and load the other tensors into the backbone."""
         plain, self._film = {}, {}
         for key, tensor in _merged(saved).items():
             name = key.removeprefix("vision_backbone.")
@@ -462,7 +483,7 @@ class Film:
 
     def __call__(self, pixels: Any, language: Any) -> Any:
         """Return patches (B, P, V) of pixels (B, C, S, S) for instructions (B, D), each the mean of its embeddings."""
-        import torch  # the compiler follows a statement, and not `require`
+        import torch  # the compiler follows an import statement, but not `require`
 
         parts = pixels.split(3, dim=1)
         return torch.cat([self._see(name, part, language) for name, part in zip(self._vits, parts, strict=True)], dim=2)
@@ -481,7 +502,7 @@ class Film:
 
 
 def _merged(saved: Weights) -> dict[str, Any]:
-    """Add the low-rank adapters to their layers, also to convolutions: OFT+ saves them separately."""
+    """Add the low-rank adapters to their layers, including convolutions; OFT+ saves adapters separately."""
     merged = {key.replace(".base_layer.", "."): tensor for key, tensor in saved.items() if ".lora_" not in key}
     for key, down in saved.items():
         if ".lora_A." in key:

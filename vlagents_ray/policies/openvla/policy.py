@@ -47,7 +47,7 @@ class OpenVLAConfig(PrismaticConfig):
 
 
 class OpenVLA(PrismaticPolicy):
-    """The policy, which returns one action for each `act`."""
+    """The policy OpenVLA, which returns one action for each `act`."""
 
     Config = OpenVLAConfig
     config: OpenVLAConfig
@@ -91,7 +91,7 @@ class OpenVLA(PrismaticPolicy):
         return row.frames[-1], self.model.base.tokens(row.instruction)
 
     def _compute(self, prepared: Sequence[PreparedRow]) -> list[DecodedChunk]:
-        """Decode all answers: a session's own greedily unless values are requested, samples at temperature 1."""
+        """Decode all answers: sessions greedily unless outputs are requested, samples at temperature 1."""
         firsts, owners = shared_frames([entry.row for entry in prepared])
         draws = np.full((len(prepared), max(entry.scale.dim for entry in prepared)), np.nan)
         for numbers, entry in zip(draws, prepared, strict=True):
@@ -106,10 +106,10 @@ class OpenVLA(PrismaticPolicy):
 
 @dataclass
 class TokenDecoder:
-    """A checkpoint, and its passes: functions of tensors, which `compile_with` replaces by their compiled forms."""
+    """A checkpoint and its passes: functions of tensors, which `compile_with` replaces by their compiled forms."""
 
     base: Prismatic
-    longest: int  # the number of tokens of an answer, at most
+    longest: int  # the largest number of tokens of an answer
     adapters: Adapters = field(default_factory=Adapters)  # of the policy
 
     def compile_with(self, compilation: Compilation) -> None:
@@ -124,13 +124,16 @@ class TokenDecoder:
         draws: np.ndarray,
         fingerprints: Sequence[str] = (),
     ) -> tuple[Any, Any]:
-        """Return R answers to P prompts, as tokens (R, S) and the logits (R, S, V) by which they were chosen.
+        """Decode R answers to P prompts.
 
         Args:
             prompts: The pixels (C, S, S) and tokens of each prompt.
             owners: (R,), the prompt of each answer; a prompt with several answers is read once.
             draws: (R, S), for `ActionBins.choose`.
-            fingerprints: (P,), the adapter of each prompt, see `Row.adapter`; empty: none has one.
+            fingerprints: (P,), the adapter of each prompt, see `Row.adapter`; empty: no prompt has one.
+
+        Returns:
+            Tokens (R, S), and the logits (R, S, V) from which they were chosen.
         """
         torch, base, steps = require("torch"), self.base, draws.shape[1]
         with torch.inference_mode(), self.adapters.rows(fingerprints):
@@ -140,7 +143,7 @@ class TokenDecoder:
         with torch.inference_mode(), self.adapters.rows([fingerprints[i] for i in owners] if fingerprints else ()):
             index = torch.tensor(owners, device=base.device)
             length, position = mask.shape[1], mask.sum(1)[index]
-            # a place for each token but the last one, and one at the end for the token that is being read
+            # one place for each token but the last, and one at the end for the current token
             places = max(steps, self.longest)
             cache = torch.nn.functional.pad(cache[index], (0, 0, 0, places - 1))
             hidden, mask = hidden[index], torch.nn.functional.pad(mask[index], (0, places))
@@ -180,8 +183,8 @@ class TokenDecoder:
 
         Args:
             tokens: The last token of each row.
-            positions: Their places in the text.
-            mask: (R, T + 1), not 0 for what each token attends to: T places of the cache, and itself.
+            positions: The positions of these tokens in the text.
+            mask: (R, T + 1), not 0 where a token attends: T places of the cache, and itself.
             cache: Keys and values (R, layers, 2, heads, T, E).
 
         Returns:
@@ -198,7 +201,7 @@ class TokenDecoder:
         return result.last_hidden_state[:, -1], _stacked(own)[..., 0, :]
 
     def _left_padded(self, prompts: Sequence[tuple[Any, list[int]]]) -> tuple[Any, Any]:
-        """Return embeddings (P, L, D) and their mask (P, L), with the patches after the first token, as in training."""
+        """Return embeddings (P, L, D) and their mask (P, L); the patches follow the first token, as in training."""
         torch, base = require("torch"), self.base
         patches = self.encode_images(base.to_device([pixels for pixels, _ in prompts]))
         rows = []
@@ -215,7 +218,7 @@ class TokenDecoder:
 
 
 def _stacked(cache: Any) -> Any:
-    """Return a model's keys and values (B, heads, L, E) of each layer as one tensor (B, layers, 2, heads, L, E)."""
-    import torch  # the compiler follows a statement, and not `require`
+    """Stack a model's keys and values (B, heads, L, E) of each layer into one tensor (B, layers, 2, heads, L, E)."""
+    import torch  # the compiler follows an import statement, but not `require`
 
     return torch.stack([torch.stack(layer, 1) for layer in cache], 1)

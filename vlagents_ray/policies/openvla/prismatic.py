@@ -1,4 +1,4 @@
-"""The common parts of both policies: the model, the checkpoint, its statistics, images and prompts."""
+"""The common parts of OpenVLA and OpenVLA-OFT: the model, the checkpoint, its statistics, images and prompts."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Scale:
 
     low: np.ndarray  # (D,) float64
     high: np.ndarray  # (D,)
-    mask: np.ndarray  # (D,) bool; the other dimensions, such as the gripper, are not normalised
+    mask: np.ndarray  # (D,) bool; other dimensions, such as the gripper, are not normalised
 
     @property
     def dim(self) -> int:
@@ -66,7 +66,7 @@ class Scale:
 
 
 class Statistics:
-    """The statistics of every dataset that a checkpoint was trained on, by its name, the `unnorm_key`."""
+    """The statistics of all datasets on which a checkpoint was trained, by `unnorm_key`, the name of the dataset."""
 
     def __init__(self, datasets: Mapping[str, Any], bounds: Bounds = "q99") -> None:
         self._datasets = datasets
@@ -95,7 +95,7 @@ class Statistics:
         return list(self._datasets)
 
     def key(self, wanted: str | None) -> str:
-        """Return the dataset of that name, with or without `_no_noops`; by default the only one."""
+        """Return the key of the dataset `wanted`, with or without `_no_noops`; None selects the only dataset."""
         if wanted is None and len(self._datasets) == 1:
             return next(iter(self._datasets))
         for name in (wanted, f"{wanted}_no_noops"):
@@ -123,7 +123,7 @@ class Statistics:
         return {self.scale(key).dim for key in (self._datasets if wanted is None else [self.key(wanted)])}
 
     def require(self, wanted: str | None) -> None:
-        """Raise `ConfigError` unless the dataset that a deployment names exists."""
+        """Raise `ConfigError` unless the dataset `wanted` by a deployment exists."""
         try:
             if wanted is not None:
                 self.scale(self.key(wanted))
@@ -132,9 +132,9 @@ class Statistics:
 
 
 _NEEDS = ("config.json", "preprocessor_config.json", "tokenizer_config.json", "*.safetensors")
-_SPACE = 29871  # Llama's token of an empty word, which is between "Out:" and the action in training
+_SPACE = 29871  # Llama's token of an empty word, between "Out:" and the action in training
 _PROMPT = "In: What action should the robot take to {}?\nOut:"
-_PROMPT_V01 = (  # OpenVLA v0.1 was fine-tuned from Vicuna; upstream also recognises it by the checkpoint's name
+_PROMPT_V01 = (  # OpenVLA v0.1 was fine-tuned from Vicuna; upstream also detects it by the checkpoint's name
     "A chat between a curious user and an artificial intelligence assistant. The assistant gives helpful, detailed, "
     "and polite answers to the user's questions. USER: What action should the robot take to {}? ASSISTANT:"
 )
@@ -145,7 +145,7 @@ class Prismatic:
     """A loaded checkpoint."""
 
     path: Path
-    network: Any  # OpenVLAForActionPrediction, of which vision_backbone, projector and language_model are used
+    network: Any  # OpenVLAForActionPrediction; uses its vision_backbone, projector and language_model
     tokenizer: Any
     processor: Any  # PrismaticImageProcessor
     bins: ActionBins
@@ -153,7 +153,7 @@ class Prismatic:
     prompt: str
     device: Any
     dtype: Any
-    padded_tokens: int  # the length to which shorter prompts are padded; 0: that of the longest one
+    padded_tokens: int  # the length to which shorter prompts are padded; 0: that of the longest prompt
     own: dict[str, Statistics] = field(default_factory=dict)  # of adapters that were trained on other datasets
 
     def pixels(self, image: np.ndarray) -> Any:
@@ -161,7 +161,7 @@ class Prismatic:
         return self.processor.apply_transform(require("PIL.Image").fromarray(image))
 
     def tokens(self, instruction: str) -> list[int]:
-        """Return the prompt for an instruction, not to be changed; raises `InvalidObservation` if it is too long."""
+        """Return the prompt's tokens, read-only; raises `InvalidObservation` if the instruction is too long."""
         ids = self._tokenized(instruction)
         most = self.network.config.llm_max_length
         if len(ids) > most:
@@ -170,7 +170,7 @@ class Prismatic:
 
     @cached_property
     def _tokenized(self) -> Callable[[str], list[int]]:
-        """The tokens of an instruction, which is the same at each act of a session."""
+        """Tokenizes an instruction, with a cache, since it is the same in each act of a session."""
 
         @keeping_tokens
         def tokenized(instruction: str) -> list[int]:
@@ -180,7 +180,7 @@ class Prismatic:
         return tokenized
 
     def to_device(self, arrays: Sequence[Any]) -> Any:
-        """Stack tensors of one shape to a batch in the model's dtype; the copy to a GPU is asynchronous."""
+        """Stack tensors of one shape into a batch in the model's dtype; the copy to a GPU is asynchronous."""
         torch = require("torch")
         batch = torch.stack(list(arrays))
         if self.device.type == "cuda":
@@ -221,7 +221,7 @@ def load_prismatic(config: PrismaticConfig, bounds: Bounds = "q99") -> Prismatic
 
 
 class PrismaticConfig(ModelConfig):
-    """Settings of both policies."""
+    """Settings of OpenVLA and OpenVLA-OFT."""
 
     compiled_tokens: int = Field(
         default=64,
@@ -255,22 +255,22 @@ class PrismaticConfig(ModelConfig):
 
 
 class ActionBins:
-    """The bins of [-1, 1], which are the last tokens of the vocabulary; the very last one is the lowest bin."""
+    """The bins of [-1, 1], which are the last tokens of the vocabulary; the very last token is the lowest bin."""
 
     def __init__(self, config: Any, device: Any) -> None:
         torch = require("torch")
         edges = np.linspace(-1, 1, config.n_action_bins)
         middles = (edges[:-1] + edges[1:]) / 2
         self._first = config.text_config.vocab_size - config.pad_to_multiple_of - 1
-        # there is one token more than bins
+        # there is one token more than there are bins
         self._middles = torch.tensor(np.append(middles, middles[-1]), device=device)
         self._tokens = self._first - torch.arange(config.n_action_bins, device=device)
 
     def choose(self, logits: Any, draws: Any) -> Any:
-        """Return tokens (…) for logits (…, V): those of bins at given quantiles, or the likeliest tokens.
+        """Choose tokens (…) from logits (…, V): bins at given quantiles, or the likeliest tokens.
 
-        A number of `draws` (…), in [0, 1), is the quantile of the distribution over bins; where it is NaN, the
-        likeliest of all tokens is taken.
+        An element of `draws` (…), in [0, 1), is a quantile of the distribution over bins; NaN selects the likeliest of
+        all tokens.
         """
         torch = require("torch")
         upto = self._over_bins(logits).cumsum(-1)
@@ -304,7 +304,7 @@ class ActionBins:
 
 
 MODEL, PROCESSOR = "OpenVLAForActionPrediction", "PrismaticImageProcessor"
-VARIABLES = ("OPENVLA_SRC", "OPENVLA_OFT_SRC")  # either serves both policies: the used code is the same
+VARIABLES = ("OPENVLA_SRC", "OPENVLA_OFT_SRC")  # either serves both policies, which use code common to both
 _PACKAGES = ("prismatic", "prismatic.extern", "prismatic.extern.hf", "prismatic.training", "prismatic.vla")
 
 
@@ -316,7 +316,7 @@ def model_classes(checkpoint: Path, source_dir: str | None, trust_remote_code: b
     an installed `prismatic`.
 
     Raises:
-        ConfigError: There are no such classes.
+        ConfigError: The classes are not found.
     """
     if trust_remote_code:
         return (
@@ -364,7 +364,7 @@ def _from_source(root: Path) -> tuple[Any, Any]:
 
 @contextlib.contextmanager
 def _bare_packages(root: Path) -> Iterator[None]:
-    """Import from `root` without the packages' own `__init__`, which import TensorFlow and more."""
+    """Import from `root` without the packages' own `__init__`, which would import TensorFlow and more."""
     before = _take_out()
     for name in _PACKAGES:
         package = types.ModuleType(name)
@@ -388,7 +388,7 @@ def _take_out() -> dict[str, types.ModuleType]:
 
 UNNORM_KEY = "unnorm_key"  # key of reset's options and of an observation's info, as sent by OpenVLA's clients
 OFFERED = ("logprob", "entropy", "replay")  # of action tokens
-_SINGLE_ARM = 7  # six numbers of a motion, and one of the gripper
+_SINGLE_ARM = 7  # six numbers for motion, one for the gripper
 
 
 @dataclass(frozen=True, slots=True)
@@ -396,18 +396,18 @@ class PreparedRow:
     """A valid row, ready for the model."""
 
     row: Row
-    scale: Scale  # the scale of its dataset's actions
+    scale: Scale  # of the actions of its dataset
     model_input: Any
 
 
 @dataclass(frozen=True, slots=True)
 class DecodedChunk:
-    """A chunk (H, D) in [-1, 1], and the distribution whose mode it is, where the model states one."""
+    """A chunk (H, D) in [-1, 1], and, if the model has one, the distribution of which it is the mode."""
 
     values: np.ndarray
     mean: np.ndarray | None = None
     spread: np.ndarray | None = None
-    behaviour: dict[str, Any] = field(default_factory=dict)  # requested values of the row
+    behaviour: dict[str, Any] = field(default_factory=dict)  # requested outputs of the row
 
     def prediction(self, scale: Scale) -> Prediction:
         return Prediction(
@@ -431,7 +431,7 @@ class PrismaticPolicy(ModelPolicy):
 
     @abc.abstractmethod
     def _model_input(self, row: Row, key: str) -> Any:
-        """Return the model's input for a row with that dataset; an error fails that row only."""
+        """Return the model's input for a row of the dataset `key`; an error fails only that row."""
 
     @abc.abstractmethod
     def _compute(self, prepared: Sequence[PreparedRow]) -> list[DecodedChunk]:
@@ -460,13 +460,13 @@ class PrismaticPolicy(ModelPolicy):
         return [results[i] for i in range(len(rows))]
 
     def _example(self, seed: int, instruction: str = "warm up") -> Row:
-        """Return a row of any dataset; sessions may name theirs later."""
+        """Return a row of any dataset; sessions may select theirs later."""
         row = super()._example(seed, instruction)
         datasets = self._statistics(row.adapter)
         return replace(row, memory={UNNORM_KEY: self._default(row.adapter) or datasets.names[0]})
 
     def adapt(self, adapter: str, folder: Path) -> None:
-        """Keep the statistics of the adapter's datasets, if they lie beside it."""
+        """Keep the statistics of the adapter's datasets, if its folder has them."""
         if not (folder / FILE).is_file():
             return
         own, base = Statistics.of(folder, self._statistics().bounds), self._statistics()
@@ -481,7 +481,7 @@ class PrismaticPolicy(ModelPolicy):
     def _decoded(
         self, bins: ActionBins, prepared: Sequence[PreparedRow], tokens: Any, logits: Any
     ) -> list[DecodedChunk]:
-        """Return the chunks of action tokens (B, H, D) that were chosen by logits (B, H, D, V)."""
+        """Return the chunks of action tokens (B, H, D) that were chosen from logits (B, H, D, V)."""
         parts = bins.values(tokens), *bins.moments(logits)
         chunks = []
         for i, entry in enumerate(prepared):
@@ -490,7 +490,7 @@ class PrismaticPolicy(ModelPolicy):
         return chunks
 
     def _stated(self, bins: ActionBins, entry: PreparedRow, tokens: Any, logits: Any) -> dict[str, Any]:
-        """Return the outputs requested of a row with tokens (H, D), drawn from the bins by logits (H, D, V)."""
+        """Return the requested outputs of a row with tokens (H, D), drawn from the bins by logits (H, D, V)."""
         if not entry.row.want:
             return {}
         tokens = tokens[:, : entry.scale.dim]
@@ -517,7 +517,7 @@ class PrismaticPolicy(ModelPolicy):
         return self._statistics(adapter).key(key)
 
     def _key(self, row: Row) -> str:
-        """Return the dataset of a row: the observation's, the episode's, the config's, or the only one."""
+        """Return the dataset of a row: that of the observation, the episode or the settings, or the only one."""
         named = self._named(row.info, row.adapter) or row.memory.get(UNNORM_KEY) or self._default(row.adapter)
         return self._statistics(row.adapter).key(named)
 
@@ -530,12 +530,12 @@ class PrismaticPolicy(ModelPolicy):
 
 
 SIDE = 224  # px; the size of all images in OpenVLA's training data
-CROP_AREA = 0.9  # share of the area that the random crops of training kept
+CROP_AREA = 0.9  # share of the area that training's random crops kept
 _LOBES = 3  # of the Lanczos kernel
 
 
 def resized(image: np.ndarray) -> np.ndarray:
-    """Resize an (H, W, 3) uint8 image to (224, 224, 3) by JPEG of quality 95 and Lanczos; that size stays unchanged."""
+    """Resize an (H, W, 3) uint8 image to (224, 224, 3) by JPEG of quality 95 and Lanczos, unless it has that size."""
     height, width = image.shape[:2]
     if (height, width) == (SIDE, SIDE):
         return image
@@ -547,7 +547,7 @@ def middle(image: np.ndarray) -> np.ndarray:
     """Crop the central nine tenths of the area of an (H, W, 3) uint8 image, and scale them to (224, 224, 3)."""
     height, width = image.shape[:2]
     pixels = _apply(_crop(height), _crop(width), image.astype(np.float32) / 255)
-    return _uint8(pixels * 255.5, 255.5)  # TensorFlow's conversion: add a half, then truncate
+    return _uint8(pixels * 255.5, 255.5)  # as TensorFlow converts: add a half, then truncate
 
 
 def _uint8(pixels: np.ndarray, most: float) -> np.ndarray:
@@ -555,9 +555,9 @@ def _uint8(pixels: np.ndarray, most: float) -> np.ndarray:
 
 
 def _through_jpeg(image: np.ndarray) -> np.ndarray:
-    """Compress and decompress the image by the algorithms that TensorFlow chooses.
+    """Compress and decompress the image with the algorithms that TensorFlow uses.
 
-    Its encoder is Pillow's exact one, its decoder the fast one; simplejpeg's encoder would be off by up to 18.
+    Its encoder is Pillow's exact one, its decoder the fast one; simplejpeg's encoder differs by up to 18.
     """
     file = io.BytesIO()
     require("PIL.Image").fromarray(image).save(file, "JPEG", quality=95, subsampling="4:2:0")

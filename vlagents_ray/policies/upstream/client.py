@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-Answer = np.ndarray | Mapping[str, np.ndarray]  # (D,) or (H, D), or such by the upstream's names
-_LOGGED = 8000  # characters of an upstream's error
+Answer = np.ndarray | Mapping[str, np.ndarray]  # (D,) or (H, D), or several of them by the upstream's names
+_LOGGED = 8000  # characters of an upstream's error that are logged
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,13 +34,13 @@ class ClientOptions:
     """The address and the settings of an upstream."""
 
     url: str
-    timeout_s: float  # s: an answer that takes longer counts as lost
+    timeout_s: float  # s; after this time the answer counts as lost
     key: str | None = field(default=None, repr=False)  # the upstream's API key
     limits: Limits = DEFAULT_LIMITS
 
 
 class UpstreamClient(abc.ABC):
-    """One connection to an upstream, which one thread uses at a time."""
+    """One connection to an upstream, used by one thread at a time."""
 
     batches: ClassVar[bool] = False
     """Whether `ask` sends all observations in one message."""
@@ -53,14 +53,14 @@ class UpstreamClient(abc.ABC):
     takes_key: ClassVar[bool] = True
     """Whether the protocol has a place for an API key."""
     text_key: ClassVar[str] = "task"
-    """What the `*` of the instruction's key stands for."""
+    """The replacement of `*` in the key of the instruction."""
 
     def __init__(self, options: ClientOptions) -> None:
         self.options = options
 
     @staticmethod
     def is_nested(key: str) -> bool:
-        """Return whether a key `a/b` of the mapping is the key `b` within `a`; else, it is one key."""
+        """Return whether a key `a/b` of the mapping means the key `b` within `a`; if not, it is a single key."""
         return "/" in key
 
     @abc.abstractmethod
@@ -83,14 +83,14 @@ class UpstreamClient(abc.ABC):
         """
 
     def begin(self) -> None:  # noqa: B027 - not abstract: a protocol may have no such message
-        """Announce the begin of an episode, if the protocol can; raises as `ask` does."""
+        """Announce the start of an episode, if the protocol can; raises the same errors as `ask`."""
 
     @abc.abstractmethod
     def close(self) -> None:
-        """Close the connection; it may be called twice."""
+        """Close the connection; repeated calls are allowed."""
 
     def differences(self, metadata: Mapping[str, Any], outgoing: Outgoing) -> list[str]:
-        """Return the differences of the upstream's metadata from the mapping, with a remedy each."""
+        """Return the differences between the upstream's metadata and the mapping, each with its cure."""
         return []
 
     def chunk(self, metadata: Mapping[str, Any]) -> int | None:
@@ -98,7 +98,7 @@ class UpstreamClient(abc.ABC):
         return None
 
     def failed(self, text: object) -> PolicyFailed:
-        """Log an error that the upstream answered with, and return ours, without the upstream's details."""
+        """Log an error that the upstream sent, and return ours, without the upstream's details."""
         logger.error("upstream %s answered with an error: %s", self.options.url, str(text)[:_LOGGED])
         return PolicyFailed(f"upstream {self.options.url}: it answered with an error, which the server's log has")
 
@@ -125,15 +125,15 @@ class UpstreamClient(abc.ABC):
 
 
 _LOG = logging.getLogger("vlagents_ray.upstream.websocket")
-_LOG.setLevel(logging.CRITICAL)  # it logs each lost connection as an error, which is raised as well
+_LOG.setLevel(logging.CRITICAL)  # it logs each lost connection as an error, which is also raised
 _CLOSE_S = 1
 _REFUSED = (401, 403)
-# While an upstream computes on its event loop, it answers no pings. Older versions of `websockets` send none.
+# An upstream that computes on its event loop answers no pings meanwhile. Older versions of `websockets` send none.
 _NO_PINGS: dict[str, Any] = {"ping_interval": None} if "ping_interval" in inspect.signature(connect).parameters else {}
 
 
 class WebSocketClient(UpstreamClient):
-    """A client over a WebSocket, which bounds the size of messages and the time of waiting.
+    """A client over a WebSocket, with limits on the size of messages and on the waiting time.
 
     A separate thread answers the upstream's pings, so that a connection stays open while no session acts.
     """
@@ -153,7 +153,7 @@ class WebSocketClient(UpstreamClient):
         return self._connection is not None and self._connection.protocol.state is State.OPEN
 
     def open(self, timeout_s: float) -> None:
-        """Connect; raises `PolicyUnavailable` if it cannot be reached, `Unauthorized` if it refuses the key."""
+        """Connect; raises `PolicyUnavailable` if the upstream is unreachable, `Unauthorized` if it rejects the key."""
         url = self.options.url
         try:
             opening = connect(

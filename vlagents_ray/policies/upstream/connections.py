@@ -1,4 +1,4 @@
-"""Connections to upstreams: those that all sessions share, and one for each session of upstreams that keep sessions."""
+"""Connections to upstreams: shared by all sessions, or one for each session if the upstream keeps sessions."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ logger = logging.getLogger(__name__)
 
 _CONNECT_S = 5.0  # s for one attempt to connect
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.02, 1.0
-_ATTEMPTS = 3  # connections that one row may lose: a row on which an upstream dies must not end them all
+_ATTEMPTS = 3  # connections that one row may lose, so that a row that crashes an upstream does not end them all
 
 Check = Callable[[UpstreamClient, Mapping[str, Any]], None]
 
@@ -39,11 +39,11 @@ class _Share:
 
 
 class Lanes:
-    """The shared connections; a lost one is opened again in the background, while the others continue.
+    """The shared connections; a lost one is reopened in the background while the others continue.
 
     Args:
-        clients: The clients, which are not connected yet.
-        check: Raises an error if an upstream, by its metadata, is the wrong one.
+        clients: The clients, not connected yet.
+        check: Raises an error if the metadata shows that an upstream is the wrong one.
         retry_s: How long a batch waits for a lost upstream if there is no other, s.
     """
 
@@ -72,8 +72,8 @@ class Lanes:
     def ask(self, observations: Sequence[Mapping[str, Any]]) -> list[Answer | Exception]:
         """Return the answer to each observation, or the error in its place.
 
-        A row whose connection is lost is sent again over another one, or over the same once it is open again, since an
-        upstream without sessions keeps nothing of it.
+        If a connection is lost, its rows are sent again over another one, or over the same one once it is reopened: an
+        upstream without sessions keeps no state of them.
         """
         results: list[Answer | Exception] = [NoReplica("upstream: not asked")] * len(observations)
         deadline = time.monotonic() + self._retry_s
@@ -103,18 +103,18 @@ class Lanes:
             self._changed.notify_all()
             ready, self._ready = self._ready, []
         self._pool.shutdown()
-        for client in ready:  # one that is being connected belongs to its thread, which closes it
+        for client in ready:  # a client that is connecting is closed by the thread that connects it
             client.close()
         for thread in self._connecting:
             thread.join(2 * _CONNECT_S)
 
     def _shares(self, rows: int, lanes: int) -> list[_Share]:
-        """Return the rows one by one, or, if the protocol has batches, in as many parts as there are lanes."""
+        """Split rows into shares: single rows, or as many parts as there are lanes if the protocol has batches."""
         parts = min(rows, lanes) if self._clients[0].batches else rows
         return [_Share(range(rows * i // parts, rows * (i + 1) // parts)) for i in range(parts)]
 
     def _wait_ready(self, deadline: float) -> list[UpstreamClient]:
-        """Return the open connections as soon as there is one; none after `deadline`."""
+        """Return the open connections once there is one; an empty list after `deadline`."""
         with self._changed:
             self._changed.wait_for(lambda: self._ready or self._closed, max(0.0, deadline - time.monotonic()))
             return list(self._ready)
@@ -126,7 +126,7 @@ class Lanes:
         observations: Sequence[Mapping[str, Any]],
         results: list[Answer | Exception],
     ) -> None:
-        """Ask for shares over one connection until none is left, or until it is lost; none is spent on an ended one."""
+        """Send shares over one connection until none is left or it is lost; an ended connection consumes no share."""
         while True:
             if not client.is_open:
                 client.close()
@@ -149,7 +149,7 @@ class Lanes:
                 return
             except Exception as error:  # noqa: BLE001 - the result of these rows alone
                 answers = [error] * len(share.rows)
-                if len(share.rows) > 1:  # one of them may be the reason, which must not fail the others
+                if len(share.rows) > 1:  # one of the rows may be the cause, and must not fail the others
                     work.extend(_Share(range(row, row + 1), share.attempts) for row in share.rows)
             for row, answer in zip(share.rows, answers, strict=True):
                 results[row] = answer
@@ -203,23 +203,23 @@ class Lanes:
 
 
 def _is_passing(reason: VLAgentsError) -> bool:
-    """Return whether waiting may help: the upstream is missing, rather than the wrong one."""
+    """Return whether waiting may help: the upstream is unavailable, not the wrong one."""
     return reason.status == NoReplica.status
 
 
 # Connections to upstreams that keep sessions: one for each session's episode.
 
-_AT_ONCE = 32  # sessions of a batch that are sent at the same time
+_AT_ONCE = 32  # largest number of sessions of a batch that are sent at the same time
 
 
 class SessionConnections:
-    """The connection of each session, to the upstream that has the fewest.
+    """The connection of each session, to the upstream with the fewest sessions.
 
     Args:
         urls: The addresses of the upstreams.
         make: Returns a client of an address.
-        check: Raises an error if an upstream, by its metadata, is the wrong one.
-        retry_s: How long the begin of an episode waits for an upstream, s.
+        check: Raises an error if the metadata shows that an upstream is the wrong one.
+        retry_s: How long the start of an episode waits for an upstream, s.
     """
 
     def __init__(
@@ -234,7 +234,7 @@ class SessionConnections:
         self._pool = ThreadPoolExecutor(_AT_ONCE, "upstream")
 
     def start(self, timeout_s: float) -> None:
-        """Return when one upstream answers, with which the mapping is checked; raises as `Lanes.start`."""
+        """Return when one upstream answers and its metadata fits the mapping; raises the errors of `Lanes.start`."""
         self._connected(timeout_s).close()
 
     def begin(self, session: str) -> None:
@@ -288,7 +288,7 @@ class SessionConnections:
         return answer
 
     def _connected(self, timeout_s: float) -> UpstreamClient:
-        """Return a client that is connected to the upstream with the fewest sessions of those that answer."""
+        """Return a client connected to the upstream with the fewest sessions among those that answer."""
         deadline, pause_s = time.monotonic() + timeout_s, _FIRST_PAUSE_S
         while True:
             with self._lock:

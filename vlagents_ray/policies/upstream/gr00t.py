@@ -1,4 +1,4 @@
-"""A client of GR00T's `PolicyServer`: a batch a message over ZeroMQ."""
+"""A client of GR00T's `PolicyServer`: one batch per message over ZeroMQ."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from vlagents_ray.wire.outgoing import Outgoing
 
 
 class GR00TClient(UpstreamClient):
-    """A client of N1.6 and newer, or of N1.5, recognised by modality keys such as `video.front`.
+    """A client of servers from N1.6 on, or of N1.5, recognised by modality keys such as `video.front`.
 
-    If the mapping's keys are like that, so are those of the observation, as `Gr00tSimPolicyWrapper` reads it.
+    If the mapping has such keys, the observation has them also, as `Gr00tSimPolicyWrapper` expects.
     """
 
     batches: ClassVar[bool] = True
@@ -44,7 +44,7 @@ class GR00TClient(UpstreamClient):
         self._context = zmq.Context(io_threads=1)
         self._socket = self._context.socket(zmq.REQ)
         self._socket.setsockopt(zmq.LINGER, 0)
-        self._socket.setsockopt(zmq.IMMEDIATE, 1)  # nothing is queued for an upstream that is not there
+        self._socket.setsockopt(zmq.IMMEDIATE, 1)  # do not queue messages for an upstream that is not connected
         self._socket.setsockopt(zmq.MAXMSGSIZE, self.options.limits.body_bytes)
         self._monitor = self._socket.get_monitor_socket(zmq.EVENT_DISCONNECTED)
         try:
@@ -128,7 +128,7 @@ class GR00TClient(UpstreamClient):
         return reply
 
     def _wait(self, event: int, deadline: float, what: str) -> None:
-        """Wait until the socket can be written or read; raise `ConnectionLost` if its connection ends before."""
+        """Wait until the socket can be written or read; raise `ConnectionLost` if its connection ends first."""
         begun = time.monotonic()
         poller = self._zmq.Poller()
         poller.register(self._socket, event)
@@ -141,7 +141,7 @@ class GR00TClient(UpstreamClient):
 
 
 def _is_flat(reply: Any) -> bool:
-    """Return whether modalities have N1.5's keys, with their modality in front."""
+    """Return whether modalities have N1.5's keys, which begin with the name of the modality."""
     video = reply.get("video") if isinstance(reply, dict) else None
     config = video.get("as_json", video) if isinstance(video, dict) else None
     return isinstance(config, str) or (

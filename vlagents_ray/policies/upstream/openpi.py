@@ -1,4 +1,4 @@
-"""Clients of openpi's servers, one observation or a batch a message, and of RoboArena's."""
+"""Clients of openpi's servers, with one observation or a batch per message, and of RoboArena's."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from vlagents_ray.policies.upstream.client import Answer, ClientOptions, WebSock
 from vlagents_ray.wire import openpi
 from vlagents_ray.wire.outgoing import Outgoing
 
-_RESET = "reset successful"  # what RoboArena's servers answer to `reset`
+_RESET = "reset successful"  # the answer of RoboArena's servers to `reset`
 
 
 class OpenPiClient(WebSocketClient):
-    """A client of a server that speaks openpi's protocol, which keeps nothing between two observations."""
+    """A client of servers with openpi's protocol, which keep no state between observations."""
 
     key_scheme = "Api-Key"  # as openpi_client.websocket_client_policy sends it
 
     @staticmethod
     def is_nested(key: str) -> bool:
-        """Return whether a key is a path: openpi's keys under `observation/` are not, `images/cam_high` is."""
+        """Return whether a key is a path: `images/cam_high` is one, openpi's keys under `observation/` are not."""
         return not key.startswith("observation/")
 
     def connect(self, timeout_s: float) -> dict[str, Any]:
@@ -46,7 +46,7 @@ class OpenPiClient(WebSocketClient):
         return self._map(data)
 
     def _map(self, data: bytes | str) -> dict[str, Any]:
-        """Return the map in a message; a text is an error, after which the upstream closes the connection."""
+        """Return the map in a message; a text message is an error, after which the upstream closes the connection."""
         if isinstance(data, str):
             self.close()
             raise self.failed(data)
@@ -61,7 +61,7 @@ class OpenPiClient(WebSocketClient):
 
 
 class OpenPiBatchClient(OpenPiClient):
-    """A client that sends `{"batch": [...]}`, the message of openpi's pull request 941, as our own dialect takes it."""
+    """A client that sends `{"batch": [...]}`, as in openpi's pull request 941 and in our own dialect."""
 
     batches: ClassVar[bool] = True
 
@@ -73,7 +73,7 @@ class OpenPiBatchClient(OpenPiClient):
 
 
 class RoboArenaClient(OpenPiClient):
-    """A client of RoboArena's servers, which keep a session for each `session_id` and are reset."""
+    """A client of RoboArena's servers, which keep a session for each `session_id` and have a reset."""
 
     keeps_sessions: ClassVar[bool] = True
     mapping: ClassVar[str | None] = "roboarena"
@@ -92,7 +92,7 @@ class RoboArenaClient(OpenPiClient):
         self.send(openpi.encode({"endpoint": "reset"}))
         answer = self.recv()
         if answer != _RESET:
-            self._read(answer)  # vLLM-Omni answers a map; any other text is an error
+            self._read(answer)  # vLLM-Omni answers with a map; any text other than `_RESET` is an error
 
     def differences(self, metadata: Mapping[str, Any], outgoing: Outgoing) -> list[str]:
         cameras = [camera.key.partition("|")[0] for camera in outgoing.mapping.cameras.values()]
@@ -111,7 +111,7 @@ class RoboArenaClient(OpenPiClient):
         return found
 
     def _read(self, data: bytes | str) -> Any:
-        """Return a map, or the array that older servers answer; vLLM-Omni sends an error as a map."""
+        """Return a map, or the array that older servers send; vLLM-Omni sends an error as a map."""
         reply = self._map(data) if isinstance(data, str) else openpi.decode_any(data, self.options.limits)
         if isinstance(reply, dict) and reply.get("type") == "error":
             raise self.failed(reply.get("message"))

@@ -18,7 +18,7 @@ _BUSY = (408, 429, 502, 503, 504)
 
 
 class OpenVLAClient(UpstreamClient):
-    """A client that posts one observation a request to `/act`, over a connection that stays open."""
+    """A client that posts one observation per request to `/act`, over a connection that stays open."""
 
     mapping: ClassVar[str | None] = "openvla"
     schemes: ClassVar[tuple[str, ...]] = ("http", "https")
@@ -43,7 +43,7 @@ class OpenVLAClient(UpstreamClient):
         if sock is None:
             return False
         if isinstance(sock, ssl.SSLSocket):
-            return True  # what can be read may be a ticket of TLS
+            return True  # readable data may be a TLS session ticket
         ended = select.poll()  # uvicorn closes a connection that is idle for 5 s
         ended.register(sock, select.POLLIN)
         return not ended.poll(0)

@@ -104,7 +104,7 @@ class UpstreamConfig(BaseModel, extra="forbid"):
                 f"mapping: {self.protocol} has none of its own; give an object, or a preset, such as openpi-libero for "
                 f"openpi"
             )
-        self.keys()  # raises an error for a mapping that is wrong
+        self.keys()  # raises an error for an invalid mapping
         return self
 
     @property
@@ -124,10 +124,10 @@ UPSTREAM_MS = "upstream_ms"  # in `Act.info`: the time that the upstreams needed
 
 
 class Upstream(Agent):
-    """Asks the servers of another system for the actions of each batch.
+    """Requests the actions of each batch from the servers of another system.
 
-    The observation is sent with the upstream's own keys, by the mapping. Its actions are returned as they are; the
-    contract states its gripper's commands.
+    The mapping converts the observation to the upstream's own keys. The upstream's actions are returned unchanged; the
+    contract states the range of their gripper commands.
     """
 
     Config: ClassVar[type] = UpstreamConfig
@@ -145,12 +145,12 @@ class Upstream(Agent):
 
     @property
     def contract(self) -> Contract:
-        """The contract by the mapping and the settings, with the length of a chunk, if the upstream states it."""
+        """The contract from the mapping and the settings, with the length of a chunk if the upstream states it."""
         contract: Contract = self._state["contract"]
         return contract
 
     def initialize(self) -> None:
-        """Connect to the upstreams; raises `ContractMismatch` if their own statements differ from the mapping."""
+        """Connect to the upstreams; raises `ContractMismatch` if their metadata contradicts the mapping."""
         key = None
         if (name := self.config.key_env) is not None and not (key := os.environ.get(name)):
             raise ConfigError(f"key_env: the environment variable {name!r} is not set; set it where the replica runs")
@@ -169,7 +169,7 @@ class Upstream(Agent):
             self._lanes.start(self.config.connect_timeout_s)
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
-        """Begin an episode, at the upstream too if that keeps sessions."""
+        """Begin an episode, also at the upstream if that keeps sessions."""
         self._instruction = instruction
         if self._sessions is not None:
             self._session = uuid.uuid4().hex
@@ -179,7 +179,7 @@ class Upstream(Agent):
         return {}
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
-        """Ask the upstreams for the actions of all sessions at once; an error is that of its session alone."""
+        """Request the actions of all sessions from the upstreams at once; an error only fails its own session."""
         results: list[Any] = [None] * len(obs)
         asked: list[tuple[int, dict[str, Any]]] = []
         for i, (one, session) in enumerate(zip(obs, sessions, strict=True)):
@@ -222,7 +222,7 @@ class Upstream(Agent):
 
 
 def _contract(mapped: Contract, stated: Mapping[str, Any]) -> Contract:
-    """Return the contract of a mapping, overridden by the deployment's."""
+    """Return the contract of a mapping, overridden by the one in the deployment file."""
     own = {name: value for name, value in stated.items() if value is not None}
     whole: dict[str, Any] = mapped.to_json() | own
     whole["action"] = mapped.to_json()["action"] | own.get("action", {})

@@ -19,7 +19,7 @@ _STATED = ("model_server", "harness_version", "protocol_version", "observation_p
 
 
 class VlaEvalClient(WebSocketClient):
-    """A client that announces episodes, and requests one action a step."""
+    """A client that announces episodes, and requests one action per step."""
 
     keeps_sessions: ClassVar[bool] = True
     mapping: ClassVar[str | None] = "vla-eval"
@@ -27,7 +27,7 @@ class VlaEvalClient(WebSocketClient):
     def __init__(self, options: ClientOptions) -> None:
         super().__init__(options)
         self._seq = 0
-        self._begun = -1  # the number of the last begin of an episode
+        self._begun = -1  # the number of the last message that began an episode
 
     def connect(self, timeout_s: float) -> dict[str, Any]:
         self.open(timeout_s)

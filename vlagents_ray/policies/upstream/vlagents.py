@@ -13,11 +13,11 @@ from vlagents_ray.policies.upstream.client import Answer, ClientOptions, Upstrea
 from vlagents_ray.wire import rpyc
 from vlagents_ray.wire import vlagents as wire
 
-_PAUSE_S = 0.2  # between two questions whether the upstream's model is loaded
+_PAUSE_S = 0.2  # s, between two checks whether the upstream's model is loaded
 
 
 class VlagentsClient(UpstreamClient):
-    """A client of one agent, which all connections share; the instruction is in each observation."""
+    """A client of one agent, shared by all connections; each observation contains the instruction."""
 
     schemes: ClassVar[tuple[str, ...]] = ("rpyc",)
     takes_key: ClassVar[bool] = False
@@ -93,7 +93,7 @@ class VlagentsClient(UpstreamClient):
         except OSError as error:
             raise self.lost(error) from error
         except VLAgentsError:
-            self.close()  # the place in the stream is lost
+            self.close()  # the position in the stream is lost
             raise
 
     def _receive(self, connection: socket.socket, count: int, deadline: float) -> bytearray:
