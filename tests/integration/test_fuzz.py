@@ -30,7 +30,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from tests.integration.conftest import serving
 from vlagents_ray import Obs, RemoteAgent
-from vlagents_ray.protocol.frames import CONTENT_TYPE, decode_reply, encode_request
+from vlagents_ray.protocol.frames import CONTENT_TYPE, decode_replies, encode_requests
 from vlagents_ray.protocol.messages import Request
 from vlagents_ray.serve.launch.server import Server
 from vlagents_ray.wire import openpi as openpi_codec
@@ -65,7 +65,7 @@ def server(shared_ray: None) -> Iterator[Server]:
 
 
 def request(op: str) -> bytes:
-    return encode_request(Request(op, OBS, instruction="task 4" if op == "reset" else None, request_id="r"))  # type: ignore[arg-type]
+    return encode_requests([Request(op, OBS, instruction="task 4" if op == "reset" else None, request_id="r")])  # type: ignore[arg-type]
 
 
 @dataclass
@@ -96,7 +96,7 @@ def as_vla_eval(tree: dict[str, Any]) -> bytes:
 
 
 def frame_pixel(answer: bytes) -> float:
-    act = decode_reply(answer).act
+    act = decode_replies(answer)[0].act
     return -1.0 if act is None else act.action[0, 0]
 
 

@@ -29,13 +29,7 @@ from vlagents_ray.images.codecs import JPEG, RAW, ImageCodec
 from vlagents_ray.images.jpeg_png import encode_jpeg
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.protocol.frame_layout import Buffer, pack
-from vlagents_ray.protocol.frames import (
-    decode_replies,
-    decode_reply,
-    encode_replies,
-    encode_request,
-    encode_requests,
-)
+from vlagents_ray.protocol.frames import decode_replies, encode_replies, encode_requests
 from vlagents_ray.protocol.json_messages import request_from_parts
 from vlagents_ray.protocol.messages import (
     DEFAULT_LIMITS,
@@ -96,7 +90,7 @@ def same(a: object, b: object) -> bool:
 @given(observations, st.none() | st.text(max_size=20), infos)
 def test_a_request_comes_back_as_it_was(obs: Obs, instruction: str | None, kwargs: dict) -> None:
     sent = Request("reset", obs, instruction, kwargs, request_id="r1", deadline_ms=20.0)
-    got = decode_request(encode_request(sent, RAW))
+    got = decode_request(encode_requests([sent], RAW))
     assert (got.op, got.instruction, got.request_id, got.deadline_ms) == ("reset", instruction, "r1", 20.0)
     assert got.obs is not None
     for part in ("cameras", "gripper", "state", "info"):
@@ -106,7 +100,7 @@ def test_a_request_comes_back_as_it_was(obs: Obs, instruction: str | None, kwarg
 
 @given(hnp.arrays(np.float32, hnp.array_shapes(min_dims=1, max_dims=2)), st.booleans(), infos)
 def test_a_reply_comes_back_as_it_was(action: np.ndarray, done: bool, info: dict) -> None:
-    got = decode_reply(encode_replies([Reply("r1", Act(action, done, info), timing={"queue_ms": 0.5})]))
+    got = decode_replies(encode_replies([Reply("r1", Act(action, done, info), timing={"queue_ms": 0.5})]))[0]
     assert same(action, got.act.action)
     assert (got.request_id, got.act.done, got.timing) == ("r1", done, {"queue_ms": 0.5})
     assert same(info, got.act.info)
@@ -117,15 +111,18 @@ def test_the_header_is_json_for_every_parser_though_a_policy_says_nan(value: flo
     frame = encode_replies([Reply("r1", Act(np.zeros(2, np.float32), info={"loss": [value]}))])
     header = frame[8 : 8 + struct.unpack("<I", frame[4:8])[0]]
     json.loads(header, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
-    got = decode_reply(frame).act
+    got = decode_replies(frame)[0].act
     assert same(got.info["loss"], [float(value)])
 
 
 def test_a_step_is_text_since_some_parsers_round_it() -> None:
     step = 2**61 + 1
-    for frame in (encode_request(Request("act", Obs(), step=step)), encode_replies([Reply("r1", info={}, step=step)])):
+    for frame in (
+        encode_requests([Request("act", Obs(), step=step)]),
+        encode_replies([Reply("r1", info={}, step=step)]),
+    ):
         assert json.loads(frame[8 : 8 + struct.unpack("<I", frame[4:8])[0]])["step"] == str(step)
-        assert (decode_request(frame) if b'"op"' in frame else decode_reply(frame)).step == step
+        assert (decode_request(frame) if b'"op"' in frame else decode_replies(frame)[0]).step == step
     assert decode_request(b"".join(pack({"op": "act", "obs": {}, "step": "3"}, []))).step == 3
     for wrong in (3, "x", "-1", "1.5", "\u00b2", "1" * 99, 2.0, -1, True, []):
         with pytest.raises(MalformedMessage, match="step"):
@@ -147,7 +144,7 @@ def test_half_of_a_surrogate_pair_is_malformed() -> None:
 
 
 def test_an_error_comes_back_as_its_own_class() -> None:
-    got = decode_reply(encode_replies([Reply("r1", error=MissingCamera("wrist", have=["front"]))]))
+    got = decode_replies(encode_replies([Reply("r1", error=MissingCamera("wrist", have=["front"]))]))[0]
     assert type(got.error) is MissingCamera
     assert "wrist" in str(got.error)
 
@@ -155,7 +152,7 @@ def test_an_error_comes_back_as_its_own_class() -> None:
 def test_encoding_leaves_the_observation_alone() -> None:
     image = np.zeros((8, 8, 3), np.uint8)
     obs = Obs({"front": image}, state={"joints": np.zeros(3)})
-    encode_request(Request("act", obs), JPEG)
+    encode_requests([Request("act", obs)], JPEG)
     assert obs.cameras["front"] is image
     assert obs.state["joints"].dtype == np.float64
 
@@ -164,9 +161,9 @@ def test_jpeg_is_close_and_smaller() -> None:
     y, x = np.mgrid[0:64, 0:64]
     image = np.stack([x * 4, y * 4, (x + y) * 2], axis=-1).astype(np.uint8)
     request = Request("act", Obs({"front": image}))
-    frame = encode_request(request, ImageCodec("jpeg", quality=90))
+    frame = encode_requests([request], ImageCodec("jpeg", quality=90))
     got = decode_request(frame).obs
-    assert len(frame) < len(encode_request(request, RAW)) / 2
+    assert len(frame) < len(encode_requests([request], RAW)) / 2
     assert np.abs(got.cameras["front"].astype(int) - image).mean() < 3
 
 
@@ -238,11 +235,11 @@ def test_each_fault_has_its_error(header: dict, blobs: tuple[bytes, ...], error:
 @pytest.mark.parametrize("act", [3, {}, {"action": {"$": ["nd", 0, "<f4", [1]]}}, {"action": 1, "done": 1, "info": {}}])
 def test_a_broken_reply_is_malformed(act: object) -> None:
     with pytest.raises(MalformedMessage):
-        decode_reply(_frame({"act": act}, b"1234"))
+        decode_replies(_frame({"act": act}, b"1234"))[0]
 
 
 def test_pixels_are_limited_before_memory_is_taken() -> None:
-    jpeg = bytearray(encode_request(Request("act", Obs({"a": np.zeros((8, 8, 3), np.uint8)})), JPEG))
+    jpeg = bytearray(encode_requests([Request("act", Obs({"a": np.zeros((8, 8, 3), np.uint8)}))], JPEG))
     at = jpeg.index(b"\xff\xc0")  # start of frame: length, precision, height, width
     jpeg[at + 5 : at + 9] = struct.pack(">HH", 60_000, 60_000)
     with pytest.raises(MessageTooLarge, match="60000x60000"):
@@ -292,7 +289,7 @@ def test_a_long_header_is_refused_unread(values: int, reason: str) -> None:
 
 
 def test_a_body_over_the_limit_is_too_large() -> None:
-    frame = encode_request(Request("act", Obs({"a": np.zeros((64, 64, 3), np.uint8)})))
+    frame = encode_requests([Request("act", Obs({"a": np.zeros((64, 64, 3), np.uint8)}))])
     with pytest.raises(MessageTooLarge, match="limit is 4096"):
         decode_request(frame, Limits(body_bytes=4096))
 
@@ -300,7 +297,7 @@ def test_a_body_over_the_limit_is_too_large() -> None:
 @pytest.mark.parametrize("value", [object(), {1: 2}, {"$": 1}, np.array(["text"]), np.array([1j])])
 def test_what_the_wire_cannot_carry_is_named_by_the_sender(value: object) -> None:
     with pytest.raises(InvalidInput):
-        encode_request(Request("act", Obs(info={"x": value})))
+        encode_requests([Request("act", Obs(info={"x": value}))])
 
 
 @settings(max_examples=many(30))

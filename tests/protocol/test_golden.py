@@ -19,13 +19,7 @@ from vlagents_ray.errors import MalformedMessage
 from vlagents_ray.images.jpeg_png import decode
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.frame_layout import pack, unpack
-from vlagents_ray.protocol.frames import (
-    CONTENT_TYPE,
-    decode_replies,
-    encode_replies,
-    encode_request,
-    encode_requests,
-)
+from vlagents_ray.protocol.frames import CONTENT_TYPE, decode_replies, encode_replies, encode_requests
 from vlagents_ray.protocol.messages import (
     DEFAULT_LIMITS,
     PROTOCOL_VERSION,
@@ -210,11 +204,11 @@ def test_what_a_server_answers_is_what_the_schema_says(client: TestClient) -> No
     assert answer.json()["info"]["pixels"] == {"front": golden.PIXELS.tolist()}
     require_valid(client.post("/v1/act", json={"info": {"fail": 1}}, headers=session).json(), "problem")
     frame = {"content-type": CONTENT_TYPE, "accept": CONTENT_TYPE}
-    answer = client.post("/v1/act", content=encode_request(Request("act", Obs())), headers=session | frame)
+    answer = client.post("/v1/act", content=encode_requests([Request("act", Obs())]), headers=session | frame)
     require_valid(unpack(answer.content, DEFAULT_LIMITS)[0], "replies_header")
     require_valid(client.post("/v1/close", headers=session).json(), "close_answer")
     with client.websocket_connect("/v1/stream") as stream:
-        for data, error in ((encode_request(Request("reset", Obs())), False), (b"VLA", True)):
+        for data, error in ((encode_requests([Request("reset", Obs())]), False), (b"VLA", True)):
             stream.send_bytes(data)
             reply = stream.receive_bytes()
             require_valid(unpack(reply, DEFAULT_LIMITS)[0], "replies_header")

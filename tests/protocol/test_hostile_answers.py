@@ -13,7 +13,7 @@ import resource, sys
 from contextlib import suppress
 from pathlib import Path
 from vlagents_ray.errors import VLAgentsError
-from vlagents_ray.protocol.frames import decode_reply
+from vlagents_ray.protocol.frames import decode_replies
 from vlagents_ray.validation import check_action
 
 def peak_mb():
@@ -22,7 +22,7 @@ def peak_mb():
 before = peak_mb()
 for file in Path(sys.argv[1]).iterdir():
     with suppress(VLAgentsError):
-        reply = decode_reply(file.read_bytes())
+        [reply] = decode_replies(file.read_bytes())
         if reply.act is not None:
             check_action(reply.act.action, None)
 print(peak_mb() - before)

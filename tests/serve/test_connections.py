@@ -29,7 +29,7 @@ from vlagents_ray.client.transports.shm import ShmTransport
 from vlagents_ray.client.transports.websocket import Stream
 from vlagents_ray.errors import PolicyUnavailable, TooManyRequests, Unauthorized
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.protocol.frames import decode_reply, encode_request
+from vlagents_ray.protocol.frames import decode_replies, encode_requests
 from vlagents_ray.protocol.messages import PROTOCOL_VERSION, Limits, Request
 from vlagents_ray.serve import periodic
 from vlagents_ray.serve.access import api_keys
@@ -141,7 +141,7 @@ def frame(payload: bytes) -> bytes:
     return head + mask + bytes(byte ^ mask[i % 4] for i, byte in enumerate(payload))
 
 
-RESET = frame(encode_request(Request("reset", Obs(), "move to the human", session="arm/robot-1")))
+RESET = frame(encode_requests([Request("reset", Obs(), "move to the human", session="arm/robot-1")]))
 
 
 def answer(port: int, *segments: bytes) -> bytes:
@@ -253,12 +253,12 @@ def test_a_silent_connection_ends_and_none_that_is_used_or_that_the_policy_keeps
         token = busy.known.add("arm")
         other, waiting = busy.stream(token), busy.stream(token)
         for client in (other, waiting):
-            client.send(encode_request(Request("reset", Obs())), 5)
+            client.send(encode_requests([Request("reset", Obs())]), 5)
             client.recv(5)
         busy.policy.hold.clear()
-        other.send(encode_request(Request("act", Obs())), 5)
+        other.send(encode_requests([Request("act", Obs())]), 5)
         assert busy.policy.acting.wait(5)
-        waiting._socket.sendall(frame(encode_request(Request("act", Obs(info={"much": bytes(20_000)})))))
+        waiting._socket.sendall(frame(encode_requests([Request("act", Obs(info={"much": bytes(20_000)}))])))
         token = quiet.known.add("arm")
         silent, used = quiet.stream(token), quiet.stream(token)
         begun = time.monotonic()
@@ -271,7 +271,7 @@ def test_a_silent_connection_ends_and_none_that_is_used_or_that_the_policy_keeps
             listen_to_the_end(silent)
         busy.policy.hold.set()
         for client in (other, waiting):
-            assert decode_reply(client.recv(5)).error is None
+            assert decode_replies(client.recv(5))[0].error is None
 
 
 @pytest.mark.parametrize(
@@ -297,10 +297,10 @@ def test_connections_end_with_their_key_and_no_others(keyed: Replica, change: di
 def test_a_revoked_key_is_cut_off_while_the_policy_takes_long(keyed: Replica) -> None:
     token, other = keyed.known.add("arm"), keyed.known.add("lab")
     busy, leaver = keyed.stream(other), keyed.stream(token)
-    busy.send(encode_request(Request("reset", Obs())), 5)
+    busy.send(encode_requests([Request("reset", Obs())]), 5)
     busy.recv(5)
     keyed.policy.hold.clear()
-    busy.send(encode_request(Request("act", Obs())), 5)
+    busy.send(encode_requests([Request("act", Obs())]), 5)
     assert keyed.policy.acting.wait(5)
     keyed.known.change("arm", revoked=True)
     with pytest.raises((ConnectionClosed, OSError)):
@@ -410,7 +410,7 @@ def test_a_full_replica_closes_a_proxied_websocket_with_its_reason(keyed: Replic
     for number in range(8):
         keyed.engine.sessions.open(f"lab/{number}")
     with connect(serving(keyed.engine, keyed.known.keys), additional_headers=shown(token)) as late:
-        assert isinstance(decode_reply(late.recv(5)).error, PolicyUnavailable)
+        assert isinstance(decode_replies(late.recv(5))[0].error, PolicyUnavailable)
         with pytest.raises(ConnectionClosed) as closed:
             late.recv(5)
     assert closed.value.rcvd.code == 1013
@@ -427,10 +427,10 @@ def test_a_probe_is_answered_without_a_session_and_a_broken_one_leaves_the_strea
         assert is_probe_answer(stream.receive_bytes(), probe)
         assert len(keyed.engine.sessions) == 0
         stream.send_bytes(b"VLA?\0\0")
-        error = decode_reply(stream.receive_bytes()).error
+        error = decode_replies(stream.receive_bytes())[0].error
         assert error.code == "malformed"
-        stream.send_bytes(encode_request(Request("reset", Obs())))
-        assert decode_reply(stream.receive_bytes()).error is None
+        stream.send_bytes(encode_requests([Request("reset", Obs())]))
+        assert decode_replies(stream.receive_bytes())[0].error is None
     assert not keyed.policy.acting.is_set()
 
 

@@ -36,7 +36,7 @@ from many import many
 from rpyc_client import LOCAL, ROOT, TUPLE, VALUE, call, document, request
 
 from vlagents_ray.interface import Obs
-from vlagents_ray.protocol.frames import CONTENT_TYPE, encode_request
+from vlagents_ray.protocol.frames import CONTENT_TYPE, encode_requests
 from vlagents_ray.protocol.messages import LocalAddress, Request
 from vlagents_ray.wire import rpyc
 from vlagents_ray.wire import vla_eval as vla_eval_codec
@@ -49,8 +49,8 @@ ANSWER_S = 20.0
 GROWTH = 64 * 2**20  # bytes, whatever the number of sequences
 KEYS = (None, "vlr_wrong", "vlr_leaver", "vlr_elsewhere", "vlr_", "\xe9", "x" * 5000)
 PICTURE = np.full((8, 8, 3), 9, np.uint8)
-RESET = encode_request(Request("reset", Obs({"front": PICTURE}), "move to the human", session="robot-1"))
-ACT = encode_request(Request("act", Obs({"front": PICTURE}), session="robot-1"))
+RESET = encode_requests([Request("reset", Obs({"front": PICTURE}), "move to the human", session="robot-1")])
+ACT = encode_requests([Request("act", Obs({"front": PICTURE}), session="robot-1")])
 FORM = b'--b\r\nContent-Disposition: form-data; name="obs"\r\n\r\n{}\r\n--b--'
 Sequence = list[bytes]
 

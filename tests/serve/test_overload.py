@@ -59,10 +59,9 @@ from vlagents_ray.protocol.frames import (
     CONTENT_TYPE,
     Decoded,
     decode_replies,
-    decode_reply,
     decode_requests,
     encode_replies,
-    encode_request,
+    encode_requests,
 )
 from vlagents_ray.protocol.messages import (
     DEFAULT_LIMITS,
@@ -370,7 +369,7 @@ def test_robots_have_a_share_of_the_memory_for_themselves() -> None:
 def test_how_long_to_wait_travels_with_the_refusal() -> None:
     for error in (TooManyRequests("x"), Overloaded("x")):
         error.retry_after_s = 2.5
-        told = decode_reply(encode_replies([Reply(error=error)])).error
+        told = decode_replies(encode_replies([Reply(error=error)]))[0].error
         assert type(told) is type(error)
         assert told.retry_after_s == 2.5  # type: ignore[union-attr]
 
@@ -670,7 +669,7 @@ def test_a_connection_ends_after_some_refusals_in_a_row(replica: KeyedReplica, m
     replica.known.change(visitor.name, rate=1e-6)
     replica.known.keys.check(visitor.token, "app").admit()
     for _ in range(REFUSALS):
-        client.send(encode_request(Request("reset", OBS)), 10)
+        client.send(encode_requests([Request("reset", OBS)]), 10)
         assert isinstance(decode_replies(client.recv(10))[0].error, TooManyRequests)
     with pytest.raises((ConnectionError, VLAgentsError)):
         client.recv(5)
@@ -680,7 +679,7 @@ def test_a_connection_ends_after_some_refusals_in_a_row(replica: KeyedReplica, m
 def test_a_key_over_its_rate_is_read_on_none_of_its_connections(replica: KeyedReplica) -> None:
     visitor = replica.visitor("right")
     first, second = _keyed_stream(replica, visitor.token), _keyed_stream(replica, visitor.token)
-    frame = encode_request(Request("reset", OBS))
+    frame = encode_requests([Request("reset", OBS)])
     for client in (first, second):
         client.send(frame, 10)
         assert decode_replies(client.recv(10))[0].error is None

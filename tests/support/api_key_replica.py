@@ -40,7 +40,7 @@ from vlagents_ray.client.transports.base import CodecChoice
 from vlagents_ray.client.transports.shm import ShmTransport
 from vlagents_ray.errors import BY_CODE, VLAgentsError
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.protocol.frames import decode_replies, decode_reply, encode_request
+from vlagents_ray.protocol.frames import decode_replies, encode_requests
 from vlagents_ray.protocol.messages import (
     PROTOCOL_VERSION,
     Limits,
@@ -396,7 +396,7 @@ def status_of(text: str) -> str:
 
 def _read_reply(data: bytes | str) -> str:
     assert isinstance(data, bytes)
-    error = decode_reply(data).error
+    error = decode_replies(data)[0].error
     return "done" if error is None else str(error.status)
 
 
@@ -441,7 +441,7 @@ def over_plasma(visitor: Visitor, _when: str) -> str:
     """A plasma channel."""
     visitor.become()
     key = visitor.name.encode().ljust(28, b"\0")
-    PlasmaChannel.frames[key] = encode_request(Request("reset", Obs(), visitor.mark))
+    PlasmaChannel.frames[key] = encode_requests([Request("reset", Obs(), visitor.mark)])
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:
         connection.settimeout(ANSWER_S)
         connection.connect(visitor.replica.plasma.plasma.socket)
@@ -455,7 +455,7 @@ def over_handle(visitor: Visitor, _when: str) -> str:
     from vlagents_ray.serve.replica.replica import answer_frame
 
     visitor.become()
-    frame = encode_request(Request("reset", Obs(), visitor.mark))
+    frame = encode_requests([Request("reset", Obs(), visitor.mark)])
     [reply] = decode_replies(asyncio.run(answer_frame(visitor.replica.engine, LIMITS, visitor.name, frame)))
     return "done" if reply.error is None else str(reply.error.status)
 
@@ -555,7 +555,7 @@ def _read_seen(data: bytes | str) -> str:
 
 
 def _stream_message(mark: str) -> bytes:
-    return encode_request(Request("reset", Obs(), mark))
+    return encode_requests([Request("reset", Obs(), mark)])
 
 
 def _reset(mark: str) -> dict[str, Any]:

@@ -75,7 +75,8 @@ def choose(points: Sequence[MeasuredPoint], goal: TuningGoal) -> MeasuredPoint:
     if not reaching:
         raise GoalMissed(_nearest(points, goal))
     variants = sorted({point.variant.name: point.variant for point in reaching}.values(), key=lambda v: len(v.changes))
-    best, *others = (_best([one for one in reaching if one.variant is variant], goal) for variant in variants)
+    reached = lambda point: point.actions_per_s if goal.kind == "throughput" else point.sessions  # noqa: E731
+    best, *others = (max((one for one in reaching if one.variant is variant), key=reached) for variant in variants)
     for other in others:
         if _is_better(other, best, goal):
             best = other
@@ -110,10 +111,6 @@ def figures(points: Sequence[MeasuredPoint]) -> list[list[str]]:
         numbers = [f"{one.actions_per_s:.1f}", f"{one.round_trip_ms:.1f}", f"{one.p99_ms:.1f}", f"{one.peak_mib:.0f}"]
         rows.append([one.variant.name, str(one.sessions), *numbers, f"{one.difference:.3%}"])
     return rows
-
-
-def _best(points: Sequence[MeasuredPoint], goal: TuningGoal) -> MeasuredPoint:
-    return max(points, key=lambda point: point.actions_per_s if goal.kind == "throughput" else point.sessions)
 
 
 def _is_better(one: MeasuredPoint, other: MeasuredPoint, goal: TuningGoal) -> bool:

@@ -158,7 +158,10 @@ def _run(options: argparse.Namespace) -> LoopReport:
         if report.outcome:
             say(f"marked as a {report.outcome} on the live page")
         say(_line(_HEADER))
-        say(_row(f"{options.mode}, {agent.transport}", report.jitter))
+        jitter = report.jitter
+        numbers = [f"{jitter['ticks']:.0f}", f"{jitter['missed']:.0f}", f"{100 * jitter['on_time']:.2f} %"]
+        times = (f"{jitter[key]:.3f}" for key in ("p50_ms", "p99_ms", "max_ms"))
+        say(_line((f"{options.mode}, {agent.transport}", *numbers, *times)))
         _say_outcome(report, say, led=leader is not None)
     if recorder is not None:  # closed: everything is written
         say(f"recorded: {recorder.episodes} episodes in {options.record}, {recorder.dropped} frames dropped")
@@ -308,11 +311,6 @@ def command_parser() -> tuple[argparse.ArgumentParser, list[argparse.Action], li
     simulated("--episodes", type=rows, default=10, metavar="N", help="how many (%(default)s)")
     simulated("--seed", type=int, default=0, help="of the first episode; the others count on (%(default)s)")
     return parser, of_robot, of_env
-
-
-def _row(name: str, jitter: dict[str, float]) -> str:
-    numbers = [f"{jitter['ticks']:.0f}", f"{jitter['missed']:.0f}", f"{100 * jitter['on_time']:.2f} %"]
-    return _line((name, *numbers, *(f"{jitter[key]:.3f}" for key in ("p50_ms", "p99_ms", "max_ms"))))
 
 
 def _line(cells: Sequence[str]) -> str:

@@ -311,15 +311,11 @@ class Libero(SimulatorEnv):
             "joints": raw["robot0_joint_pos"],
         }
         return Obs(
-            cameras={name: _turned(raw[f"{own}_image"]) for name, own in cameras.items()},
+            cameras={name: np.ascontiguousarray(raw[f"{own}_image"][::-1, ::-1]) for name, own in cameras.items()},
             gripper=gripper_opening(raw),
             state={name: part.astype(np.float32) for name, part in state.items()},
             info={"sim_state": {"positions": self._env.positions(), "goal": self._env.goal}},
         )
-
-
-def _turned(image: np.ndarray) -> np.ndarray:
-    return np.ascontiguousarray(image[::-1, ::-1])
 
 
 def _contract_of(protocol: LiberoProtocol) -> Contract:

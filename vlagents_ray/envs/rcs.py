@@ -284,7 +284,8 @@ class Rcs(SimulatorEnv):
             self._env = maker.create_env(config)
             self._resources.callback(self._env.close)
             self._sim = self._env.get_wrapper_attr("sim")
-            self._loose = _loose_joints(self._sim.model)
+            model, free = self._sim.model, int(require("mujoco").mjtJoint.mjJNT_FREE)
+            self._loose = [model.joint(i).name for i in range(model.njnt) if model.jnt_type[i] == free]
             self._arms = Arms(self._env.action_space, self._env.observation_space, self._mode)
         self._contract = Contract(
             cameras=dict.fromkeys(config.camera_cfgs or (), CameraSpec(height, width)),
@@ -367,11 +368,6 @@ class DuoBench(Rcs):
     suite = "duobench"
     known: ClassVar[Mapping[str, RcsTask]] = DUOBENCH_TASKS
     packages, distributions = ("rcs", "duobench"), ("rcs-core", "duobench", "mujoco")
-
-
-def _loose_joints(model: Any) -> list[str]:
-    free = int(require("mujoco").mjtJoint.mjJNT_FREE)
-    return [model.joint(i).name for i in range(model.njnt) if model.jnt_type[i] == free]
 
 
 class Arms:

@@ -76,7 +76,7 @@ class RobosuiteEnv(SimulatorEnv):
         contract = self.contract
         cameras = list(contract.cameras or {}) if look else []
         return Obs(
-            cameras={name: _upright(raw[f"{name}_image"]) for name in cameras},
+            cameras={name: np.ascontiguousarray(raw[f"{name}_image"][::-1]) for name in cameras},
             gripper=gripper_opening(raw) if contract.gripper else None,
             state={name: np.asarray(raw[self._raw.get(name, name)], np.float32) for name in contract.state or {}},
             info={"sim_state": self._sim_state(raw)},
@@ -86,10 +86,6 @@ class RobosuiteEnv(SimulatorEnv):
 def gripper_opening(raw: Mapping[str, Any]) -> float:
     """Return the opening of the Panda's gripper in robosuite's observation, 0 closed to 1 open."""
     return min(max(float(raw["robot0_gripper_qpos"][0]) / _OPEN_M, 0.0), 1.0)
-
-
-def _upright(image: np.ndarray) -> np.ndarray:
-    return np.ascontiguousarray(image[::-1])
 
 
 class CameraRenderer:

@@ -270,7 +270,9 @@ class _Replaying:
             for step in self._steps(part, agent):
                 try:
                     if not begun:
-                        agent.reset(step.obs, part.instruction, **_options(play))
+                        # without the options that choose its weights
+                        options = {name: play.options[name] for name in play.options.keys() - {CHOICE, STEP, OPTION}}
+                        agent.reset(step.obs, part.instruction, **options)
                         begun = True
                     got = agent.act(step.obs).rows()
                 except VLAgentsError as error:
@@ -293,11 +295,6 @@ class _Replaying:
         with self.lock:
             mae = self.result.table.add(expected, got)
             self.result.frames.append(FrameError(part.dataset.root.name, part.index, frame, mae))
-
-
-def _options(play: RecordedSession) -> dict[str, Any]:
-    """Return the reset's options for the policy, without those that choose its weights."""
-    return {name: value for name, value in play.options.items() if name not in (CHOICE, STEP, OPTION)}
 
 
 def write_result(result: OpenLoopResult, policy: str, folder: Path) -> Path:

@@ -127,7 +127,8 @@ class Pi0(ModelPolicy):
         device = torch_device(self.config.device)
         dtype = torch_dtype(self.config.dtype, device)
         ensure_torchvision()
-        network = _network(path, device, dtype)
+        network = from_pretrained(require("transformers").PI0ForConditionalGeneration, path, dtype=dtype)
+        network = network.eval().requires_grad_(False).to(device)
         passes = Pi0HfPasses(network, self.compilation)
         passes.adapters = self.adapters
         return LoadedPi0(network, _processor(path), device, dtype, passes)
@@ -243,11 +244,6 @@ def _cameras(chosen: Mapping[str, str] | None) -> dict[str, str]:
     known = [name for name in CAMERAS if name in asked] if asked and set(asked) <= set(CAMERAS) else CAMERAS
     mapping = choose_cameras(chosen, USUAL_CAMERAS, known)
     return {name: mapping[name] for name in known}
-
-
-def _network(path: Path, device: Any, dtype: Any) -> Any:
-    network = from_pretrained(require("transformers").PI0ForConditionalGeneration, path, dtype=dtype)
-    return network.eval().requires_grad_(False).to(device)
 
 
 def _processor(path: Path) -> Any:

@@ -46,11 +46,6 @@ _OF_CLOSE = ("op", "step", *_OPTIONAL)
 _REQUEST_KEYS = {"op", "obs", "instruction", "kwargs", "contract", "history", "blobs", "step", *_OPTIONAL}
 
 
-def encode_request(request: Request, codec: ImageCodec = RAW) -> bytes:
-    """Encode a request as one frame, without changing `request.obs`."""
-    return b"".join(request_parts([request], codec))
-
-
 def encode_requests(requests: Sequence[Request], codec: ImageCodec = RAW) -> bytes:
     """Encode requests as one frame, the inverse of `decode_requests`."""
     return b"".join(request_parts(requests, codec))
@@ -241,11 +236,6 @@ def _write_reply(reply: Reply, writer: ValueWriter) -> dict[str, Any]:
     if reply.draining:
         node["draining"] = True
     return node
-
-
-def decode_reply(data: Buffer, limits: Limits = DEFAULT_LIMITS) -> Reply:
-    """Decode the reply in a frame; a server's error has the class that the server raised."""
-    return decode_replies(data, limits)[0]
 
 
 def decode_replies(data: Buffer, limits: Limits = DEFAULT_LIMITS) -> list[Reply]:

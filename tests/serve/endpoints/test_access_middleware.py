@@ -291,7 +291,7 @@ def test_a_body_that_does_not_come_is_cut_off(endpoint: Endpoint) -> None:
 
 
 def test_a_websocket_that_never_reads_its_replies_ends_with_its_sessions_alone(endpoint: Endpoint) -> None:
-    from vlagents_ray.protocol.frames import encode_request
+    from vlagents_ray.protocol.frames import encode_requests
     from vlagents_ray.protocol.messages import Request
 
     with endpoint.agent("lab", "websocket") as bystander:
@@ -309,11 +309,11 @@ def test_a_websocket_that_never_reads_its_replies_ends_with_its_sessions_alone(e
             ping_interval=None,
             close_timeout=1,
         ) as stream:
-            stream.send(encode_request(Request("reset", Obs())))
+            stream.send(encode_requests([Request("reset", Obs())]))
             wait_for(deaf_ones)
             with contextlib.suppress(ConnectionClosed):  # before the last is sent, on a busy machine
                 for _ in range(30):
-                    stream.send(encode_request(Request("act", Obs(info={"bytes": 2**20}))))
+                    stream.send(encode_requests([Request("act", Obs(info={"bytes": 2**20}))]))
             wait_for(lambda: not deaf_ones())
             bystander.act(Obs())
             with contextlib.suppress(OSError):

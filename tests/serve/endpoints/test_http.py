@@ -16,7 +16,7 @@ from vlagents_ray.contract import CameraSpec, Contract, StateSpec
 from vlagents_ray.images.jpeg_png import encode_jpeg
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.policies.loading import report_progress, report_uncompiled
-from vlagents_ray.protocol.frames import CONTENT_TYPE, encode_request
+from vlagents_ray.protocol.frames import CONTENT_TYPE, encode_requests
 from vlagents_ray.protocol.messages import Limits, Request
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
@@ -151,7 +151,7 @@ def test_a_camera_or_state_whose_name_is_none_is_refused(client: TestClient, nam
         Obs({"front": IMAGE}, None, {"joints": np.zeros(2, np.float32), name: np.zeros(2, np.float32)}),
     ):
         headers = {"x-session-id": "robot-1", "content-type": CONTENT_TYPE}
-        answer = client.post("/v1/act", content=encode_request(Request("act", obs)), headers=headers)
+        answer = client.post("/v1/act", content=encode_requests([Request("act", obs)]), headers=headers)
         assert (answer.status_code, answer.json()["code"]) == (422, "invalid_observation")
         assert "want 1 to 128 printable characters" in answer.json()["detail"]
 
@@ -206,7 +206,7 @@ def test_health_and_refusals_name_the_step_of_a_long_start() -> None:
 NAN, HUGE = float("nan"), 10**400
 
 
-FRAME = encode_request(Request("act", Obs({"front": IMAGE}, 1.0, {"joints": np.zeros(2, np.float32)})))
+FRAME = encode_requests([Request("act", Obs({"front": IMAGE}, 1.0, {"joints": np.zeros(2, np.float32)}))])
 FRAMED = {"content-type": CONTENT_TYPE}
 
 # (request, status, code): each kind of fault that a robot's software can commit; tests/protocol has more of frames.
@@ -250,7 +250,7 @@ FAULTS: list[tuple[dict[str, Any], int, str]] = [
     ({"content": b"{}", "headers": {"content-type": "multipart/form-data"}}, 400, "malformed"),
     ({"content": b"--x", "headers": {"content-type": "multipart/form-data; boundary=x"}}, 400, "malformed"),
     ({"content": bytes(400_000), "headers": FRAMED}, 413, "too_large"),
-    ({"content": encode_request(Request("close")), "headers": FRAMED}, 400, "malformed"),
+    ({"content": encode_requests([Request("close")]), "headers": FRAMED}, 400, "malformed"),
     ({"content": FRAME.replace(b'"<f4"', b'"|O8"'), "headers": FRAMED}, 400, "malformed"),
 ]  # fmt: skip
 

@@ -28,7 +28,7 @@ from vlagents_ray.client.transports.shm import ShmTransport, reaches
 from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, InvalidObservation, PolicyUnavailable, UnknownSession
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol import shm_layout
-from vlagents_ray.protocol.frames import encode_request
+from vlagents_ray.protocol.frames import encode_requests
 from vlagents_ray.protocol.messages import LocalAddress, Request, peer_uid
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints.shm import ShmServer
@@ -285,7 +285,7 @@ def test_faults_are_answered_and_harm_nobody(served: tuple[Engine, ShmServer]) -
 
     act = shm_layout.ShmWriter().write([request("act")])
     assert act is not None
-    frame = encode_request(request("act"))
+    frame = encode_requests([request("act")])
 
     def memory(data: bytes, sealed: bool = True) -> int:
         descriptor = os.memfd_create("test", os.MFD_ALLOW_SEALING)
@@ -329,7 +329,7 @@ def test_faults_are_answered_and_harm_nobody(served: tuple[Engine, ShmServer]) -
 
 
 def test_a_client_that_reads_no_replies_is_cut_off(served: tuple[Engine, ShmServer]) -> None:
-    frame = encode_request(request("act"))
+    frame = encode_requests([request("act")])
     descriptor = os.memfd_create("test", os.MFD_ALLOW_SEALING)
     os.write(descriptor, frame)
     fcntl.fcntl(descriptor, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK)

@@ -29,7 +29,7 @@ from websockets.sync.client import connect
 from vlagents_ray.client.transports.websocket import Stream
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.protocol.frames import Decoded, decode_reply, decode_requests, encode_request
+from vlagents_ray.protocol.frames import Decoded, decode_replies, decode_requests, encode_requests
 from vlagents_ray.protocol.messages import STREAM_BYTES, Budget, Limits, Reply, Request
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints import websocket
@@ -64,8 +64,8 @@ def stream(endpoint: WebSocketServer) -> Stream:
 
 def ask(client: Stream, op: Any, pixel: int = 0, **info: Any) -> Reply:
     obs = Obs({"front": np.full((16, 16, 3), pixel, np.uint8)}, info=info)
-    client.send(encode_request(Request(op, obs, request_id=os.urandom(4).hex())), 5)
-    return decode_reply(client.recv(5))
+    client.send(encode_requests([Request(op, obs, request_id=os.urandom(4).hex())]), 5)
+    return decode_replies(client.recv(5))[0]
 
 
 def test_each_connection_is_a_session_that_ends_with_it(endpoint: WebSocketServer) -> None:
@@ -99,8 +99,8 @@ def test_an_ordinary_websocket_client_is_served_too(endpoint: WebSocketServer) -
         probe = bytes_probe(300_000)
         socket_.send(probe)
         assert is_probe_answer(socket_.recv(5), probe)
-        socket_.send(encode_request(Request("reset", Obs())))
-        assert decode_reply(socket_.recv(5)).error is None
+        socket_.send(encode_requests([Request("reset", Obs())]))
+        assert decode_replies(socket_.recv(5))[0].error is None
 
 
 @pytest.mark.parametrize("fragments", [True, False])
@@ -152,7 +152,7 @@ def test_a_client_that_takes_no_replies_holds_up_nobody(
     slow, other = stream(endpoint), stream(endpoint)
     for client in (slow, other):
         ask(client, "reset")
-    frame = encode_request(Request("act", Obs({"front": np.zeros((2, 2, 3), np.uint8)}, info={"bytes": 3_000_000})))
+    frame = encode_requests([Request("act", Obs({"front": np.zeros((2, 2, 3), np.uint8)}, info={"bytes": 3_000_000}))])
     with suppress(ConnectionClosed, OSError):  # cut off before the last is sent, on a busy machine
         for _ in range(4):
             slow.send(frame, 5)
@@ -218,12 +218,12 @@ def test_who_does_not_wait_for_answers_fills_no_memory_and_gets_them_all(
 
     monkeypatch.setattr(Echo, "act", act)
     frames = [
-        encode_request(Request("act", Obs({"front": np.full((64, 64, 3), i % 256, np.uint8)}), request_id=str(i)))
+        encode_requests([Request("act", Obs({"front": np.full((64, 64, 3), i % 256, np.uint8)}), request_id=str(i))])
         for i in range(1000)
     ]
     with connect(f"ws://127.0.0.1:{endpoint.address.port}{endpoint.address.path}", compression=None) as client:
-        client.send(encode_request(Request("reset", Obs())))
-        assert decode_reply(client.recv(5)).error is None
+        client.send(encode_requests([Request("reset", Obs())]))
+        assert decode_replies(client.recv(5))[0].error is None
         sending = threading.Thread(target=lambda: [client.send(frame) for frame in frames])
         sending.start()
         (one,) = endpoint._clients
@@ -231,7 +231,7 @@ def test_who_does_not_wait_for_answers_fills_no_memory_and_gets_them_all(
         assert sending.is_alive()
         assert endpoint.engine.queue.depth() < 400  # 256, and what was in the same read: 85 frames in 1 MiB
         hurry.set()
-        replies = [decode_reply(client.recv(10)) for _ in frames]
+        replies = [decode_replies(client.recv(10))[0] for _ in frames]
         sending.join(10)
     assert [reply.request_id for reply in replies] == [str(i) for i in range(1000)]
     assert all(reply.act is not None for reply in replies)

@@ -26,7 +26,7 @@ from vlagents_ray.client.transports.shm import ShmTransport
 from vlagents_ray.client.transports.websocket import Stream
 from vlagents_ray.errors import DeadlineExceeded
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.protocol.frames import decode_reply, encode_request
+from vlagents_ray.protocol.frames import decode_replies, encode_requests
 from vlagents_ray.protocol.messages import DEADLINE_HEADER, SESSION_HEADER, Limits, Reply, Request
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
@@ -84,10 +84,10 @@ class WebSocket:
         self.close = self._stream.close
 
     def send(self, request: Request) -> None:
-        self._stream.send(encode_request(request), 5)
+        self._stream.send(encode_requests([request]), 5)
 
     def receive(self) -> Reply:
-        return decode_reply(self._stream.recv(20))
+        return decode_replies(self._stream.recv(20))[0]
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ from starlette.testclient import TestClient
 
 from vlagents_ray.images.codecs import JPEG
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.protocol.frames import CONTENT_TYPE, decode_reply, encode_request
+from vlagents_ray.protocol.frames import CONTENT_TYPE, decode_replies, encode_requests
 from vlagents_ray.protocol.messages import Limits, Op, Request
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
@@ -67,16 +67,16 @@ def check(timing: dict[str, float], round_trip_ms: float) -> None:
 
 def test_stages_add_up_over_http_in_json_and_in_frames(client: TestClient) -> None:
     headers = {"x-session-id": "robot", "content-type": CONTENT_TYPE}
-    client.post("/v1/reset", content=encode_request(Request("reset", OBS)), headers=headers)
+    client.post("/v1/reset", content=encode_requests([Request("reset", OBS)]), headers=headers)
     begun = time.perf_counter()
-    answer = client.post("/v1/act", content=encode_request(Request("act", OBS), JPEG), headers=headers)
+    answer = client.post("/v1/act", content=encode_requests([Request("act", OBS)], JPEG), headers=headers)
     check(answer.json()["timing"], (time.perf_counter() - begun) * 1e3)
     assert answer.json()["info"]["text"] == "ünïcode"
     begun = time.perf_counter()
     answer = client.post(
-        "/v1/act", content=encode_request(Request("act", OBS), JPEG), headers={**headers, "accept": CONTENT_TYPE}
+        "/v1/act", content=encode_requests([Request("act", OBS)], JPEG), headers={**headers, "accept": CONTENT_TYPE}
     )
-    check(decode_reply(answer.content).timing, (time.perf_counter() - begun) * 1e3)
+    check(decode_replies(answer.content)[0].timing, (time.perf_counter() - begun) * 1e3)
     form = {"obs": (None, json.dumps({"gripper": 1.0}), "application/json")}
     begun = time.perf_counter()
     answer = client.post("/v1/act", files=form, headers={"x-session-id": "robot"})
@@ -86,12 +86,12 @@ def test_stages_add_up_over_http_in_json_and_in_frames(client: TestClient) -> No
 def test_what_was_answered_is_recorded_with_its_code(client: TestClient, engine: Engine) -> None:
     headers = {"x-session-id": "robot", "content-type": CONTENT_TYPE}
     for op, obs in (("act", OBS), ("reset", OBS), ("act", OBS), ("act", Obs(info={"fail": 1}))):
-        client.post(f"/v1/{op}", content=encode_request(Request(op, obs)), headers=headers)  # type: ignore[arg-type]
+        client.post(f"/v1/{op}", content=encode_requests([Request(op, obs)]), headers=headers)  # type: ignore[arg-type]
     client.post("/v1/act", content=b"VLA", headers=headers)
     with client.websocket_connect("/v1/stream") as socket:
         socket.send_bytes(b"garbage")
         socket.receive_bytes()
-        socket.send_bytes(encode_request(Request("reset", OBS)))
+        socket.send_bytes(encode_requests([Request("reset", OBS)]))
         socket.receive_bytes()
         assert engine.sessions.by_transport() == {"http": 1, "websocket": 1}
     batches: list[int] = []

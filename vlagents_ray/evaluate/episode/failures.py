@@ -181,17 +181,13 @@ def checked_obs(obs: object, contract: Contract, where: str, *, images: bool = T
     try:
         check_observation(obs, contract if images else replace(contract, cameras=None))
     except InvalidObservation as error:
-        if _has_diverged(obs):
+        numbers = [*map(np.asarray, obs.state.values()), np.asarray(0 if obs.gripper is None else obs.gripper)]
+        if not all(np.isfinite(part).all() for part in numbers if part.dtype.kind == "f"):
             wrong = EnvFailed
         raise wrong(f"env {where}: the observation does not fit the env's own contract: {error}") from error
     except TypeError as error:  # such as a gripper that is not a number
         raise wrong(f"env {where}: got {obs.gripper!r} as the gripper, want a number in [0, 1]") from error
     return obs
-
-
-def _has_diverged(obs: Obs) -> bool:
-    numbers = [*map(np.asarray, obs.state.values()), np.asarray(0 if obs.gripper is None else obs.gripper)]
-    return not all(np.isfinite(part).all() for part in numbers if part.dtype.kind == "f")
 
 
 def _number(reward: Any) -> float:

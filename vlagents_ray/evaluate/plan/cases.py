@@ -61,9 +61,11 @@ class EvalCase:
     @property
     def settings(self) -> dict[str, Any]:
         """All that an episode depends on, apart from its number and seed."""
-        pushed = self.policy.pushed_weights
-        return {
-            **({} if self.robot is None else {"robot": _settings(*self.on_robot)}),
+        pushed, robot = self.policy.pushed_weights, {}
+        if self.robot is not None:
+            settings, task = self.on_robot
+            robot = {"robot": settings.model_dump(exclude={"tasks", "key"}) | {"task": task.model_dump()}}
+        return robot | {
             "pushed_weights": None if pushed is None else pushed.model_dump(),
             "env": self.env,
             "env_options": self.suite.env_options,
@@ -114,10 +116,6 @@ def env_program(cell: EvalCase, code: Callable[[str], Program] = code_of_class) 
     modules = [f"{cls.__module__}:{cls.__name__}", cell.suite.env_options.get("module") or namespace]
     found = {name: digest for module in modules if isinstance(module, str) for name, digest in code(module).items()}
     return found | files_named(settings, folders=False)
-
-
-def _settings(robot: RobotConfig, task: RobotTask) -> dict[str, Any]:
-    return robot.model_dump(exclude={"tasks", "key"}) | {"task": task.model_dump()}
 
 
 def contender(policy: str, step: int | None) -> str:

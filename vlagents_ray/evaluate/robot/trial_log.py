@@ -72,7 +72,8 @@ class TrialLog:
             self._file = self._path.open("a+b")
         try:
             self._lock()
-            self._read(config, hmac.digest(self.key, _identity(cells), hashlib.sha256).hex())
+            plan = canonical([[cell.fingerprint, *cell.name, cell.planned, cell.suite.seeds] for cell in cells])
+            self._read(config, hmac.digest(self.key, plan.encode(), hashlib.sha256).hex())
         except BaseException:
             self._file.close()
             raise
@@ -184,10 +185,6 @@ def _crypt(key: bytes, nonce: bytes, text: bytes) -> bytes:
     """Encrypt or decrypt with SHAKE-256 of key and nonce as the key stream."""
     stream = hashlib.shake_256(b"vlagents_ray trials" + key + nonce).digest(len(text))
     return bytes(a ^ b for a, b in zip(text, stream, strict=True))
-
-
-def _identity(cells: Sequence[EvalCase]) -> bytes:
-    return canonical([[cell.fingerprint, *cell.name, cell.planned, cell.suite.seeds] for cell in cells]).encode()
 
 
 def _key(config: EvalConfig) -> bytes:

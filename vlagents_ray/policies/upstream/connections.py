@@ -63,7 +63,8 @@ class Lanes:
         for client in self._clients:
             self._connect_in_background(client)
         with self._changed:
-            self._changed.wait_for(lambda: self._ready or not _is_passing(self._reason), timeout_s)
+            # Waiting may help if the upstream is unavailable, but not if it is the wrong one.
+            self._changed.wait_for(lambda: self._ready or self._reason.status != NoReplica.status, timeout_s)
             failed = None if self._ready else self._reason
         if failed is not None:
             self.close()
@@ -200,11 +201,6 @@ class Lanes:
             self._ready.append(client)
             self._changed.notify_all()
         logger.info("upstream %s answers", client.options.url)
-
-
-def _is_passing(reason: VLAgentsError) -> bool:
-    """Return whether waiting may help: the upstream is unavailable, not the wrong one."""
-    return reason.status == NoReplica.status
 
 
 # Connections to upstreams that keep sessions: one for each session's episode.

@@ -154,7 +154,9 @@ def float64_multi_array(row: np.ndarray) -> dict[str, Any]:
 
 def joint_state(row: np.ndarray, names: Sequence[str], values: Values = "position") -> dict[str, Any]:
     """Return a `sensor_msgs/msg/JointState` that commands joints, (D,) in the order of `names`."""
-    return {"header": _header(), "name": list(names), values: row.astype(np.float64).tolist()}
+    now = time.time_ns()
+    header = {"stamp": {"sec": now // 10**9, "nanosec": now % 10**9}, "frame_id": ""}
+    return {"header": header, "name": list(names), values: row.astype(np.float64).tolist()}
 
 
 def twist(row: np.ndarray, fields: Sequence[str] = TWIST) -> dict[str, Any]:
@@ -178,11 +180,6 @@ def joint_trajectory(row: np.ndarray, names: Sequence[str], reach_s: float) -> d
     }
     now = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}  # controllers read a stamp of zero as now
     return {"header": now, "joint_names": list(names), "points": [point]}
-
-
-def _header() -> dict[str, Any]:
-    now = time.time_ns()
-    return {"stamp": {"sec": now // 10**9, "nanosec": now % 10**9}, "frame_id": ""}
 
 
 def _whole(name: str, value: Any) -> int:

@@ -159,7 +159,10 @@ def _change(file: Path, change: Callable[[list[Key]], list[Key]]) -> None:
     """
     with _locked(file):
         keys = change(read_keys(file))
-        text = json.dumps({"keys": [_document(key) for key in keys]}, indent=2) + "\n"
+        stated = [
+            {name: value for name, value in asdict(key).items() if value not in (None, (), False)} for key in keys
+        ]
+        text = json.dumps({"keys": stated}, indent=2) + "\n"
         descriptor, name = tempfile.mkstemp(dir=file.parent, prefix=f".{file.name}.")
         try:
             with os.fdopen(descriptor, "w", encoding="utf-8") as written:
@@ -200,10 +203,6 @@ def _sync_folder(folder: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
-
-
-def _document(key: Key) -> dict[str, Any]:
-    return {name: value for name, value in asdict(key).items() if value not in (None, (), False)}
 
 
 @contextlib.contextmanager

@@ -158,7 +158,8 @@ class Pool:
 
     def _create(self, capacity: int) -> Channel:
         """Create a channel without the lock, which the policy thread needs: allocation can be slow."""
-        store = _store_bytes()
+        here = ray.get_runtime_context().get_node_id()
+        store: float = next(one["Resources"]["object_store_memory"] for one in ray.nodes() if one["NodeID"] == here)
         with self._lock:
             if self._bytes + capacity > _SHARE * store:
                 raise MessageTooLarge(
@@ -233,12 +234,6 @@ class LeasedChannel:
         if self._channel is not None:
             self._pool.release(self._channel)
             self._channel = None
-
-
-def _store_bytes() -> float:
-    node_id = ray.get_runtime_context().get_node_id()
-    size: float = next(node["Resources"]["object_store_memory"] for node in ray.nodes() if node["NodeID"] == node_id)
-    return size
 
 
 def _remove_if_dead(path: Path) -> None:
