@@ -38,6 +38,16 @@ def taken(waiting: FairQueue, size: int = 16, now: float = 0.0) -> list[str]:
     return [one.session_id for one in waiting.take(size, now)[0]]
 
 
+@pytest.mark.parametrize("others", [0, 1])
+def test_sessions_that_wait_are_counted_and_found_also_if_there_is_only_one(others: int) -> None:
+    requests = [ticket(f"env{i}") for i in range(1 + others)]
+    waiting = filled(*requests)
+    assert waiting.sessions == 1 + others
+    assert waiting.heads() == requests
+    assert "env0" in waiting
+    assert waiting.sessions == 1 + others
+
+
 def test_a_large_bundle_delays_others_by_no_more_than_a_batch() -> None:
     waiting = filled(*bundle("learner", 512), *(ticket(f"env{i}") for i in range(10)))
     first = taken(waiting)
