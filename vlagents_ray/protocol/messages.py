@@ -83,7 +83,7 @@ class Reply:
     timing: dict[str, float] = field(default_factory=dict)  # ms, by stage
 
     def answers(self, request: Request) -> bool:
-        """Return whether this is the reply to that request not to an earlier one; an unreadable frame has no id."""
+        """Return whether this is the reply to that request, not an earlier one; an unreadable frame has no id."""
         return self.request_id in ("", request.request_id)
 
     @property
