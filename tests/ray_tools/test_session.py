@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import psutil
 import pytest
@@ -47,6 +48,15 @@ def test_a_cluster_that_cannot_be_joined_is_a_wrong_setting(error: Exception, mo
         cause = re.escape(f"Ray cluster at '{named}': {error}")
         with pytest.raises(ConfigError, match=cause), joined(*([asked] if asked else [])):
             pytest.fail("joined it")
+
+
+@pytest.mark.parametrize(("here", "own"), [("127.0.0.1:1", True), ("127.0.0.1:2", False), (None, False)])
+def test_a_cluster_that_was_lost_is_not_taken_for_the_one_that_this_process_joined_later(
+    monkeypatch: pytest.MonkeyPatch, here: str | None, own: bool
+) -> None:
+    monkeypatch.setattr(joining, "_started", [SimpleNamespace(gcs_address="127.0.0.1:1")])
+    monkeypatch.setattr(joining, "node_of_this_process", lambda: here and SimpleNamespace(gcs_address=here))
+    assert joining.started_here() is own
 
 
 @pytest.mark.parametrize(

@@ -270,8 +270,8 @@ class _Replaying:
             for step in self._steps(part, agent):
                 try:
                     if not begun:
-                        # without the options that choose its weights
-                        options = {name: play.options[name] for name in play.options.keys() - {CHOICE, STEP, OPTION}}
+                        chosen = CHOICE, STEP, OPTION  # options that choose its weights
+                        options = {name: one for name, one in play.options.items() if name not in chosen}
                         agent.reset(step.obs, part.instruction, **options)
                         begun = True
                     got = agent.act(step.obs).rows()

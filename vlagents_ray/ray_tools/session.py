@@ -199,7 +199,8 @@ def leave_ray() -> None:
 
 def started_here() -> bool:
     """Return whether this process is in a cluster that it started itself."""
-    return bool(_started) and node_of_this_process() is not None
+    node = node_of_this_process()
+    return node is not None and any(one.gcs_address == node.gcs_address for one in _started)
 
 
 @contextlib.contextmanager
