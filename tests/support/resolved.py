@@ -54,7 +54,7 @@ def lines(file: Path) -> list[str]:
 
 def overrides(requirements: Sequence[str]) -> list[str]:
     """The lines of torch.txt but for packages of which the requirements pin a version, as for another CUDA."""
-    pinned = {Requirement(text).name for text in requirements if "==" in text}
+    pinned = {one.name for one in map(Requirement, requirements) if any(part.operator == "==" for part in one.specifier)}
     return [text for text in lines(TORCH) if Requirement(text).name not in pinned]
 
 
