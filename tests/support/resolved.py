@@ -54,7 +54,8 @@ def lines(file: Path) -> list[str]:
 
 def overrides(requirements: Sequence[str]) -> list[str]:
     """The lines of torch.txt but for packages of which the requirements pin a version, as for another CUDA."""
-    pinned = {one.name for one in map(Requirement, requirements) if any(part.operator == "==" for part in one.specifier)}
+    wanted = map(Requirement, requirements)
+    pinned = {one.name for one in wanted if any(part.operator == "==" for part in one.specifier)}
     return [text for text in lines(TORCH) if Requirement(text).name not in pinned]
 
 
