@@ -188,7 +188,7 @@ class TestAPolicysPython:
         (["gcc", "clang"], True, "gcc"),
         (["clang"], True, "clang"),
         (["gcc"], False, "no "),
-        ([], True, "none: models with `compile: true` run uncompiled"),
+        ([], True, "none, which torch.compile needs on a GPU"),
     ],
 )
 def test_triton_needs_a_compiler_and_pythons_headers(
