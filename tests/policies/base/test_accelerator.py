@@ -6,7 +6,6 @@ import copy
 import re
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -18,7 +17,7 @@ from vlagents_ray import Obs
 from vlagents_ray.contract import ActionSpec, Contract, StateSpec
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import DISTRIBUTION, SAMPLES, Act
-from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row, accelerator
+from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row
 from vlagents_ray.policies.base.accelerator import is_device_failure, is_out_of_memory, jax_device, torch_device
 from vlagents_ray.policies.base.model_inputs import state_vector
 from vlagents_ray.policies.loading import loading_report, report_device
@@ -80,33 +79,6 @@ def test_what_a_gpu_is_is_reported(monkeypatch: Any) -> None:
         "memory_mib": 81920,
         "cuda": "13.0",
     }
-
-
-@pytest.mark.parametrize(
-    ("file", "smi", "version"),
-    [
-        (
-            "NVRM version: NVIDIA UNIX x86_64 Kernel Module  550.54.15  Tue Mar  5",
-            "exit 9",
-            "550.54.15",
-        ),
-        ("NVRM version: NVIDIA UNIX Open Kernel Module for x86_64  580.65.06  Release Build", "exit 9", "580.65.06"),
-        (None, "echo 576.02; echo 576.02", "576.02"),  # WSL2, with two GPUs
-        (None, "exit 9", None),
-        (None, None, None),
-    ],
-)
-def test_the_driver_is_the_kernels_or_that_of_windows(
-    file: str | None, smi: str | None, version: str | None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setattr(accelerator, "_DRIVER", tmp_path / "version")
-    monkeypatch.setenv("PATH", str(tmp_path))
-    if file is not None:
-        (tmp_path / "version").write_text(file)
-    if smi is not None:
-        (tmp_path / "nvidia-smi").write_text(f"#!/bin/sh\n{smi}\n")
-        (tmp_path / "nvidia-smi").chmod(0o755)
-    assert accelerator.driver_version() == version
 
 
 class FakeJax:

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from vlagents_ray.errors import ConfigError, MissingDependency
+from vlagents_ray.policies.base import accelerator
 from vlagents_ray.serve.python_env import create as making
 from vlagents_ray.serve.python_env.create import create, find_python, make_environment
 
@@ -198,6 +199,33 @@ def test_a_gpu_is_found_on_linux_and_wsl_and_none_on_a_jetson(
     monkeypatch.setenv("PATH", str(tmp_path / "bin"))
     monkeypatch.setattr(making, "Path", lambda path: tmp_path / path.removeprefix("/"))
     assert making.has_gpu() is found
+
+
+@pytest.mark.parametrize(
+    ("file", "smi", "version"),
+    [
+        (
+            "NVRM version: NVIDIA UNIX x86_64 Kernel Module  550.54.15  Tue Mar  5",
+            "exit 9",
+            "550.54.15",
+        ),
+        ("NVRM version: NVIDIA UNIX Open Kernel Module for x86_64  580.65.06  Release Build", "exit 9", "580.65.06"),
+        (None, "echo 576.02; echo 576.02", "576.02"),  # WSL2, with two GPUs
+        (None, "exit 9", None),
+        (None, None, None),
+    ],
+)
+def test_the_driver_is_the_kernels_or_that_of_windows(
+    file: str | None, smi: str | None, version: str | None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(accelerator, "_DRIVER", tmp_path / "version")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    if file is not None:
+        (tmp_path / "version").write_text(file)
+    if smi is not None:
+        (tmp_path / "nvidia-smi").write_text(f"#!/bin/sh\n{smi}\n")
+        (tmp_path / "nvidia-smi").chmod(0o755)
+    assert accelerator.driver_version() == version
 
 
 def test_it_imports_torchvision_and_lerobot_as_fits_the_machine(
