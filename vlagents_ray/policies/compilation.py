@@ -179,7 +179,7 @@ class CudaGraph:
         """Capture a function of tensors on one GPU without other effects; raises `RuntimeError` if that fails.
 
         Args:
-            function: The function. It is kept, since the graph reads constants of a compiled one.
+            function: The function. It is kept, since the graph reads its constants.
             inputs: Tensors from which each replay reads, and to which a call copies its own.
             memory: That of the policy's graphs; None: of this graph alone.
         """
@@ -411,6 +411,10 @@ class Core:
             function = self._compiled[size] = self._program(inputs)
         if device.type != "cuda":
             return function
+        if tier == _GRAPH:
+            from vlagents_ray.policies.capturable import Capturable
+
+            function = Capturable(function)
         owner.capturing = tier
         try:
             return CudaGraph(function, inputs, owner.memory(device))

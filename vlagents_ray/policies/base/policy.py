@@ -157,6 +157,9 @@ class ModelPolicy(Agent, abc.ABC):
             self._run_examples(size, seeds)
         if sizes:
             free_memory()  # which a full batch took, and usual ones do not need
+        for device in self.report.devices:
+            if device["kind"] == "cuda" and cores:
+                device["graphs_mib"] = round(self.compilation.graph_bytes / 2**20, 1)
 
     def _decide_on_compiling(self) -> None:
         """Set `compile` to what it means for the loaded model and its device."""
