@@ -413,11 +413,8 @@ _MASKS = ("image_mask", "backbone_attention_mask")  # of tokens (B, S), argument
 def compile_with(transformer: Any, spare: int, compilation: Compilation) -> None:
     """Compile the transformer that a GR00T network calls in each step of the flow.
 
-    Args:
-        transformer: The network's; its `forward` is replaced.
-        spare: If it masks padding, tokens that are appended to those of the first call, which is the warm-up's, so that
-            longer prompts have the same shape.
-        compilation: That of the policy.
+    If it masks padding, prompts with up to `spare` tokens more than those of the first call, the warm-up's, are padded
+    to one shape.
     """
     functional, forward = require("torch.nn.functional"), transformer.forward
 
