@@ -131,6 +131,7 @@ def test_fixed_sizes_of_the_file_are_those_that_are_measured() -> None:
 def test_other_modes_of_compilation_are_tried_unless_the_file_compiles(
     own: Any, modes: list[Any], tried: list[Any]
 ) -> None:
-    ready = {"settings": {"compile": own, "batch_sizes": None}, "dtypes": [], "modes": modes}
+    sizes = [1, 2, 4, 8] if own else None  # by default
+    ready = {"settings": {"compile": own, "batch_sizes": sizes}, "dtypes": [], "modes": modes}
     found = [variant.changes for variant in tuner()._variants(ready, [1, 2])]
     assert found == [{"compile": mode} | ({"batch_sizes": [1, 2]} if mode else {}) for mode in tried]

@@ -139,8 +139,8 @@ class Tuner:
         dtypes = [change for change in named if change.keys() <= has.keys() and not change.items() <= has.items()]
         own = has.get("compile", True)  # what "auto" means here
         modes = [] if own is True or own == "require" else [mode for mode in ready["modes"] if mode != own]
-        fixed = {"batch_sizes": list(sizes)} if has.get("batch_sizes", 0) is None else {}
-        compiled = [{"compile": mode} | (fixed if mode else {}) for mode in modes]
+        free = "batch_sizes" in has and self._plan.args.config.get("batch_sizes") is None
+        compiled = [{"compile": mode} | ({"batch_sizes": list(sizes)} if mode and free else {}) for mode in modes]
         both = [one | other for other in compiled for one in dtypes]
         return [Variant(changes) for changes in [*dtypes, *compiled, *both]]
 

@@ -18,6 +18,7 @@ from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import ConfigError, PolicyFailed, PolicyUnavailable
 from vlagents_ray.interface import Act, Agent
 from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row
+from vlagents_ray.policies.capturable import Capturable
 from vlagents_ray.policies.compilation import CAPTURES, Compilation, CompileMode, CudaGraph
 from vlagents_ray.policies.flow import FlowPasses
 from vlagents_ray.policies.loading import loading_report, report_device
@@ -212,6 +213,20 @@ def test_constants_from_the_host_are_copied_before_the_capture(cuda: FakeCuda) -
         same(core(x), masked(x))
         with pytest.raises(torch.AcceleratorError, match="operation failed due to a previous error"):
             CudaGraph(masked, [x])
+
+
+def test_casts_of_autocast_are_not_kept_beyond_it() -> None:
+    """The cache ends with the context, in which a graph was captured, but the graph reads the memory further on."""
+    layer, cached = torch.nn.Linear(DIM, DIM), list[bool]()
+
+    def function(x: Any) -> Any:
+        cached.append(torch.is_autocast_cache_enabled())
+        return layer(x)
+
+    with torch.autocast("cpu", torch.bfloat16):
+        assert Capturable(function)(torch.ones(1, DIM)).dtype == torch.bfloat16
+        assert torch.is_autocast_cache_enabled()
+    assert cached == [False]
 
 
 STEPS = 3
