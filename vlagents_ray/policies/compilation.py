@@ -162,8 +162,9 @@ class GraphMemory:
     def taken(self) -> int:
         """Return the bytes that the process has reserved on the device since the first graph."""
         torch = require("torch")
-        torch.cuda.empty_cache()  # of memory that no tensor and no graph has
-        return int(torch.cuda.memory_reserved(self._device)) - self._others
+        with CAPTURES.pushes:  # not beside a capture of another thread, which that would end
+            torch.cuda.empty_cache()  # of memory that no tensor and no graph has
+            return int(torch.cuda.memory_reserved(self._device)) - self._others
 
 
 class CudaGraph:

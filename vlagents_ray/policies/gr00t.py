@@ -170,10 +170,10 @@ class Gr00tConfig(ModelConfig):
         "whose path must contain that name; unset: from the hub or its cache",
     )
     steps: int | None = Field(default=None, ge=1, description="steps of the flow; unset: the checkpoint's, usually 4")
-    compiled_tokens: int = Field(
+    spare_tokens: int = Field(
         default=32,
-        ge=1,
-        description="compiled: tokens by which a prompt may be longer than two words; a longer one runs without",
+        ge=0,
+        description="compiled: tokens that a prompt may have beyond two words; a longer one runs without",
     )
     trust_remote_code: bool = Field(
         default=False,
@@ -425,7 +425,7 @@ def compile_with(transformer: Any, spare: int, compilation: Compilation) -> None
     core, length = compilation.core("denoise", denoise), 0
 
     def call(hidden_states: Any, encoder_hidden_states: Any, timestep: Any, **given: Any) -> Any:
-        """Return the core's result; a cache of keys and values is not used, as it may hold those of another act."""
+        """Return the core's result; the cache of keys and values is not used, as it is of this act alone."""
         nonlocal length
         if not compilation.mode:
             return forward(hidden_states, encoder_hidden_states, timestep, **given)
@@ -490,7 +490,7 @@ class Gr00t(ModelPolicy):
         """Read the checkpoint; raises `ConfigError` for settings that do not fit it."""
         network = Gr00tNetwork.load(self.config)
         self._cameras(network.embodiment)
-        compile_with(network.model.action_head.model, self.config.compiled_tokens, self.compilation)
+        compile_with(network.model.action_head.model, self.config.spare_tokens, self.compilation)
         return network
 
     def perceive(self, obs: Obs) -> SeenByGr00t:

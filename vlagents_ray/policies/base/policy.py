@@ -167,7 +167,8 @@ class ModelPolicy(Agent, abc.ABC):
         mode = self.config.compile_on(kind)
         if self.config.compile == "auto":
             mode = mode if self.compilation.cores else False
-            logger.info("compile: auto: %s, on %r, with %d cores", mode, kind, len(self.compilation.cores))
+            why = (kind, len(self.compilation.cores), len(self.config.adapters))
+            logger.info("compile: auto: %s, on %r, with %d cores and %d adapters", mode, *why)
         elif mode == "graphs" and kind != "cuda":
             raise ConfigError(f"compile: graphs: got a model on {kind!r}, want 'cuda'; leave it out")
         self.compilation.mode = mode
