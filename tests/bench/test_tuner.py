@@ -116,3 +116,22 @@ def test_fixed_sizes_of_the_file_are_those_that_are_measured() -> None:
     assert [one.sessions for one in measured.measure()] == [2, 3]
     with pytest.raises(ConfigError, match="--max-batch: got 1"):
         tuner(batch={"sizes": [2, 3]}, max_batch=1).measure()
+
+
+@pytest.mark.parametrize(
+    ("own", "modes", "tried"),
+    [
+        (False, [False, True], [True]),
+        ("graphs", [False, "graphs", True], [False, True]),
+        (False, [False, "graphs", True], ["graphs", True]),
+        (True, [False, "graphs", True], []),
+        ("require", [False, True], []),
+    ],
+)
+def test_other_modes_of_compilation_are_tried_unless_the_file_compiles(
+    own: Any, modes: list[Any], tried: list[Any]
+) -> None:
+    sizes = [1, 2, 4, 8] if own else None  # by default
+    ready = {"settings": {"compile": own, "batch_sizes": sizes}, "dtypes": [], "modes": modes}
+    found = [variant.changes for variant in tuner()._variants(ready, [1, 2])]
+    assert found == [{"compile": mode} | ({"batch_sizes": [1, 2]} if mode else {}) for mode in tried]

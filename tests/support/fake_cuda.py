@@ -24,6 +24,7 @@ from typing import Any
 
 import pytest
 import torch
+from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_leaves, tree_map
 
 _EMPTY = (
@@ -243,6 +244,22 @@ class Capture:
             for old, new in zip(tree_leaves(result), tree_leaves(call()), strict=True):
                 if isinstance(old, torch.Tensor) and old.data_ptr() != new.data_ptr():
                     old.copy_(new)
+
+
+class HostCopies(TorchFunctionMode):  # type: ignore[misc]
+    """A context in which `torch.tensor` copies to a fake's GPU, which no capture allows."""
+
+    def __init__(self, cuda: FakeCuda) -> None:
+        super().__init__()
+        self._cuda = cuda
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        given = dict(kwargs or {})
+        if func is not torch.tensor or given.get("device") is None:
+            return func(*args, **given)
+        index = self._cuda._index(given.pop("device"))
+        self._cuda._require(index)
+        return self._cuda.tensor(torch.tensor(*args, **given), index)
 
 
 class GpuTensor(torch.Tensor):

@@ -137,9 +137,10 @@ class Tuner:
         wanted = ready["dtypes"] if self._plan.dtypes is None else self._plan.dtypes
         named = [{"quantization" if one in get_args(Quantization) else "dtype": one} for one in wanted]
         dtypes = [change for change in named if change.keys() <= has.keys() and not change.items() <= has.items()]
-        compiled: list[dict[str, Any]] = []
-        if has.get("compile") is False:
-            compiled = [{"compile": True} | ({"batch_sizes": list(sizes)} if has.get("batch_sizes", 0) is None else {})]
+        own = has.get("compile", True)  # what "auto" means here
+        modes = [] if own is True or own == "require" else [mode for mode in ready["modes"] if mode != own]
+        free = "batch_sizes" in has and self._plan.args.config.get("batch_sizes") is None
+        compiled = [{"compile": mode} | ({"batch_sizes": list(sizes)} if mode and free else {}) for mode in modes]
         both = [one | other for other in compiled for one in dtypes]
         return [Variant(changes) for changes in [*dtypes, *compiled, *both]]
 

@@ -40,7 +40,7 @@ class Variant:
     def name(self) -> str:
         """The changes in words, without the batch sizes, which have their own column in the table."""
         shown = {key: value for key, value in self.changes.items() if key != "batch_sizes"}
-        words = [f"{key}: {str(value).lower() if value is True else value}" for key, value in shown.items()]
+        words = [f"{key}: {str(value).lower() if isinstance(value, bool) else value}" for key, value in shown.items()]
         return ", ".join(words) or "own settings"
 
 

@@ -100,6 +100,7 @@ def _serve(settings: ProcessSettings, answer: Callable[[Mapping[str, Any]], None
         answer({
             "device": device_name(), "load_s": measured.load_s, "uncompiled": uncompiled,
             "settings": _settings_of(agent), "dtypes": _native_dtypes(),
+            "modes": [False, True] if cuda() is None else [False, "graphs", True],  # of `compile`
         })  # fmt: skip
         for line in sys.stdin:
             try:

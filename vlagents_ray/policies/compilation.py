@@ -156,16 +156,15 @@ class GraphMemory:
         self._device, self.pool = device, torch.cuda.graph_pool_handle()
         # torch's own stream for captures is on the device of the first capture of the process
         self.stream = torch.cuda.Stream(device)
-        self._before = self._reserved()
+        self._others = 0
+        self._others = self.taken()
 
     def taken(self) -> int:
         """Return the bytes that the process has reserved on the device since the first graph."""
-        return self._reserved() - self._before
-
-    def _reserved(self) -> int:
         torch = require("torch")
-        torch.cuda.empty_cache()  # of memory that no tensor and no graph has
-        return int(torch.cuda.memory_reserved(self._device))
+        with CAPTURES.pushes:  # not beside a capture of another thread, which that would end
+            torch.cuda.empty_cache()  # of memory that no tensor and no graph has
+            return int(torch.cuda.memory_reserved(self._device)) - self._others
 
 
 class CudaGraph:
@@ -179,7 +178,7 @@ class CudaGraph:
         """Capture a function of tensors on one GPU without other effects; raises `RuntimeError` if that fails.
 
         Args:
-            function: The function. It is kept, since the graph reads constants of a compiled one.
+            function: The function. It is kept, since the graph reads its constants.
             inputs: Tensors from which each replay reads, and to which a call copies its own.
             memory: That of the policy's graphs; None: of this graph alone.
         """
@@ -300,22 +299,13 @@ class Compilation:
             self.building = None
         failures = [failure for core in self.cores for failure in core.settle(size)]
         if failures and self.mode == "require":
-            raise ConfigError(
-                f"compile: require: {'; '.join(failures)}; with `compile: true` it would run without that"
-            )
+            raise ConfigError(f"compile: require: {'; '.join(failures)}; with `compile: true` it would run without")
         if failures:
-            logger.warning("not compiled for %d rows: %s", size, "; ".join(failures))
             report_uncompiled(f"{size} rows: {'; '.join(failures)}")
         if used := {core.name: tier for core in self.cores if (tier := core.tier(size))}:
             insort(self.sizes, size)
             logger.info("compiled for %d rows in %.1f s: %s", size, time.monotonic() - began, used)
         self.graph_bytes = sum(memory.taken() for memory in self.memories.values())
-
-    def memory(self, device: Any) -> GraphMemory:
-        """Return the memory of the policy's graphs on a device."""
-        if device not in self.memories:
-            self.memories[device] = GraphMemory(device)
-        return self.memories[device]
 
 
 class Core:
@@ -372,11 +362,15 @@ class Core:
     def _compared(self, tensors: Sequence[Any]) -> Any:
         """Return the eager result, once the programs are made; keep those whose results are near it."""
         wanted, size = self._function(*tensors), len(tensors[0])
-        missing = size not in self._programs
-        programs = self._programs.setdefault(size, {})
-        self._kinds.setdefault(size, _row_kinds(tensors))
-        limit = _tolerance([*tensors, *_each(wanted)])
-        for tier in self._tiers(tensors) if missing else list(programs):
+        tiers, limit = list(self._programs.get(size, ())), _tolerance([*tensors, *_each(wanted)])
+        if missing := size not in self._programs:
+            self._programs[size], self._kinds[size] = {}, _row_kinds(tensors)
+            both = self._owner.mode != "graphs" and all(
+                _COMPILED in part._programs.get(size, ()) for part in self._parts
+            )
+            tiers = [_GRAPH] * (tensors[0].device.type == "cuda") + [_COMPILED] * both
+        programs = self._programs[size]
+        for tier in tiers:
             try:
                 program = self._made(tier, tensors) if missing else programs[tier]
                 error = _largest_error(program(*tensors), wanted)
@@ -391,14 +385,6 @@ class Core:
             self._failures.append(f"{self.name!r} by {tier}: {said}")
         return wanted
 
-    def _tiers(self, tensors: Sequence[Any]) -> list[str]:
-        """Return the tiers to try, slowest first."""
-        if tensors[0].device.type != "cuda":
-            return [_COMPILED]
-        size, mode = len(tensors[0]), self._owner.mode
-        both = mode != "graphs" and all(_COMPILED in part._programs.get(size, ()) for part in self._parts)
-        return [_GRAPH, _COMPILED] if both else [_GRAPH]
-
     def _made(self, tier: str, tensors: Sequence[Any]) -> Any:
         """Return a tier's program for tensors of these shapes.
 
@@ -411,9 +397,15 @@ class Core:
             function = self._compiled[size] = self._program(inputs)
         if device.type != "cuda":
             return function
+        if tier == _GRAPH:
+            from vlagents_ray.policies.capturable import Capturable
+
+            function = Capturable(function)
+        if device not in owner.memories:
+            owner.memories[device] = GraphMemory(device)
         owner.capturing = tier
         try:
-            return CudaGraph(function, inputs, owner.memory(device))
+            return CudaGraph(function, inputs, owner.memories[device])
         finally:
             owner.capturing = None
 

@@ -319,10 +319,10 @@ class FlowPasses(abc.ABC):
 
     def _flow(self, steps: int, changes: Sequence[Change], encoded: Any, seen: Any, state: Any, noise: Any) -> Any:
         """Return actions (B, H, D): without changes, whose values differ for each batch, all steps are one core."""
-        torch = require("torch")
+        float32 = require("torch").float32
 
         def velocity(actions: Any, time: float) -> Any:
-            times = torch.full((len(actions),), time, dtype=torch.float32, device=actions.device)
+            times = actions.new_full((len(actions),), time, dtype=float32)
             return self._velocity(encoded, seen, state, actions, times)
 
         return follow(velocity, noise, steps, *changes)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -33,6 +33,7 @@ from vlagents_ray.policies.base.model_inputs import (
     state_specs,
     state_vector,
 )
+from vlagents_ray.policies.compilation import Compilation
 from vlagents_ray.registry import require
 
 CONFIG, STATISTICS = "processor_config.json", "statistics.json"
@@ -169,7 +170,11 @@ class Gr00tConfig(ModelConfig):
         "whose path must contain that name; unset: from the hub or its cache",
     )
     steps: int | None = Field(default=None, ge=1, description="steps of the flow; unset: the checkpoint's, usually 4")
-    compile: Literal[False] = Field(default=False, description="not offered for GR00T")
+    spare_tokens: int = Field(
+        default=32,
+        ge=0,
+        description="compiled: tokens that a prompt may have beyond two words; a longer one runs without",
+    )
     trust_remote_code: bool = Field(
         default=False,
         description="run Python code in the checkpoint or its backbone: write access to them then gives all rights "
@@ -402,6 +407,38 @@ def packed_attention(
     return require("torch").cat([attention(*part, scale=scaling) for part in parts], dim=2).transpose(1, 2), None
 
 
+_MASKS = ("image_mask", "backbone_attention_mask")  # of tokens (B, S), arguments of N1.6's usual transformer and N1.7's
+
+
+def compile_with(transformer: Any, spare: int, compilation: Compilation) -> None:
+    """Compile the transformer that a GR00T network calls in each step of the flow.
+
+    If it masks padding, prompts with up to `spare` tokens more than those of the first call, the warm-up's, are padded
+    to one shape.
+    """
+    functional, forward = require("torch.nn.functional"), transformer.forward
+
+    def denoise(hidden: Any, times: Any, seen: Any, *masks: Any) -> Any:
+        masked = dict(zip(_MASKS, masks, strict=False))
+        return forward(hidden_states=hidden, encoder_hidden_states=seen, timestep=times, **masked)
+
+    core, length = compilation.core("denoise", denoise), 0
+
+    def call(hidden_states: Any, encoder_hidden_states: Any, timestep: Any, **given: Any) -> Any:
+        """Return the core's result; the cache of keys and values is not used, as it is of this act alone."""
+        nonlocal length
+        if not compilation.mode:
+            return forward(hidden_states, encoder_hidden_states, timestep, **given)
+        seen, masks = encoder_hidden_states, [given[name] for name in _MASKS if given.get(name) is not None]
+        length = length or seen.shape[1] + spare
+        if masks and (missing := length - seen.shape[1]) > 0:
+            seen = functional.pad(seen, (0, 0, 0, missing))
+            masks = [functional.pad(mask, (0, missing)) for mask in masks]
+        return core(hidden_states, timestep, seen, *masks)
+
+    transformer.forward = call
+
+
 USUAL_CAMERAS = {"image": "front", "wrist_image": "wrist"}  # of LIBERO; other embodiments use the checkpoint's names
 GRIPPER_QPOS = "gripper_qpos"  # the part of the state for a group `gripper` with several numbers, as in LIBERO
 
@@ -453,6 +490,7 @@ class Gr00t(ModelPolicy):
         """Read the checkpoint; raises `ConfigError` for settings that do not fit it."""
         network = Gr00tNetwork.load(self.config)
         self._cameras(network.embodiment)
+        compile_with(network.model.action_head.model, self.config.spare_tokens, self.compilation)
         return network
 
     def perceive(self, obs: Obs) -> SeenByGr00t:

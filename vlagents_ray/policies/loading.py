@@ -83,6 +83,7 @@ def report_device(device: dict[str, Any]) -> None:
 
 
 def report_uncompiled(what: str) -> None:
-    """Report a part that runs uncompiled although its policy's settings require compilation."""
+    """Log and report a part that runs uncompiled although its policy's settings require compilation."""
+    logger.warning("not compiled: %s", what)
     if (report := _report.get()) is not None:
         report.uncompiled.append(what)

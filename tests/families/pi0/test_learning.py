@@ -163,3 +163,14 @@ def test_plans_samples_and_random_steps_are_those_without_compilation(
 def test_it_acts_with_pushed_weights(compiled: Pi0, programs: list[int]) -> None:
     check_pushed_weights(compiled, lambda: begun(compiled, 0).act(seen(0)).action)
     assert programs == [SIZE, SIZE]
+
+
+@pytest.mark.parametrize("samples", [0, 2])
+def test_nothing_is_compiled_in_service(compiled: Pi0, programs: list[int], samples: int) -> None:
+    plan: dict[str, Any] = {LEFTOVER: np.ones((6, tiny.ACTION_DIM), np.float32), DELAY: 2}
+    with torch.compiler.set_stance("fail_on_recompile"):
+        for size in range(1, SIZE + 3):
+            for info in ({}, plan, {WANT: ALL}):
+                given = info | ({SAMPLES: samples} if samples else {})
+                acts(compiled, [seen(i, **(given if i % 2 == 0 else {})) for i in range(size)])
+    assert programs == [SIZE, SIZE]

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 import torch
-from fake_cuda import FakeCuda
+from fake_cuda import FakeCuda, HostCopies
 from in_flight import checked, submit
 
 from vlagents_ray import Obs
@@ -18,8 +18,10 @@ from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import ConfigError, PolicyFailed, PolicyUnavailable
 from vlagents_ray.interface import Act, Agent
 from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row
-from vlagents_ray.policies.compilation import CAPTURES, Compilation, CudaGraph
-from vlagents_ray.policies.loading import report_device
+from vlagents_ray.policies.capturable import Capturable
+from vlagents_ray.policies.compilation import CAPTURES, Compilation, CompileMode, CudaGraph
+from vlagents_ray.policies.flow import FlowPasses
+from vlagents_ray.policies.loading import loading_report, report_device
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.weights import ModelWeights, PushOptions
@@ -60,19 +62,29 @@ def test_a_replay_computes_with_its_own_inputs_in_memory_of_its_own(cuda: FakeCu
         same(second, x * y)
 
 
-def compiled(cuda: FakeCuda, function: Callable[[Any], Any], index: int = 0) -> Callable[[Any], Any]:
-    compilation = Compilation("require")
+def compiled(
+    cuda: FakeCuda, function: Callable[..., Any], index: int = 0, mode: CompileMode = "require"
+) -> tuple[Callable[..., Any], Compilation]:
+    compilation = Compilation(mode)
     core = compilation.core("core", function)
-    for size in (1, 2):
+    for size in (4, 2, 1):
         compilation.add_size(size, lambda size=size: core(numbers(cuda, size, index)))  # type: ignore[misc]
-    return core
+    return core, compilation
 
 
-def test_policies_on_two_devices_are_each_captured_on_their_own(cuda: FakeCuda) -> None:
+MODES = ("graphs", "require")
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_policies_on_two_devices_are_each_captured_on_their_own(cuda: FakeCuda, mode: CompileMode) -> None:
+    cores = []
     for index in (0, 1):
         w = weight(cuda, index)
-        core = compiled(cuda, lambda x, w=w: (x @ w).tanh(), index)  # type: ignore[misc]
-        for rows in (1, 2):
+        core, compilation = compiled(cuda, lambda x, w=w: (x @ w).tanh(), index, mode)  # type: ignore[misc]
+        assert [device.index for device in compilation.memories] == [index]
+        cores.append((core, w, index))
+    for rows in (1, 2, 3, 4):
+        for core, w, index in cores:
             x = numbers(cuda, rows, index)
             same(core(x), (x @ w).tanh())
 
@@ -88,17 +100,198 @@ def elsewhere(cuda: FakeCuda, function: Callable[[Any], Any]) -> Callable[[Any],
     return run
 
 
-def test_a_graph_that_recorded_nothing_is_refused(cuda: FakeCuda) -> None:
-    with pytest.raises(
-        ConfigError, match="compile: require: 'core' by CUDA graph: RuntimeError: the CUDA graph is empty"
-    ):
+NAMES = {"graphs": "CUDA graph", "require": "torch.compile"}
+
+
+def compiles_to(monkeypatch: pytest.MonkeyPatch, change: Callable[[Callable[..., Any]], Callable[..., Any]]) -> None:
+    monkeypatch.setattr(torch, "compile", lambda function, **_: change(function))
+
+
+def refused(cuda: FakeCuda, monkeypatch: pytest.MonkeyPatch, mode: CompileMode, function: Callable[..., Any]) -> str:
+    """Return the report of a mode whose last tier has this function in the place of the core."""
+    eager = (lambda x: x.tanh() + x) if mode == "require" else function
+    compiles_to(monkeypatch, lambda _: function)
+    with loading_report(lambda _: None) as report:
+        core, compilation = compiled(cuda, eager, mode=True if mode == "require" else mode)
+    x = numbers(cuda)
+    same(core(x), eager(x))
+    assert len(report.uncompiled) == 3
+    assert compilation.sizes == ([1, 2, 4] if mode == "require" else [])  # the graph of the eager core stays
+    return report.uncompiled[0]
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_graph_that_recorded_nothing_is_refused(
+    cuda: FakeCuda, monkeypatch: pytest.MonkeyPatch, mode: CompileMode
+) -> None:
+    said = refused(cuda, monkeypatch, mode, elsewhere(cuda, lambda x: x.tanh() + x))
+    assert said.startswith(f"4 rows: 'core' by {NAMES[str(mode)]}: RuntimeError: the CUDA graph is empty")
+    with pytest.raises(ConfigError, match="compile: require: 'core' by CUDA graph: RuntimeError: the CUDA graph is em"):
         compiled(cuda, elsewhere(cuda, lambda x: x.tanh()))
 
 
-def test_a_graph_that_missed_a_part_is_refused(cuda: FakeCuda) -> None:
+@pytest.mark.parametrize("mode", MODES)
+def test_a_graph_that_missed_a_part_is_refused(
+    cuda: FakeCuda, monkeypatch: pytest.MonkeyPatch, mode: CompileMode
+) -> None:
     part = elsewhere(cuda, lambda x: x.tanh())
+    said = refused(cuda, monkeypatch, mode, lambda x: part(x) + x)
+    assert said.startswith(f"4 rows: 'core' by {NAMES[str(mode)]}: its results are off by")
     with pytest.raises(ConfigError, match="'core' by CUDA graph: its results are off by"):
         compiled(cuda, lambda x: part(x) + x)
+
+
+def test_without_a_compiler_the_graphs_of_eager_cores_stay(cuda: FakeCuda, monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(function: Any) -> Any:
+        raise RuntimeError("Cannot find a working triton installation")
+
+    compiles_to(monkeypatch, missing)
+    for mode in ("graphs", True):
+        cuda.replays.clear()
+        with loading_report(lambda _: None) as report:
+            core, _ = compiled(cuda, torch.tanh, mode=mode)
+        x = numbers(cuda)
+        np.testing.assert_array_equal(core(x).values, x.values.tanh())
+        assert cuda.replays
+        reasons = [f"{n} rows: 'core' by torch.compile: RuntimeError: Cannot find a working triton" for n in (4, 2, 1)]
+        assert [said[: len(reasons[0])] for said in report.uncompiled] == (reasons if mode is True else [])
+    with pytest.raises(ConfigError, match=r"require: 'core' by torch.compile: RuntimeError: Cannot find"):
+        compiled(cuda, torch.tanh)
+
+
+@pytest.mark.parametrize(
+    ("eager", "compiled_ones", "used"), [(100, 97, 97), (100, 98, 100), (100, 120, 100), (2, 1, 1)]
+)
+def test_what_torch_compiles_is_used_if_it_is_faster_by_three_percent(
+    cuda: FakeCuda, monkeypatch: pytest.MonkeyPatch, eager: int, compiled_ones: int, used: int
+) -> None:
+    def doubled(times: int) -> Callable[[Any], Any]:
+        def function(x: Any) -> Any:
+            for _ in range(times - 1):
+                x = -x
+            return x.abs()
+
+        return function
+
+    compiles_to(monkeypatch, lambda _: doubled(compiled_ones))
+    core, _ = compiled(cuda, doubled(eager))
+    cuda.replays.clear()
+    core(numbers(cuda))
+    assert [len(graph.calls) for graph in cuda.replays] == [used]  # operations
+
+
+def test_the_graphs_of_a_policy_share_memory_and_the_largest_is_made_first(cuda: FakeCuda) -> None:
+    compilation, w = Compilation("graphs"), weight(cuda)
+    halves = [compilation.core("a", lambda x: x @ w), compilation.core("b", lambda x: (x * 2, x - 1))]
+
+    def act(x: Any) -> Any:
+        return [core(x) for core in (*halves, *halves)]
+
+    for size in (4, 2):
+        compilation.add_size(size, lambda size=size: act(numbers(cuda, size)))  # type: ignore[misc]
+    assert len({id(graph.pool) for graph in cuda.captures}) == len({graph.stream for graph in cuda.captures}) == 1
+    assert [len(graph.calls[0][1]) for graph in cuda.captures] == [4, 4, 2, 2]
+    assert compilation.graph_bytes == cuda.reserved[0] == (4 + 2) * 3 * DIM * 4
+    compiled(cuda, torch.tanh)
+    assert len({id(graph.pool) for graph in cuda.captures}) == 2
+    for rows in (1, 2, 3, 4, 2):  # each replay overwrites what all others left in the pool
+        x = numbers(cuda, rows)
+        first, (second, third), again, _ = act(x)
+        for got, wanted in ((first, x @ w), (second, x * 2), (third, x - 1), (again, x @ w)):
+            same(got, wanted)
+
+
+def test_constants_from_the_host_are_copied_before_the_capture(cuda: FakeCuda) -> None:
+    def masked(x: Any) -> Any:
+        mask = torch.tensor([1.0] + [0.0] * (DIM - 1), device=x.device)
+        return x * mask + torch.tensor(2.0, device=x.device)
+
+    with HostCopies(cuda):
+        core, compilation = compiled(cuda, masked, mode="graphs")
+        x = numbers(cuda)
+        assert compilation.sizes == [1, 2, 4]
+        same(core(x), masked(x))
+        with pytest.raises(torch.AcceleratorError, match="operation failed due to a previous error"):
+            CudaGraph(masked, [x])
+
+
+def test_casts_of_autocast_are_not_kept_beyond_it() -> None:
+    """The cache ends with the context, in which a graph was captured, but the graph reads the memory further on."""
+    layer, cached = torch.nn.Linear(DIM, DIM), list[bool]()
+
+    def function(x: Any) -> Any:
+        cached.append(torch.is_autocast_cache_enabled())
+        return layer(x)
+
+    with torch.autocast("cpu", torch.bfloat16):
+        assert Capturable(function)(torch.ones(1, DIM)).dtype == torch.bfloat16
+        assert torch.is_autocast_cache_enabled()
+    assert cached == [False]
+
+
+STEPS = 3
+
+
+class Passes(FlowPasses):
+    """The passes of a model without layers."""
+
+    def encode(self, tokens: Any, mask: Any, cameras: Any, state: Any, *images: Any) -> tuple[Any, Any]:
+        return tokens.float()[:, :1] + state, mask.long()
+
+    def velocity(self, encoded: Any, seen: Any, state: Any, actions: Any, times: Any) -> Any:
+        return (actions * times[:, None, None] + (encoded * seen.float()[:, :1])[:, None]).tanh()
+
+
+def drawn(cuda: FakeCuda, rows: int) -> dict[str, Any]:
+    """Return the arguments of `sample`, of random values."""
+    return {
+        "images": [],
+        "cameras": [cuda.tensor(torch.ones(rows, dtype=torch.bool))],
+        "tokens": cuda.tensor(torch.randint(9, (rows, 4))),
+        "mask": cuda.tensor(torch.ones(rows, 4, dtype=torch.bool)),
+        "state": numbers(cuda, rows),
+        "noise": cuda.tensor(torch.randn(rows, 2, DIM)),
+        "owners": range(rows),
+        "steps": STEPS,
+    }
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_flow_is_one_graph_and_one_of_each_step_if_steps_are_changed(cuda: FakeCuda, mode: CompileMode) -> None:
+    compilation = Compilation(mode)
+    passes, plain = Passes(cuda, compilation), Passes(cuda, Compilation(False))
+    for size in (4, 1):
+        compilation.add_size(size, lambda size=size: passes.sample(**drawn(cuda, size)))  # type: ignore[misc]
+    assert [core.name for core in compilation.cores] == ["encode", "velocity", "flow"]
+    assert [core.tier(size) for core in compilation.cores for size in (1, 4)] == ["CUDA graph"] * 6
+    for rows in (1, 2, 4):
+        for changes, replays in (((), 2), ([lambda velocity, actions, time: velocity - time * actions], 1 + STEPS)):
+            inputs = drawn(cuda, rows) | {"changes": changes, "fingerprints": [""] * rows}
+            wanted = plain.sample(**inputs)
+            cuda.replays.clear()
+            same(passes.sample(**inputs), wanted)
+            assert len(cuda.replays) == replays
+    cuda.replays.clear()
+    same(passes.sample(**(inputs := drawn(cuda, 5))), plain.sample(**inputs))  # no graph has so many rows
+    assert cuda.replays == []
+
+
+def test_the_graph_of_a_flow_has_the_compiled_steps(cuda: FakeCuda, monkeypatch: pytest.MonkeyPatch) -> None:
+    compiles_to(
+        monkeypatch, lambda function: lambda *tensors: tanh_alone(*tensors) if len(tensors) == 5 else function(*tensors)
+    )
+
+    def tanh_alone(encoded: Any, seen: Any, state: Any, actions: Any, times: Any) -> Any:
+        """Compute the velocity in fewer operations, for a mask of ones."""
+        return torch.addcmul(encoded[:, None], actions, times[:, None, None]).tanh()
+
+    compilation = Compilation(True)
+    passes, plain = Passes(cuda, compilation), Passes(cuda, Compilation(False))
+    compilation.add_size(2, lambda: passes.sample(**drawn(cuda, 2)))
+    assert [core.tier(2) for core in compilation.cores] == ["CUDA graph", "torch.compile", "torch.compile"]
+    cuda.replays.clear()
+    same(passes.sample(**(inputs := drawn(cuda, 2))), plain.sample(**inputs))
+    assert len(cuda.replays) == 2
 
 
 def test_after_a_capture_that_failed_the_thread_is_on_its_stream_again(cuda: FakeCuda) -> None:
@@ -232,13 +425,14 @@ class OnGpu(ModelPolicy):
 
     Config = ModelConfig
     cuda: ClassVar[FakeCuda]
+    kind = "cuda"  # as it reports
 
     @property
     def contract(self) -> Contract:
         return Contract(action=ActionSpec(dim=DIM), chunk=self.chunk(1))
 
     def load(self) -> Any:
-        report_device({"kind": "cuda"})
+        report_device({"kind": self.kind})
         w = self.cuda.tensor(torch.eye(DIM))
         self.core = self.compilation.core("layer", lambda x: x @ w)
         return {}
@@ -277,7 +471,7 @@ def test_a_model_on_a_gpu_acts_from_graphs_in_less_memory_and_until_the_gpu_fail
         return sorted(reply.act.action.tolist() for reply in replies if reply.act is not None)
 
     try:
-        assert engine.models.devices == [{"kind": "cuda"}]
+        assert engine.models.devices == [{"kind": "cuda", "graphs_mib": 0.0}]
         alone = actions(act(4))
         assert len(alone) == 4
         cuda.most_rows = 2
@@ -290,3 +484,58 @@ def test_a_model_on_a_gpu_acts_from_graphs_in_less_memory_and_until_the_gpu_fail
             engine.check_health()
     finally:
         engine.close()
+
+
+class OnCpu(OnGpu):
+    """The same model on a CPU."""
+
+    kind = "cpu"
+
+
+class WithoutCores(OnGpu):
+    """A model on the fake GPU that marks nothing."""
+
+    def load(self) -> Any:
+        loaded = super().load()
+        self.compilation.cores.clear()
+        return loaded
+
+
+@pytest.mark.parametrize(
+    ("kind", "mode", "decided"),
+    [
+        (OnGpu, "auto", "graphs"),
+        (OnCpu, "auto", False),
+        (WithoutCores, "auto", False),
+        (OnGpu, False, False),
+        (OnGpu, "graphs", "graphs"),
+        (OnGpu, True, True),
+        (OnCpu, True, True),
+    ],
+)
+def test_the_device_and_the_family_decide_unless_the_settings_do(
+    cuda: FakeCuda, caplog: pytest.LogCaptureFixture, kind: type[OnGpu], mode: Any, decided: Any
+) -> None:
+    OnGpu.cuda = cuda
+    caplog.set_level("INFO")
+    policy = kind.from_config({"checkpoint": "none"} | ({} if mode == "auto" else {"compile": mode}))
+    with loading_report(lambda _: None, [1, 2]):
+        policy.initialize()
+    assert (policy.config.compile, policy.compilation.mode) == (decided, decided)
+    assert policy.config.batch_sizes == ([1, 2] if decided else None)
+    assert policy.compilation.sizes == ([1, 2] if decided else [])
+    assert ("compile: auto:" in caplog.text) == (mode == "auto")
+
+
+def test_graphs_alone_are_for_gpus(cuda: FakeCuda) -> None:
+    OnGpu.cuda = cuda
+    with pytest.raises(ConfigError, match="compile: graphs: got a model on 'cpu', want 'cuda'"):
+        OnCpu.from_config({"checkpoint": "none", "compile": "graphs"}).initialize()
+
+
+def test_adapters_leave_nothing_to_compile_and_8_bits_do() -> None:
+    assert ModelConfig(checkpoint="none", quantization="int8").compile_on("cuda") == "graphs"
+    assert ModelConfig(checkpoint="none", adapters={"a": "b"}).compile_on("cuda") is False
+    for mode in ("graphs", True, "require"):
+        with pytest.raises(ValueError, match="adapters and compile: got both"):
+            ModelConfig(checkpoint="none", adapters={"a": "b"}, compile=mode)

@@ -243,7 +243,7 @@ def test_a_program_that_keeps_an_input_of_its_first_call_is_not_used(
         return program
 
     monkeypatch.setattr(Compilation, "backend", staticmethod(stale))
-    with pytest.raises(ConfigError, match="compile: require: 'linear' by torch.compile: its results are off by"):
+    with pytest.raises(ConfigError, match=r"compile: require: 'linear' by torch.compile: its results are off by"):
         made(compile="require", batch_sizes=[2])
     torch._dynamo.reset()
 
@@ -261,7 +261,7 @@ def test_a_program_is_not_made_with_the_inputs_with_which_it_is_compared(monkeyp
     monkeypatch.setattr(Compilation, "backend", staticmethod(stale))
     compilation, always = Compilation("require"), torch.ones(2, 3)
     core = compilation.core("sum", lambda numbers: numbers.sum(-1))
-    with pytest.raises(ConfigError, match="'sum' by torch.compile: its results are off by"):
+    with pytest.raises(ConfigError, match=r"'sum' by torch.compile: its results are off by"):
         compilation.add_size(2, lambda: core(always))
     torch._dynamo.reset()
 

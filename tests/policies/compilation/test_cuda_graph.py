@@ -45,9 +45,9 @@ def test_a_core_is_captured_on_one_thread_and_acts_on_another(layer: Any) -> Non
     compilation, results = Compilation("require"), list[Any]()
     with torch.inference_mode():
         core = compilation.core("layer", lambda x: layer(x).relu())
-        for size in (1, ROWS):
+        for size in (ROWS, 1):
             compilation.add_size(size, lambda size=size: core(numbers()[:size]))  # type: ignore[misc]
-        assert all(isinstance(program, CudaGraph) for program in compilation.cores[0]._programs.values())
+        assert compilation.sizes == [1, ROWS]
         inputs = [numbers()[:size] for size in (1, 2, ROWS)]
 
         def act() -> None:
@@ -59,3 +59,24 @@ def test_a_core_is_captured_on_one_thread_and_acts_on_another(layer: Any) -> Non
         thread.join()
         for x, result in zip(inputs, results, strict=True):
             torch.testing.assert_close(result, layer(x).relu())
+
+
+@pytest.mark.parametrize("mode", ["graphs", True])
+def test_cores_of_one_policy_share_memory_and_keep_their_results(layer: Any, mode: Any) -> None:
+    compilation = Compilation(mode)
+
+    def shifted(x: Any) -> Any:
+        return layer(x) + torch.tensor([1.0] + [0.0] * (DIM - 1), device=x.device)
+
+    with torch.inference_mode():
+        step = compilation.core("step", shifted)
+        both = compilation.core("both", lambda x: step(step(x)), parts=[step])
+        for size in (ROWS, 1):
+            compilation.add_size(size, lambda size=size: both(numbers()[:size]))  # type: ignore[misc]
+        assert compilation.sizes == [1, ROWS]
+        assert compilation.graph_bytes >= 0
+        inputs = [numbers()[:size] for size in (1, 2, ROWS)]
+        results = [(step(x), both(x)) for x in inputs]
+        for x, (once, twice) in zip(inputs, results, strict=True):
+            torch.testing.assert_close(once, shifted(x))
+            torch.testing.assert_close(twice, shifted(shifted(x)))

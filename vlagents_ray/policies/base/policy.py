@@ -163,16 +163,19 @@ class ModelPolicy(Agent, abc.ABC):
             self._run_examples(size, seeds)
         if sizes:
             free_memory()  # which a full batch took, and usual ones do not need
+        for device in self.report.devices:
+            if device["kind"] == "cuda" and cores:
+                device["graphs_mib"] = round(self.compilation.graph_bytes / 2**20, 1)
 
     def _decide_on_compiling(self) -> None:
         """Set `compile` to what it means for the loaded model and its device."""
-        setting, has_cores = self.config.compile, bool(self.compilation.cores)
         kind = next((device["kind"] for device in self.report.devices if device["kind"] != "cpu"), "cpu")
         mode = self.config.compile_on(kind)
-        if setting == "auto":
-            mode = mode if has_cores else False
-            logger.info("compile: auto: %s, on %s, %s cores", mode or "false", kind, "with" if has_cores else "without")
-        elif setting == "graphs" and kind != "cuda":
+        if self.config.compile == "auto":
+            mode = mode if self.compilation.cores else False
+            why = (kind, len(self.compilation.cores), len(self.config.adapters))
+            logger.info("compile: auto: %s, on %r, with %d cores and %d adapters", mode, *why)
+        elif mode == "graphs" and kind != "cuda":
             raise ConfigError(f"compile: graphs: got a model on {kind!r}, want 'cuda'; leave it out")
         self.compilation.mode = mode
         self.config = self.config.model_copy(update={"compile": mode})

@@ -226,7 +226,7 @@ class PrismaticConfig(ModelConfig):
     compiled_tokens: int = Field(
         default=64,
         ge=1,
-        description="with `compile`: tokens to which prompts are padded; longer ones run without compilation",
+        description="compiled: tokens to which prompts are padded; longer ones run without compilation",
     )
     unnorm_key: str | None = Field(
         default=None,

@@ -1,0 +1,47 @@
+"""Eager functions that a CUDA graph can capture, although they copy constants from the host."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+from torch.overrides import TorchFunctionMode
+
+_COPIES = (torch.tensor, torch.as_tensor, torch.Tensor.to, torch.Tensor.cuda)
+
+
+class Capturable(TorchFunctionMode):  # type: ignore[misc]
+    """A core whose later calls use the tensors that its first call copied from the host, as no capture may do that.
+
+    They are the same in each call, as a core depends on nothing but its arguments, and are found by their order. Casts
+    of weights by `autocast` are not cached, as the cache ends with its context, and the graph does not.
+    """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__()
+        self._function, self._calls = function, 0
+        self._copied: list[Any] = []  # results of `_COPIES`; None: it was no copy from the host
+
+    def __call__(self, *tensors: Any) -> Any:
+        cached, self._calls = torch.is_autocast_cache_enabled(), 0
+        torch.set_autocast_cache_enabled(False)
+        try:
+            with self:
+                return self._function(*tensors)
+        finally:
+            torch.set_autocast_cache_enabled(cached)
+
+    def __torch_function__(
+        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Mapping[str, Any] | None = None
+    ) -> Any:
+        if func not in _COPIES:
+            return func(*args, **(kwargs or {}))
+        place, self._calls = self._calls, self._calls + 1
+        if place < len(self._copied) and (copied := self._copied[place]) is not None:
+            return copied.clone()
+        result = func(*args, **(kwargs or {}))
+        if place == len(self._copied):
+            own = any(isinstance(one, torch.Tensor) and one.is_cuda for one in args)
+            self._copied.append(result if result.is_cuda and not own else None)
+        return result
