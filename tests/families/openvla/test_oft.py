@@ -215,11 +215,11 @@ def test_action_tokens_have_log_probabilities_and_other_heads_have_none(loaded: 
     tokens = torch.tensor(np.concatenate([said["replay"]["tokens"][None], act.info[DISTRIBUTION]["replay"]["tokens"]]))
     session = begun(policy, 0)
     inputs = [policy._model_input(Row((session.perceive(seen(0)),), WORDS[0], None), "bridge_orig")]
-    _, logits = policy.model.choose(inputs, [0], np.full((1, tiny.CHUNK, tiny.ACTION_DIM), np.nan))
-    want = bins.logprob(tokens, logits.expand(3, -1, -1, -1))
+    _, over = policy.model.choose(inputs, [0], np.full((1, tiny.CHUNK, tiny.ACTION_DIM), np.nan))
+    *_, want, entropy, _ = bins.stated(tokens, over.expand(3, -1, -1, -1))
     np.testing.assert_allclose(said["logprob"], want[0], atol=1e-4)
     np.testing.assert_allclose(act.info[DISTRIBUTION]["logprob"], want[1:], atol=1e-4)
-    assert said["entropy"] == pytest.approx(bins.stated(tokens[:1], logits)[1].sum(), rel=1e-4)
+    assert said["entropy"] == pytest.approx(entropy[0].sum(), rel=1e-4)
 
 
 def test_regression_is_sure_of_its_only_answer(loaded: Callable[..., Any]) -> None:

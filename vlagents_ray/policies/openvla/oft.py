@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -199,6 +199,19 @@ class ModelInput:
     proprio: np.ndarray | None  # (P,) in [-1, 1]
 
 
+@dataclass(frozen=True)
+class Sequences:
+    """The parts of sequences of embeddings that are known before the actions, and how they make up a sequence."""
+
+    seen: Any  # (B, P, D), of images and state
+    words: Any  # (B, L, D)
+    places: Any  # (B, T), as for `Prismatic.assembled`; the actions are the last part
+    lengths: Any  # (B,), without padding
+
+    def rows(self, index: Any) -> Sequences:
+        return Sequences(self.seen[index], self.words[index], self.places[index], self.lengths[index])
+
+
 @dataclass
 class Parallel:
     """A checkpoint of OFT: OpenVLA's, and its components; a component is None if training did not use it.
@@ -237,9 +250,10 @@ class Parallel:
         torch = require("torch")
         with torch.inference_mode():
             sequences = self._sequences(inputs)
-            seen = [sequences[owner] for owner in owners]
+            if list(owners) != list(range(len(inputs))):
+                sequences = sequences.rows(self.base.moved(np.array(owners)))
             start = self.base.to_device(torch.from_numpy(noise))
-            return _numpy(denoise(start, lambda time, noisy: self._noise(seen, time, noisy), *self.steps))
+            return _numpy(denoise(start, lambda time, noisy: self._noise(sequences, time, noisy), *self.steps))
 
     def choose(self, inputs: Sequence[ModelInput], owners: Sequence[int], draws: np.ndarray) -> tuple[Any, Any]:
         """Choose the tokens of chunks.
@@ -250,34 +264,49 @@ class Parallel:
             draws: (B, H, D), as for `ActionBins.choose`.
 
         Returns:
-            The tokens (B, H, D), and the logits (B, H, D, V) from which they were chosen.
+            The tokens (B, H, D), and the logits of the bins (B, H, D, bins) there.
         """
-        torch = require("torch")
-        with torch.inference_mode():
+        with require("torch").inference_mode():
             hidden = self._hidden(self._sequences(inputs)).unflatten(1, (self.horizon, self.dim))
-            logits = self.base.network.language_model.lm_head(hidden).float()[list(owners)]
-            return self.base.bins.choose(logits, torch.tensor(draws, device=self.base.device)), logits
+            index, bins = self.base.moved(np.array(owners)), self.base.bins
+            likeliest, over = (one[index] for one in bins.read(self.base.network.language_model.lm_head(hidden)))
+            return bins.choose(likeliest, over, self.base.moved(draws)), over
 
     def _heads(self, hidden: Any) -> Any:
         return self.head(hidden.reshape(len(hidden), self.horizon, -1))  # type: ignore[misc]
 
-    def _noise(self, seen: Sequence[tuple[Any, Any]], time: int, actions: Any) -> Any:
-        now = time_embedding(time, seen[0][0].shape[-1], actions.device).to(actions.dtype)[None]
+    def _noise(self, sequences: Sequences, time: int, actions: Any) -> Any:
+        seen = sequences.seen
+        now = time_embedding(time, seen.shape[-1], actions.device).to(actions.dtype).expand(len(seen), 1, -1)
         noisy = self.noisy(actions.flatten(1)[..., None])  # type: ignore[misc]
-        return self._heads(self._hidden([(require("torch").cat([s, now]), w) for s, w in seen], noisy))
+        return self._heads(self._hidden(replace(sequences, seen=require("torch").cat([seen, now], 1)), noisy))
 
-    def _sequences(self, inputs: Sequence[ModelInput]) -> list[tuple[Any, Any]]:
-        """Return, for each input, the embeddings of images and state (P, D), and of the words (L, D)."""
-        torch = require("torch")
-        words = [self.base.embed([*model_input.tokens, _STOP]) for model_input in inputs]
-        views = len(inputs[0].pictures)
-        pixels = self.base.to_device([picture for model_input in inputs for picture in model_input.pictures])
-        language = torch.stack([one.mean(0) for one in words])
-        seen = self.encode_images(pixels.unflatten(0, (len(inputs), views)), language)
+    def _sequences(self, inputs: Sequence[ModelInput]) -> Sequences:
+        """Return the sequences of inputs; for a diffusion head, with a place for the time after images and state."""
+        torch, base = require("torch"), self.base
+        prompts = [[*model_input.tokens, _STOP] for model_input in inputs]
+        counts = np.array([len(tokens) for tokens in prompts])
+        words = np.zeros((len(prompts), counts.max()), np.int64)
+        for row, tokens in zip(words, prompts, strict=True):
+            row[: len(tokens)] = tokens
+        numbers = base.moved(np.column_stack([words, counts]))
+        embedded, count = base.embed(numbers[:, :-1]), numbers[:, -1:]
+        padding = torch.arange(words.shape[1], device=base.device) >= count
+        language = embedded.float().masked_fill(padding[..., None], 0).sum(1) / count
+        pixels = base.to_device([picture for model_input in inputs for picture in model_input.pictures])
+        seen = self.encode_images(pixels.unflatten(0, (len(inputs), -1)), language.to(embedded.dtype))
         if self.proprio is not None:
-            states = self.base.to_device([torch.from_numpy(model_input.proprio) for model_input in inputs])
+            states = base.to_device([torch.from_numpy(model_input.proprio) for model_input in inputs])
             seen = torch.cat([seen, self.proprio(states)[:, None]], 1)
-        return list(zip(seen, words, strict=True))
+        before, actions = seen.shape[1] + (self.noisy is not None), np.arange(self.horizon * self.dim)
+        places = np.zeros((len(prompts), before + len(actions) + max(words.shape[1], base.padded_tokens)), np.int64)
+        for row, length in zip(places, counts, strict=True):
+            text = 1 + before + np.arange(length)
+            answer = (1 + before + words.shape[1] + actions) * (self.noisy is not None)  # else zeros
+            row[: before + len(actions) + length] = [text[0], *range(1, 1 + before), *text[1:-1], *answer, text[-1]]
+        lengths = before + len(actions) + counts
+        moved = base.moved(np.column_stack([places, lengths]))
+        return Sequences(seen, embedded, moved[:, :-1], moved[:, -1])
 
     def encode_images(self, pixels: Any, language: Any) -> Any:
         """Return the embeddings (P, N, D) of images (P, views, C, S, S); `language` (P, D) is the mean of the words."""
@@ -301,24 +330,14 @@ class Parallel:
             [embeddings] = layer(embeddings, attention_mask=mask, position_ids=places)
         return model.norm(embeddings)
 
-    def _hidden(self, sequences: Sequence[tuple[Any, Any]], actions: Any = None) -> Any:
-        """Return hidden states (B, H * D, …) of the action tokens, which are `actions` or zeros."""
-        torch = require("torch")
-        count = self.horizon * self.dim
-        if actions is None:
-            actions = sequences[0][0].new_zeros(len(sequences), count, sequences[0][0].shape[-1])
-        rows = [
-            torch.cat([words[:1], seen, words[1:-1], tokens, words[-1:]])
-            for (seen, words), tokens in zip(sequences, actions, strict=True)
-        ]
-        embeddings = torch.nn.utils.rnn.pad_sequence(rows, batch_first=True)
-        missing = max(0, self.base.padded_tokens - max(len(words) for _, words in sequences))
-        embeddings = torch.nn.functional.pad(embeddings, (0, 0, 0, missing))
-        lengths = torch.tensor([len(row) for row in rows], device=self.base.device)
+    def _hidden(self, sequences: Sequences, *actions: Any) -> Any:
+        """Return hidden states (B, H * D, …) of the action tokens: `actions` for a diffusion head, else zeros."""
+        lengths, count = sequences.lengths, self.horizon * self.dim
+        embeddings = self.base.assembled([sequences.seen, sequences.words, *actions], sequences.places)
         hidden = self.hidden_states(embeddings, lengths)
-        starts = lengths - count - 2  # the preceding token predicts an action, as in training
-        places = starts[:, None] + torch.arange(count, device=self.base.device)
-        return hidden[torch.arange(len(rows))[:, None], places]
+        # the preceding token predicts an action, as in training
+        places = lengths[:, None] - count - 2 + require("torch").arange(count, device=self.base.device)
+        return hidden.take_along_dim(places[..., None], 1)
 
 
 def _numpy(tensor: Any) -> np.ndarray:

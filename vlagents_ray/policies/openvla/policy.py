@@ -98,10 +98,10 @@ class OpenVLA(PrismaticPolicy):
             if entry.row.sample:
                 numbers[: entry.scale.dim] = entry.row.rng.random(entry.scale.dim)
         seen = [prepared[i] for i in firsts]
-        tokens, logits = self.model.decode(
+        tokens, over = self.model.decode(
             [entry.model_input for entry in seen], owners, draws, [entry.row.adapter for entry in seen]
         )
-        return self._decoded(self.model.base.bins, prepared, tokens[:, None], logits[:, None])
+        return self._decoded(self.model.base.bins, prepared, tokens[:, None], over[:, None])
 
 
 @dataclass
@@ -133,31 +133,34 @@ class TokenDecoder:
             fingerprints: (P,), the adapter of each prompt, see `Row.adapter`; empty: no prompt has one.
 
         Returns:
-            Tokens (R, S), and the logits (R, S, V) from which they were chosen.
+            Tokens (R, S), and the logits of the bins (R, S, bins) there.
         """
         torch, base, steps = require("torch"), self.base, draws.shape[1]
         with torch.inference_mode(), self.adapters.rows(fingerprints):
-            uniform = torch.tensor(draws, device=base.device)
+            uniform = base.moved(draws)
             embeddings, mask = self._left_padded(prompts)
             hidden, cache = self.prefill(embeddings, mask)
         with torch.inference_mode(), self.adapters.rows([fingerprints[i] for i in owners] if fingerprints else ()):
-            index = torch.tensor(owners, device=base.device)
-            length, position = mask.shape[1], mask.sum(1)[index]
+            if list(owners) != list(range(len(prompts))):
+                index = base.moved(np.array(owners))
+                hidden, mask, cache = hidden[index], mask[index], cache[index]
+            length, position = mask.shape[1], mask.sum(1)
             # one place for each token but the last, and one at the end for the current token
             places = max(steps, self.longest)
-            cache = torch.nn.functional.pad(cache[index], (0, 0, 0, places - 1))
-            hidden, mask = hidden[index], torch.nn.functional.pad(mask[index], (0, places))
+            cache = torch.nn.functional.pad(cache, (0, 0, 0, places - 1))
+            mask = torch.nn.functional.pad(mask, (0, places))
             mask[:, -1] = 1
             chosen: list[Any] = []
-            logits: list[Any] = []
+            found: list[Any] = []
             for step in range(steps):
                 if step:
                     hidden, own = self.continue_from(chosen[-1], position + step - 1, mask, cache)
                     place = length + step - 1
                     cache[..., place, :], mask[:, place] = own, 1
-                logits.append(base.network.language_model.lm_head(hidden).float())
-                chosen.append(base.bins.choose(logits[-1], uniform[:, step]))
-            return torch.stack(chosen, 1), torch.stack(logits, 1)
+                likeliest, over = base.bins.read(base.network.language_model.lm_head(hidden))
+                found.append(over)
+                chosen.append(base.bins.choose(likeliest, over, uniform[:, step]))
+            return torch.stack(chosen, 1), torch.stack(found, 1)
 
     def encode_images(self, pixels: Any) -> Any:
         """Return the embeddings (P, N, D) of images (P, C, S, S)."""
@@ -202,19 +205,17 @@ class TokenDecoder:
 
     def _left_padded(self, prompts: Sequence[tuple[Any, list[int]]]) -> tuple[Any, Any]:
         """Return embeddings (P, L, D) and their mask (P, L); the patches follow the first token, as in training."""
-        torch, base = require("torch"), self.base
+        base, lengths = self.base, [len(tokens) for _, tokens in prompts]
         patches = self.encode_images(base.to_device([pixels for pixels, _ in prompts]))
-        rows = []
-        for seen, (_, tokens) in zip(patches, prompts, strict=True):
-            words = base.embed(tokens)
-            rows.append(torch.cat([words[:1], seen, words[1:]]))
-        length = max(*map(len, rows), base.padded_tokens and base.padded_tokens + patches.shape[1])
-        embeddings = patches.new_zeros(len(rows), length, patches.shape[-1])
-        mask = torch.zeros(len(rows), length, dtype=torch.long, device=base.device)
-        for i, row in enumerate(rows):
-            embeddings[i, -len(row) :] = row
-            mask[i, -len(row) :] = 1
-        return embeddings, mask
+        seen, longest = patches.shape[1], max(lengths)
+        length = seen + max(longest, base.padded_tokens)
+        numbers = np.zeros((len(prompts), longest + length), np.int64)  # tokens, and their places below
+        for row, (_, tokens), count in zip(numbers, prompts, lengths, strict=True):
+            row[:count] = tokens
+            words = 1 + seen + np.arange(count)
+            row[-seen - count :] = [words[0], *range(1, 1 + seen), *words[1:]]
+        tokens, places = base.moved(numbers).split([longest, length], 1)
+        return base.assembled([patches, base.embed(tokens)], places), (places > 0).long()
 
 
 def _stacked(cache: Any) -> Any:
