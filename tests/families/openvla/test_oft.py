@@ -20,7 +20,7 @@ from vlagents_ray import Obs
 from vlagents_ray.errors import InvalidObservation, MissingCamera, MissingState
 from vlagents_ray.interface import BEHAVIOUR, DISTRIBUTION, SAMPLES, WANT, Act
 from vlagents_ray.policies.base import Row
-from vlagents_ray.policies.openvla import oft
+from vlagents_ray.policies.base import policy as base_policy
 from vlagents_ray.policies.openvla.oft import OpenVLAOFT
 from vlagents_ray.policies.openvla.prismatic import middle, resized
 from vlagents_ray.testing import check_agent
@@ -196,7 +196,7 @@ def test_samples_share_the_images_of_their_session(
     monkeypatch.setattr(backbone, "forward", lambda pixels: read.append(len(pixels)) or forward(pixels))
     views = [seen(0, **{SAMPLES: 3}), seen(1)]
     shared = policy.act_batch(views, [begun(policy, 0), begun(policy, 1)])
-    monkeypatch.setattr(oft, "shared_frames", lambda rows: (list(range(len(rows))), list(range(len(rows)))))
+    monkeypatch.setattr(base_policy, "shared_frames", lambda rows: (list(range(len(rows))), list(range(len(rows)))))
     each = policy.act_batch(views, [begun(policy, 0), begun(policy, 1)])
     assert read == [4, 10]  # of two cameras
     for one, other in zip(shared, each, strict=True):

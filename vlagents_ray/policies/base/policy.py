@@ -30,6 +30,7 @@ from vlagents_ray.policies.base.model_inputs import (
     count_in,
     drawn,
     leftover_plan,
+    shared_frames,
     wanted_behaviour,
     wanted_samples,
 )
@@ -104,6 +105,11 @@ class ModelPolicy(Agent, abc.ABC):
     def most_rows(self) -> int:
         """The largest number of rows of one forward pass: the config's, or fewer if more did not fit into memory."""
         return min(self.config.rows, self.report.most_rows or self.config.rows)
+
+    @property
+    def gathers(self) -> bool:
+        """Whether a batch whose rows share observations runs programs of its own, which JAX compiles at first use."""
+        return False
 
     @property
     def state_dim(self) -> int | None:
@@ -359,7 +365,20 @@ class ModelPolicy(Agent, abc.ABC):
         return found
 
     def _run_examples(self, size: int, seeds: Iterator[int]) -> None:
-        self._chunks([self._example(next(seeds)) for _ in range(size)])
+        rows = [self._example(next(seeds)) for _ in range(size)]
+        self._chunks(rows)
+        for few in self.config.batch_sizes or () if self.gathers else ():
+            if few < size:
+                self._chunks([*rows[:few], *(drawn(rows[0], row.rng) for row in rows[few:])])
+
+    def observations_of(self, rows: Sequence[Row]) -> tuple[list[int], list[int]]:
+        """Return the rows to encode, padded to one of `batch_sizes`, and for each row the place of its observations.
+
+        As many observations as rows are those of the rows: 0, 1, …, which needs no gathering.
+        """
+        firsts, owners = shared_frames(rows)
+        firsts, each = self.padded(firsts), list(range(len(rows)))
+        return (each, each) if len(firsts) == len(rows) else (firsts, owners)
 
     def _chunks(self, rows: Sequence[Row]) -> list[np.ndarray]:
         """Return the chunks of rows; raises the first error of a row."""

@@ -15,7 +15,7 @@ from typing_extensions import Self
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, InvalidObservation
 from vlagents_ray.interface import Obs
-from vlagents_ray.policies.base import Row, shared_frames
+from vlagents_ray.policies.base import Row
 from vlagents_ray.policies.base.model_inputs import (
     camera_images,
     camera_specs,
@@ -159,7 +159,7 @@ class OpenVLAOFT(PrismaticPolicy):
 
     def _compute(self, prepared: Sequence[PreparedRow]) -> list[DecodedChunk]:
         """Run one forward pass, or one per diffusion step. Regression gives a session's samples the same answer."""
-        firsts, owners = shared_frames([entry.row for entry in prepared])
+        firsts, owners = self.observations_of([entry.row for entry in prepared])
         inputs = [prepared[i].model_input for i in firsts]
         shape = (self.model.horizon, self.model.dim)
         if self.config.head == "l1":

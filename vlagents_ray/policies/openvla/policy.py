@@ -17,7 +17,7 @@ from pydantic import Field
 from vlagents_ray.contract import Contract
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.adapters import Adapters
-from vlagents_ray.policies.base import Row, shared_frames
+from vlagents_ray.policies.base import Row
 from vlagents_ray.policies.base.model_inputs import camera_images, camera_specs, choose_cameras
 from vlagents_ray.policies.compilation import Compilation
 from vlagents_ray.policies.openvla.prismatic import (
@@ -92,7 +92,7 @@ class OpenVLA(PrismaticPolicy):
 
     def _compute(self, prepared: Sequence[PreparedRow]) -> list[DecodedChunk]:
         """Decode all answers: sessions greedily unless outputs are requested, samples at temperature 1."""
-        firsts, owners = shared_frames([entry.row for entry in prepared])
+        firsts, owners = self.observations_of([entry.row for entry in prepared])
         draws = np.full((len(prepared), max(entry.scale.dim for entry in prepared)), np.nan)
         for numbers, entry in zip(draws, prepared, strict=True):
             if entry.row.sample:
