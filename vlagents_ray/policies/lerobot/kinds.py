@@ -134,7 +134,7 @@ class Diffusion(Kind):
             len(rows),
             global_cond=self._encode(*stacked(batch, self.config, len(rows)).values()),
             generator=[generator_of(row.rng) for row in rows],
-            noise=torch.from_numpy(noise).to(self.config.device),
+            noise=torch.from_numpy(noise).to(self.config.device, non_blocking=True),
         )
         return actions[:, self.steps - 1 :]
 
@@ -199,7 +199,7 @@ class Flow(Kind):
         shape = (self.horizon, int(self.config.max_action_dim))
 
         def convert(array: np.ndarray) -> Any:
-            return torch.from_numpy(array).to(self.config.device)
+            return torch.from_numpy(array).to(self.config.device, non_blocking=True)
 
         noise = convert(
             np.stack([row.noise(*shape) for row in rows])
