@@ -22,7 +22,7 @@ from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, InvalidAction, InvalidObservation, NotReset, PolicyFailed
 from vlagents_ray.interface import BEHAVIOUR, DELAY, DISTRIBUTION, EXECUTED, LEFTOVER, Act, Agent, Obs
 from vlagents_ray.policies.adapters import ADAPTER, Adapters, require_base_alone
-from vlagents_ray.policies.base.accelerator import free_memory, is_out_of_memory
+from vlagents_ray.policies.base.accelerator import free_memory, is_out_of_memory, set_matmul
 from vlagents_ray.policies.base.checkpoint import find_adapter, used_checkpoints
 from vlagents_ray.policies.base.checkpoint_files import weights_of
 from vlagents_ray.policies.base.config import ModelConfig
@@ -150,6 +150,8 @@ class ModelPolicy(Agent, abc.ABC):
         """
         with current_report() as self.report:
             self.model = self._load_with_adapters() if self.config.adapters else self.load()
+        for device in self.report.devices:
+            set_matmul(self.config.matmul, device)
         self._decide_on_compiling()
         if self.config.quantization:
             quantize(self, self.config.quantization)
