@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import io
+import json
 import os
 import socket
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from unittest.mock import Mock
@@ -30,7 +33,7 @@ def nvidia_smi(folder: Path, monkeypatch: pytest.MonkeyPatch, script: str) -> No
 
 
 def table(monkeypatch: pytest.MonkeyPatch, *rows: Check) -> tuple[int, str]:
-    monkeypatch.setattr(doctor, "checks", lambda _: ((f"row {i}", row) for i, row in enumerate(rows)))
+    monkeypatch.setattr(doctor, "checks", lambda *_: ((f"row {i}", row) for i, row in enumerate(rows)))
     text = io.StringIO()
     code = doctor.run(Console(file=text, width=200))
     return code, text.getvalue()
@@ -108,23 +111,98 @@ def test_no_gpu_or_one_that_its_driver_lost_is_a_warning(monkeypatch: pytest.Mon
     assert "Driver/library version mismatch" in row.detail
 
 
+TORCH = {"version": "2.13.0", "cuda": "13.0", "device": None, "why": "error 802: system not yet initialized"}
+JAX = {"version": "0.5.3", "cuda": "12", "device": None, "why": "no platforms are present"}
+
+
 @pytest.mark.parametrize(
-    ("torch", "status", "said"),
+    ("name", "found", "driver", "status", "said", "cure"),
     [
-        ("2.13.0|13.0|True", "ok", "torch 2.13.0 uses it"),
-        ("2.13.0+cpu|None|False", "warn", "CPU-only"),
-        ("2.13.0|13.0|False", "warn", "cannot use it"),
+        ("torch", TORCH | {"device": "NVIDIA H100"}, "580.65.06", "ok", "2.13.0, for CUDA 13.0, uses NVIDIA H100", ""),
+        ("torch", TORCH, "580.65.06", "warn", "cannot use the GPU: error 802", "dmesg"),
+        ("torch", TORCH, "570.124.06", "warn", "needs driver 580 or newer; got 570.124.06", "env make"),
+        ("torch", TORCH | {"cuda": "12.8"}, "570.124.06", "warn", "cannot use the GPU", "dmesg"),
+        ("torch", TORCH | {"cuda": None}, "580.65.06", "warn", "for CPUs only", "--force-reinstall torch"),
+        ("torch", TORCH | {"cuda": None}, None, "ok", "for CPUs only; no GPU here", ""),
+        ("jax", JAX | {"device": "NVIDIA H100"}, "535.1", "ok", "0.5.3, for CUDA 12, uses NVIDIA H100", ""),
+        ("jax", JAX, "470.1", "warn", "needs driver 525 or newer; got 470.1", "update the driver"),
+        ("jax", JAX | {"cuda": None}, "535.1", "warn", "for CPUs only", "'jax[cuda12]==0.5.3'"),
+    ],
+)  # fmt: skip
+def test_a_library_counts_only_if_it_can_use_the_gpu(
+    name: str, found: dict[str, str], driver: str | None, status: str, said: str, cure: str
+) -> None:
+    row = doctor.judge_library(name, driver, **found)
+    assert row.status == status
+    assert said in row.detail
+    assert cure in row.cure
+    assert bool(cure) is (status == "warn")
+
+
+class TestAPolicysPython:
+    @pytest.fixture(autouse=True)
+    def old_driver(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(doctor, "has_gpu", lambda: True)
+        monkeypatch.setattr(doctor, "driver_version", lambda: "570.1")
+
+    def interpreter(self, folder: str, says: str) -> Path:
+        """A Python that prints that in place of what it has."""
+        python = Path(folder) / "bin" / "python"
+        python.parent.mkdir(parents=True)
+        python.write_text(f"#!/bin/sh\n{says}\n")
+        python.chmod(0o755)
+        return python
+
+    def test_is_one_of_env_make_here_unless_others_are_named(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.interpreter(".venv-hf", f"echo '{json.dumps({'headers': '/none', 'libraries': {'torch': TORCH}})}'")
+        other = self.interpreter(
+            "other", f"echo 'a warning'; echo '{json.dumps({'headers': '/none', 'libraries': {'jax': JAX}})}'"
+        )
+        monkeypatch.setattr(doctor, "guarded", lambda _: Check("ok", ""))
+        found = dict(doctor.checks())
+        assert "needs driver 580 or newer; got 570.1" in found["torch in .venv-hf"].detail
+        assert found["C compiler for Triton in .venv-hf"].status == "warn"
+        assert not [name for name in found if "other" in name]
+        named = dict(doctor.checks(pythons=[other]))
+        assert "cannot use the GPU: no platforms are present" in named["jax in other"].detail
+        assert not [name for name in named if "Triton" in name or ".venv-hf" in name]
+
+    def test_that_does_not_run_is_a_row(self) -> None:
+        broken = self.interpreter(".venv-hf", "echo 'no libpython' >&2; exit 127")
+        for python, said in ((broken, "no libpython"), (Path("/none/bin/python"), "No such file")):
+            [(_, row)] = doctor.libraries(python)
+            assert row.status == "warn"
+            assert said in row.detail
+
+    @pytest.mark.torch
+    def test_says_what_it_has(self) -> None:
+        """The program of the check, in this Python."""
+        found = dict(doctor.libraries(Path(sys.executable)))
+        assert found["torch"].detail.startswith(importlib.metadata.version("torch"))
+
+
+@pytest.mark.parametrize(
+    ("tools", "headers", "detail"),
+    [
+        (["gcc", "clang"], True, "gcc"),
+        (["clang"], True, "clang"),
+        (["gcc"], False, "no "),
+        ([], True, "none, which torch.compile needs on a GPU"),
     ],
 )
-def test_a_gpu_counts_only_if_torch_can_use_it(
-    torch: str, status: str, said: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+def test_triton_needs_a_compiler_and_pythons_headers(
+    tools: list[str], headers: bool, detail: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    nvidia_smi(tmp_path, monkeypatch, "echo 'NVIDIA H200, 143771 MiB, 580.1'")
-    monkeypatch.setattr(doctor, "_TORCH_CUDA", f"print({torch!r})")
-    row = doctor.gpu()
-    assert row.status == status
-    assert "NVIDIA H200, 143771 MiB, 580.1" in row.detail
-    assert said in row.detail
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.delenv("CC", raising=False)
+    for tool in tools:
+        (tmp_path / tool).touch(0o755)
+    if headers:
+        (tmp_path / "Python.h").touch()
+    row = doctor.triton_compiler(tmp_path)
+    assert detail in row.detail
+    assert (row.status == "ok") is (headers and bool(tools))
 
 
 @pytest.mark.parametrize(("software", "status"), [(True, "ok"), (False, "warn")])

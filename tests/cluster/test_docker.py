@@ -6,6 +6,7 @@ No container engine is needed. Locks get what pyproject.toml and requirements/ w
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -64,6 +65,7 @@ LOCKS = {  # of the stages that install
 INSTALL = (FOLDER / "install.sh").read_text()
 SIMULATORS = re.findall(r'^(\w+) = \["vlagents-ray\[sim\]"', (ROOT / "pyproject.toml").read_text(), re.MULTILINE)
 FAMILIES = [file.stem for file in resolved.families()]
+MODELS = set(FAMILIES) - set(SIMULATORS) - {"rcs", "robosuite"}
 
 
 def of(word: str, stage: str | None = None) -> list[str]:
@@ -181,10 +183,38 @@ def test_a_target_brings_its_own_packages_into_the_servers_environment_or_beside
 @pytest.mark.parametrize("target", TARGETS)
 def test_what_runs_is_no_root_and_owns_nothing_but_where_it_writes(target: str) -> None:
     stages = [line for stage in reversed(chain(target)) for line in LINES if line.stage == stage]
-    assert [line.text for line in stages if line.word == "USER"] == ["1000:1000"]
-    after = stages[[line.word for line in stages].index("USER") :]
+    users = [i for i, line in enumerate(stages) if line.word == "USER"]
+    # Root installs a model's compiler, and no more.
+    assert [stages[i].text for i in users] == ["1000:1000", *(["0:0", "1000:1000"] if target in MODELS else [])]
+    after = stages[users[-1] :]
     assert not [line for line in after if line.word in ("RUN", "ADD") or "chown" in line.flags]
     assert json.loads(of("VOLUME", "system")[0]) == ["/tmp", "/home/robot", "/results"]
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_models_alone_have_a_compiler(target: str) -> None:
+    """Triton compiles a C program when a model runs on a GPU."""
+    installed = " ".join(run for stage in chain(target) for run in of("RUN", stage) if "apt-get install" in run)
+    assert ("gcc libc6-dev" in installed) is (target in MODELS)
+
+
+@pytest.mark.parametrize(("package", "headers", "built"), [("triton", 1, True), ("triton", 0, False), ("six", 0, True)])
+def test_triton_needs_the_headers_of_its_python(package: str, headers: bool, built: bool, tmp_path: Path) -> None:
+    """install.sh runs with a uv that installs nothing, and a Python that names a folder of headers."""
+    environment, include = tmp_path / "environment", tmp_path / "include"
+    for folder in (include, environment / "bin", environment / "lib/python3.11/site-packages"):
+        folder.mkdir(parents=True)
+    for file, line in ((tmp_path / "uv", "exit 0"), (environment / "bin/python", f"echo {include}")):
+        file.write_text(f"#!/bin/sh\n{line}\n")
+        file.chmod(0o755)
+    if headers:
+        (include / "Python.h").touch()
+    (tmp_path / "lock.txt").write_text(f"# x, for Python 3.11 on y: `make locks` writes it.\n{package}==1.0\n")
+    command = ["sh", str(FOLDER / "install.sh"), str(environment)]
+    path = {"PATH": f"{tmp_path}:{os.environ['PATH']}"}
+    done = subprocess.run(command, cwd=tmp_path, env=path, capture_output=True, text=True, check=False)
+    assert (done.returncode == 0) is built, done.stderr
+    assert built or f"no {include}/Python.h" in done.stderr
 
 
 def test_it_says_how_it_is() -> None:
@@ -236,7 +266,6 @@ def test_its_command_asks_for_keys(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 ENTRY = re.compile(r"([a-z0-9-]+)==(\S+)((?: \\\n    --hash=sha256:[0-9a-f]{64})+)\n")
-TORCH = {Requirement(line).name: Requirement(line) for line in resolved.lines(resolved.TORCH)}
 
 
 def locked(text: str) -> dict[str, str]:
@@ -250,7 +279,8 @@ def locked(text: str) -> dict[str, str]:
 def unmet(versions: dict[str, str], requirements: list[str]) -> list[str]:
     """The requirements that no locked version meets."""
     wanted = [Requirement(text) for text in requirements]
-    wanted = [TORCH.get(one.name, one) for one in wanted if one.marker is None or one.marker.evaluate()]
+    torch = {one.name: one for one in map(Requirement, resolved.overrides(requirements))}
+    wanted = [torch.get(one.name, one) for one in wanted if one.marker is None or one.marker.evaluate()]
     return [
         str(one)
         for one in wanted
@@ -270,8 +300,16 @@ def test_a_lock_meets_what_its_image_wants_and_has_a_digest_of_every_package(nam
     assert f"for Python {python} on {resolved.PLATFORM}:" in text
     versions = locked(text)
     assert len(versions) > 60
-    torch = [str(one) for name, one in TORCH.items() if name in versions]  # the same in all images
+    torch = [text for text in resolved.overrides(requirements) if Requirement(text).name in versions]
     assert unmet(versions, [*requirements, *torch]) == [], "run `make locks`"
+
+
+@pytest.mark.parametrize("name", resolved.locks())
+def test_a_lock_has_no_library_of_nvidia_twice(name: str) -> None:
+    """Those of two CUDAs overwrite each other: nvidia-cudnn-cu12 and -cu13 are unpacked into nvidia/cudnn/lib."""
+    packages = [one for one in locked((resolved.LOCKS / f"{name}.txt").read_text()) if one.startswith("nvidia-")]
+    libraries = [re.sub(r"-cu\d+$", "", one) for one in packages]
+    assert sorted(libraries) == sorted(set(libraries)), packages
 
 
 def test_a_lock_that_is_out_of_date_or_has_no_digest_is_told() -> None:

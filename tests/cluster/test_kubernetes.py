@@ -200,6 +200,20 @@ def test_a_pod_writes_where_the_image_says(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", PODS)
+def test_a_pod_with_a_gpu_keeps_its_programs_for_the_next_one(name: str) -> None:
+    spec = PODS[name]["spec"]
+    kept = [one for one in spec["volumes"] if "persistentVolumeClaim" in one]
+    claims = {one["name"]: one["persistentVolumeClaim"]["claimName"] for one in kept}
+    for container in spec["containers"]:
+        mounts = {one["mountPath"]: claims.get(one["name"]) for one in container["volumeMounts"]}
+        cache = {one["name"]: one["value"] for one in container.get("env", [])}.get("XDG_CACHE_HOME", "")
+        assert (mounts.get(cache) == "cache") is ("nvidia.com/gpu" in container["resources"]["limits"])
+        # A mount below a volume would have parents that are root's.
+        assert not [path for path in mounts for other in mounts if path.startswith(f"{other}/")]
+    assert manifest("PersistentVolumeClaim", "cache")["spec"]["accessModes"] == ["ReadWriteMany"]
+
+
+@pytest.mark.parametrize("name", PODS)
 def test_the_autoscaler_alone_may_ask_kubernetes(name: str) -> None:
     spec = complete(name)
     assert spec["automountServiceAccountToken"] is False
@@ -318,7 +332,8 @@ def test_manifests_agree_on_names_versions_and_labels() -> None:
         assert manifest("NetworkPolicy", label)["spec"]["podSelector"]["matchLabels"] == {"vlagents-ray/cluster": label}
     [backend] = values_of(manifest("Ingress", "policy"), "service")
     assert backend["name"] == f"{SERVICE.metadata.name}-serve-svc"  # as KubeRay names it
-    assert set(values_of(everything, "claimName")) == {manifest("PersistentVolumeClaim", "results")["metadata"]["name"]}
+    claims = {one["metadata"]["name"] for one in everything if one["kind"] == "PersistentVolumeClaim"}
+    assert set(values_of(everything, "claimName")) == claims
 
 
 def vlagents_ray_version() -> str:

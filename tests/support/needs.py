@@ -29,6 +29,7 @@ from cpp_client import no_compiler
 from typescript_client import node_version
 
 from vlagents_ray.errors import ConfigError
+from vlagents_ray.serve.python_env.create import has_gpu
 
 # Ray makes a session's folder in this one: in no process of the test does one start that finds a file in its place.
 _NO_RAY = "/dev/null/not-marked-ray"  # short: a longer name would be replaced, as sockets in it could not be named
@@ -65,7 +66,7 @@ def mark_tier(item: pytest.Item) -> None:
 
 def skip_what_is_missing(item: pytest.Item) -> None:
     """Skip what this machine cannot run; the Vulkan device is looked for when the first test wants it."""
-    if item.get_closest_marker("gpu") and not any(Path("/dev").glob("nvidia[0-9]*")):
+    if item.get_closest_marker("gpu") and not has_gpu():
         pytest.skip("no NVIDIA GPU")
     for marker in item.iter_markers("source"):
         [variable] = marker.args

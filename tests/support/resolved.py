@@ -11,6 +11,7 @@ import json
 import re
 import subprocess
 import sys
+import tempfile
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -51,6 +52,13 @@ def lines(file: Path) -> list[str]:
     return [line for line in kept if line and not line.startswith("#")]
 
 
+def overrides(requirements: Sequence[str]) -> list[str]:
+    """The lines of torch.txt but for packages of which the requirements pin a version, as for another CUDA."""
+    wanted = map(Requirement, requirements)
+    pinned = {one.name for one in wanted if any(part.operator == "==" for part in one.specifier)}
+    return [text for text in lines(TORCH) if Requirement(text).name not in pinned]
+
+
 def resolve(requirements: Sequence[str], python: str, *words: str) -> list[dict[str, Any]]:
     """The packages, as in a `pylock.toml`: of each its `name`, `version`, and the `wheels` that fit the platform.
 
@@ -60,8 +68,12 @@ def resolve(requirements: Sequence[str], python: str, *words: str) -> list[dict[
     """
     command = [sys.executable, "-m", "uv", "pip", "compile", "--quiet", "--no-config", "--format", "pylock.toml"]
     command += ["--no-python-downloads"]  # it would look for that Python, which resolving does not need
-    command += ["--python-version", python, "--python-platform", PLATFORM, "--override", str(TORCH), *words, "-"]
-    done = subprocess.run(command, input="\n".join(requirements), capture_output=True, text=True, check=False)
+    command += ["--python-version", python, "--python-platform", PLATFORM, *words]
+    with tempfile.NamedTemporaryFile("w", suffix=".txt") as file:
+        file.write("\n".join(overrides(requirements)))
+        file.flush()
+        command += ["--override", file.name, "-"]
+        done = subprocess.run(command, input="\n".join(requirements), capture_output=True, text=True, check=False)
     if done.returncode != 0:
         raise (LookupError if "No solution found" in done.stderr else RuntimeError)(done.stderr)
     return list(tomllib.loads(done.stdout)["packages"])

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import importlib.metadata
+import json
 import os
 import re
 import resource
@@ -13,16 +13,17 @@ import socket
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from vlagents_ray.errors import MissingDependency
+from vlagents_ray.policies.base.accelerator import OLDEST_DRIVERS, driver_version
 from vlagents_ray.registry import require
+from vlagents_ray.serve.python_env.create import has_gpu
 
 if TYPE_CHECKING:
-    from packaging.specifiers import SpecifierSet
     from rich.console import Console
 
     from vlagents_ray.envs.render_probe import RenderProbe
@@ -41,7 +42,27 @@ _FIRST_FREE = 1024  # ports below are root's
 OLDEST_PYTHON = (3, 10)
 _WIDTH = 120  # columns of the table in a file or a pipe
 _STYLE = {"ok": "green", "warn": "yellow", "fail": "bold red"}
-_TORCH_CUDA = "import torch; print(torch.__version__, torch.version.cuda, torch.cuda.is_available(), sep='|')"
+# Prints the versions of torch and JAX in an interpreter, their CUDA, and the GPU that they use or what prevents it.
+_LIBRARIES = """
+import json, os, sysconfig
+from importlib.metadata import distributions
+os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
+installed = {one.name: one.version for one in distributions()}
+found = {"headers": sysconfig.get_path("include"), "libraries": {}}
+for name in [name for name in ("torch", "jax") if name in installed]:
+    one = found["libraries"][name] = {"version": installed[name], "cuda": None, "device": None, "why": ""}
+    try:
+        library = __import__(name)
+        if name == "torch":
+            one["cuda"] = library.version.cuda
+            one["device"] = library.cuda.get_device_name()
+        else:
+            one["cuda"] = next((cuda for cuda in ("12", "13") if f"jax-cuda{cuda}-plugin" in installed), None)
+            one["device"] = library.devices("gpu")[0].device_kind
+    except Exception as error:
+        one["why"] = (str(error).splitlines() or [type(error).__name__])[0]
+print("\\n" + json.dumps(found))
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,8 +170,8 @@ def port_free(port: int) -> Check:
     return Check("ok", "free")
 
 
-def run(console: Console, port: int = DEFAULT_PORT) -> int:
-    """Print a row for each check. Returns the exit code: 1 if any check failed, else 0."""
+def run(console: Console, port: int = DEFAULT_PORT, pythons: Sequence[Path] = ()) -> int:
+    """Print a row for each check, see `checks`. Returns the exit code: 1 if any check failed, else 0."""
     from rich.table import Table
     from rich.text import Text
 
@@ -159,7 +180,7 @@ def run(console: Console, port: int = DEFAULT_PORT) -> int:
         table.add_column(column, overflow="fold")
     failed = False
     with console.status("looking around; rendering a frame takes some seconds"):
-        for name, check in checks(port):
+        for name, check in checks(port, pythons):
             failed |= check.status == "fail"
             style = _STYLE[check.status]
             table.add_row(name, Text(check.status, style), Text(check.detail), Text(check.cure))
@@ -167,8 +188,8 @@ def run(console: Console, port: int = DEFAULT_PORT) -> int:
     return int(failed)
 
 
-def checks(port: int = DEFAULT_PORT) -> Iterator[tuple[str, Check]]:
-    """Run every check, and yield names and results; a check that raises is also a row."""
+def checks(port: int = DEFAULT_PORT, pythons: Sequence[Path] = ()) -> Iterator[tuple[str, Check]]:
+    """Yield names and results of all checks; `pythons` take the place of those that `env make` made in this folder."""
     todo: list[tuple[str, Callable[[], Check]]] = [
         ("Python", lambda: python(sys.version_info[:3])),
         ("Ray", ray),
@@ -183,6 +204,9 @@ def checks(port: int = DEFAULT_PORT) -> Iterator[tuple[str, Check]]:
     ]
     for name, check in todo:
         yield name, guarded(check)
+    made = [*sorted(Path().glob(".venv-*/bin/python")), *Path("/opt/family/bin").glob("python")]
+    for interpreter in [Path(sys.executable), *(pythons or made)]:
+        yield from libraries(interpreter)
 
 
 def guarded(check: Callable[[], Check]) -> Check:
@@ -207,12 +231,16 @@ def python(version: tuple[int, ...]) -> Check:
 
 def ray() -> Check:
     """Check that Ray has the tested version; all nodes of a cluster need the same one."""
+    from packaging.requirements import Requirement
+    from packaging.specifiers import SpecifierSet
+
     cure = "pip install 'vlagents-ray[serve]'"
     try:
         version = importlib.metadata.version("ray")
     except importlib.metadata.PackageNotFoundError:
         return Check("fail", "not installed: robots can do without, servers and evaluations cannot", cure)
-    wanted = _required("ray")
+    needed = map(Requirement, importlib.metadata.requires("vlagents-ray") or [])
+    wanted = next((one.specifier for one in needed if one.name == "ray"), SpecifierSet())
     if version not in wanted:
         return Check("warn", f"{version}; this package is tested with {wanted}", cure)
     return Check("ok", version)
@@ -234,31 +262,59 @@ def haproxy() -> Check:
 
 
 def gpu() -> Check:
-    """List NVIDIA GPUs, and check that the installed torch can use them."""
-    smi = shutil.which("nvidia-smi")
-    if smi is None:
+    """List NVIDIA GPUs."""
+    if (smi := shutil.which("nvidia-smi")) is None:
         return Check(
             "warn",
             "no nvidia-smi: policies run on the CPU",
-            "enough for `scripted` and for simulation; a VLA model wants an NVIDIA GPU and its driver",
+            "enough for `scripted` and for simulation; a VLA model needs an NVIDIA GPU and its driver: docs/gpu.md",
         )
-    query = [smi, "--query-gpu=name,memory.total,driver_version", "--format=csv,noheader"]
-    answer = _output(query)
+    answer = _output([smi, "--query-gpu=name,memory.total,driver_version", "--format=csv,noheader"])
     if answer.returncode != 0:
         why = _last_line(answer.stderr or answer.stdout)
         return Check("warn", f"nvidia-smi: {why}", "reload or reinstall the NVIDIA driver; a reboot often helps")
-    found = "; ".join(answer.stdout.strip().splitlines())
-    torch = _output([sys.executable, "-c", _TORCH_CUDA])
-    if torch.returncode != 0:
-        return Check("ok", f"{found} (torch: {_last_line(torch.stderr)})")
-    version, cuda, usable = torch.stdout.strip().split("|")
-    if usable == "True":
-        return Check("ok", f"{found}; torch {version} uses it")
-    if cuda == "None":
-        cure = "install torch's CUDA build: pip install --force-reinstall torch, without an index of CPU-only wheels"
-        return Check("warn", f"{found}; torch {version} is CPU-only", cure)
-    cure = "update the NVIDIA driver, or install a torch for an older CUDA"
-    return Check("warn", f"{found}; torch {version} (CUDA {cuda}) cannot use it", cure)
+    return Check("ok", "; ".join(answer.stdout.strip().splitlines()))
+
+
+def libraries(python: Path) -> Iterator[tuple[str, Check]]:
+    """Yield names and results of the checks of an interpreter: of torch, JAX and Triton's compiler, if it has them."""
+    where = "" if str(python) == sys.executable else f" in {python.parent.parent}"
+    answer = _output([str(python), "-c", _LIBRARIES])
+    if answer.returncode != 0:
+        yield f"Python{where}", Check("warn", _last_line(answer.stderr), "make it again: vlagents-ray env make")
+        return
+    found = json.loads(_last_line(answer.stdout))
+    driver = driver_version() if has_gpu() else None
+    for name, library in found["libraries"].items():
+        yield f"{name}{where}", judge_library(name, driver, **library)
+    if found["libraries"].get("torch", {}).get("cuda") is not None:
+        yield f"C compiler for Triton{where}", triton_compiler(Path(found["headers"]))
+
+
+def judge_library(name: str, driver: str | None, version: str, cuda: str | None, device: str | None, why: str) -> Check:
+    """Judge torch or jax: its version, its CUDA or None, its GPU or why it has none; `driver` is None without a GPU."""
+    detail = f"{version}, {f'for CUDA {cuda}' if cuda else 'for CPUs only'}"
+    if device is not None:
+        return Check("ok", f"{detail}, uses {device}")
+    if driver is None:
+        return Check("ok", f"{detail}; no GPU here")
+    if cuda is None:
+        package = f"'jax[cuda12]=={version}'" if name == "jax" else "--force-reinstall torch"
+        return Check("warn", detail, f"uv pip install {package} there, without an index of CPU-only wheels")
+    if int(driver.partition(".")[0]) < (oldest := OLDEST_DRIVERS.get(int(cuda.partition(".")[0]), 0)):
+        cure = "update the driver, or make the environment again: env make takes torch for CUDA 12 with one from 525 on"
+        return Check("warn", f"{detail}, which needs driver {oldest} or newer; got {driver}", cure)
+    return Check("warn", f"{detail}, cannot use the GPU: {why}", "see the kernel's log (dmesg); a reboot often helps")
+
+
+def triton_compiler(headers: Path) -> Check:
+    """Check that Triton finds a C compiler and Python's headers, with which it builds a program that starts kernels."""
+    compiler = os.environ.get("CC") or shutil.which("gcc") or shutil.which("clang")
+    if compiler is None:
+        return Check("warn", "none, which torch.compile needs on a GPU", "apt-get install gcc libc6-dev")
+    if not (headers / "Python.h").exists():
+        return Check("warn", f"{compiler}, but no {headers}/Python.h", "apt-get install python3-dev, of this version")
+    return Check("ok", compiler)
 
 
 def vulkan() -> Check:
@@ -287,21 +343,11 @@ def _rendered(simulator: str, probe: RenderProbe) -> Check:
     return Check("warn", f"{simulator} cannot render: {probe.error}", probe.cure or "")
 
 
-def _required(package: str) -> SpecifierSet:
-    """Return the versions of `package` that our metadata allows."""
-    from packaging.requirements import Requirement
-    from packaging.specifiers import SpecifierSet
-
-    with contextlib.suppress(importlib.metadata.PackageNotFoundError):  # run from a source tree that is not installed
-        for one in map(Requirement, importlib.metadata.requires("vlagents-ray") or []):
-            if one.name == package:
-                return one.specifier
-    return SpecifierSet()
-
-
 def _output(command: list[str], timeout_s: float = 60) -> subprocess.CompletedProcess[str]:
     try:
         return subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)  # noqa: S603 - our own commands
+    except OSError as error:
+        return subprocess.CompletedProcess(command, 127, "", str(error))
     except subprocess.TimeoutExpired:
         return subprocess.CompletedProcess(command, 124, "", f"no answer in {timeout_s:.0f} s")
 

@@ -127,11 +127,14 @@ def _list(listed: Sequence[Listed], name: str | None, *, as_json: bool) -> None:
 
 
 @app.command()
-def doctor(port: Annotated[int, typer.Option(help="The port that a server would take.")] = 8000) -> None:
-    """Check this machine: Python, Ray, GPU, rendering, shared memory, ports, video; each with the cure."""
+def doctor(
+    port: Annotated[int, typer.Option(help="The port that a server would take.")] = 8000,
+    python: Annotated[list[Path], typer.Option(help="A policy's Python, repeatable; default: in .venv-*.")] = [],  # noqa: B006
+) -> None:
+    """Check this machine: Python, Ray, GPU, torch, JAX, rendering, shared memory, ports; each with the cure."""
     from vlagents_ray.cli.doctor import run
 
-    raise typer.Exit(run(out, port))
+    raise typer.Exit(run(out, port, python))
 
 
 @env.callback()

@@ -11,19 +11,20 @@ from pathlib import Path
 import pytest
 
 from vlagents_ray.errors import ConfigError, MissingDependency
+from vlagents_ray.policies.base import accelerator
 from vlagents_ray.serve.python_env import create as making
 from vlagents_ray.serve.python_env.create import create, find_python, make_environment
 
 
 @pytest.fixture
 def asked(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """What uv is told in the place of installing, overrides with what they hold; nothing is installed."""
+    """What uv is told in the place of installing, with the text of overrides and constraints; nothing is installed."""
     told: list[str] = []
 
     def uv(arguments: Sequence[str]) -> str:
         if arguments[0] == "venv":
             return real(arguments)
-        files = [Path(arguments[i + 1]) for i, word in enumerate(arguments) if word == "--override"]
+        files = [Path(arguments[i + 1]) for i, word in enumerate(arguments) if word in ("--override", "--constraint")]
         told.append(" ".join(arguments) + " " + " ".join(file.read_text() for file in files))
         return ""
 
@@ -112,7 +113,7 @@ def own_torch() -> str:
 class TestWithoutAGpu:
     @pytest.fixture(autouse=True)
     def no_gpu(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(making, "_has_gpu", lambda: False)
+        monkeypatch.setattr(making, "has_gpu", lambda: False)
 
     @pytest.mark.torch
     def test_torch_is_this_environments_own(self, asked: list[str], requirements: Path, tmp_path: Path) -> None:
@@ -155,11 +156,76 @@ class TestWithoutAGpu:
 def test_with_a_gpu_nothing_is_replaced(
     asked: list[str], requirements: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(making, "_has_gpu", lambda: True)
+    monkeypatch.setattr(making, "has_gpu", lambda: True)
+    monkeypatch.setattr(making, "driver_version", lambda: "580.65.06")
     (tmp_path / "some.cpu.txt").write_text("torchvision==0.1\n")
     make_environment(requirements, tmp_path / "env")
     assert len(asked) == 1
     assert "--override" not in asked[0]
+    assert "--constraint" not in asked[0]
+
+
+def test_torch_is_for_cuda_12_where_the_driver_is_too_old_for_13(
+    asked: list[str], requirements: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(making, "has_gpu", lambda: True)
+    monkeypatch.setattr(making, "driver_version", lambda: "570.124.06")
+    said: list[str] = []
+    make_environment(requirements, tmp_path / "env", progress=said.append)
+    assert asked[-1].endswith("torch<2.11\n")
+    assert "the driver, 570.124.06, is older than 580, the first for CUDA 13: taking torch<2.11" in said
+    monkeypatch.setenv("UV_TORCH_BACKEND", "cu126")
+    make_environment(requirements, tmp_path / "env")
+    assert "--constraint" not in asked[-1]
+
+
+@pytest.mark.parametrize(
+    ("files", "found"),
+    [
+        ([], False),
+        (["dev/nvidiactl"], False),
+        (["dev/nvidiactl", "dev/nvidia0"], True),
+        (["dev/nvidia0", "etc/nv_tegra_release"], False),
+        (["dev/dxg"], False),
+        (["dev/dxg", "bin/nvidia-smi"], True),
+    ],
+)
+def test_a_gpu_is_found_on_linux_and_wsl_and_none_on_a_jetson(
+    files: list[str], found: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for file in map(tmp_path.joinpath, files):
+        file.parent.mkdir(exist_ok=True)
+        file.touch(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path / "bin"))
+    monkeypatch.setattr(making, "Path", lambda path: tmp_path / path.removeprefix("/"))
+    assert making.has_gpu() is found
+
+
+@pytest.mark.parametrize(
+    ("file", "smi", "version"),
+    [
+        (
+            "NVRM version: NVIDIA UNIX x86_64 Kernel Module  550.54.15  Tue Mar  5",
+            "exit 9",
+            "550.54.15",
+        ),
+        ("NVRM version: NVIDIA UNIX Open Kernel Module for x86_64  580.65.06  Release Build", "exit 9", "580.65.06"),
+        (None, "echo 576.02; echo 576.02", "576.02"),  # WSL2, with two GPUs
+        (None, "exit 9", None),
+        (None, None, None),
+    ],
+)
+def test_the_driver_is_the_kernels_or_that_of_windows(
+    file: str | None, smi: str | None, version: str | None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(accelerator, "_DRIVER", tmp_path / "version")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    if file is not None:
+        (tmp_path / "version").write_text(file)
+    if smi is not None:
+        (tmp_path / "nvidia-smi").write_text(f"#!/bin/sh\n{smi}\n")
+        (tmp_path / "nvidia-smi").chmod(0o755)
+    assert accelerator.driver_version() == version
 
 
 def test_it_imports_torchvision_and_lerobot_as_fits_the_machine(

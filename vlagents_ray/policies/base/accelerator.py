@@ -7,6 +7,7 @@ import importlib
 import importlib.util
 import os
 import re
+import subprocess
 import sys
 from contextlib import suppress
 from pathlib import Path
@@ -21,6 +22,9 @@ from vlagents_ray.registry import require
 
 VISIBLE = "CUDA_VISIBLE_DEVICES"  # Ray sets it in a process that it gives GPUs
 
+# The oldest driver for each major version of CUDA:
+# https://docs.nvidia.com/deploy/cuda-compatibility/minor-version-compatibility.html
+OLDEST_DRIVERS = {12: 525, 13: 580}
 _DRIVER = Path("/proc/driver/nvidia/version")
 # Texts of errors of torch and of JAX, whose classes differ between their versions.
 _EXHAUSTED = re.compile(r"out of memory|ALLOC_FAILED|OUT_OF_MEMORY|RESOURCE_EXHAUSTED", re.IGNORECASE)
@@ -64,15 +68,23 @@ def _described(torch: Any, device: Any) -> dict[str, Any]:
     if device.type != "cuda":
         return described
     properties = torch.cuda.get_device_properties(device)
-    driver = None
-    with suppress(OSError):
-        driver = re.search(r"Kernel Module\s+(?:for \S+\s+)?([\d.]+)", _DRIVER.read_text())
     return described | {
         "name": properties.name,
         "memory_mib": properties.total_memory // 2**20,
         "cuda": torch.version.cuda or torch.version.hip,
-        "driver": driver and driver[1],
+        "driver": driver_version(),
     }
+
+
+def driver_version() -> str | None:
+    """Return the version of NVIDIA's driver, such as "580.65.06"; None if there is none, or it does not say."""
+    with suppress(OSError):
+        driver = re.search(r"Kernel Module\s+(?:for \S+\s+)?([\d.]+)", _DRIVER.read_text())
+        return driver and driver[1]
+    with suppress(OSError, subprocess.SubprocessError, IndexError):  # WSL2 has no such file
+        command = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
+        return subprocess.run(command, capture_output=True, text=True, timeout=10, check=True).stdout.split()[0]  # noqa: S603
+    return None
 
 
 def torch_dtype(name: DType, device: Any, preferred: str = "bfloat16") -> Any:

@@ -18,6 +18,7 @@ from pathlib import Path
 import vlagents_ray
 from vlagents_ray.errors import ConfigError, MissingDependency
 from vlagents_ray.policies.base import import_fixes
+from vlagents_ray.policies.base.accelerator import OLDEST_DRIVERS, driver_version
 
 Progress = Callable[[str], None]
 
@@ -26,6 +27,7 @@ _FIXES = "vlagents_ray_import_fixes"  # a module and a .pth file in the environm
 _NOT_IN_A_WHEEL = {"RECORD", "INSTALLER", "REQUESTED", "direct_url.json"}  # files that an installer writes
 _SHOWN = 2000  # number of characters at the end of uv's output that an error quotes
 _MINOR = "import sys; print('%d.%d' % sys.version_info[:2])"
+_CUDA_12 = "torch<2.11"  # those whose wheels on PyPI are for CUDA 12
 _PYTHON = re.compile(r"^# python: (3\.\d+)\s*$", re.MULTILINE)
 _CUDA = re.compile(r"^ \+ ((?:nvidia|cuda)-\S+)", re.MULTILINE)
 # pip's variables for package sources, and those of uv, which take precedence.
@@ -104,7 +106,8 @@ def make_environment(
     """Create an environment for a policy, with this package in it.
 
     On a machine without an NVIDIA GPU it gets the version of torch of this environment, and the replacements for other
-    requirements in `NAME.cpu.txt`, in the folder of `requirements`.
+    requirements in `NAME.cpu.txt`, in the folder of `requirements`. Where the GPU's driver is too old for CUDA 13, it
+    gets a torch for CUDA 12, unless `UV_TORCH_BACKEND` is set.
 
     Args:
         requirements: The requirements file of the policy.
@@ -138,7 +141,9 @@ def make_environment(
     with tempfile.TemporaryDirectory() as scratch:
         asked = [*_ourselves(light, Path(scratch))]
         asked += [word for file in files for word in ("--requirement", str(file))]
-        if not _has_gpu():
+        if has_gpu():
+            asked += _for_driver(Path(scratch), progress)
+        else:
             for override in _overrides(requirements, Path(scratch)):
                 asked += ["--override", str(override)]
             if not cuda:
@@ -205,6 +210,17 @@ def _overrides(requirements: Path, scratch: Path) -> list[Path]:
     return found
 
 
+def _for_driver(scratch: Path, progress: Progress) -> list[str]:
+    """Return uv's arguments for a torch that runs with this machine's driver, unless uv's own variable chooses one."""
+    driver = driver_version()
+    if "UV_TORCH_BACKEND" in os.environ or driver is None or int(driver.partition(".")[0]) >= OLDEST_DRIVERS[13]:
+        return []
+    progress(f"the driver, {driver}, is older than {OLDEST_DRIVERS[13]}, the first for CUDA 13: taking {_CUDA_12}")
+    constraints = scratch / "constraints.txt"
+    constraints.write_text(f"{_CUDA_12}\n")
+    return ["--constraint", str(constraints)]
+
+
 def _require_no_cuda(python: Path, wanted: Sequence[str]) -> None:
     plan = _uv(["pip", "install", "--dry-run", "--python", str(python), *wanted])
     if found := _CUDA.findall(plan):
@@ -222,8 +238,10 @@ def _install_import_fixes(python: Path) -> None:
     (folder / f"{_FIXES}.pth").write_text(f"import {_FIXES}; {_FIXES}.install()\n")
 
 
-def _has_gpu() -> bool:
-    return any(Path("/dev").glob("nvidia[0-9]*"))
+def has_gpu() -> bool:
+    """Return whether this machine shows an NVIDIA GPU, other than a Jetson's, which PyPI's torch does not support."""
+    on_wsl = Path("/dev/dxg").exists() and shutil.which("nvidia-smi") is not None  # WSL2 has no /dev/nvidia0
+    return (on_wsl or any(Path("/dev").glob("nvidia[0-9]*"))) and not Path("/etc/nv_tegra_release").exists()
 
 
 def _minor(python: Path) -> str:
