@@ -68,7 +68,7 @@ def test_draws_that_are_no_rows_own_are_refused(model: Any) -> None:
 
     with RowDraws(rngs(1, 2), model), pytest.raises(PolicyFailed, match="drew from rand: its actions would depend"):
         model.draw_otherwise()
-    with pytest.raises(PolicyFailed, match="drew no numbers where its sessions'"), RowDraws(rngs(1), model):
+    with pytest.raises(PolicyFailed, match="drew no numbers for its rows"), RowDraws(rngs(1), model):
         pass
     with RowNoise([Row((), "", rng) for rng in rngs(1, 2)], 1, model), pytest.raises(PolicyFailed, match="one row for"):
         model.draw(3)

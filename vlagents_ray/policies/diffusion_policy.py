@@ -291,19 +291,10 @@ def _draws(module: Any, device: Any) -> int:
 def _conditional_sample(
     module: Any, times: Any, data: Any, known: Any, *, generator: Any = None, cond: Any = None, **options: Any
 ) -> Any:
-    """Denoise as the module's `conditional_sample` does, on a GPU without its two copies and two waits at each step.
+    """Return numbers (B, T, D), denoised as the module's `conditional_sample` does, without waiting for a GPU.
 
-    Args:
-        module: The policy.
-        times: Those of the steps, on the device of the module; the scheduler branches on its own, on the CPU.
-        data: Numbers that are not denoised, as `known` (B, T, D) says.
-        known: (B, T, D) bool.
-        generator: See the scheduler's `step`, as for other options.
-        cond: What the network sees, (B, T, C); other networks have `local_cond` and `global_cond`.
-        options: Those of the network and of the scheduler's steps.
-
-    Returns:
-        The denoised numbers (B, T, D).
+    Theirs copies the time to it, and indexes by truth values, at each step. `times` are on the device; the scheduler
+    branches on its own, on the CPU. `data` (B, T, D) are not denoised where `known`.
     """
     torch, scheduler = require("torch"), module.noise_scheduler
     names = [name for name in ("local_cond", "global_cond") if name in options]

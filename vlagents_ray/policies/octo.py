@@ -112,10 +112,6 @@ class Octo(ModelPolicy):
         )
 
     @property
-    def gathers(self) -> bool:
-        return True
-
-    @property
     def state_dim(self) -> int | None:
         return None if self.model is None else self.model.proprio_dim
 
@@ -322,14 +318,7 @@ class OctoNetwork:
         return encoded
 
     def decode(self, encoded: tuple[Any, Any], owners: np.ndarray, keys: np.ndarray, dim: int) -> np.ndarray:
-        """Sample normalised actions (B, H, dim).
-
-        Args:
-            encoded: The result of `encode`.
-            owners: (B,), the index of each row in it; 0, 1, … if there are as many.
-            keys: The random key of each row, (B, 2) uint32.
-            dim: The length of an action.
-        """
+        """Sample normalised actions (B, H, dim) from `encode` of `owners` (B,), with random keys (B, 2) uint32."""
         tokens, mask = encoded if len(encoded[0]) == len(owners) else self._gather(encoded, owners)
         return np.asarray(self._decode(self.params, tokens, mask, keys, dim=dim))
 

@@ -257,7 +257,6 @@ class OpenPiModel(abc.ABC):
 
     noise_shape: tuple[int, int] | None = None  # (H, action_dim) of a row's noise; None for a model without noise
     shares = False  # whether several rows can share one observation
-    gathers = False  # as of `ModelPolicy`
 
     @abc.abstractmethod
     def sample(self, batch: SampleBatch) -> np.ndarray:
@@ -275,7 +274,7 @@ class JaxFlow(OpenPiModel):
     follows the flow of each row, with the steps of openpi's `sample_actions`.
     """
 
-    shares = gathers = True
+    shares = True
 
     def __init__(self, network: Any, device: Any, config: OpenPiConfig) -> None:
         jax, nnx, models = require("jax"), require("flax.nnx"), require("openpi.models.model")
@@ -518,10 +517,6 @@ class OpenPi(ModelPolicy):
     def continues_plans(self) -> bool:
         flows = self.model is not None and self.model.model.noise_shape is not None
         return flows and self.config.actions == "chunk"
-
-    @property
-    def gathers(self) -> bool:
-        return self.loaded().model.gathers
 
     def load(self) -> LoadedOpenPi:
         use_source("openpi", SOURCE, self.config.source_dir, within=FOLDERS)

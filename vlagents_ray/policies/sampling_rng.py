@@ -43,12 +43,7 @@ class RowDraws:
     """
 
     def __init__(self, rngs: Sequence[np.random.Generator], *models: Any) -> None:
-        """Prepare to draw for rows.
-
-        Args:
-            rngs: The generator of each row.
-            models: The objects whose code draws, or modules.
-        """
+        """Prepare to draw from the generator of each row in the code of these objects, or modules."""
         self._rngs, self._drawn = rngs, False
         for model in models:
             _redirect(model)
@@ -60,10 +55,7 @@ class RowDraws:
     def __exit__(self, kind: object, *_: object) -> None:
         _DRAWS.reset(self._token)
         if kind is None and not self._drawn:
-            raise PolicyFailed(
-                "the model drew no numbers where its sessions' are given to it: its actions would depend on its "
-                "neighbours'; install the version of its code that the family's page names"
-            )
+            raise PolicyFailed("the model drew no numbers for its rows; is its code of the version that is required?")
 
     @cached_property
     def _generators(self) -> list[Any]:
@@ -77,7 +69,7 @@ class RowDraws:
         if name != "randn":
             raise PolicyFailed(f"the model drew from {name}: its actions would depend on its neighbours'")
         sizes = options["size"] if "size" in options else args[0] if len(args) == 1 else args
-        return self._randn(tuple(sizes), {"device": options.get("device"), "dtype": options.get("dtype")})
+        return self._randn(tuple(sizes), {place: options.get(place) for place in ("device", "dtype")})
 
     def _randn(self, shape: tuple[int, ...], place: dict[str, Any]) -> Any:
         each = shape[0] // len(self._generators)
@@ -86,11 +78,9 @@ class RowDraws:
 
     def _multinomial(self, weights: Any, num_samples: int) -> Any:
         blocks = weights.float().cpu().chunk(len(self._generators))
-        drawn = [
-            torch.multinomial(block, num_samples, generator=generator)
-            for block, generator in zip(blocks, self._generators, strict=True)
-        ]
-        return torch.cat(drawn).to(weights.device)
+        each = zip(blocks, self._generators, strict=True)
+        drawn = [torch.multinomial(block, num_samples, generator=generator) for block, generator in each]
+        return torch.cat(drawn).to(weights.device, non_blocking=True)
 
 
 class RowNoise(RowDraws):

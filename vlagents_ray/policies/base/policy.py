@@ -110,11 +110,6 @@ class ModelPolicy(Agent, abc.ABC):
         return min(self.config.rows, self.report.most_rows or self.config.rows)
 
     @property
-    def gathers(self) -> bool:
-        """Whether a batch whose rows share observations runs programs of its own, which JAX compiles at first use."""
-        return False
-
-    @property
     def state_dim(self) -> int | None:
         """The length of the model's state vector, once loaded; for the warm-up where its parts may have any length."""
         return None
@@ -403,9 +398,9 @@ class ModelPolicy(Agent, abc.ABC):
     def _run_examples(self, size: int, seeds: Iterator[int]) -> None:
         rows = [self._example(next(seeds)) for _ in range(size)]
         self._chunks(rows)
-        for few in self.config.batch_sizes or () if self.gathers else ():
-            if few < size:
-                self._chunks([*rows[:few], *(drawn(rows[0], row.rng) for row in rows[few:])])
+        in_jax = any("jax" in device for device in self.report.devices)  # compiles at the first use, also a gathering
+        for few in (few for few in self.config.batch_sizes or () if in_jax and few < size):
+            self._chunks([*rows[:few], *(drawn(rows[0], row.rng) for row in rows[few:])])
 
     def observations_of(self, rows: Sequence[Row]) -> tuple[list[int], list[int]]:
         """Return the rows to encode, padded to one of `batch_sizes`, and for each row the place of its observations.

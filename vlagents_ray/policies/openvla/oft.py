@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -199,17 +199,13 @@ class ModelInput:
     proprio: np.ndarray | None  # (P,) in [-1, 1]
 
 
-@dataclass(frozen=True)
-class Sequences:
+class Sequences(NamedTuple):
     """The parts of sequences of embeddings that are known before the actions, and how they make up a sequence."""
 
     seen: Any  # (B, P, D), of images and state
     words: Any  # (B, L, D)
     places: Any  # (B, T), as for `Prismatic.assembled`; the actions are the last part
     lengths: Any  # (B,), without padding
-
-    def rows(self, index: Any) -> Sequences:
-        return Sequences(self.seen[index], self.words[index], self.places[index], self.lengths[index])
 
 
 @dataclass
@@ -237,38 +233,23 @@ class Parallel:
             return _numpy(self._heads(self._hidden(self._sequences(inputs))))
 
     def denoise(self, inputs: Sequence[ModelInput], owners: Sequence[int], noise: np.ndarray) -> np.ndarray:
-        """Denoise chunks with the diffusion head.
-
-        Args:
-            inputs: The inputs, whose images are encoded once.
-            owners: (B,), the index of each chunk's input.
-            noise: (B, H, D), standard normal.
-
-        Returns:
-            (B, H, D) in [-1, 1].
-        """
+        """Denoise chunks (B, H, D) in [-1, 1] from standard normal noise, for the inputs `owners` (B,)."""
         torch = require("torch")
         with torch.inference_mode():
             sequences = self._sequences(inputs)
-            if list(owners) != list(range(len(inputs))):
-                sequences = sequences.rows(self.base.moved(np.array(owners)))
+            index = self.base.moved(owners)
+            sequences = Sequences(*(part[index] for part in sequences))
             start = self.base.to_device(torch.from_numpy(noise))
             return _numpy(denoise(start, lambda time, noisy: self._noise(sequences, time, noisy), *self.steps))
 
     def choose(self, inputs: Sequence[ModelInput], owners: Sequence[int], draws: np.ndarray) -> tuple[Any, Any]:
-        """Choose the tokens of chunks.
+        """Choose tokens (B, H, D) for the inputs `owners` (B,), by draws (B, H, D) as in `ActionBins.choose`.
 
-        Args:
-            inputs: The inputs, each of which is computed once.
-            owners: (B,), the index of each chunk's input.
-            draws: (B, H, D), as for `ActionBins.choose`.
-
-        Returns:
-            The tokens (B, H, D), and the logits of the bins (B, H, D, bins) there.
+        Returns the tokens, and the logits of the bins (B, H, D, bins) there.
         """
         with require("torch").inference_mode():
             hidden = self._hidden(self._sequences(inputs)).unflatten(1, (self.horizon, self.dim))
-            index, bins = self.base.moved(np.array(owners)), self.base.bins
+            index, bins = self.base.moved(owners), self.base.bins
             likeliest, over = (one[index] for one in bins.read(self.base.network.language_model.lm_head(hidden)))
             return bins.choose(likeliest, over, self.base.moved(draws)), over
 
@@ -279,34 +260,26 @@ class Parallel:
         seen = sequences.seen
         now = time_embedding(time, seen.shape[-1], actions.device).to(actions.dtype).expand(len(seen), 1, -1)
         noisy = self.noisy(actions.flatten(1)[..., None])  # type: ignore[misc]
-        return self._heads(self._hidden(replace(sequences, seen=require("torch").cat([seen, now], 1)), noisy))
+        return self._heads(self._hidden(sequences._replace(seen=require("torch").cat([seen, now], 1)), noisy))
 
     def _sequences(self, inputs: Sequence[ModelInput]) -> Sequences:
         """Return the sequences of inputs; for a diffusion head, with a place for the time after images and state."""
         torch, base = require("torch"), self.base
-        prompts = [[*model_input.tokens, _STOP] for model_input in inputs]
-        counts = np.array([len(tokens) for tokens in prompts])
-        words = np.zeros((len(prompts), counts.max()), np.int64)
-        for row, tokens in zip(words, prompts, strict=True):
-            row[: len(tokens)] = tokens
-        numbers = base.moved(np.column_stack([words, counts]))
-        embedded, count = base.embed(numbers[:, :-1]), numbers[:, -1:]
-        padding = torch.arange(words.shape[1], device=base.device) >= count
-        language = embedded.float().masked_fill(padding[..., None], 0).sum(1) / count
+        prompts, timed = [[*model_input.tokens, _STOP] for model_input in inputs], self.noisy is not None
+        words, counts = base.embed(base.padded(prompts)), base.moved([len(tokens) for tokens in prompts])
+        padding = torch.arange(words.shape[1], device=base.device) >= counts[:, None]
+        language = words.float().masked_fill(padding[..., None], 0).sum(1) / counts[:, None]
         pixels = base.to_device([picture for model_input in inputs for picture in model_input.pictures])
-        seen = self.encode_images(pixels.unflatten(0, (len(inputs), -1)), language.to(embedded.dtype))
+        seen = self.encode_images(pixels.unflatten(0, (len(inputs), -1)), language.to(words.dtype))
         if self.proprio is not None:
             states = base.to_device([torch.from_numpy(model_input.proprio) for model_input in inputs])
             seen = torch.cat([seen, self.proprio(states)[:, None]], 1)
-        before, actions = seen.shape[1] + (self.noisy is not None), np.arange(self.horizon * self.dim)
-        places = np.zeros((len(prompts), before + len(actions) + max(words.shape[1], base.padded_tokens)), np.int64)
-        for row, length in zip(places, counts, strict=True):
-            text = 1 + before + np.arange(length)
-            answer = (1 + before + words.shape[1] + actions) * (self.noisy is not None)  # else zeros
-            row[: before + len(actions) + length] = [text[0], *range(1, 1 + before), *text[1:-1], *answer, text[-1]]
-        lengths = before + len(actions) + counts
-        moved = base.moved(np.column_stack([places, lengths]))
-        return Sequences(seen, embedded, moved[:, :-1], moved[:, -1])
+        first, count = 1 + seen.shape[1] + timed, self.horizon * self.dim  # `first`: place of a row's first token
+        actions = [(first + words.shape[1] + i) * timed for i in range(count)]  # zeros without a diffusion head
+        lasts = [first + len(tokens) - 1 for tokens in prompts]
+        places = [[first, *range(1, first), *range(first + 1, last), *actions, last] for last in lasts]
+        length = first - 1 + count + max(words.shape[1], base.padded_tokens)
+        return Sequences(seen, words, base.padded(places, length), counts + (first - 1 + count))
 
     def encode_images(self, pixels: Any, language: Any) -> Any:
         """Return the embeddings (P, N, D) of images (P, views, C, S, S); `language` (P, D) is the mean of the words."""

@@ -73,6 +73,8 @@ class OpenVLA(PrismaticPolicy):
 
     def load(self) -> TokenDecoder:
         base = load_prismatic(self.config)
+        if self.config.attention != "flash_attention_2":  # which reads the mask as it is
+            base.network.language_model.model._update_causal_mask = _causal_mask
         decoder = TokenDecoder(base, max(base.statistics.action_dims(self.config.unnorm_key)), self.adapters)
         decoder.compile_with(self.compilation)
         return decoder
@@ -142,7 +144,7 @@ class TokenDecoder:
             hidden, cache = self.prefill(embeddings, mask)
         with torch.inference_mode(), self.adapters.rows([fingerprints[i] for i in owners] if fingerprints else ()):
             if list(owners) != list(range(len(prompts))):
-                index = base.moved(np.array(owners))
+                index = base.moved(owners)
                 hidden, mask, cache = hidden[index], mask[index], cache[index]
             length, position = mask.shape[1], mask.sum(1)
             # one place for each token but the last, and one at the end for the current token
@@ -170,8 +172,7 @@ class TokenDecoder:
     def prefill(self, embeddings: Any, mask: Any) -> tuple[Any, Any]:
         """Run the language model on prompts (P, L, D), whose tokens are where `mask` (P, L) is not 0.
 
-        Returns:
-            The last hidden state (P, D), and keys and values (P, layers, 2, heads, L, E).
+        Returns the last hidden state (P, D), and keys and values (P, layers, 2, heads, L, E).
         """
         result = self.base.network.language_model.model(
             inputs_embeds=embeddings,
@@ -182,16 +183,10 @@ class TokenDecoder:
         return result.last_hidden_state[:, -1], _stacked(result.past_key_values)
 
     def continue_from(self, tokens: Any, positions: Any, mask: Any, cache: Any) -> tuple[Any, Any]:
-        """Run the language model on one more token (R,) of each row, at `positions` (R,).
+        """Run the language model on one more token (R,) of each row, at `positions` (R,) of its text.
 
-        Args:
-            tokens: The last token of each row.
-            positions: The positions of these tokens in the text.
-            mask: (R, T + 1), not 0 where a token attends: T places of the cache, and itself.
-            cache: Keys and values (R, layers, 2, heads, T, E).
-
-        Returns:
-            The hidden state (R, D), and the token's own keys and values (R, layers, 2, heads, E).
+        A token attends where `mask` (R, T + 1) is not 0: T places of keys and values (R, layers, 2, heads, T, E), and
+        itself. Returns the hidden state (R, D), and the token's own keys and values (R, layers, 2, heads, E).
         """
         result = self.base.network.language_model.model(
             input_ids=tokens[:, None],
@@ -205,17 +200,26 @@ class TokenDecoder:
 
     def _left_padded(self, prompts: Sequence[tuple[Any, list[int]]]) -> tuple[Any, Any]:
         """Return embeddings (P, L, D) and their mask (P, L); the patches follow the first token, as in training."""
-        base, lengths = self.base, [len(tokens) for _, tokens in prompts]
+        base, rows = self.base, [tokens for _, tokens in prompts]
         patches = self.encode_images(base.to_device([pixels for pixels, _ in prompts]))
-        seen, longest = patches.shape[1], max(lengths)
-        length = seen + max(longest, base.padded_tokens)
-        numbers = np.zeros((len(prompts), longest + length), np.int64)  # tokens, and their places below
-        for row, (_, tokens), count in zip(numbers, prompts, lengths, strict=True):
-            row[:count] = tokens
-            words = 1 + seen + np.arange(count)
-            row[-seen - count :] = [words[0], *range(1, 1 + seen), *words[1:]]
-        tokens, places = base.moved(numbers).split([longest, length], 1)
-        return base.assembled([patches, base.embed(tokens)], places), (places > 0).long()
+        first = 1 + patches.shape[1]  # place of a row's first token
+        places = [[first, *range(1, first), *range(first + 1, first + len(tokens))] for tokens in rows]
+        length = first - 1 + base.padded_tokens
+        index = base.padded(places, length, left=True)
+        return base.assembled([patches, base.embed(base.padded(rows))], index), (index > 0).long()
+
+
+def _causal_mask(mask: Any, embeddings: Any, positions: Any, *_: Any) -> Any:
+    """Return Llama's mask (B, 1, Q, K) of tokens (B, Q, D) at positions (Q,) that attend where `mask` (B, K) is not 0.
+
+    Its own code reads whether anything is masked: each pass would wait for a GPU, and no graph could be captured.
+    """
+    import torch  # the compiler follows an import statement, but not `require`
+
+    hidden = (torch.arange(mask.shape[1], device=mask.device) > positions[:, None]) | (mask[:, None] == 0)
+    hidden = hidden & ~hidden.all(-1, keepdim=True)  # padding attends to all: fast kernels give NaN for no token at all
+    shown = torch.zeros_like(hidden, dtype=embeddings.dtype)
+    return shown.masked_fill(hidden, torch.finfo(embeddings.dtype).min)[:, None]
 
 
 def _stacked(cache: Any) -> Any:

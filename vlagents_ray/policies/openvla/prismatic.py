@@ -187,9 +187,16 @@ class Prismatic:
             batch = batch.pin_memory()
         return batch.to(self.device, self.dtype, non_blocking=True)
 
-    def moved(self, array: np.ndarray) -> Any:
-        """Copy an array to the model's device, without waiting for what a GPU computes."""
-        return require("torch").from_numpy(array).to(self.device, non_blocking=True)
+    def moved(self, numbers: Any) -> Any:
+        """Copy numbers to the model's device, without waiting for what a GPU computes."""
+        return require("torch").as_tensor(numbers).to(self.device, non_blocking=True)
+
+    def padded(self, rows: Sequence[Sequence[int]], length: int = 0, *, left: bool = False) -> Any:
+        """Return rows of int64 on the device with zeros after them, or before them, up to the longest or `length`."""
+        found = np.zeros((len(rows), max(length, *map(len, rows))), np.int64)
+        for row, numbers in zip(found, rows, strict=True):
+            row[slice(-len(numbers), None) if left else slice(len(numbers))] = numbers
+        return self.moved(found)
 
     def embed(self, tokens: Any) -> Any:
         """Return the embeddings (…, D) of tokens (…)."""
@@ -197,12 +204,7 @@ class Prismatic:
 
     @staticmethod
     def assembled(parts: Sequence[Any], places: Any) -> Any:
-        """Return sequences (B, L, D) of embeddings.
-
-        Args:
-            parts: (B, N, D) each.
-            places: (B, L), the place of each token in all parts of its row, from 1; 0: zeros, for padding.
-        """
+        """Return sequences (B, L, D) of the parts (B, N, D) at places (B, L), which count from 1; at 0 are zeros."""
         zeros = parts[0].new_zeros(len(places), 1, parts[0].shape[-1])
         return require("torch").cat([zeros, *parts], 1).take_along_dim(places[..., None], 1)
 
@@ -301,15 +303,11 @@ class ActionBins:
         return over.gather(-1, (self._first - tokens)[..., None])[..., 0]
 
     def stated(self, tokens: Any, over: Any) -> np.ndarray:
-        """Return all numbers of chosen tokens (…), with one copy from the device.
-
-        Args:
-            tokens: One that is not a bin counts as the nearest bin, as upstream.
-            over: The logits of the bins, (…, bins) float64.
+        """Return what is known of tokens (…) by the logits of bins, (…, bins) float64, with one copy from the device.
 
         Returns:
-            (6, …) float64: values in [-1, 1]; mean and standard deviation of the distribution over bins; its
-            log-probability and entropy, nats; and the tokens.
+            (6, …) float64: values in [-1, 1], of the nearest bin for other tokens, as upstream; mean and standard
+            deviation over the bins; log-probability and entropy, nats; and the tokens.
         """
         torch = require("torch")
         share, bins = over.softmax(-1), (self._first - tokens).clamp(0, len(self._middles) - 1)
