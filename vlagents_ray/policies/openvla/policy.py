@@ -7,8 +7,9 @@ are one tensor of a fixed length, with a masked place for each future token.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -74,7 +75,8 @@ class OpenVLA(PrismaticPolicy):
     def load(self) -> TokenDecoder:
         base = load_prismatic(self.config)
         if self.config.attention != "flash_attention_2":  # which reads the mask as it is
-            base.network.language_model.model._update_causal_mask = _causal_mask
+            model = base.network.language_model.model
+            model._update_causal_mask = partial(_causal_mask, model._update_causal_mask)
         decoder = TokenDecoder(base, max(base.statistics.action_dims(self.config.unnorm_key)), self.adapters)
         decoder.compile_with(self.compilation)
         return decoder
@@ -209,13 +211,15 @@ class TokenDecoder:
         return base.assembled([patches, base.embed(base.padded(rows))], index), (index > 0).long()
 
 
-def _causal_mask(mask: Any, embeddings: Any, positions: Any, *_: Any) -> Any:
+def _causal_mask(own: Callable[..., Any], mask: Any, embeddings: Any, positions: Any, *others: Any) -> Any:
     """Return Llama's mask (B, 1, Q, K) of tokens (B, Q, D) at positions (Q,) that attend where `mask` (B, K) is not 0.
 
-    Its own code reads whether anything is masked: each pass would wait for a GPU, and no graph could be captured.
+    Its `own` code reads whether anything is masked: each pass would wait for a GPU, and no graph could be captured.
     """
     import torch  # the compiler follows an import statement, but not `require`
 
+    if mask is None or mask.ndim != 2:
+        return own(mask, embeddings, positions, *others)
     hidden = (torch.arange(mask.shape[1], device=mask.device) > positions[:, None]) | (mask[:, None] == 0)
     hidden = hidden & ~hidden.all(-1, keepdim=True)  # padding attends to all: fast kernels give NaN for no token at all
     shown = torch.zeros_like(hidden, dtype=embeddings.dtype)
