@@ -398,9 +398,9 @@ class ModelPolicy(Agent, abc.ABC):
     def _run_examples(self, size: int, seeds: Iterator[int]) -> None:
         rows = [self._example(next(seeds)) for _ in range(size)]
         self._chunks(rows)
-        in_jax = any("jax" in device for device in self.report.devices)  # compiles at the first use, also a gathering
-        for few in (few for few in self.config.batch_sizes or () if in_jax and few < size):
-            self._chunks([*rows[:few], *(drawn(rows[0], row.rng) for row in rows[few:])])
+        if any("jax" in device for device in self.report.devices) and size <= self.most_rows:
+            for few in (few for few in self.config.batch_sizes or () if few < size):  # JAX compiles for each such pair
+                self.predict([*rows[:few], *(drawn(rows[0], row.rng) for row in rows[few:])])  # its duration is another
 
     def observations_of(self, rows: Sequence[Row]) -> tuple[list[int], list[int]]:
         """Return the rows to encode, padded to one of `batch_sizes`, and for each row the place of its observations.
