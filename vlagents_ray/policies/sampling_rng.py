@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextvars import ContextVar, Token
 from functools import cached_property, partial
 from types import ModuleType
@@ -115,7 +115,7 @@ for _name in ("randn", "multinomial", "rand", "randint", "randn_like", "rand_lik
 def _redirect(model: Any) -> None:
     """Have a module, or those that define an object's class, draw from the rows' generators from now on."""
     names = [kind.__module__ for kind in type(model).__mro__]
-    modules = [model] if isinstance(model, ModuleType) else map(sys.modules.get, names)
+    modules: Iterable[Any] = [model] if isinstance(model, ModuleType) else map(sys.modules.get, names)
     for module in modules:
         if getattr(module, "torch", None) is torch and not module.__name__.startswith("torch."):
             module.torch = _TORCH
