@@ -297,7 +297,7 @@ def _conditional_sample(
     branches on its own, on the CPU. `data` (B, T, D) are not denoised where `known`.
     """
     torch, scheduler = require("torch"), module.noise_scheduler
-    names = {"local_cond", "global_cond"} & set(options)
+    names = [name for name in ("local_cond", "global_cond") if name in options]
     seen: dict[str, Any] = {name: options.pop(name) for name in names} or {"cond": cond}
     randn = require("diffusers.utils.torch_utils").randn_tensor
     numbers = torch.where(known, data, randn(data.shape, device=data.device, dtype=data.dtype))
