@@ -12,8 +12,9 @@ import hashlib
 import json
 import math
 import struct
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -58,13 +59,16 @@ class Adapter:
         return {"checkpoint": self.source, "weights": self.weights, "revision": self.revision}
 
 
+# Indices of the adapters of the rows of this thread's pass, int64; None if no row has one.
+_CHOSEN: ContextVar[Any] = ContextVar("chosen adapters", default=None)
+
+
 class Adapters:
     """The adapters of one network."""
 
     def __init__(self) -> None:
         self._named: dict[str, Adapter] = {}
         self._places: dict[str, int] = {"": 0}  # by fingerprint: the index in the tensors of all adapters
-        self._chosen: Any = None  # indices of the rows of the running pass, int64; None if no row has an adapter
         self._device: Any = None
 
     @property
@@ -139,24 +143,21 @@ class Adapters:
 
     @contextmanager
     def rows(self, fingerprints: Iterable[str]) -> Iterator[None]:
-        """Apply an adapter to each row of the network's passes."""
-        before = self._chosen
-        self._chosen = self._tensor([self._places[one] for one in fingerprints])
+        """Apply an adapter to each row of the network's passes on this thread."""
+        places, chosen = [self._places[one] for one in fingerprints], None
+        if any(places):
+            import torch
+
+            chosen = torch.tensor(places).to(self._device, non_blocking=True)
+        before = _CHOSEN.set(chosen)
         try:
             yield
         finally:
-            self._chosen = before
-
-    def _tensor(self, places: Sequence[int]) -> Any:
-        if not any(places):
-            return None
-        import torch
-
-        return torch.tensor(places, device=self._device)
+            _CHOSEN.reset(before)
 
     def _add(self, downs: Any, ups: Any, module: Any, inputs: tuple[Any, ...], output: Any) -> Any:
         """Return the output of a layer, with N entries, after adding the change of each row's adapter."""
-        chosen, [x] = self._chosen, inputs
+        chosen, [x] = _CHOSEN.get(), inputs
         if chosen is None:
             return output
         if len(x) % len(chosen):

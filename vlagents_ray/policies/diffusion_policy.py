@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -14,7 +13,7 @@ import numpy as np
 from pydantic import Field
 
 from vlagents_ray.contract import ActionSpec, Contract, StateSpec
-from vlagents_ray.errors import ConfigError, PolicyFailed
+from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row
 from vlagents_ray.policies.base.accelerator import ensure_torchvision, torch_device
@@ -131,7 +130,10 @@ class DiffusionPolicy(ModelPolicy):
             tensor = torch.from_numpy(stacked).to(network.device, non_blocking=True)
             # (B, T, H, W, 3) uint8 -> (B, T, 3, H, W) in [0, 1]
             inputs[name] = tensor.movedim(-1, 2).float() / 255 if name in network.images else tensor
-        with torch.inference_mode(), noise_of(rows):
+        from vlagents_ray.policies.sampling_rng import RowNoise
+
+        own = network.module, require("diffusers.utils.torch_utils")  # the scheduler's steps draw in the latter
+        with torch.inference_mode(), RowNoise(rows, network.draws, *own):
             actions = network.module.predict_action(inputs)["action"]
         return [Prediction(chunk) for chunk in actions.float().cpu().numpy()]
 
@@ -172,6 +174,7 @@ class DiffusionNetwork:
     images: dict[str, tuple[int, int]]  # height and width, by the checkpoint's name
     vectors: dict[str, int]  # length, by the checkpoint's name, in its order
     absolute: bool  # poses with 6D rotations, as in the robomimic tasks with `abs_action`
+    draws: int  # of noise in a pass, made at once; a pass may need others
 
     @classmethod
     def load(cls, config: DiffusionPolicyConfig) -> DiffusionNetwork:
@@ -202,7 +205,8 @@ class DiffusionNetwork:
             module.num_inference_steps = config.steps
         device = torch_device(config.device)
         absolute = bool(require("omegaconf").OmegaConf.select(settings, "task.abs_action"))
-        return cls(module.to(device).eval(), device, images, vectors, absolute)
+        module.to(device).eval()
+        return cls(module, device, images, vectors, absolute, _draws(module, device))
 
 
 def checkpoint_file(config: DiffusionPolicyConfig) -> Path:
@@ -274,6 +278,37 @@ def _inputs(module: Any, settings: Any) -> tuple[dict[str, tuple[int, int]], dic
     )
 
 
+def _draws(module: Any, device: Any) -> int:
+    """Have the module denoise without waiting for its device, and return how often it then draws noise."""
+    scheduler = module.noise_scheduler
+    scheduler.set_timesteps(module.num_inference_steps)
+    if type(module).conditional_sample.__module__.startswith("diffusion_policy."):  # else the loop may be another
+        module.conditional_sample = partial(_conditional_sample, module, scheduler.timesteps.to(device))
+    noisy = "variance_type" in scheduler.config  # DDPM's steps add noise, except the last one
+    return 1 + noisy * int((scheduler.timesteps > 0).sum())
+
+
+def _conditional_sample(
+    module: Any, times: Any, data: Any, known: Any, *, generator: Any = None, cond: Any = None, **options: Any
+) -> Any:
+    """Return numbers (B, T, D), denoised as the module's `conditional_sample` does, without waiting for a GPU.
+
+    Theirs copies the time to it, and indexes by truth values, at each step. `times` are on the device; the scheduler
+    branches on its own, on the CPU. `data` (B, T, D) are not denoised where `known`.
+    """
+    torch, scheduler = require("torch"), module.noise_scheduler
+    names = [name for name in ("local_cond", "global_cond") if name in options]
+    seen: dict[str, Any] = {name: options.pop(name) for name in names} or {"cond": cond}
+    randn = require("diffusers.utils.torch_utils").randn_tensor
+    numbers = torch.where(known, data, randn(data.shape, device=data.device, dtype=data.dtype))
+    scheduler.set_timesteps(module.num_inference_steps)
+    for time, time_there in zip(scheduler.timesteps, times, strict=True):
+        output = module.model(numbers, time_there, **seen)
+        numbers = scheduler.step(output, time, numbers, generator=generator, **options).prev_sample
+        numbers = torch.where(known, data, numbers)
+    return numbers
+
+
 _CONDITIONS = {"obs_as_cond": "cond", "obs_as_local_cond": "local_cond", "obs_as_global_cond": "global_cond"}
 
 
@@ -335,38 +370,3 @@ def _without_branches_on_values(module: Any, device: Any) -> None:
 
 def _normalised(mean: Any, std: Any, image: Any) -> Any:
     return (image - mean) / std
-
-
-def noise_of(rows: Sequence[Row]) -> Any:
-    """Return a context in which `torch.randn` draws each row, along the first axis, from its session's generator.
-
-    The policies draw their first trajectory with it, and the scheduler the noise of each step; neither accepts one
-    generator for each row. Draws from the process's generator are refused.
-    """
-    return _mode()(rows)
-
-
-@functools.cache
-def _mode() -> type[Any]:
-    """Return the class of that context, always the same, since programs are compiled for the class of their context."""
-    torch = require("torch")
-    uniform = (torch.rand, torch.randint, torch.rand_like, torch.randn_like)
-
-    class Noise(require("torch.overrides").TorchFunctionMode):  # type: ignore[misc]
-        def __init__(self, rows: Sequence[Row]) -> None:
-            super().__init__()
-            self._rows = rows
-
-        def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-            options = kwargs or {}
-            if func in uniform:
-                raise PolicyFailed(f"the model drew from {func.__name__}: its actions would depend on its neighbours'")
-            if func is not torch.randn:
-                return func(*args, **options)
-            shape, rows = options["size"] if "size" in options else args[0], self._rows
-            if len(shape) < 2 or shape[0] != len(rows):
-                raise PolicyFailed(f"the model asked for noise {tuple(shape)}, want one row for each of {len(rows)}")
-            drawn = np.stack([row.noise(*shape[1:]) for row in rows])
-            return torch.from_numpy(drawn).to(device=options.get("device"), dtype=options.get("dtype"))
-
-    return Noise

@@ -136,8 +136,9 @@ class RandomSteps:
             convert: Makes a tensor of an array, on the model's device.
         """
         self._wants = {i: row.want for i, row in enumerate(rows) if row.want}
-        self._index, self._steps, self._level = list(self._wants), shape[0], noise_level
-        self._draws = convert(np.stack([rows[i].noise(*shape) for i in self._index], axis=1))  # (K, E, H, D)
+        self._steps, self._level = shape[0], noise_level
+        self._draws = convert(np.stack([rows[i].noise(*shape) for i in self._wants], axis=1))  # (K, E, H, D)
+        self._index = convert(np.array(list(self._wants)))  # (E,); a list would be copied to the device at each step
         self._chain: list[Any] = []  # noisy actions (E, H, D) at first, and after each step
         self._means: list[Any] = []  # of those after each step
 
@@ -157,9 +158,7 @@ class RandomSteps:
         self._chain = self._chain or [before]
         self._chain.append(before - change / self._steps)  # rounded as the actions will be
         self._means.append(mean)
-        velocity = velocity.clone()
-        velocity[self._index] = change
-        return velocity
+        return velocity.index_copy(0, self._index, change.to(velocity.dtype))
 
     def stated(self, execute: int | None, dim: int | None) -> dict[int, dict[str, Any]]:
         """Return the outputs requested of rows, by their places, after the last step; None: all rows, all numbers."""
@@ -308,7 +307,7 @@ class FlowPasses(abc.ABC):
                 tokens, mask, torch.stack(list(cameras), 1), state, *self.encode_images(images)
             )
         if list(owners) != list(range(len(mask))):
-            index = torch.tensor(owners, device=mask.device)
+            index = torch.tensor(owners).to(mask.device, non_blocking=True)
             encoded, seen, state = encoded[index], seen[index], state[index]
 
         if not changes and steps not in self._flows:

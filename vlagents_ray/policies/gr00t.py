@@ -299,7 +299,7 @@ class Gr00tNetwork:
     ) -> list[np.ndarray]:
         from vlagents_ray.policies.sampling_rng import RowDraws
 
-        with require("torch").inference_mode(), RowDraws(rngs):
+        with require("torch").inference_mode(), RowDraws(rngs, self.model.action_head):
             drawn = self.model.get_action(**collated)["action_pred"].float().cpu().numpy()
         raw = {group: np.stack([one["raw"][group] for one in inputs]) for group in self.embodiment.state}
         decoded = self.processor.decode_action(drawn, self.embodiment, raw)

@@ -156,15 +156,12 @@ class Octo(ModelPolicy):
     def predict(self, rows: Sequence[Row]) -> list[Prediction]:
         """Compute the chunks, with one pass of the transformer per window and one of the action head per row."""
         network: OctoNetwork = self.model
-        windows = {id(row.frames): row for row in rows}  # the samples of a session share its window
-        place = {window: i for i, window in enumerate(windows)}
-        asked = self.padded(list(windows.values()))
-        tokens, mask = network.encode(self._observations(asked), self._tasks(asked))
-
-        owners = [place[id(row.frames)] for row in rows]
+        firsts, owners = self.observations_of(rows)
+        asked = [rows[i] for i in firsts]
         keys = np.stack([row.rng.integers(2**32, size=2, dtype=np.uint32) for row in rows])
         statistics = network.statistics(self.config.dataset, "action")
-        actions = network.decode(tokens[owners], mask[owners], keys, len(statistics["mean"]))
+        encoded = network.encode(self._observations(asked), self._tasks(asked))
+        actions = network.decode(encoded, np.array(owners), keys, len(statistics["mean"]))
         return [Prediction(real_actions(chunk, statistics, self.config.normalization)) for chunk in actions]
 
     def _observations(self, rows: Sequence[Row]) -> dict[str, np.ndarray]:
@@ -256,6 +253,7 @@ class OctoNetwork:
         self.longest: int = model.module.octo_transformer.max_horizon
         self._decode = jax.jit(self._decoded, static_argnames="dim")
         self._encode = jax.jit(self._encoded)
+        self._gather = jax.jit(lambda encoded, owners: jax.tree_util.tree_map(lambda one: one[owners], encoded))
 
     @classmethod
     def load(cls, config: OctoConfig) -> OctoNetwork:
@@ -314,13 +312,14 @@ class OctoNetwork:
             )
         return {name: np.asarray(values) for name, values in own[part].items()}
 
-    def encode(self, observations: Mapping[str, np.ndarray], tasks: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-        """Compute the inputs of the action head: tokens (B, W, N, E) and their mask (B, W, N)."""
-        tokens, mask = self._encode(self.params, observations, tasks)
-        return np.asarray(tokens), np.asarray(mask)
+    def encode(self, observations: Mapping[str, np.ndarray], tasks: Mapping[str, Any]) -> tuple[Any, Any]:
+        """Compute the inputs of the action head on the device: tokens (P, W, N, E) and their mask (P, W, N)."""
+        encoded: tuple[Any, Any] = self._encode(self.params, observations, tasks)
+        return encoded
 
-    def decode(self, tokens: np.ndarray, mask: np.ndarray, keys: np.ndarray, dim: int) -> np.ndarray:
-        """Sample normalised actions (B, H, dim) with a random key for each row, (B, 2) uint32."""
+    def decode(self, encoded: tuple[Any, Any], owners: np.ndarray, keys: np.ndarray, dim: int) -> np.ndarray:
+        """Sample normalised actions (B, H, dim) from `encode` of `owners` (B,), with random keys (B, 2) uint32."""
+        tokens, mask = encoded if len(encoded[0]) == len(owners) else self._gather(encoded, owners)
         return np.asarray(self._decode(self.params, tokens, mask, keys, dim=dim))
 
     def _encoded(self, params: Any, observations: Any, tasks: Any) -> Any:

@@ -17,7 +17,7 @@ from pydantic import Field
 from vlagents_ray.contract import ActionSpec, Contract, StateSpec
 from vlagents_ray.errors import ConfigError, InvalidObservation
 from vlagents_ray.interface import Obs
-from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row, shared_frames
+from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row
 from vlagents_ray.policies.base.accelerator import jax_device, torch_device
 from vlagents_ray.policies.base.checkpoint import STEP, SavedTensors, find_checkpoint, require_loaded
 from vlagents_ray.policies.base.config import NoiseLevel
@@ -248,7 +248,7 @@ class SampleBatch:
     inputs: dict[str, Any]  # of P observations
     noise: np.ndarray  # one array for each row
     guide: Guide | None  # of the rows, if any of them follows a plan
-    owners: Sequence[int]  # the observation of each row; 0, 1, … unless the model `shares`
+    owners: Sequence[int]  # the observation of each row, as of `ModelPolicy.observations_of`
     random: RandomSteps | None  # the result of `random_steps` for the rows
 
 
@@ -316,7 +316,11 @@ class JaxFlow(OpenPiModel):
 
             return jax.lax.while_loop(lambda now: now[1] >= 0.5 / steps, step, (noise, 1.0))[0]
 
-        self._encode, self._follow = jax.jit(encode), jax.jit(follow)
+        def gather(encoded: Any, owners: Any) -> Any:
+            return jax.tree.map(lambda one: one[owners], encoded)
+
+        # `gather` is apart from `follow`: one of each two sizes compiles in no time, `follow` in minutes
+        self._encode, self._gather, self._follow = jax.jit(encode), jax.jit(gather), jax.jit(follow)
         self.noise_shape = (network.action_horizon, network.action_dim)
 
     def sample(self, batch: SampleBatch) -> np.ndarray:
@@ -325,11 +329,11 @@ class JaxFlow(OpenPiModel):
         if guide is None:
             none = np.zeros((*batch.noise.shape[:2], 1), np.float32)
             guide = Guide(np.zeros_like(batch.noise), none, none)
-        given = batch.inputs, batch.noise, (guide.plan, guide.frozen, guide.weight)
-        inputs, noise, plan = jax.device_put(given, self._device)
+        given = batch.inputs, np.asarray(batch.owners), batch.noise, (guide.plan, guide.frozen, guide.weight)
+        inputs, owners, noise, plan = jax.device_put(given, self._device)
         encoded = self._encode(self._state, inputs)
-        if list(batch.owners) != list(range(len(encoded[0]))):
-            encoded = jax.tree.map(lambda one: one[np.asarray(batch.owners)], encoded)
+        if len(encoded[0]) < len(owners):
+            encoded = self._gather(encoded, owners)
         return np.asarray(self._follow(self._state, encoded, noise, plan), np.float32)  # waits for the device
 
 
@@ -557,15 +561,6 @@ class OpenPi(ModelPolicy):
             for i, (one, flow) in enumerate(zip(read, flows, strict=True))
         ]
 
-    def _shared(self, rows: Sequence[Row]) -> tuple[list[int], list[int]]:
-        """Return `shared_frames`, or one observation per row if the model's rows cannot share one.
-
-        The observations are padded to one of `batch_sizes`, as rows are.
-        """
-        each = list(range(len(rows)))
-        firsts, owners = shared_frames(rows) if self.loaded().model.shares else (each, each)
-        return self.padded(firsts), owners
-
     def _planned(self, row: Row) -> TransformedRow | Exception:
         """Return the row with its leftover actions in the model's units, or an exception for its session."""
         loaded, seen = self.loaded(), row.frames[-1]
@@ -579,7 +574,8 @@ class OpenPi(ModelPolicy):
     def _sample(self, ready: Sequence[TransformedRow]) -> tuple[np.ndarray, dict[int, dict[str, Any]]]:
         """Return the model's output for rows, and the requested extra outputs by the index of the row."""
         model, rows = self.loaded().model, [one.row for one in ready]
-        firsts, owners = self._shared(rows)
+        each = list(range(len(rows)))
+        firsts, owners = self.observations_of(rows) if model.shares else (each, each)
         batch = require("jax").tree.map(lambda *leaves: np.stack(leaves), *(ready[i].inputs for i in firsts))
         shape = model.noise_shape
         guide = None if shape is None else Guide.of(rows, *shape)

@@ -12,10 +12,10 @@ from counting_compiler import CountingCompiler, counting_compiler
 from tests.families.diffusion_policy.conftest import LIBRARIES, Checkpoint, begun, loaded, made, seen
 from vlagents_ray import Obs
 from vlagents_ray.contract import StateSpec
-from vlagents_ray.errors import MissingCamera, PolicyFailed
+from vlagents_ray.errors import MissingCamera
 from vlagents_ray.interface import DISTRIBUTION, SAMPLES, Act
 from vlagents_ray.policies.base import Row
-from vlagents_ray.policies.diffusion_policy import DiffusionPolicy, noise_of
+from vlagents_ray.policies.diffusion_policy import DiffusionPolicy
 from vlagents_ray.testing import check_agent
 
 pytestmark = [pytest.mark.source("DIFFUSION_POLICY_SRC"), *LIBRARIES]
@@ -52,7 +52,9 @@ class TorchDraws:
 
 @pytest.mark.verifies("parity")
 @pytest.mark.parametrize("kind", KINDS)
-def test_gives_what_the_authors_code_gives(kind: str, policies: Callable[[str], DiffusionPolicy]) -> None:
+def test_gives_what_the_authors_code_gives(
+    kind: str, policies: Callable[[str], DiffusionPolicy], monkeypatch: pytest.MonkeyPatch
+) -> None:
     import torch
 
     policy = policies(kind)
@@ -66,6 +68,7 @@ def test_gives_what_the_authors_code_gives(kind: str, policies: Callable[[str], 
         positions = np.stack([view.state["agent_pos"] for view in views])[None]
         stacked = {"image": np.moveaxis(pictures, -1, 1)[None], "agent_pos": positions}
     torch.manual_seed(0)
+    monkeypatch.delattr(policy.model.module, "conditional_sample")  # ours, in the place of theirs
     with torch.no_grad():
         wanted = policy.model.module.predict_action({name: torch.from_numpy(x) for name, x in stacked.items()})
     np.testing.assert_allclose(found.actions, wanted["action"][0].numpy(), atol=ATOL)
@@ -114,19 +117,6 @@ def test_a_missing_camera_fails_its_own_session_alone(policies: Callable[[str], 
     bad, good = policy.act_batch([blind, seen(1)], [begun(policy), begun(policy)])
     assert isinstance(bad, MissingCamera)
     assert not isinstance(good, Exception)
-
-
-def test_draws_that_are_no_rows_own_are_refused() -> None:
-    import torch
-
-    rows = [Row((), "", np.random.default_rng(i)) for i in range(2)]
-    with noise_of(rows):
-        drawn = torch.randn((2, 3))
-        for unfair in (lambda: torch.randn((3, 3)), lambda: torch.rand((2, 3)), lambda: torch.randint(0, 5, (2,))):
-            with pytest.raises(PolicyFailed):
-                unfair()
-    wanted = [np.random.default_rng(i).standard_normal(3, dtype=np.float32) for i in range(2)]
-    np.testing.assert_array_equal(drawn.numpy(), wanted)
 
 
 CORES = {"unet": 1, "transformer": 1, "image": 2, "hybrid": 2}  # a step from noise, and what is seen in images

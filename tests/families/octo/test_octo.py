@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from jax_compiles import jax_compiles
 
 from tests.families.octo.conftest import MARKS
-from vlagents_ray import Obs
+from vlagents_ray import Act, Obs
 from vlagents_ray.errors import InvalidObservation, MissingCamera
 from vlagents_ray.interface import DISTRIBUTION, GOAL_IMAGE, SAMPLES
 from vlagents_ray.policies.octo import Octo
@@ -159,3 +160,16 @@ def test_a_missing_camera_fails_its_own_session_alone(policy: Octo) -> None:
     bad, good = policy.act_batch([blind, seen(1)], [begun(policy, seen(0)), begun(policy, seen(1))])
     assert isinstance(bad, MissingCamera)
     assert not isinstance(good, Exception)
+
+
+def test_no_act_compiles_a_program(pretrained: Path) -> None:
+    policy = made(pretrained, batch_sizes=[1, 2, 4])
+    policy.initialize()
+    batches: list[list[dict[str, Any]]] = [[{}] * count for count in range(1, 7)]
+    batches += [[{SAMPLES: count}, *[{}] * others] for count in (1, 2, 3, 5) for others in range(3)]
+    with jax_compiles() as compiled:
+        for batch in batches:
+            views = [seen(i, **info) for i, info in enumerate(batch)]
+            acts = policy.act_batch(views, [begun(policy, view, seed=i) for i, view in enumerate(views)])
+            assert all(isinstance(act, Act) for act in acts)
+    assert compiled == []

@@ -7,12 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from jax_compiles import jax_compiles
 
 from tests.families.openpi.conftest import MARKS
-from vlagents_ray import Obs
+from vlagents_ray import Act, Obs
 from vlagents_ray.errors import ConfigError, InvalidObservation, MissingCamera
 from vlagents_ray.interface import DELAY, DISTRIBUTION, LEFTOVER, SAMPLES
-from vlagents_ray.policies import openpi as openpi_policy
+from vlagents_ray.policies.base import policy as base_policy
 from vlagents_ray.serve.config.dialects import presets
 from vlagents_ray.testing import check_agent
 
@@ -103,7 +104,7 @@ def test_the_samples_of_an_observation_are_of_one_reading_of_it(
     views = [seen(kind, 0, **{SAMPLES: 4}), seen(kind, 1, **{SAMPLES: 1, LEFTOVER: plan, DELAY: 2})]
     read.clear()
     shared = policy.act_batch(views, [begun(policy, kind, i) for i in range(2)])
-    monkeypatch.setattr(openpi_policy, "shared_frames", lambda rows: (list(range(len(rows))),) * 2)
+    monkeypatch.setattr(base_policy, "shared_frames", lambda rows: (list(range(len(rows))),) * 2)
     each = policy.act_batch(views, [begun(policy, kind, i) for i in range(2)])
     assert read == [2, 8]
     for one, other in zip(shared, each, strict=True):
@@ -111,6 +112,41 @@ def test_the_samples_of_an_observation_are_of_one_reading_of_it(
         samples = [act.info[DISTRIBUTION]["samples"] for act in (one, other)]
         np.testing.assert_allclose(*samples, atol=BATCHED, rtol=1e-5)
     assert (encode._cache_size(), follow._cache_size()) == (2, 2)  # of the two sizes, from the start
+
+
+def test_no_act_compiles_a_program(loaded: Any) -> None:
+    policy = type(loaded("pi0"))(loaded("pi0").config.model_copy(update={"batch_sizes": [1, 2, 4]}))
+    policy.initialize()
+    plan = begun(policy, "pi0", 1).act(seen("pi0", 1)).action[1:]
+    batches = [[{}] * count for count in range(1, 7)]
+    batches += [[{SAMPLES: count}, *[{}] * others] for count in (1, 2, 3, 5) for others in range(3)]
+    batches += [[{LEFTOVER: plan, DELAY: 2}, {SAMPLES: 1}]]
+    with jax_compiles() as compiled:
+        for batch in batches:
+            sessions = [begun(policy, "pi0", i) for i in range(len(batch))]
+            acts = policy.act_batch([seen("pi0", i, **info) for i, info in enumerate(batch)], sessions)
+            assert all(isinstance(act, Act) for act in acts)
+    assert compiled == []
+    with jax_compiles() as compiled:  # the count sees other sizes
+        policy.config = policy.config.model_copy(update={"batch_sizes": None})
+        policy.act_batch([seen("pi0", i) for i in range(3)], [begun(policy, "pi0", i) for i in range(3)])
+    assert len(compiled) >= 2
+
+
+def test_its_programs_never_call_the_host(loaded: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    policy, texts = loaded("pi0"), list[str]()
+    model = policy.model.model
+    for name in ("_encode", "_follow"):
+        program = getattr(model, name)
+
+        def lowered(*args: Any, program: Any = program) -> Any:
+            texts.append(program.lower(*args).compile().as_text())
+            return program(*args)
+
+        monkeypatch.setattr(model, name, lowered)
+    begun(policy, "pi0", 0).act(seen("pi0", 0))
+    assert len(texts) == 2
+    assert not [word for text in texts for word in ("callback", "infeed", "outfeed", "send(") if word in text]
 
 
 def test_it_keeps_what_an_agent_promises(loaded: Any, checkpoint: Any) -> None:

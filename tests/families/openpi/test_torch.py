@@ -17,7 +17,7 @@ from tests.families.openpi.conftest import MARKS
 from tests.families.openpi.test_openpi import BATCHED, WORDS, begun, seen, theirs
 from vlagents_ray.errors import ConfigError, InvalidObservation
 from vlagents_ray.interface import BEHAVIOUR, DELAY, DISTRIBUTION, LEFTOVER, SAMPLES, WANT
-from vlagents_ray.policies import openpi as openpi_policy
+from vlagents_ray.policies.base import policy as base_policy
 from vlagents_ray.policies.openpi import OpenPi, _observation
 
 pytestmark = MARKS
@@ -149,7 +149,7 @@ def test_the_samples_of_an_observation_are_of_one_reading_of_it(port: Path, monk
         return policy.act_batch(views, sessions)
 
     shared = acted()
-    monkeypatch.setattr(openpi_policy, "shared_frames", lambda rows: (list(range(len(rows))),) * 2)
+    monkeypatch.setattr(base_policy, "shared_frames", lambda rows: (list(range(len(rows))),) * 2)
     each = acted()
     assert read == [2, 10]
     assert isinstance(shared[0], InvalidObservation)

@@ -20,7 +20,7 @@ from vlagents_ray import Obs
 from vlagents_ray.errors import InvalidObservation, MissingCamera, MissingState
 from vlagents_ray.interface import BEHAVIOUR, DISTRIBUTION, SAMPLES, WANT, Act
 from vlagents_ray.policies.base import Row
-from vlagents_ray.policies.openvla import oft
+from vlagents_ray.policies.base import policy as base_policy
 from vlagents_ray.policies.openvla.oft import OpenVLAOFT
 from vlagents_ray.policies.openvla.prismatic import middle, resized
 from vlagents_ray.testing import check_agent
@@ -196,7 +196,7 @@ def test_samples_share_the_images_of_their_session(
     monkeypatch.setattr(backbone, "forward", lambda pixels: read.append(len(pixels)) or forward(pixels))
     views = [seen(0, **{SAMPLES: 3}), seen(1)]
     shared = policy.act_batch(views, [begun(policy, 0), begun(policy, 1)])
-    monkeypatch.setattr(oft, "shared_frames", lambda rows: (list(range(len(rows))), list(range(len(rows)))))
+    monkeypatch.setattr(base_policy, "shared_frames", lambda rows: (list(range(len(rows))), list(range(len(rows)))))
     each = policy.act_batch(views, [begun(policy, 0), begun(policy, 1)])
     assert read == [4, 10]  # of two cameras
     for one, other in zip(shared, each, strict=True):
@@ -215,11 +215,11 @@ def test_action_tokens_have_log_probabilities_and_other_heads_have_none(loaded: 
     tokens = torch.tensor(np.concatenate([said["replay"]["tokens"][None], act.info[DISTRIBUTION]["replay"]["tokens"]]))
     session = begun(policy, 0)
     inputs = [policy._model_input(Row((session.perceive(seen(0)),), WORDS[0], None), "bridge_orig")]
-    _, logits = policy.model.choose(inputs, [0], np.full((1, tiny.CHUNK, tiny.ACTION_DIM), np.nan))
-    want = bins.logprob(tokens, logits.expand(3, -1, -1, -1))
+    _, over = policy.model.choose(inputs, [0], np.full((1, tiny.CHUNK, tiny.ACTION_DIM), np.nan))
+    *_, want, entropy, _ = bins.stated(tokens, over.expand(3, -1, -1, -1))
     np.testing.assert_allclose(said["logprob"], want[0], atol=1e-4)
     np.testing.assert_allclose(act.info[DISTRIBUTION]["logprob"], want[1:], atol=1e-4)
-    assert said["entropy"] == pytest.approx(bins.stated(tokens[:1], logits)[1].sum(), rel=1e-4)
+    assert said["entropy"] == pytest.approx(entropy[0].sum(), rel=1e-4)
 
 
 def test_regression_is_sure_of_its_only_answer(loaded: Callable[..., Any]) -> None:

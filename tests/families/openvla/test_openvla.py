@@ -145,8 +145,8 @@ def scored(policy: OpenVLA, seed: int, tokens: np.ndarray) -> torch.distribution
     """The distributions over bins of each token after those before it, all in one pass of the whole sequence."""
     model = policy.model.base
     patches = model.network.projector(model.network.vision_backbone(policy.perceive(seen(seed))[None]))[0]
-    words = model.embed(model.tokens(WORDS[seed]))
-    sequence = torch.cat([words[:1], patches, words[1:], model.embed(tokens.tolist()[:-1])])
+    words = model.embed(torch.tensor(model.tokens(WORDS[seed])))
+    sequence = torch.cat([words[:1], patches, words[1:], model.embed(torch.tensor(tokens[:-1]))])
     logits = model.network.language_model(inputs_embeds=sequence[None]).logits[0, -len(tokens) :]
     return torch.distributions.Categorical(logits=logits[:, 32000 - 256 :][:, :256].double())
 
@@ -166,7 +166,8 @@ def test_the_log_probability_is_that_of_the_tokens_in_one_pass_over_them(policy:
 def unit(policy: OpenVLA, tokens: np.ndarray) -> np.ndarray:
     """The action of tokens."""
     scale = policy.model.base.statistics.scale("bridge_orig")
-    return scale.restore(policy.model.base.bins.values(torch.tensor(tokens))).astype(np.float32)
+    chosen = torch.tensor(tokens)
+    return scale.restore(policy.model.base.bins.stated(chosen, torch.zeros(*chosen.shape, 256).double())[0])
 
 
 def test_an_act_of_which_something_is_wanted_is_drawn_and_others_are_the_likeliest(policy: OpenVLA) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -82,6 +83,28 @@ def test_each_row_of_one_pass_acts_as_its_adapter_merged_alone(tmp_path: Path) -
             np.testing.assert_allclose(
                 act.info[DISTRIBUTION]["samples"], wanted.info[DISTRIBUTION]["samples"], rtol=RTOL, atol=RTOL
             )
+
+
+def test_passes_of_two_threads_each_have_the_adapters_of_their_rows(tmp_path: Path) -> None:
+    made, found = three(tmp_path), dict[str, np.ndarray]()
+    policy, barrier = loaded(tmp_path, adapters=paths(tmp_path, *made)), threading.Barrier(2, timeout=60)
+
+    def meet(*_: Any) -> None:
+        barrier.wait()  # both threads are in a pass
+
+    def act(name: str) -> None:
+        found[name] = begun(policy, 0, adapter=name).act(at(0)).action
+
+    wanted = {name: begun(policy, 0, adapter=name).act(at(0)).action for name in ("stack", "pour")}
+    for place in (0, 2):  # whose adapters are then those of one thread before both have used them
+        policy.model["head"][place].register_forward_pre_hook(meet)
+    threads = [threading.Thread(target=act, args=[name]) for name in wanted]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    for name, actions in wanted.items():
+        np.testing.assert_array_equal(found[name], actions)
 
 
 def test_sessions_without_an_adapter_act_as_the_base_to_the_bit(tmp_path: Path) -> None:

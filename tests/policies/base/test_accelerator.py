@@ -18,7 +18,13 @@ from vlagents_ray.contract import ActionSpec, Contract, StateSpec
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import DISTRIBUTION, SAMPLES, Act
 from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row
-from vlagents_ray.policies.base.accelerator import is_device_failure, is_out_of_memory, jax_device, torch_device
+from vlagents_ray.policies.base.accelerator import (
+    is_device_failure,
+    is_out_of_memory,
+    jax_device,
+    set_matmul,
+    torch_device,
+)
 from vlagents_ray.policies.base.model_inputs import state_vector
 from vlagents_ray.policies.loading import loading_report, report_device
 from vlagents_ray.serve.engine.engine import Engine
@@ -169,6 +175,32 @@ def acted(policy: Crowded, number: int, samples: int = 0) -> list[Act]:
     acts = policy.act_batch([view] * number, sessions)
     assert all(isinstance(act, Act) for act in acts)
     return acts  # type: ignore[return-value]
+
+
+@pytest.mark.parametrize(("setting", "wanted"), [({}, "high"), ({"matmul": "highest"}, "highest")])
+def test_float32_products_on_a_gpu_are_as_set(
+    monkeypatch: pytest.MonkeyPatch, setting: dict[str, Any], wanted: str
+) -> None:
+    found: list[Any] = []
+    monkeypatch.setattr(torch, "set_float32_matmul_precision", found.append)
+    monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", wanted != "high")
+    monkeypatch.setattr(Roomy, "predict", lambda _, rows: found.append("rows") or Crowded.predict(_, rows))
+    policy = made(Roomy, **setting)
+    assert found[:2] == [wanted, "rows"]
+    assert torch.backends.cudnn.allow_tf32 is (wanted == "high")
+    assert policy.report.devices == [{"kind": "cuda", "matmul": wanted}]
+
+
+def test_float32_products_of_jax_are_as_set_and_those_of_a_cpu_stay(monkeypatch: pytest.MonkeyPatch) -> None:
+    found: list[Any] = []
+    monkeypatch.setitem(
+        sys.modules, "jax", SimpleNamespace(config=SimpleNamespace(update=lambda *to: found.append(to)))
+    )
+    gpu, cpu = {"kind": "gpu", "jax": "0.5.3"}, {"kind": "cpu", "torch": "2.13.0"}
+    set_matmul("highest", gpu)
+    set_matmul("high", cpu)
+    assert found == [("jax_default_matmul_precision", "float32")]
+    assert (gpu["matmul"], "matmul" in cpu) == ("highest", False)
 
 
 def test_a_full_batch_that_does_not_fit_is_found_while_a_model_loads(caplog: pytest.LogCaptureFixture) -> None:

@@ -19,6 +19,7 @@ from vlagents_ray.interface import BEHAVIOUR, DELAY, DISTRIBUTION, LEFTOVER, SAM
 from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row, shared_frames
 from vlagents_ray.policies.base.model_inputs import state_specs, state_vector
 from vlagents_ray.policies.base.policy import fastest_split
+from vlagents_ray.policies.loading import report_device
 from vlagents_ray.testing import check_agent
 
 HORIZON, DIM = 4, 2
@@ -104,6 +105,32 @@ def test_one_forward_pass_for_a_batch_and_padding_to_the_sizes_that_were_warmed_
     assert policy.model["batches"] == [2, 4]
     policy.act_batch([at(0.0)] * 3, [begun(policy, seed) for seed in range(3)])
     assert policy.model["batches"] == [2, 4, 4]
+
+
+def test_rows_that_share_observations_are_encoded_in_a_size_of_their_own_or_each() -> None:
+    policy = loaded(batch_sizes=[2, 4, 8])
+    one, other, third = (Row((seed,), "", np.random.default_rng(seed)) for seed in range(3))
+    assert policy.observations_of([one, other, third, third]) == ([0, 1, 2, 3], [0, 1, 2, 3])
+    assert policy.observations_of([one, one, one, one]) == ([0, 0], [0, 0, 0, 0])
+    assert policy.observations_of([one, one, other, other] * 2) == ([0, 2], [0, 0, 1, 1] * 2)
+
+
+class Compiled(Wobble):
+    """One that JAX computes."""
+
+    def load(self) -> Any:
+        report_device({"kind": "cpu", "jax": "0.5.3"})
+        return {"batches": [], "read": set()}
+
+    def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
+        self.model["read"].add((len(shared_frames(rows)[0]), len(rows)))
+        return super().predict(rows)
+
+
+def test_sizes_of_rows_that_share_observations_run_while_a_model_of_jax_loads() -> None:
+    policy = Compiled.from_config({"checkpoint": "none", "batch_sizes": [1, 2, 4]})
+    policy.initialize()
+    assert policy.model["read"] == {(1, 1), (1, 2), (1, 4), (2, 2), (2, 4), (4, 4)}
 
 
 def test_nine_rows_are_a_pass_of_eight_and_one_of_one_where_that_is_faster() -> None:

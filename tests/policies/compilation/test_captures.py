@@ -471,7 +471,7 @@ def test_a_model_on_a_gpu_acts_from_graphs_in_less_memory_and_until_the_gpu_fail
         return sorted(reply.act.action.tolist() for reply in replies if reply.act is not None)
 
     try:
-        assert engine.models.devices == [{"kind": "cuda", "graphs_mib": 0.0}]
+        assert engine.models.devices == [{"kind": "cuda", "matmul": "high", "graphs_mib": 0.0}]
         alone = actions(act(4))
         assert len(alone) == 4
         cuda.most_rows = 2

@@ -15,7 +15,7 @@ from typing import Any
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.base import import_fixes
-from vlagents_ray.policies.base.config import DType
+from vlagents_ray.policies.base.config import DType, Matmul
 from vlagents_ray.policies.compilation import keep_jax_programs
 from vlagents_ray.policies.loading import report_device
 from vlagents_ray.registry import require
@@ -117,6 +117,20 @@ def jax_device(name: str = "auto") -> Any:
     keep_jax_programs(jax, device.platform)
     report_device({"kind": device.platform, "device": str(device), "name": device.device_kind, "jax": jax.__version__})
     return device
+
+
+def set_matmul(precision: Matmul, device: dict[str, Any]) -> None:
+    """Set, and add to the description of a GPU, the precision of float32 products and convolutions of this process."""
+    if device["kind"] == "cpu":
+        return
+    if "jax" in device:
+        named = {"high": "tensorfloat32", "highest": "float32"}[precision]
+        require("jax").config.update("jax_default_matmul_precision", named)
+    else:
+        torch = require("torch")
+        torch.set_float32_matmul_precision(precision)
+        torch.backends.cudnn.allow_tf32 = precision == "high"
+    device["matmul"] = precision
 
 
 def is_out_of_memory(error: BaseException) -> bool:

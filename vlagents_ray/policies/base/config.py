@@ -12,6 +12,7 @@ from vlagents_ray.policies.base.checkpoint import STEP
 from vlagents_ray.policies.compilation import CompileMode, Quantization
 
 DType = Literal["auto", "float32", "bfloat16", "float16"]
+Matmul = Literal["high", "highest"]
 NoiseLevel = Annotated[
     float,
     Field(
@@ -32,6 +33,11 @@ class ModelConfig(BaseModel, extra="forbid"):
     checkpoint_step: int | None = Field(default=None, ge=0, description="the training step that replaces `{step}`")
     device: str = Field(default="auto", description="'auto' (an accelerator if there is one), 'cpu', 'cuda', 'cuda:1'")
     dtype: DType = Field(default="auto", description="of the weights; 'auto': the family's own choice")
+    matmul: Matmul = Field(
+        default="high",
+        description="products of float32 matrices on a GPU: 'high' in TF32, which keeps 10 bits of their inputs; "
+        "'highest' in float32, several times slower; of the whole process, in which the last policy to load decides",
+    )
     quantization: Quantization | None = Field(
         default=None,
         description="keep the weights of linear layers in 8 bits (torchao): a quarter to a half of their memory, and "

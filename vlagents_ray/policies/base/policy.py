@@ -22,7 +22,7 @@ from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, InvalidAction, InvalidObservation, NotReset, PolicyFailed
 from vlagents_ray.interface import BEHAVIOUR, DELAY, DISTRIBUTION, EXECUTED, LEFTOVER, Act, Agent, Obs
 from vlagents_ray.policies.adapters import ADAPTER, Adapters, require_base_alone
-from vlagents_ray.policies.base.accelerator import free_memory, is_out_of_memory
+from vlagents_ray.policies.base.accelerator import free_memory, is_out_of_memory, set_matmul
 from vlagents_ray.policies.base.checkpoint import find_adapter, used_checkpoints
 from vlagents_ray.policies.base.checkpoint_files import weights_of
 from vlagents_ray.policies.base.config import ModelConfig
@@ -31,6 +31,7 @@ from vlagents_ray.policies.base.model_inputs import (
     count_in,
     drawn,
     leftover_plan,
+    shared_frames,
     wanted_behaviour,
     wanted_samples,
 )
@@ -144,6 +145,8 @@ class ModelPolicy(Agent, abc.ABC):
         """
         with current_report() as self.report:
             self.model = self._load_with_adapters() if self.config.adapters else self.load()
+        for device in self.report.devices:
+            set_matmul(self.config.matmul, device)
         self._decide_on_compiling()
         if self.config.quantization:
             quantize(self, self.config.quantization)
@@ -396,7 +399,20 @@ class ModelPolicy(Agent, abc.ABC):
         return [most] * whole + [rest] * bool(rest)
 
     def _run_examples(self, size: int, seeds: Iterator[int]) -> None:
-        self._chunks([self._example(next(seeds)) for _ in range(size)])
+        rows = [self._example(next(seeds)) for _ in range(size)]
+        self._chunks(rows)
+        if any("jax" in device for device in self.report.devices) and size <= self.most_rows:
+            for few in (few for few in self.config.batch_sizes or () if few < size):  # JAX compiles for each such pair
+                self.predict([*rows[:few], *(drawn(rows[0], row.rng) for row in rows[few:])])  # its duration is another
+
+    def observations_of(self, rows: Sequence[Row]) -> tuple[list[int], list[int]]:
+        """Return the rows to encode, padded to one of `batch_sizes`, and for each row the place of its observations.
+
+        As many observations as rows are those of the rows: 0, 1, …, which needs no gathering.
+        """
+        firsts, owners = shared_frames(rows)
+        firsts, each = self.padded(firsts), list(range(len(rows)))
+        return (each, each) if len(firsts) == len(rows) else (firsts, owners)
 
     def _chunks(self, rows: Sequence[Row]) -> list[np.ndarray]:
         """Return the chunks of rows; raises the first error of a row."""

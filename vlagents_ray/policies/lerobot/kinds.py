@@ -134,7 +134,7 @@ class Diffusion(Kind):
             len(rows),
             global_cond=self._encode(*stacked(batch, self.config, len(rows)).values()),
             generator=[generator_of(row.rng) for row in rows],
-            noise=torch.from_numpy(noise).to(self.config.device),
+            noise=torch.from_numpy(noise).to(self.config.device, non_blocking=True),
         )
         return actions[:, self.steps - 1 :]
 
@@ -162,7 +162,8 @@ class MultiTaskDit(Kind):
         for name in _TOKENS:
             seen[name] = batch[name].unflatten(0, (len(rows), -1))[:, -1]  # the same in each step of a history
         condition = self.policy.observation_encoder.encode(seen)
-        with RowDraws([row.rng for row in rows]):
+        own = self.policy.objective, require("diffusers.utils.torch_utils")  # DDPM's steps draw in the latter
+        with RowDraws([row.rng for row in rows], *own):
             actions = self.policy.objective.conditional_sample(self.policy.noise_predictor, len(rows), condition)
         return actions[:, self.steps - 1 :]
 
@@ -198,7 +199,7 @@ class Flow(Kind):
         shape = (self.horizon, int(self.config.max_action_dim))
 
         def convert(array: np.ndarray) -> Any:
-            return torch.from_numpy(array).to(self.config.device)
+            return torch.from_numpy(array).to(self.config.device, non_blocking=True)
 
         noise = convert(
             np.stack([row.noise(*shape) for row in rows])
@@ -378,7 +379,7 @@ class Groot(Kind):
             groups.setdefault(int(length), []).append(place)
         chunks: list[Any] = [None] * len(rows)
         for length, places in groups.items():
-            with RowDraws([rows[place].rng for place in places]):
+            with RowDraws([rows[place].rng for place in places], self.policy._groot_model.action_head):
                 drawn = self.policy.predict_action_chunk(_part(batch, places, length, len(rows)))
             for place, chunk in zip(places, drawn, strict=True):
                 chunks[place] = chunk
@@ -500,7 +501,7 @@ class XVla(Kind):
             return {name: one[owners] for name, one in self._look(*(each[firsts] for each in inputs)).items()}
 
         self.policy.model.forward_vlm = look
-        with RowDraws([row.rng for row in rows]):
+        with RowDraws([row.rng for row in rows], self.policy.model):
             return self.policy.predict_action_chunk(batch)
 
 
@@ -521,7 +522,7 @@ class VqBet(Kind):
     def draw(self, batch: dict[str, Any], rows: Sequence[Row], leftovers: Sequence[Any]) -> Any:
         from vlagents_ray.policies.sampling_rng import RowDraws
 
-        with RowDraws([row.rng for row in rows]):
+        with RowDraws([row.rng for row in rows], self.policy.vqbet):
             return self.policy.vqbet(stacked(batch, self.config, len(rows)), rollout=True)
 
 

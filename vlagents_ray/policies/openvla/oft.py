@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -15,7 +15,7 @@ from typing_extensions import Self
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, InvalidObservation
 from vlagents_ray.interface import Obs
-from vlagents_ray.policies.base import Row, shared_frames
+from vlagents_ray.policies.base import Row
 from vlagents_ray.policies.base.model_inputs import (
     camera_images,
     camera_specs,
@@ -159,7 +159,7 @@ class OpenVLAOFT(PrismaticPolicy):
 
     def _compute(self, prepared: Sequence[PreparedRow]) -> list[DecodedChunk]:
         """Run one forward pass, or one per diffusion step. Regression gives a session's samples the same answer."""
-        firsts, owners = shared_frames([entry.row for entry in prepared])
+        firsts, owners = self.observations_of([entry.row for entry in prepared])
         inputs = [prepared[i].model_input for i in firsts]
         shape = (self.model.horizon, self.model.dim)
         if self.config.head == "l1":
@@ -199,6 +199,15 @@ class ModelInput:
     proprio: np.ndarray | None  # (P,) in [-1, 1]
 
 
+class Sequences(NamedTuple):
+    """The parts of sequences of embeddings that are known before the actions, and how they make up a sequence."""
+
+    seen: Any  # (B, P, D), of images and state
+    words: Any  # (B, L, D)
+    places: Any  # (B, T), as for `Prismatic.assembled`; the actions are the last part
+    lengths: Any  # (B,), without padding
+
+
 @dataclass
 class Parallel:
     """A checkpoint of OFT: OpenVLA's, and its components; a component is None if training did not use it.
@@ -224,60 +233,53 @@ class Parallel:
             return _numpy(self._heads(self._hidden(self._sequences(inputs))))
 
     def denoise(self, inputs: Sequence[ModelInput], owners: Sequence[int], noise: np.ndarray) -> np.ndarray:
-        """Denoise chunks with the diffusion head.
-
-        Args:
-            inputs: The inputs, whose images are encoded once.
-            owners: (B,), the index of each chunk's input.
-            noise: (B, H, D), standard normal.
-
-        Returns:
-            (B, H, D) in [-1, 1].
-        """
+        """Denoise chunks (B, H, D) in [-1, 1] from standard normal noise, for the inputs `owners` (B,)."""
         torch = require("torch")
         with torch.inference_mode():
             sequences = self._sequences(inputs)
-            seen = [sequences[owner] for owner in owners]
+            index = self.base.moved(owners)
+            sequences = Sequences(*(part[index] for part in sequences))
             start = self.base.to_device(torch.from_numpy(noise))
-            return _numpy(denoise(start, lambda time, noisy: self._noise(seen, time, noisy), *self.steps))
+            return _numpy(denoise(start, lambda time, noisy: self._noise(sequences, time, noisy), *self.steps))
 
     def choose(self, inputs: Sequence[ModelInput], owners: Sequence[int], draws: np.ndarray) -> tuple[Any, Any]:
-        """Choose the tokens of chunks.
+        """Choose tokens (B, H, D) for the inputs `owners` (B,), by draws (B, H, D) as in `ActionBins.choose`.
 
-        Args:
-            inputs: The inputs, each of which is computed once.
-            owners: (B,), the index of each chunk's input.
-            draws: (B, H, D), as for `ActionBins.choose`.
-
-        Returns:
-            The tokens (B, H, D), and the logits (B, H, D, V) from which they were chosen.
+        Returns the tokens, and the logits of the bins (B, H, D, bins) there.
         """
-        torch = require("torch")
-        with torch.inference_mode():
+        with require("torch").inference_mode():
             hidden = self._hidden(self._sequences(inputs)).unflatten(1, (self.horizon, self.dim))
-            logits = self.base.network.language_model.lm_head(hidden).float()[list(owners)]
-            return self.base.bins.choose(logits, torch.tensor(draws, device=self.base.device)), logits
+            index, bins = self.base.moved(owners), self.base.bins
+            likeliest, over = (one[index] for one in bins.read(self.base.network.language_model.lm_head(hidden)))
+            return bins.choose(likeliest, over, self.base.moved(draws)), over
 
     def _heads(self, hidden: Any) -> Any:
         return self.head(hidden.reshape(len(hidden), self.horizon, -1))  # type: ignore[misc]
 
-    def _noise(self, seen: Sequence[tuple[Any, Any]], time: int, actions: Any) -> Any:
-        now = time_embedding(time, seen[0][0].shape[-1], actions.device).to(actions.dtype)[None]
+    def _noise(self, sequences: Sequences, time: int, actions: Any) -> Any:
+        seen = sequences.seen
+        now = time_embedding(time, seen.shape[-1], actions.device).to(actions.dtype).expand(len(seen), 1, -1)
         noisy = self.noisy(actions.flatten(1)[..., None])  # type: ignore[misc]
-        return self._heads(self._hidden([(require("torch").cat([s, now]), w) for s, w in seen], noisy))
+        return self._heads(self._hidden(sequences._replace(seen=require("torch").cat([seen, now], 1)), noisy))
 
-    def _sequences(self, inputs: Sequence[ModelInput]) -> list[tuple[Any, Any]]:
-        """Return, for each input, the embeddings of images and state (P, D), and of the words (L, D)."""
-        torch = require("torch")
-        words = [self.base.embed([*model_input.tokens, _STOP]) for model_input in inputs]
-        views = len(inputs[0].pictures)
-        pixels = self.base.to_device([picture for model_input in inputs for picture in model_input.pictures])
-        language = torch.stack([one.mean(0) for one in words])
-        seen = self.encode_images(pixels.unflatten(0, (len(inputs), views)), language)
+    def _sequences(self, inputs: Sequence[ModelInput]) -> Sequences:
+        """Return the sequences of inputs; for a diffusion head, with a place for the time after images and state."""
+        torch, base = require("torch"), self.base
+        prompts, timed = [[*model_input.tokens, _STOP] for model_input in inputs], self.noisy is not None
+        words, counts = base.embed(base.padded(prompts)), base.moved([len(tokens) for tokens in prompts])
+        padding = torch.arange(words.shape[1], device=base.device) >= counts[:, None]
+        language = words.float().masked_fill(padding[..., None], 0).sum(1) / counts[:, None]
+        pixels = base.to_device([picture for model_input in inputs for picture in model_input.pictures])
+        seen = self.encode_images(pixels.unflatten(0, (len(inputs), -1)), language.to(words.dtype))
         if self.proprio is not None:
-            states = self.base.to_device([torch.from_numpy(model_input.proprio) for model_input in inputs])
+            states = base.to_device([torch.from_numpy(model_input.proprio) for model_input in inputs])
             seen = torch.cat([seen, self.proprio(states)[:, None]], 1)
-        return list(zip(seen, words, strict=True))
+        first, count = 1 + seen.shape[1] + timed, self.horizon * self.dim  # `first`: place of a row's first token
+        actions = [(first + words.shape[1] + i) * timed for i in range(count)]  # zeros without a diffusion head
+        lasts = [first + len(tokens) - 1 for tokens in prompts]
+        places = [[first, *range(1, first), *range(first + 1, last), *actions, last] for last in lasts]
+        length = first - 1 + count + max(words.shape[1], base.padded_tokens)
+        return Sequences(seen, words, base.padded(places, length), counts + (first - 1 + count))
 
     def encode_images(self, pixels: Any, language: Any) -> Any:
         """Return the embeddings (P, N, D) of images (P, views, C, S, S); `language` (P, D) is the mean of the words."""
@@ -301,24 +303,14 @@ class Parallel:
             [embeddings] = layer(embeddings, attention_mask=mask, position_ids=places)
         return model.norm(embeddings)
 
-    def _hidden(self, sequences: Sequence[tuple[Any, Any]], actions: Any = None) -> Any:
-        """Return hidden states (B, H * D, …) of the action tokens, which are `actions` or zeros."""
-        torch = require("torch")
-        count = self.horizon * self.dim
-        if actions is None:
-            actions = sequences[0][0].new_zeros(len(sequences), count, sequences[0][0].shape[-1])
-        rows = [
-            torch.cat([words[:1], seen, words[1:-1], tokens, words[-1:]])
-            for (seen, words), tokens in zip(sequences, actions, strict=True)
-        ]
-        embeddings = torch.nn.utils.rnn.pad_sequence(rows, batch_first=True)
-        missing = max(0, self.base.padded_tokens - max(len(words) for _, words in sequences))
-        embeddings = torch.nn.functional.pad(embeddings, (0, 0, 0, missing))
-        lengths = torch.tensor([len(row) for row in rows], device=self.base.device)
+    def _hidden(self, sequences: Sequences, *actions: Any) -> Any:
+        """Return hidden states (B, H * D, …) of the action tokens: `actions` for a diffusion head, else zeros."""
+        lengths, count = sequences.lengths, self.horizon * self.dim
+        embeddings = self.base.assembled([sequences.seen, sequences.words, *actions], sequences.places)
         hidden = self.hidden_states(embeddings, lengths)
-        starts = lengths - count - 2  # the preceding token predicts an action, as in training
-        places = starts[:, None] + torch.arange(count, device=self.base.device)
-        return hidden[torch.arange(len(rows))[:, None], places]
+        # the preceding token predicts an action, as in training
+        places = lengths[:, None] - count - 2 + require("torch").arange(count, device=self.base.device)
+        return hidden.take_along_dim(places[..., None], 1)
 
 
 def _numpy(tensor: Any) -> np.ndarray:

@@ -7,8 +7,9 @@ are one tensor of a fixed length, with a masked place for each future token.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from pydantic import Field
 from vlagents_ray.contract import Contract
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.adapters import Adapters
-from vlagents_ray.policies.base import Row, shared_frames
+from vlagents_ray.policies.base import Row
 from vlagents_ray.policies.base.model_inputs import camera_images, camera_specs, choose_cameras
 from vlagents_ray.policies.compilation import Compilation
 from vlagents_ray.policies.openvla.prismatic import (
@@ -73,6 +74,9 @@ class OpenVLA(PrismaticPolicy):
 
     def load(self) -> TokenDecoder:
         base = load_prismatic(self.config)
+        if self.config.attention != "flash_attention_2":  # which reads the mask as it is
+            model = base.network.language_model.model
+            model._update_causal_mask = partial(_causal_mask, model._update_causal_mask)
         decoder = TokenDecoder(base, max(base.statistics.action_dims(self.config.unnorm_key)), self.adapters)
         decoder.compile_with(self.compilation)
         return decoder
@@ -92,16 +96,16 @@ class OpenVLA(PrismaticPolicy):
 
     def _compute(self, prepared: Sequence[PreparedRow]) -> list[DecodedChunk]:
         """Decode all answers: sessions greedily unless outputs are requested, samples at temperature 1."""
-        firsts, owners = shared_frames([entry.row for entry in prepared])
+        firsts, owners = self.observations_of([entry.row for entry in prepared])
         draws = np.full((len(prepared), max(entry.scale.dim for entry in prepared)), np.nan)
         for numbers, entry in zip(draws, prepared, strict=True):
             if entry.row.sample:
                 numbers[: entry.scale.dim] = entry.row.rng.random(entry.scale.dim)
         seen = [prepared[i] for i in firsts]
-        tokens, logits = self.model.decode(
+        tokens, over = self.model.decode(
             [entry.model_input for entry in seen], owners, draws, [entry.row.adapter for entry in seen]
         )
-        return self._decoded(self.model.base.bins, prepared, tokens[:, None], logits[:, None])
+        return self._decoded(self.model.base.bins, prepared, tokens[:, None], over[:, None])
 
 
 @dataclass
@@ -133,31 +137,34 @@ class TokenDecoder:
             fingerprints: (P,), the adapter of each prompt, see `Row.adapter`; empty: no prompt has one.
 
         Returns:
-            Tokens (R, S), and the logits (R, S, V) from which they were chosen.
+            Tokens (R, S), and the logits of the bins (R, S, bins) there.
         """
         torch, base, steps = require("torch"), self.base, draws.shape[1]
         with torch.inference_mode(), self.adapters.rows(fingerprints):
-            uniform = torch.tensor(draws, device=base.device)
+            uniform = base.moved(draws)
             embeddings, mask = self._left_padded(prompts)
             hidden, cache = self.prefill(embeddings, mask)
         with torch.inference_mode(), self.adapters.rows([fingerprints[i] for i in owners] if fingerprints else ()):
-            index = torch.tensor(owners, device=base.device)
-            length, position = mask.shape[1], mask.sum(1)[index]
+            if list(owners) != list(range(len(prompts))):
+                index = base.moved(owners)
+                hidden, mask, cache = hidden[index], mask[index], cache[index]
+            length, position = mask.shape[1], mask.sum(1)
             # one place for each token but the last, and one at the end for the current token
             places = max(steps, self.longest)
-            cache = torch.nn.functional.pad(cache[index], (0, 0, 0, places - 1))
-            hidden, mask = hidden[index], torch.nn.functional.pad(mask[index], (0, places))
+            cache = torch.nn.functional.pad(cache, (0, 0, 0, places - 1))
+            mask = torch.nn.functional.pad(mask, (0, places))
             mask[:, -1] = 1
             chosen: list[Any] = []
-            logits: list[Any] = []
+            found: list[Any] = []
             for step in range(steps):
                 if step:
                     hidden, own = self.continue_from(chosen[-1], position + step - 1, mask, cache)
                     place = length + step - 1
                     cache[..., place, :], mask[:, place] = own, 1
-                logits.append(base.network.language_model.lm_head(hidden).float())
-                chosen.append(base.bins.choose(logits[-1], uniform[:, step]))
-            return torch.stack(chosen, 1), torch.stack(logits, 1)
+                likeliest, over = base.bins.read(base.network.language_model.lm_head(hidden))
+                found.append(over)
+                chosen.append(base.bins.choose(likeliest, over, uniform[:, step]))
+            return torch.stack(chosen, 1), torch.stack(found, 1)
 
     def encode_images(self, pixels: Any) -> Any:
         """Return the embeddings (P, N, D) of images (P, C, S, S)."""
@@ -167,8 +174,7 @@ class TokenDecoder:
     def prefill(self, embeddings: Any, mask: Any) -> tuple[Any, Any]:
         """Run the language model on prompts (P, L, D), whose tokens are where `mask` (P, L) is not 0.
 
-        Returns:
-            The last hidden state (P, D), and keys and values (P, layers, 2, heads, L, E).
+        Returns the last hidden state (P, D), and keys and values (P, layers, 2, heads, L, E).
         """
         result = self.base.network.language_model.model(
             inputs_embeds=embeddings,
@@ -179,16 +185,10 @@ class TokenDecoder:
         return result.last_hidden_state[:, -1], _stacked(result.past_key_values)
 
     def continue_from(self, tokens: Any, positions: Any, mask: Any, cache: Any) -> tuple[Any, Any]:
-        """Run the language model on one more token (R,) of each row, at `positions` (R,).
+        """Run the language model on one more token (R,) of each row, at `positions` (R,) of its text.
 
-        Args:
-            tokens: The last token of each row.
-            positions: The positions of these tokens in the text.
-            mask: (R, T + 1), not 0 where a token attends: T places of the cache, and itself.
-            cache: Keys and values (R, layers, 2, heads, T, E).
-
-        Returns:
-            The hidden state (R, D), and the token's own keys and values (R, layers, 2, heads, E).
+        A token attends where `mask` (R, T + 1) is not 0: T places of keys and values (R, layers, 2, heads, T, E), and
+        itself. Returns the hidden state (R, D), and the token's own keys and values (R, layers, 2, heads, E).
         """
         result = self.base.network.language_model.model(
             input_ids=tokens[:, None],
@@ -202,19 +202,28 @@ class TokenDecoder:
 
     def _left_padded(self, prompts: Sequence[tuple[Any, list[int]]]) -> tuple[Any, Any]:
         """Return embeddings (P, L, D) and their mask (P, L); the patches follow the first token, as in training."""
-        torch, base = require("torch"), self.base
+        base, rows = self.base, [tokens for _, tokens in prompts]
         patches = self.encode_images(base.to_device([pixels for pixels, _ in prompts]))
-        rows = []
-        for seen, (_, tokens) in zip(patches, prompts, strict=True):
-            words = base.embed(tokens)
-            rows.append(torch.cat([words[:1], seen, words[1:]]))
-        length = max(*map(len, rows), base.padded_tokens and base.padded_tokens + patches.shape[1])
-        embeddings = patches.new_zeros(len(rows), length, patches.shape[-1])
-        mask = torch.zeros(len(rows), length, dtype=torch.long, device=base.device)
-        for i, row in enumerate(rows):
-            embeddings[i, -len(row) :] = row
-            mask[i, -len(row) :] = 1
-        return embeddings, mask
+        first = 1 + patches.shape[1]  # place of a row's first token
+        places = [[first, *range(1, first), *range(first + 1, first + len(tokens))] for tokens in rows]
+        length = first - 1 + base.padded_tokens
+        index = base.padded(places, length, left=True)
+        return base.assembled([patches, base.embed(base.padded(rows))], index), (index > 0).long()
+
+
+def _causal_mask(own: Callable[..., Any], mask: Any, embeddings: Any, positions: Any, *others: Any) -> Any:
+    """Return Llama's mask (B, 1, Q, K) of tokens (B, Q, D) at positions (Q,) that attend where `mask` (B, K) is not 0.
+
+    Its `own` code reads whether anything is masked: each pass would wait for a GPU, and no graph could be captured.
+    """
+    import torch  # the compiler follows an import statement, but not `require`
+
+    if mask is None or mask.ndim != 2:
+        return own(mask, embeddings, positions, *others)
+    hidden = (torch.arange(mask.shape[1], device=mask.device) > positions[:, None]) | (mask[:, None] == 0)
+    hidden = hidden & ~hidden.all(-1, keepdim=True)  # padding attends to all: fast kernels give NaN for no token at all
+    shown = torch.zeros_like(hidden, dtype=embeddings.dtype)
+    return shown.masked_fill(hidden, torch.finfo(embeddings.dtype).min)[:, None]
 
 
 def _stacked(cache: Any) -> Any:

@@ -187,10 +187,26 @@ class Prismatic:
             batch = batch.pin_memory()
         return batch.to(self.device, self.dtype, non_blocking=True)
 
-    def embed(self, tokens: Sequence[int]) -> Any:
-        """Return the embeddings of tokens, (L, D)."""
-        torch = require("torch")
-        return self.network.get_input_embeddings()(torch.tensor(tokens, device=self.device))
+    def moved(self, numbers: Any) -> Any:
+        """Copy numbers to the model's device, without waiting for what a GPU computes."""
+        return require("torch").as_tensor(numbers).to(self.device, non_blocking=True)
+
+    def padded(self, rows: Sequence[Sequence[int]], length: int = 0, *, left: bool = False) -> Any:
+        """Return rows of int64 on the device with zeros after them, or before them, up to the longest or `length`."""
+        found = np.zeros((len(rows), max(length, *map(len, rows))), np.int64)
+        for row, numbers in zip(found, rows, strict=True):
+            row[slice(-len(numbers), None) if left else slice(len(numbers))] = numbers
+        return self.moved(found)
+
+    def embed(self, tokens: Any) -> Any:
+        """Return the embeddings (…, D) of tokens (…)."""
+        return self.network.get_input_embeddings()(tokens)
+
+    @staticmethod
+    def assembled(parts: Sequence[Any], places: Any) -> Any:
+        """Return sequences (B, L, D) of the parts (B, N, D) at places (B, L), which count from 1; at 0 are zeros."""
+        zeros = parts[0].new_zeros(len(places), 1, parts[0].shape[-1])
+        return require("torch").cat([zeros, *parts], 1).take_along_dim(places[..., None], 1)
 
 
 def load_prismatic(config: PrismaticConfig, bounds: Bounds = "q99") -> Prismatic:
@@ -266,41 +282,40 @@ class ActionBins:
         self._middles = torch.tensor(np.append(middles, middles[-1]), device=device)
         self._tokens = self._first - torch.arange(config.n_action_bins, device=device)
 
-    def choose(self, logits: Any, draws: Any) -> Any:
-        """Choose tokens (…) from logits (…, V): bins at given quantiles, or the likeliest tokens.
+    def read(self, logits: Any) -> tuple[Any, Any]:
+        """Return the likeliest of all tokens (…), and the logits of bins (…, bins), float64, of logits (…, V)."""
+        return logits.argmax(-1), logits[..., self._tokens].double()
+
+    def choose(self, likeliest: Any, over: Any, draws: Any) -> Any:
+        """Choose tokens (…) from the results of `read`: bins at given quantiles, or the likeliest tokens.
 
         An element of `draws` (…), in [0, 1), is a quantile of the distribution over bins; NaN selects the likeliest of
-        all tokens.
+        all tokens, as upstream does.
         """
         torch = require("torch")
-        upto = self._over_bins(logits).cumsum(-1)
+        upto = over.softmax(-1).cumsum(-1)
         drawn = (upto > (draws * upto[..., -1])[..., None]).int().argmax(-1)
-        return torch.where(draws.isnan(), logits.argmax(-1), self._tokens[drawn])
-
-    def values(self, tokens: Any) -> np.ndarray:
-        """Return the values in [-1, 1]; a token that is not a bin counts as the nearest bin, as upstream."""
-        bins = (self._first - tokens).clamp(0, len(self._middles) - 1)
-        return np.asarray(self._middles[bins].cpu())
-
-    def moments(self, logits: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Return the mean and standard deviation (…) of the distribution over bins."""
-        over = self._over_bins(logits)
-        mean = over @ self._middles
-        spread = (over * (self._middles - mean[..., None]) ** 2).sum(-1).sqrt()
-        return np.asarray(mean.cpu()), np.asarray(spread.cpu())
+        return torch.where(draws.isnan(), likeliest, self._tokens[drawn])
 
     def logprob(self, tokens: Any, logits: Any) -> Any:
         """Return the log-probabilities (…) of tokens (…) among the bins, nats, differentiable in logits (…, V)."""
         over = logits[..., self._tokens].double().log_softmax(-1)
         return over.gather(-1, (self._first - tokens)[..., None])[..., 0]
 
-    def stated(self, tokens: Any, logits: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Return the log-probabilities (…) of tokens of bins, and the entropies (…) of the distributions, nats."""
-        entropy = require("torch").special.entr(self._over_bins(logits)).sum(-1)
-        return np.asarray(self.logprob(tokens, logits).cpu()), np.asarray(entropy.cpu())
+    def stated(self, tokens: Any, over: Any) -> np.ndarray:
+        """Return what is known of tokens (…) by the logits of bins, (…, bins) float64, with one copy from the device.
 
-    def _over_bins(self, logits: Any) -> Any:
-        return logits[..., self._tokens].double().softmax(-1)
+        Returns:
+            (6, …) float64: values in [-1, 1], of the nearest bin for other tokens, as upstream; mean and standard
+            deviation over the bins; log-probability and entropy, nats; and the tokens.
+        """
+        torch = require("torch")
+        share, bins = over.softmax(-1), (self._first - tokens).clamp(0, len(self._middles) - 1)
+        mean = share @ self._middles
+        spread = (share * (self._middles - mean[..., None]) ** 2).sum(-1).sqrt()
+        logprob = over.log_softmax(-1).gather(-1, bins[..., None])[..., 0]
+        entropy = torch.special.entr(share).sum(-1)
+        return np.asarray(torch.stack([self._middles[bins], mean, spread, logprob, entropy, tokens.double()]).cpu())
 
 
 MODEL, PROCESSOR = "OpenVLAForActionPrediction", "PrismaticImageProcessor"
@@ -478,25 +493,18 @@ class PrismaticPolicy(ModelPolicy):
             )
         self._checkpoint.own[adapter] = own  # type: ignore[union-attr]
 
-    def _decoded(
-        self, bins: ActionBins, prepared: Sequence[PreparedRow], tokens: Any, logits: Any
-    ) -> list[DecodedChunk]:
-        """Return the chunks of action tokens (B, H, D) that were chosen from logits (B, H, D, V)."""
-        parts = bins.values(tokens), *bins.moments(logits)
-        chunks = []
+    def _decoded(self, bins: ActionBins, prepared: Sequence[PreparedRow], tokens: Any, over: Any) -> list[DecodedChunk]:
+        """Return the chunks of action tokens (B, H, D) that were chosen by the logits of bins (B, H, D, bins)."""
+        chunks, parts = [], bins.stated(tokens, over)
         for i, entry in enumerate(prepared):
-            values, mean, spread = (part[i, :, : entry.scale.dim] for part in parts)
-            chunks.append(DecodedChunk(values, mean, spread, self._stated(bins, entry, tokens[i], logits[i])))
+            values, mean, spread, logprob, entropy, chosen = parts[:, i, :, : entry.scale.dim]
+            said = {
+                "logprob": self._used(logprob),
+                "entropy": float(self._used(entropy).sum()),
+                "replay": {"tokens": chosen.astype(np.int64)},
+            }
+            chunks.append(DecodedChunk(values, mean, spread, {name: said[name] for name in entry.row.want}))
         return chunks
-
-    def _stated(self, bins: ActionBins, entry: PreparedRow, tokens: Any, logits: Any) -> dict[str, Any]:
-        """Return the requested outputs of a row with tokens (H, D), drawn from the bins by logits (H, D, V)."""
-        if not entry.row.want:
-            return {}
-        tokens = tokens[:, : entry.scale.dim]
-        logprob, entropy = map(self._used, bins.stated(tokens, logits[:, : entry.scale.dim]))
-        said = {"logprob": logprob, "entropy": float(entropy.sum()), "replay": {"tokens": tokens.cpu().numpy()}}
-        return {name: said[name] for name in entry.row.want}
 
     def _statistics(self, adapter: str = "") -> Statistics:
         checkpoint = self._checkpoint
