@@ -25,6 +25,7 @@ from vlagents_ray.policies.base.model_inputs import (
     state_specs,
     state_vector,
 )
+from vlagents_ray.policies.base.staging import StagedRow
 from vlagents_ray.policies.flow import OFFERED
 from vlagents_ray.policies.lerobot import checkpoint
 from vlagents_ray.policies.lerobot.config import LeRobotConfig
@@ -171,14 +172,14 @@ class LeRobot(ModelPolicy):
             self.model = model = replace(self._described(model.kind, model.processors, trained, renames), own=model.own)
         model.own[adapter] = own
 
-    def perceive(self, obs: Obs) -> dict[str, np.ndarray]:
+    def perceive(self, obs: Obs) -> StagedRow:
         model: LoadedLeRobot = self.model
         frame = {key: image.copy() for key, image in camera_images(obs, model.cameras).items()}
         if model.state:
             frame[STATE] = model.trained.wrapped(state_vector(obs, model.state, self.state_dim))
         if model.environment:
             frame[ENVIRONMENT] = state_vector(obs, model.environment, self.environment_dim)
-        return frame
+        return model.processors.staging.stage(frame)
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
         predictions: dict[int, Prediction | Exception] = {}

@@ -15,6 +15,7 @@ from vlagents_ray.errors import ConfigError, MissingDependency
 from vlagents_ray.policies.base import Row
 from vlagents_ray.policies.base.model_code import CURE
 from vlagents_ray.policies.base.model_inputs import keeping_tokens
+from vlagents_ray.policies.base.staging import Staging
 from vlagents_ray.policies.lerobot.config import LeRobotConfig
 from vlagents_ray.policies.lerobot.kinds import groot_dataset, require_groot_statistics
 from vlagents_ray.registry import require
@@ -47,7 +48,7 @@ class Processors:
     """The pre- and post-processor, on the policy's device; raises `ConfigError` if they are incomplete."""
 
     def __init__(self, folder: Path, settings: Any, config: LeRobotConfig) -> None:
-        self._device = settings.device
+        self.staging = Staging(settings.device)
         saved = [_saved_steps(folder / name) for name in PIPELINES]
         unknown = sorted(set(config.processors) - set().union(*saved))
         if unknown:
@@ -127,19 +128,16 @@ class Processors:
 
     def observe(self, rows: Sequence[Row], steps: int) -> dict[str, Any]:
         """Return the policy's inputs, (rows * steps, …) on its device: the last `steps` frames of each row."""
-        torch = require("torch")
-        frames = [frame for row in rows for frame in row.history(steps)]
-        batch: dict[str, Any] = {}
-        for key, first in frames[0].items():
-            values = torch.from_numpy(np.stack([frame[key] for frame in frames])).to(self._device)
-            batch[key] = values.permute(0, 3, 1, 2).float() / 255 if first.ndim == 3 else values
+        batch = self.staging.stack([frame for row in rows for frame in row.history(steps)])
+        for key, values in batch.items():
+            if values.ndim == 4:
+                batch[key] = values.permute(0, 3, 1, 2).float() / 255
         batch["task"] = [row.instruction for row in rows for _ in range(steps)]
         return {key: value for key, value in self._before(batch).items() if value is not None}
 
     def normalised_state(self, rows: Sequence[Row]) -> Any:
         """Return the last states of rows, (B, D) on the policy's device, in the policy's units."""
-        torch = require("torch")
-        states = torch.from_numpy(np.stack([row.frames[-1][STATE] for row in rows])).to(self._device)
+        states = self.staging.upload(np.stack([row.frames[-1][STATE] for row in rows]))
         [step] = [step for step in self._before.steps if hasattr(step, "norm_map")]
         return step._normalize_observation({STATE: states}, inverse=False)[STATE]
 
