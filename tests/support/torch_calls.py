@@ -27,7 +27,7 @@ class TorchCalls(TorchDispatchMode):
         super().__init__()
         self.calls = 0  # other than views
         self.uploads = 0  # copies from the CPU of memory that may be pinned
-        self.waits: Counter[str] = Counter()  # calls after which the GPU has nothing to do, with the lines that made them
+        self.waits: Counter[str] = Counter()  # of Python for the GPU, by their functions
 
     def __torch_dispatch__(self, op: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs, name = kwargs or {}, op.overloadpacket.__name__

@@ -135,8 +135,9 @@ class RandomSteps:
             convert: Makes a tensor of an array, on the model's device.
         """
         self._wants = {i: row.want for i, row in enumerate(rows) if row.want}
-        self._index, self._steps, self._level = list(self._wants), shape[0], noise_level
-        self._draws = convert(np.stack([rows[i].noise(*shape) for i in self._index], axis=1))  # (K, E, H, D)
+        self._steps, self._level = shape[0], noise_level
+        self._index = convert(np.array(list(self._wants)))  # on the device, so that no step waits for its copy
+        self._draws = convert(np.stack([rows[i].noise(*shape) for i in self._wants], axis=1))  # (K, E, H, D)
         self._chain: list[Any] = []  # noisy actions (E, H, D) at first, and after each step
         self._means: list[Any] = []  # of those after each step
 
@@ -163,9 +164,10 @@ class RandomSteps:
     def stated(self, execute: int | None, dim: int | None) -> dict[int, dict[str, Any]]:
         """Return the outputs requested of rows, by their places, after the last step; None: all rows, all numbers."""
         stds = [step_std(step, self._steps, self._level) for step in range(self._steps)]
-        logprob = sum(map(normal_logprob, self._chain[1:], self._means, stds))[:, :execute, :dim].cpu().numpy()
+        total = sum(map(normal_logprob, self._chain[1:], self._means, stds))
+        *chains, logprobs = require("torch").stack([*self._chain, total]).cpu().numpy()  # one copy, for which it waits
+        logprob = logprobs[:, :execute, :dim]
         entropy = chain_entropy(self._steps, self._level) * logprob[0].size
-        chains = [tensors.cpu().numpy() for tensors in self._chain]
         found: dict[int, dict[str, Any]] = {}
         for place, (i, want) in enumerate(self._wants.items()):
             replay = {"chain": np.stack([one[place] for one in chains]), "noise_level": self._level}

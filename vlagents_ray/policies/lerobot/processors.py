@@ -47,8 +47,8 @@ _STATISTICS = {
 class Processors:
     """The pre- and post-processor, on the policy's device; raises `ConfigError` if they are incomplete."""
 
-    def __init__(self, folder: Path, settings: Any, config: LeRobotConfig) -> None:
-        self.staging = Staging(settings.device)
+    def __init__(self, folder: Path, settings: Any, config: LeRobotConfig, staging: Staging) -> None:
+        self.staging = staging
         saved = [_saved_steps(folder / name) for name in PIPELINES]
         unknown = sorted(set(config.processors) - set().union(*saved))
         if unknown:
@@ -173,6 +173,7 @@ class Processors:
             if type(step) is require("lerobot.processor").TokenizerProcessorStep and step.padding == "max_length":
                 step._tokenize_text = cached_tokenizer(
                     step.input_tokenizer,
+                    self.staging.device,
                     max_length=step.max_length,
                     truncation=step.truncation,
                     padding_side=step.padding_side,
@@ -222,7 +223,7 @@ def own_processors(folder: Path, settings: Any, config: LeRobotConfig, base: Pro
     if not config.trust_remote_code:
         for name in PIPELINES:
             require_known_steps(folder / name)
-    own = Processors(folder, settings, config)
+    own = Processors(folder, settings, config, base.staging)
     features = {**settings.input_features, **settings.output_features}
     own.require_statistics(settings, [key for key in features if key != ACTION])
     changed = {key for key in features if own.normalises(features[key]) and own.statistics(key) != base.statistics(key)}
@@ -301,20 +302,22 @@ def _saved_steps(file: Path) -> dict[str, Mapping[str, Any]]:
     return {step.get("registry_name", step.get("class", "")): step.get("config", {}) for step in steps}
 
 
-def cached_tokenizer(tokenizer: Any, **settings: Any) -> Callable[[list[str]], dict[str, Any]]:
-    """Return a cached function from texts to a tokenizer's tensors (B, L).
+def cached_tokenizer(tokenizer: Any, device: Any, **settings: Any) -> Callable[[list[str]], dict[str, Any]]:
+    """Return a cached function from texts to a tokenizer's tensors (B, L) on a device.
 
     All texts are padded to one length; otherwise a row, padded to the longest text of its batch, would depend on
     the other rows.
 
     Args:
         tokenizer: A tokenizer of transformers.
+        device: The device of the tensors, where the cache has them already.
         settings: Further arguments of its calls, such as `max_length`.
     """
 
     @keeping_tokens
     def tokenized(text: str) -> dict[str, Any]:
-        return dict(tokenizer([text], padding="max_length", return_tensors="pt", **settings).items())
+        tokens = tokenizer([text], padding="max_length", return_tensors="pt", **settings)
+        return {name: row.to(device) for name, row in tokens.items()}
 
     def call(texts: list[str]) -> dict[str, Any]:
         rows = [tokenized(text) for text in texts]
