@@ -18,6 +18,7 @@ from vlagents_ray.errors import ConfigError, InvalidAction, InvalidObservation, 
 from vlagents_ray.interface import BEHAVIOUR, DELAY, DISTRIBUTION, LEFTOVER, SAMPLES, WANT, Act
 from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row, shared_frames
 from vlagents_ray.policies.base.model_inputs import state_specs, state_vector
+from vlagents_ray.policies.base.policy import fastest_split
 from vlagents_ray.testing import check_agent
 
 HORIZON, DIM = 4, 2
@@ -103,6 +104,43 @@ def test_one_forward_pass_for_a_batch_and_padding_to_the_sizes_that_were_warmed_
     assert policy.model["batches"] == [2, 4]
     policy.act_batch([at(0.0)] * 3, [begun(policy, seed) for seed in range(3)])
     assert policy.model["batches"] == [2, 4, 4]
+
+
+def test_nine_rows_are_a_pass_of_eight_and_one_of_one_where_that_is_faster() -> None:
+    policy = loaded(batch_sizes=[1, 8, 16])
+    batches, report = policy.model["batches"], policy.report
+    sessions = [begun(policy, seed) for seed in range(9)]
+
+    def passes(on: str, **pass_s: float) -> list[int]:
+        report.devices, report.pass_s = [{"kind": on}], {int(size[1:]): took for size, took in pass_s.items()}
+        batches.clear()
+        acts = policy.act_batch([at(0.0)] * 9, [copy.deepcopy(session) for session in sessions])
+        found.append([act.action for act in acts if isinstance(act, Act)])
+        return list(batches)
+
+    found: list[list[np.ndarray]] = []
+    assert passes("cuda", _1=8.0, _8=8.0, _16=9.0) == [16]
+    assert sorted(passes("cuda", _1=1.0, _8=1.0, _16=9.0)) == [1, 8]
+    assert passes("cpu", _1=1.0, _8=1.0, _16=9.0) == [16]
+    assert passes("cuda", _1=1.0, _8=1.0) == [16], "not measured yet"
+    for actions in found:
+        np.testing.assert_array_equal(actions, found[0])
+
+
+@pytest.mark.parametrize(
+    ("rows", "pass_s", "want"),
+    [
+        (9, {1: 2.0, 8: 5.0, 16: 9.0}, [1, 8]),
+        (9, {1: 4.0, 8: 5.0, 16: 9.0}, [9]),  # a pass that takes as long
+        (16, {1: 1.0, 8: 5.0, 16: 12.0}, [8, 8]),
+        (11, {1: 1.0, 2: 1.5, 8: 5.0, 16: 12.0}, [1, 2, 8]),
+        (3, {4: 1.0, 8: 5.0}, [3]),
+        (1, {1: 1.0}, [1]),
+    ],
+)
+def test_the_split_with_the_shortest_time_is_found(rows: int, pass_s: dict[int, float], want: list[int]) -> None:
+    found = fastest_split(rows, tuple(pass_s.items()))
+    assert (sorted(found), sum(found)) == (want, rows)
 
 
 class CountsViews(Wobble):

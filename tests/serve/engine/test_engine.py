@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import queue
 import random
+import threading
+import time
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -166,6 +168,51 @@ def test_a_batch_of_the_wrong_length_is_the_policys_fault(serving: Callable[...,
     engine = serving(Batched())
     ask(engine, "a", "reset")
     assert isinstance(ask(engine, "a", "act", {"short": True}).error, PolicyFailed)
+
+
+class Held(Agent):
+    """Acts for 20 ms and until it is let go, and computes or waits meanwhile."""
+
+    shared: ClassVar = ("go",)
+
+    def __init__(self, *, computes: bool) -> None:
+        self._computes, self.go = computes, threading.Event()
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        return {}
+
+    def act(self, obs: Obs) -> Act:
+        end = time.perf_counter() + 0.02
+        while (left := end - time.perf_counter()) > 0 or not self.go.is_set():
+            if not self._computes:
+                self.go.wait() if left <= 0 else time.sleep(left)
+        return Act(np.zeros(1))
+
+
+@pytest.mark.parametrize(
+    ("rank", "computes", "beside"),
+    [("simulation", True, True), ("robot", False, True), ("robot", True, False)],
+)
+def test_replies_are_sent_beside_the_next_full_batch_unless_a_robot_would_wait(
+    serving: Callable[..., Engine], rank: Any, computes: bool, beside: bool
+) -> None:
+    agent = Held(computes=computes)
+    engine, threads = serving(agent, max_batch_size=1), queue.SimpleQueue[str]()
+    for session in "ab":
+        ask(engine, session, "reset")
+    agent.go.set()
+    for _ in range(5):  # until the queue knows that batches are slow
+        ask(engine, "a", "act")
+    agent.go.clear()
+    for session in "ab":
+        submit(
+            engine, session, Request("act", Obs(), rank=rank), lambda _: threads.put(threading.current_thread().name)
+        )
+    while engine.queue.depth() != 1:
+        pass
+    agent.go.set()
+    assert ("answers" in threads.get(timeout=30)) is beside
+    assert "answers" not in threads.get(timeout=30), "nothing waits"
 
 
 def test_a_loading_policy_is_unavailable_and_a_broken_one_says_why() -> None:

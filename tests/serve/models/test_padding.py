@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import queue
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -14,6 +15,7 @@ from pydantic import ValidationError
 
 from vlagents_ray.errors import PolicyFailed
 from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.policies.loading import current_report
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.config.deployment import BatchArgs
 from vlagents_ray.serve.engine.engine import Engine
@@ -63,6 +65,18 @@ class Picky(Compiled):
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
         return [session.act(one) for one, session in zip(obs, sessions, strict=True)]
+
+
+class Pads(Compiled):
+    """Pads by itself."""
+
+    def initialize(self) -> None:
+        with current_report() as report:
+            report.pads = True
+
+    def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
+        assert len(obs) == 1
+        return super().act_batch([*obs, *obs], [*sessions, copy.copy(sessions[0])])[:1]
 
 
 def ask(engine: Engine, session: str, op: Any, value: int = 0, **fields: Any) -> Reply:
@@ -129,6 +143,12 @@ def test_without_padding_the_batch_runs_as_it_is(serving: Callable[..., Engine])
     for _ in range(3):
         assert ask(engine, "a", "act").error is None
     assert len(Picky.made) == 2  # it is tried once
+
+
+def test_a_policy_that_pads_gets_the_batch_as_it_is(serving: Callable[..., Engine]) -> None:
+    engine = serving(Pads(), **SIZED)
+    ask(engine, "a", "reset")
+    assert ask(engine, "a", "act", 3).act.action.tolist() == [3, 1]
 
 
 def test_a_refused_first_reset_is_not_what_padding_begins_with(serving: Callable[..., Engine]) -> None:

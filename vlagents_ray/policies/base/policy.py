@@ -6,10 +6,11 @@ import abc
 import copy
 import itertools
 import logging
+import time
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from functools import lru_cache, partial
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
@@ -38,6 +39,8 @@ from vlagents_ray.policies.loading import COMPILED_SIZES, LoadingReport, current
 from vlagents_ray.validation import check_action
 
 logger = logging.getLogger(__name__)
+
+_FASTER = 0.9  # share of one pass's time that several may take: what they save has to exceed what measurements vary by
 
 T = TypeVar("T")
 
@@ -140,24 +143,41 @@ class ModelPolicy(Agent, abc.ABC):
         first found by a robot.
         """
         with current_report() as self.report:
-            if self.config.compile:
-                self.config = self.config.with_sizes(self.report.batch_sizes)
             self.model = self._load_with_adapters() if self.config.adapters else self.load()
+        self._decide_on_compiling()
         if self.config.quantization:
             quantize(self, self.config.quantization)
         sizes = self.config.batch_sizes or []
-        if not sizes and any(device["kind"] != "cpu" for device in self.report.devices):
+        self.report.pads = bool(sizes)
+        if not sizes and self.report.accelerated:
             sizes = sorted({1, self.config.rows})
-        seeds = itertools.count()
-        for number, size in enumerate(sizes, 1):
+        seeds, cores = itertools.count(), self.compilation.mode and self.compilation.cores
+        for number, size in enumerate(reversed(sizes) if cores else sizes, 1):
             report_progress(
                 f"{'compiling' if self.config.compile else 'running'} {size} rows ({number} of {len(sizes)})"
             )
-            if self.compilation.cores:
+            if cores:
                 self.compilation.add_size(size, partial(self._run_examples, size, seeds))
+            elif self.config.batch_sizes and self.report.accelerated:
+                self._run_examples(size, seeds)  # which also loads kernels, so its duration is not that of later ones
             self._run_examples(size, seeds)
         if sizes:
             free_memory()  # which a full batch took, and usual ones do not need
+
+    def _decide_on_compiling(self) -> None:
+        """Set `compile` to what it means for the loaded model and its device."""
+        setting, has_cores = self.config.compile, bool(self.compilation.cores)
+        kind = next((device["kind"] for device in self.report.devices if device["kind"] != "cpu"), "cpu")
+        mode = self.config.compile_on(kind)
+        if setting == "auto":
+            mode = mode if has_cores else False
+            logger.info("compile: auto: %s, on %s, %s cores", mode or "false", kind, "with" if has_cores else "without")
+        elif setting == "graphs" and kind != "cuda":
+            raise ConfigError(f"compile: graphs: got a model on {kind!r}, want 'cuda'; leave it out")
+        self.compilation.mode = mode
+        self.config = self.config.model_copy(update={"compile": mode})
+        if mode:
+            self.config = self.config.with_sizes(self.report.batch_sizes)
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         """Begin the episode with `kwargs["seed"]`, an int, by default 0, and the adapter named `kwargs["adapter"]`."""
@@ -347,16 +367,30 @@ class ModelPolicy(Agent, abc.ABC):
 
     def _passes(self, rows: list[Row]) -> list[Prediction | Exception]:
         found: list[Prediction | Exception] = []
-        most = self.most_rows
-        for start in range(0, len(rows), most):
-            part = rows[start : start + most]
+        for size in self._split(len(rows)):
+            part = rows[len(found) : len(found) + size]
             spare = self.padded(part)[len(part) :]  # copies, so that their noise is not the session's
             filled = [*part, *(copy.deepcopy(row, {id(row.frames): row.frames}) for row in spare)]
+            began = time.perf_counter()
             results = self.predict(filled)
+            self.report.record_pass(len(filled), time.perf_counter() - began)
             if len(results) != len(filled):
                 raise PolicyFailed(f"predict: got {len(filled)} rows, returned {len(results)} chunks")
             found += results[: len(part)]
         return found
+
+    def _split(self, rows: int) -> list[int]:
+        """Return the numbers of rows of the passes for a batch: one, or several if it is too large or they are faster.
+
+        With `batch_sizes`, 9 rows may take longer as a pass of 16 than as one of 8 and one of 1. On a CPU, where the
+        time of a pass depends on what else runs, only the number of passes counts.
+        """
+        most = self.most_rows
+        whole, rest = divmod(rows, most)
+        pass_s = {size: self.report.pass_s.get(size) for size in self.config.batch_sizes or () if size <= most}
+        if rest and self.report.accelerated and pass_s and None not in pass_s.values():
+            return [most] * whole + fastest_split(rest, tuple(pass_s.items()))  # type: ignore[arg-type]
+        return [most] * whole + [rest] * bool(rest)
 
     def _run_examples(self, size: int, seeds: Iterator[int]) -> None:
         self._chunks([self._example(next(seeds)) for _ in range(size)])
@@ -398,3 +432,19 @@ def _stacked(stated: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         name: _stacked(values) if isinstance(values[0], Mapping) else np.stack(values)
         for name, values in columns.items()
     }
+
+
+@lru_cache(maxsize=256)
+def fastest_split(rows: int, pass_s: tuple[tuple[int, float], ...]) -> list[int]:
+    """Return the numbers of rows of the forward passes that take the shortest time together.
+
+    Args:
+        rows: The number of all rows, at most the largest size.
+        pass_s: The sizes of passes, to which smaller ones are padded, and how long each takes, s; ascending by size.
+    """
+    best: list[tuple[float, list[int]]] = [(0.0, [])]
+    for count in range(1, rows + 1):
+        splits = ((size, took, *best[max(0, count - size)]) for size, took in pass_s)
+        best.append(min((took + others, [*sizes, min(size, count)]) for size, took, others, sizes in splits))
+    one_s = next(took for size, took in pass_s if size >= rows)
+    return best[rows][1] if best[rows][0] < _FASTER * one_s else [rows]

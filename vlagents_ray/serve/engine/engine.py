@@ -47,6 +47,8 @@ logger = logging.getLogger(__name__)
 
 Acting = tuple[PendingRequest, Session[LoadedModel]]
 
+_WORKING = 0.5  # share of a batch's time that the policy's thread computes, over which it is busy rather than waits
+
 
 class Engine:
     """Serves an agent, or agents of several checkpoints, to many sessions, from `start` (which loads) to `close`."""
@@ -550,6 +552,8 @@ class Engine:
         padding = model.pad(observations, agents) if self._batch_sizes else 0
         rows = len(observations)
         call = model.call("act", rows if self._batch_sizes else None)
+        slow = self.queue.window.slow
+        worked_s = time.thread_time() if slow else 0.0  # two calls would take a fiftieth of the fastest acts
         try:
             with model.busy, model.uncaptured, call:
                 model.require_open()
@@ -559,6 +563,7 @@ class Engine:
                 raise PolicyFailed(f"act_batch: got {rows} observations, returned {len(results)} actions")
         except Exception as error:  # noqa: BLE001 - becomes the replies
             results = [error] * rows
+        worked_s = time.thread_time() - worked_s if slow else 0.0
         # This is skipped for a lone act that succeeded like the one before: it would take a hundredth of the act's
         # time.
         if len(acting) > 1 or isinstance(results[0], Exception) or model.calls.failed_batches:
@@ -569,14 +574,18 @@ class Engine:
         if padding:
             model.padding.check_results(results[len(acting) :])
             results = results[: len(acting)]
+        # Replies are sent while the next full batch runs: to simulations, and after a full batch to robots, too, if the
+        # policy leaves the interpreter to other threads while it waits for a GPU or another process. Beside one that
+        # computes in Python, the slowest robots would wait longer.
         defer = self.queue.full_batch_waits()
+        robots = len(acting) == self.queue.largest and worked_s < _WORKING * (call.ended - call.began)
         unsent = []
         for (pending, session), result in zip(acting, results, strict=True):
             reply = build_reply(pending, session, result, model.contract, self._reply_bytes, weights.info)
             if reply.error is None:
                 reply.timing = timing(pending.arrived, call.began - prepared_s, call.ended)
                 reply.timing["batch_size"] = len(acting)
-            if defer and pending.rank is not Rank.ROBOT:
+            if defer and (robots or pending.rank is not Rank.ROBOT):
                 unsent.append((pending, reply))
             else:
                 pending.finish(reply)

@@ -130,8 +130,9 @@ class LoadedModel:
         """Determine whether this process computes on an accelerator."""
         self.key = key_of(self.settings)
         torch = sys.modules.get("torch")
-        on_gpu = any(device["kind"] != "cpu" for device in self.report.devices)
-        self.uncaptured = CAPTURES if on_gpu or (torch and torch.cuda.is_initialized()) else threading.RLock()
+        self.uncaptured = (
+            CAPTURES if self.report.accelerated or (torch and torch.cuda.is_initialized()) else threading.RLock()
+        )
 
     @property
     def checkpoint(self) -> str | None:
@@ -251,7 +252,7 @@ class Loader:
         except BaseException:
             _close_agent(agent)
             raise
-        padding = Padding(self._batch_sizes, copies.make)
+        padding = Padding(() if report.pads else self._batch_sizes, copies.make)
         version = (self.version(settings), f"{copies.fingerprint} {weights['digest'] if weights else ''}")
         if weights is not None:
             logger.info("weights: %s, revision: %s", weights["digest"], weights.get("revision"))

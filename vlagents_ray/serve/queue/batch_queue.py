@@ -64,7 +64,7 @@ class BatchQueue:
     ) -> None:
         self._clock = clock
         self._idle_s = idle_s
-        self._max = max_batch_size
+        self.largest = max_batch_size
         self._waiting = FairQueue()
         self._load_timer = LoadTimer()  # counts the time until the policy is loaded as idle
         self._lock = threading.Lock()
@@ -122,7 +122,7 @@ class BatchQueue:
             self._load_timer.count(self._waiting.size, now)
             if self._closed:
                 return None
-            batch, expired = self._waiting.take(self._max, now)
+            batch, expired = self._waiting.take(self.largest, now)
             if batch:
                 self.window.record_start(batch)
         return Taken(batch, expired)
@@ -155,7 +155,7 @@ class BatchQueue:
 
     def full_batch_waits(self) -> bool:
         """Return whether a full batch waits, so that replies to simulations can be sent while it runs."""
-        return self.window.slow and self._waiting.sessions >= self._max
+        return self.window.slow and self._waiting.sessions >= self.largest
 
     def depth(self) -> int:
         """Return the number of requests that wait for the next batch."""
