@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import pickle
 import threading
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -83,16 +84,20 @@ def test_a_gpu_copies_rows_of_other_threads_and_the_batch_waits_for_the_copies(c
         thread.start()
     for thread in threads:
         thread.join()
-    assert not any(torch.equal(row.block.values, cuda.pinned[0]) for row in rows)  # none is copied yet
+    blocks = [row.block for row in rows]
+    assert not any(torch.equal(block.values, cuda.pinned[0]) for block in blocks)  # none is copied yet
     require_stacked(staging.stack(rows), *map(arrays, range(4)))
-    assert all(row.block.streams == [cuda.current_stream(CUDA)] for row in rows)
+    assert all(block.streams == [cuda.current_stream(CUDA)] for block in blocks)
+    assert all(row.block is None for row in rows)  # only waiting requests take memory there
+    require_stacked(staging.stack(rows[:1]), arrays(0))
 
 
 def test_a_gpu_copies_a_row_once_for_all_batches_of_a_history(cuda: FakeCuda) -> None:
     staging = Staging(CUDA)
     frames = [staging.stage(arrays(i)) for i in range(3)]
     for newest in (1, 2):
-        require_stacked(staging.stack([frames[newest - 1], frames[newest]]), arrays(newest - 1), arrays(newest))
+        batch = staging.stack([frames[newest - 1], frames[newest]], keep=True)
+        require_stacked(batch, arrays(newest - 1), arrays(newest))
     assert len(cuda.pinned) == len(frames)
 
 
@@ -110,3 +115,16 @@ def test_a_row_moves_to_another_replica_as_arrays_and_is_copied_there(cuda: Fake
     staging = Staging(CUDA)
     again = copy.deepcopy(row)
     require_stacked(staging.stack([again, staging.stage(arrays(1))]), arrays(0), arrays(1))
+
+
+def test_a_row_for_which_a_gpu_has_no_memory_is_copied_with_its_batch(
+    cuda: FakeCuda, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    staging, copy = Staging(CUDA), Staging._copy
+    full = torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB")
+    monkeypatch.setattr(Staging, "_copy", Mock(side_effect=full))
+    row = staging.stage(arrays(0))
+    with pytest.raises(torch.OutOfMemoryError):
+        staging.stack([row])
+    monkeypatch.setattr(Staging, "_copy", copy)
+    require_stacked(staging.stack([row]), arrays(0))

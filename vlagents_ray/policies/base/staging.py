@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from vlagents_ray.policies.base.accelerator import is_out_of_memory
 from vlagents_ray.registry import require
 
 _ALIGNED = 16  # bytes: tensors of all types begin at a multiple, and a GPU copies in words of this size
@@ -54,13 +55,22 @@ class Staging:
             arrays: Arrays of numbers by name, of any shapes and types. They must not change later.
         """
         row = StagedRow(arrays)
-        self._copy(row)
+        try:
+            self._copy(row)
+        except RuntimeError as error:
+            if not is_out_of_memory(error):  # otherwise `stack` copies it, where a policy frees memory
+                raise
         return row
 
-    def stack(self, rows: Sequence[StagedRow]) -> dict[str, Any]:
+    def stack(self, rows: Sequence[StagedRow], *, keep: bool = False) -> dict[str, Any]:
         """Return tensors (B, …) on the device by name, from B rows; called on the policy's thread.
 
         On a CPU they are valid until the next call.
+
+        Args:
+            rows: The rows of the batch.
+            keep: Whether later batches have them too, as those of a history; otherwise their copies are freed, so that
+                a GPU has those of waiting requests alone.
 
         Raises:
             ValueError: The rows have arrays of different names, shapes or types.
@@ -69,7 +79,7 @@ class Staging:
         for row in rows:
             if row.layout != layout:
                 raise ValueError(f"stack: got rows of {layout} and {row.layout}, want the same arrays in each")
-            if row.block is None:  # of a session that another replica began
+            if row.block is None:  # of an earlier batch, or of a session that another replica began
                 self._copy(row)
         blocks = [row.block for row in rows]
         if self._stream is not None:
@@ -85,6 +95,8 @@ class Staging:
             batch = torch.stack(blocks, out=self._batch[: len(blocks)])
         else:
             batch = torch.stack(blocks)
+        for row in () if keep else rows:
+            row.block = row.copied = None
         starts = zip(_starts(rows[0]), rows[0].items(), strict=False)
         parts = {name: (batch[:, start : start + array.nbytes], array) for start, (name, array) in starts}
         return {

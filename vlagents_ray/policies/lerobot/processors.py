@@ -128,7 +128,7 @@ class Processors:
 
     def observe(self, rows: Sequence[Row], steps: int) -> dict[str, Any]:
         """Return the policy's inputs, (rows * steps, …) on its device: the last `steps` frames of each row."""
-        batch = self.staging.stack([frame for row in rows for frame in row.history(steps)])
+        batch = self.staging.stack([frame for row in rows for frame in row.history(steps)], keep=steps > 1)
         for key, values in batch.items():
             if values.ndim == 4:
                 batch[key] = values.permute(0, 3, 1, 2).float() / 255
