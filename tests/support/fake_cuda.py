@@ -7,6 +7,8 @@ computes them again from the same tensors. The rules are CUDA's, or stricter:
 - A capture fails, on both threads, if another thread waits for its device or makes a tensor there.
 - An operation on another stream or device than the captured one runs at once and is not recorded.
 - `torch.cuda.graph` has one stream for all captures of a process, on the device of the first.
+- With `install_copies`, a copy from pinned memory on a stream other than the default one is made only when a stream
+  waits for an event after it; until then its destination has garbage.
 - The graphs of a memory pool share memory: a replay overwrites the results of all others.
 - A GPU's time is the number of replayed operations, in milliseconds.
 - After `fail`, every call fails. A tensor of more than `most_rows` rows does not fit into memory.
@@ -41,6 +43,7 @@ class FakeCuda:
         self.failure = ""
         self.most_rows = sys.maxsize
         self.emptied = 0  # calls of `empty_cache`
+        self.pinned: list[torch.Tensor] = []
         self.clock_ms = 0.0  # of all GPUs
         self.captures: list[Capture] = []  # all that were begun
         self.replays: list[Capture] = []  # the graph of each replay
@@ -68,6 +71,35 @@ class FakeCuda:
         }.items():
             patch.setattr(torch.cuda, name, value)
         patch.setattr(torch, "compile", lambda function, **_: function)
+
+    def install_copies(self, patch: pytest.MonkeyPatch) -> None:
+        """Replace pinned memory and the copies from it; one that would wait for its stream is an error."""
+        empty, pin, to, pinned = torch.empty, torch.Tensor.clone, torch.Tensor.to, set[int]()
+
+        def hold(tensor: torch.Tensor, held: bool = True) -> torch.Tensor:
+            if held:
+                pinned.add(tensor.data_ptr())
+                self.pinned.append(tensor)  # its memory stays in use, so that the address means it alone
+            return tensor
+
+        def copy(tensor: torch.Tensor, *args: Any, non_blocking: bool = False, **kwargs: Any) -> Any:
+            device = args[0] if args else None
+            if isinstance(tensor, GpuTensor) or not isinstance(device, torch.device) or device.type != "cuda":
+                return to(tensor, *args, non_blocking=non_blocking, **kwargs)
+            if not non_blocking or tensor.data_ptr() not in pinned:
+                raise AssertionError("the copy waits for its stream: want pinned memory, and non_blocking")
+            made = self.tensor(torch.full_like(tensor, _GARBAGE), self._index(device))
+            stream = self.current_stream(device)
+            stream.pending.append(lambda: made.values.copy_(tensor))
+            if stream in self._default:
+                stream.run_pending()
+            return made
+
+        patch.setattr(
+            torch, "empty", lambda *size, pin_memory=False, **kwargs: hold(empty(*size, **kwargs), pin_memory)
+        )
+        patch.setattr(torch.Tensor, "pin_memory", lambda tensor: hold(pin(tensor)))
+        patch.setattr(torch.Tensor, "to", copy)
 
     def tensor(self, values: torch.Tensor, index: int = 0) -> GpuTensor:
         """Return a tensor of these values on a GPU."""
@@ -163,10 +195,27 @@ class FakeCuda:
 
 @dataclass(eq=False)
 class Stream:
-    """A stream of one GPU, on which operations run at once."""
+    """A stream of one GPU, on which operations other than the copies of `install_copies` run at once."""
 
     cuda: FakeCuda
     index: int
+    pending: list[Callable[[], object]] = field(default_factory=list)  # copies that no stream has waited for
+
+    def record_event(self) -> Event:
+        """Return an event after all copies so far."""
+        event = Event(self.cuda)
+        event.record(self)
+        return event
+
+    def wait_event(self, event: Event) -> None:
+        """Make the copies before the event."""
+        if event.stream is not None:
+            event.stream.run_pending()
+
+    def run_pending(self) -> None:
+        """Make all copies."""
+        while self.pending:
+            self.pending.pop(0)()
 
     def wait_stream(self, other: Stream) -> None:
         """Do nothing, since no operation is ever outstanding."""
@@ -183,11 +232,12 @@ class Event:
 
     cuda: FakeCuda
     ms: float = 0.0
+    stream: Stream | None = None
 
     def record(self, stream: Stream) -> None:
-        """Note the time, as nothing is ever outstanding."""
+        """Note the time, and the stream, on which nothing but copies is ever outstanding."""
         stream.synchronize()
-        self.ms = self.cuda.clock_ms
+        self.ms, self.stream = self.cuda.clock_ms, stream
 
     def synchronize(self) -> None:
         """Do nothing, since the event has passed."""
@@ -269,6 +319,7 @@ class GpuTensor(torch.Tensor):
     values: torch.Tensor  # on the CPU
     cuda_of: FakeCuda
     index: int
+    streams: list[Stream]  # of `record_stream`
 
     @staticmethod
     def __new__(cls: Any, values: torch.Tensor, cuda: FakeCuda, index: int) -> GpuTensor:
@@ -276,7 +327,12 @@ class GpuTensor(torch.Tensor):
             cls, values.shape, strides=values.stride(), storage_offset=values.storage_offset(), dtype=values.dtype
         )
         made.values, made.cuda_of, made.index = values, cuda, index
+        made.streams = []
         return made
+
+    def record_stream(self, stream: Any) -> None:
+        """Keep the stream, before whose operations the memory is not used again."""
+        self.streams.append(stream)
 
     @property
     def device(self) -> Any:  # type: ignore[override]

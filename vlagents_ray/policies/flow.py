@@ -163,9 +163,10 @@ class RandomSteps:
     def stated(self, execute: int | None, dim: int | None) -> dict[int, dict[str, Any]]:
         """Return the outputs requested of rows, by their places, after the last step; None: all rows, all numbers."""
         stds = [step_std(step, self._steps, self._level) for step in range(self._steps)]
-        logprob = sum(map(normal_logprob, self._chain[1:], self._means, stds))[:, :execute, :dim].cpu().numpy()
+        total = sum(map(normal_logprob, self._chain[1:], self._means, stds))
+        *chains, logprobs = require("torch").stack([*self._chain, total]).cpu().numpy()  # one copy, for which it waits
+        logprob = logprobs[:, :execute, :dim]
         entropy = chain_entropy(self._steps, self._level) * logprob[0].size
-        chains = [tensors.cpu().numpy() for tensors in self._chain]
         found: dict[int, dict[str, Any]] = {}
         for place, (i, want) in enumerate(self._wants.items()):
             replay = {"chain": np.stack([one[place] for one in chains]), "noise_level": self._level}
@@ -333,7 +334,10 @@ class Pi0Passes(FlowPasses):
     def __init__(self, model: Any, compilation: Compilation, *, stated: bool = True) -> None:
         """Use the passes of a `PI0Pytorch` or `PI05Pytorch`; `stated`: whether its `denoise_step` takes the state."""
         self._stated = stated
-        model.paligemma_with_expert.paligemma.model.language_model.config._attn_implementation = "eager"
+        language = model.paligemma_with_expert.paligemma.model.language_model
+        # Upstream's eager attention makes (P, heads, L, L) float32 in each layer: 340 MB for 16 rows of three cameras.
+        language.config._attn_implementation = "sdpa"
+        self._dtype = language.layers[0].self_attn.q_proj.weight.dtype  # of queries, which that needs for the mask
         super().__init__(model, compilation)
         own = getattr(model, "_prepare_attention_masks_4d", None)  # a function in newer versions of LeRobot
         self._mask_4d = own or self.module.prepare_attention_masks_4d
@@ -344,7 +348,7 @@ class Pi0Passes(FlowPasses):
 
         embedded, seen, causal = self.model.embed_prefix(list(images), list(cameras.unbind(1)), tokens, mask)
         _, cache = self.model.paligemma_with_expert.forward(
-            attention_mask=self._mask_4d(self.module.make_att_2d_masks(seen, causal)),
+            attention_mask=self._mask_4d(self.module.make_att_2d_masks(seen, causal)).to(self._dtype),
             position_ids=seen.cumsum(1) - 1,
             inputs_embeds=[embedded, None],
             use_cache=True,

@@ -31,12 +31,14 @@ from vlagents_ray.policies.base.model_inputs import (
     state_specs,
     state_vector,
 )
+from vlagents_ray.policies.base.staging import StagedRow, Staging
 from vlagents_ray.policies.flow import OFFERED, Change, FlowPasses, Guide, RandomSteps, cache_of, layers_of
 from vlagents_ray.registry import require
 
 CAMERAS = ("base_0_rgb", "left_wrist_0_rgb", "right_wrist_0_rgb")  # openpi's names, in the order of the image tokens
 USUAL_CAMERAS = {"base_0_rgb": "front", "left_wrist_0_rgb": "wrist"}
 USUAL_STATE = ("xyz_axis_angle", "gripper_qpos")  # LIBERO
+_ROUNDING = 1e-5  # of float32, for pixels of about 1
 _EPSILON = 1e-8  # added to a standard deviation by PI0Processor
 _PROCESSOR = "processor_config.json"
 _STATISTICS = ("state_mean", "state_std", "actions_mean", "actions_std")
@@ -61,9 +63,10 @@ class LoadedPi0:
 
     network: Any
     processor: Any
-    device: Any
     dtype: Any
     passes: Pi0HfPasses
+    staging: Staging
+    scale: tuple[Any, Any]  # see `_scale`
 
     def planned(self, row: Row) -> Row:
         """Return the row with its leftover actions in the model's units."""
@@ -131,7 +134,8 @@ class Pi0(ModelPolicy):
         network = network.eval().requires_grad_(False).to(device)
         passes = Pi0HfPasses(network, self.compilation)
         passes.adapters = self.adapters
-        return LoadedPi0(network, _processor(path), device, dtype, passes)
+        processor, staging = _processor(path), Staging(device)
+        return LoadedPi0(network, processor, dtype, passes, staging, _scale(processor, staging))
 
     def adapt(self, adapter: str, folder: Path) -> None:
         """Refuse an adapter whose folder has statistics that differ from the base's."""
@@ -148,8 +152,8 @@ class Pi0(ModelPolicy):
                 f"serve that as a checkpoint of its own"
             )
 
-    def perceive(self, obs: Obs) -> dict[str, Any]:
-        """Return the model's inputs for one row, on the CPU: images, state, and the episode's tokens.
+    def perceive(self, obs: Obs) -> StagedRow:
+        """Return the model's inputs for one row: resized images, normalised state, and the episode's tokens.
 
         Several threads call it, so it never uses the tokenizer, whose padding is mutable state.
         """
@@ -157,15 +161,10 @@ class Pi0(ModelPolicy):
         torch, side = require("torch"), processor.image_processor.pad_size
         found = camera_images(obs, self.cameras)
         images = [resize_with_pad(found[name], side["height"], side["width"]) for name in self.cameras]
-        state = torch.zeros(1, processor.max_state_dim)
+        state = np.zeros(processor.max_state_dim, np.float32)
         values = state_vector(obs, self.state, self.state_dim)
-        state[0, : len(values)] = processor.normalize(torch.from_numpy(values), "state")
-        return {
-            **self._begun().prompt,
-            "pixel_values": processor.image_processor(images, return_tensors="pt")["pixel_values"][None],
-            "pixel_attention_mask": torch.ones(1, len(images), dtype=torch.bool),
-            "state": state,
-        }
+        state[: len(values)] = processor.normalize(torch.from_numpy(values), "state")
+        return self.loaded().staging.stage({**self._begun().prompt, "images": np.stack(images), "state": state})
 
     def _begin(self, instruction: str, seed: int, adapter: str = "") -> None:
         """Begin an episode and tokenize its instruction; one longer than in training is refused, not truncated."""
@@ -179,7 +178,7 @@ class Pi0(ModelPolicy):
             padding="max_length",
             max_length=patches + most,
             padding_side="right",
-            return_tensors="pt",
+            return_tensors="np",
         )
         if (got := int(tokens["attention_mask"].sum()) - patches) > most:
             raise InvalidObservation(
@@ -190,15 +189,12 @@ class Pi0(ModelPolicy):
             raise InvalidObservation(
                 f"instruction: got {processor.image_token!r} in {instruction!r}, want words; it stands for an image"
             )
-        self._begun().prompt = dict(tokens)
+        self._begun().prompt = {name: array[0] for name, array in tokens.items()}
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction]:
         model, torch = self.loaded(), require("torch")
         shape = (model.network.config.chunk_size, model.network.config.max_action_dim)
-
-        def convert(array: np.ndarray) -> Any:
-            return torch.from_numpy(array).to(model.device, non_blocking=True)
-
+        convert = model.staging.upload
         noise = convert(np.stack([row.noise(*shape) for row in rows]))
         guide = Guide.of([model.planned(row) for row in rows], *shape)
         random = RandomSteps.of(rows, (self._steps, *shape), self.config.noise_level, convert)
@@ -208,8 +204,8 @@ class Pi0(ModelPolicy):
         if random is not None:
             changes.append(random.change)
         firsts, owners = shared_frames(rows)
-        inputs = self._inputs([rows[i] for i in firsts])
         with torch.inference_mode():
+            inputs = self._inputs([rows[i] for i in firsts])
             flow = model.passes.sample(
                 [inputs["pixel_values"]],
                 inputs["pixel_attention_mask"].unbind(1),
@@ -230,11 +226,17 @@ class Pi0(ModelPolicy):
         return int(self.config.steps or self.loaded().network.config.num_inference_steps)
 
     def _inputs(self, rows: Sequence[Row]) -> Mapping[str, Any]:
-        model, torch, frames = self.loaded(), require("torch"), [row.frames[-1] for row in rows]
-        batch = {key: torch.cat([frame[key] for frame in frames]) for key in frames[0]}
+        """Stack the last frames of rows, with their images scaled on the device as the image processor does."""
+        model, torch = self.loaded(), require("torch")
+        inputs = model.staging.stack([row.frames[-1] for row in rows])
+        images = inputs.pop("images").movedim(-1, 2)  # (P, cameras, 3, S, S)
+        factor, summand = model.scale
+        pixels = images.to(torch.float32, memory_format=torch.contiguous_format).mul_(factor).add_(summand)
         return {
-            key: value.to(model.device, model.dtype if value.is_floating_point() else None, non_blocking=True)
-            for key, value in batch.items()
+            **inputs,
+            "pixel_values": pixels.to(model.dtype),
+            "pixel_attention_mask": torch.ones(images.shape[:2], dtype=torch.bool, device=images.device),
+            "state": inputs["state"].to(model.dtype),
         }
 
 
@@ -255,6 +257,26 @@ def _processor(path: Path) -> Any:
             f"PI0Processor(…, {absent[0]}=[…]).save_pretrained(folder) writes them"
         )
     return processor
+
+
+def _scale(processor: Any, staging: Staging) -> tuple[Any, Any]:
+    """Return the factor and the summand, (3, 1, 1) float32 on the device, by which a processor converts pixels.
+
+    Raises:
+        ConfigError: It does anything else with an image of its own size.
+    """
+    side = processor.image_processor.pad_size
+    levels = np.resize(np.arange(256, dtype=np.uint8), (side["height"], side["width"]))
+    image = np.repeat(levels[..., None], 3, axis=2)
+    found = np.asarray(processor.image_processor([image], return_tensors="np")["pixel_values"][0], np.float32)
+    summand = found[:, :1, :1]  # of black, the first pixel
+    factor = (found[:, levels == 255][:, :1, None] - summand) / np.float32(255)
+    if found.shape != (3, *levels.shape) or not np.allclose(levels * factor + summand, found, atol=_ROUNDING):
+        raise ConfigError(
+            f"{_PROCESSOR}: its image processor changes an image of {levels.shape} by more than a factor and a summand "
+            f"for each channel, want do_rescale and do_normalize alone; images are resized before"
+        )
+    return staging.upload(factor), staging.upload(summand)
 
 
 class Pi0HfPasses(FlowPasses):

@@ -51,7 +51,7 @@ def test_rows_of_tensors_are_those_of_the_tokenizer_and_changes_of_a_batch_do_no
     def plain(texts: list[str]) -> dict[str, Any]:
         return tokenizer(texts, padding="max_length", return_tensors="pt", max_length=8)
 
-    cached = cached_tokenizer(tokenizer, max_length=8)
+    cached = cached_tokenizer(tokenizer, "cpu", max_length=8)
     for texts in (["lift"], ["push", "lift"], ["lift"], ["lift", "push", "lift"]):
         got, want = cached(texts), plain(texts)
         assert got.keys() == want.keys()

@@ -17,6 +17,7 @@ from vlagents_ray.dataset_contract import DatasetContract
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.base import Row, shared_frames
 from vlagents_ray.policies.base.model_inputs import GRIPPER
+from vlagents_ray.policies.base.staging import Staging
 from vlagents_ray.policies.compilation import Compilation
 from vlagents_ray.policies.flow import Change, FlowPasses, Pi0Passes, RandomSteps, cache_of, layers_of
 from vlagents_ray.registry import require
@@ -38,6 +39,7 @@ class Kind:
     def __init__(self, policy: Any, compilation: Compilation) -> None:
         """Use a loaded policy, and mark its core functions for compilation if its type has any."""
         self.policy, self.config = policy, policy.config
+        self.staging = Staging(policy.config.device)
         if type(self) is Kind and self.steps > 1:
             raise ConfigError(
                 f"checkpoint: {policy.name!r} keeps {self.steps} observations by itself, so that sessions would mix; "
@@ -128,13 +130,13 @@ class Diffusion(Kind):
     def draw(self, batch: dict[str, Any], rows: Sequence[Row], leftovers: Sequence[Any]) -> Any:
         from vlagents_ray.policies.sampling_rng import generator_of
 
-        torch, model = require("torch"), self.policy.diffusion
+        model = self.policy.diffusion
         noise = np.stack([row.noise(self.config.horizon, self.config.action_feature.shape[0]) for row in rows])
         actions = model.conditional_sample(
             len(rows),
             global_cond=self._encode(*stacked(batch, self.config, len(rows)).values()),
             generator=[generator_of(row.rng) for row in rows],
-            noise=torch.from_numpy(noise).to(self.config.device, non_blocking=True),
+            noise=self.staging.upload(noise),
         )
         return actions[:, self.steps - 1 :]
 
@@ -195,20 +197,15 @@ class Flow(Kind):
         return self._shared(rows)[0]
 
     def draw(self, batch: dict[str, Any], rows: Sequence[Row], leftovers: Sequence[Any]) -> Any:
-        torch = require("torch")
         shape = (self.horizon, int(self.config.max_action_dim))
-
-        def convert(array: np.ndarray) -> Any:
-            return torch.from_numpy(array).to(self.config.device, non_blocking=True)
-
-        noise = convert(
-            np.stack([row.noise(*shape) for row in rows])
-        )  # before that of the steps, which only some rows draw
+        convert = self.staging.upload
+        # before that of the steps, which only some rows draw
+        noise = convert(np.stack([row.noise(*shape) for row in rows]))
         self.random = RandomSteps.of(rows, (self.flow_steps, *shape), self.noise_level, convert)
         changes: list[Change] = []
         if any(left is not None for left in leftovers):
             plans = [None if left is None else self._encoded(left) for left in leftovers]
-            changes.append(self.guidance.towards(plans, [row.delay for row in rows], shape, self.config.device))
+            changes.append(self.guidance.towards(plans, [row.delay for row in rows], shape, convert))
         if self.random is not None:
             changes.append(self.random.change)
         return self.policy.predict_action_chunk(
@@ -239,14 +236,14 @@ class Guidance:
     def __init__(self, processor: Any) -> None:
         self._processor = processor  # supplies settings and schedule
 
-    def towards(self, plans: Sequence[Any], delays: Sequence[int], shape: tuple[int, int], device: Any) -> Change:
+    def towards(self, plans: Sequence[Any], delays: Sequence[int], shape: tuple[int, int], convert: Any) -> Change:
         """Return the change of velocities that leads chunks to the leftovers of their sessions.
 
         Args:
             plans: The leftover of each of the B rows in the policy's units, (H', D'), or None.
             delays: For each row, the number of actions that will have been executed.
             shape: Rows and numbers of a chunk, (H, D).
-            device: The policy's device.
+            convert: Makes a tensor of an array, on the policy's device.
         """
         torch = require("torch")
         target, weights = torch.zeros(len(plans), *shape), torch.zeros(len(plans), shape[0], 1)
@@ -255,7 +252,7 @@ class Guidance:
                 part = plan[: shape[0]]
                 target[i, : len(part), : part.shape[1]] = part
                 weights[i, :, 0] = self._weights(delay, len(part), shape[0])
-        target, weights = target.to(device), weights.to(device)
+        target, weights = convert(target.numpy()), convert(weights.numpy())
 
         def change(velocity: Any, actions: Any, time: float) -> Any:
             end = actions - time * velocity

@@ -25,6 +25,7 @@ from vlagents_ray.policies.base.model_inputs import (
     state_specs,
     state_vector,
 )
+from vlagents_ray.policies.base.staging import StagedRow
 from vlagents_ray.policies.flow import OFFERED
 from vlagents_ray.policies.lerobot import checkpoint
 from vlagents_ray.policies.lerobot.config import LeRobotConfig
@@ -120,7 +121,7 @@ class LeRobot(ModelPolicy):
                 f"come out of no flow; those of {_FLOWS} do"
             )
         self.config = _with_defaults(self.config, kind)
-        processors = Processors(folder, settings, self.config)
+        processors = Processors(folder, settings, self.config, kind.staging)
         return self._described(kind, processors, _trained(settings, processors), processors.rename_map)
 
     def _described(
@@ -171,14 +172,14 @@ class LeRobot(ModelPolicy):
             self.model = model = replace(self._described(model.kind, model.processors, trained, renames), own=model.own)
         model.own[adapter] = own
 
-    def perceive(self, obs: Obs) -> dict[str, np.ndarray]:
+    def perceive(self, obs: Obs) -> StagedRow:
         model: LoadedLeRobot = self.model
         frame = {key: image.copy() for key, image in camera_images(obs, model.cameras).items()}
         if model.state:
             frame[STATE] = model.trained.wrapped(state_vector(obs, model.state, self.state_dim))
         if model.environment:
             frame[ENVIRONMENT] = state_vector(obs, model.environment, self.environment_dim)
-        return frame
+        return model.kind.staging.stage(frame)
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
         predictions: dict[int, Prediction | Exception] = {}
@@ -205,9 +206,8 @@ class LeRobot(ModelPolicy):
         torch, model = require("torch"), self.model
         kind, settings = model.kind, model.kind.config
         leftovers = [model.own.get(row.adapter, model.processors).leftover(row) for row in rows]
-        device = torch.device(settings.device).type
-        mixed = settings.use_amp and device == "cuda"  # as in LeRobot's own loop
-        with torch.inference_mode(), torch.autocast(device, enabled=mixed):
+        mixed = settings.use_amp and torch.device(settings.device).type == "cuda"  # as in LeRobot's own loop
+        with torch.inference_mode(), torch.autocast("cuda", enabled=mixed):
             seen = [rows[i] for i in kind.observations(rows)]
             inputs = model.processors.observe(seen, kind.steps)
             for adapter, own in model.own.items():

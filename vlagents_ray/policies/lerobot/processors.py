@@ -15,6 +15,7 @@ from vlagents_ray.errors import ConfigError, MissingDependency
 from vlagents_ray.policies.base import Row
 from vlagents_ray.policies.base.model_code import CURE
 from vlagents_ray.policies.base.model_inputs import keeping_tokens
+from vlagents_ray.policies.base.staging import Staging
 from vlagents_ray.policies.lerobot.config import LeRobotConfig
 from vlagents_ray.policies.lerobot.kinds import groot_dataset, require_groot_statistics
 from vlagents_ray.registry import require
@@ -46,8 +47,8 @@ _STATISTICS = {
 class Processors:
     """The pre- and post-processor, on the policy's device; raises `ConfigError` if they are incomplete."""
 
-    def __init__(self, folder: Path, settings: Any, config: LeRobotConfig) -> None:
-        self._device = settings.device
+    def __init__(self, folder: Path, settings: Any, config: LeRobotConfig, staging: Staging) -> None:
+        self.staging = staging
         saved = [_saved_steps(folder / name) for name in PIPELINES]
         unknown = sorted(set(config.processors) - set().union(*saved))
         if unknown:
@@ -127,19 +128,16 @@ class Processors:
 
     def observe(self, rows: Sequence[Row], steps: int) -> dict[str, Any]:
         """Return the policy's inputs, (rows * steps, …) on its device: the last `steps` frames of each row."""
-        torch = require("torch")
-        frames = [frame for row in rows for frame in row.history(steps)]
-        batch: dict[str, Any] = {}
-        for key, first in frames[0].items():
-            values = torch.from_numpy(np.stack([frame[key] for frame in frames])).to(self._device)
-            batch[key] = values.permute(0, 3, 1, 2).float() / 255 if first.ndim == 3 else values
+        batch = self.staging.stack([frame for row in rows for frame in row.history(steps)], keep=steps > 1)
+        for key, values in batch.items():
+            if values.ndim == 4:
+                batch[key] = values.permute(0, 3, 1, 2).float() / 255
         batch["task"] = [row.instruction for row in rows for _ in range(steps)]
         return {key: value for key, value in self._before(batch).items() if value is not None}
 
     def normalised_state(self, rows: Sequence[Row]) -> Any:
         """Return the last states of rows, (B, D) on the policy's device, in the policy's units."""
-        torch = require("torch")
-        states = torch.from_numpy(np.stack([row.frames[-1][STATE] for row in rows])).to(self._device)
+        states = self.staging.upload(np.stack([row.frames[-1][STATE] for row in rows]))
         [step] = [step for step in self._before.steps if hasattr(step, "norm_map")]
         return step._normalize_observation({STATE: states}, inverse=False)[STATE]
 
@@ -175,6 +173,7 @@ class Processors:
             if type(step) is require("lerobot.processor").TokenizerProcessorStep and step.padding == "max_length":
                 step._tokenize_text = cached_tokenizer(
                     step.input_tokenizer,
+                    self.staging.device,
                     max_length=step.max_length,
                     truncation=step.truncation,
                     padding_side=step.padding_side,
@@ -224,7 +223,7 @@ def own_processors(folder: Path, settings: Any, config: LeRobotConfig, base: Pro
     if not config.trust_remote_code:
         for name in PIPELINES:
             require_known_steps(folder / name)
-    own = Processors(folder, settings, config)
+    own = Processors(folder, settings, config, base.staging)
     features = {**settings.input_features, **settings.output_features}
     own.require_statistics(settings, [key for key in features if key != ACTION])
     changed = {key for key in features if own.normalises(features[key]) and own.statistics(key) != base.statistics(key)}
@@ -303,20 +302,22 @@ def _saved_steps(file: Path) -> dict[str, Mapping[str, Any]]:
     return {step.get("registry_name", step.get("class", "")): step.get("config", {}) for step in steps}
 
 
-def cached_tokenizer(tokenizer: Any, **settings: Any) -> Callable[[list[str]], dict[str, Any]]:
-    """Return a cached function from texts to a tokenizer's tensors (B, L).
+def cached_tokenizer(tokenizer: Any, device: Any, **settings: Any) -> Callable[[list[str]], dict[str, Any]]:
+    """Return a cached function from texts to a tokenizer's tensors (B, L) on a device.
 
     All texts are padded to one length; otherwise a row, padded to the longest text of its batch, would depend on
     the other rows.
 
     Args:
         tokenizer: A tokenizer of transformers.
+        device: The device of the tensors, where the cache has them already.
         settings: Further arguments of its calls, such as `max_length`.
     """
 
     @keeping_tokens
     def tokenized(text: str) -> dict[str, Any]:
-        return dict(tokenizer([text], padding="max_length", return_tensors="pt", **settings).items())
+        tokens = tokenizer([text], padding="max_length", return_tensors="pt", **settings)
+        return {name: row.to(device) for name, row in tokens.items()}
 
     def call(texts: list[str]) -> dict[str, Any]:
         rows = [tokenized(text) for text in texts]

@@ -1,0 +1,125 @@
+"""The inputs of rows on their way to the policy's device, where they are stacked into a batch.
+
+On a GPU, the threads that prepare observations copy each row as soon as it is prepared, from pinned memory and on a
+stream of their own: the copies for the next batch run while a batch computes, and the policy's thread waits for none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.policies.base.accelerator import is_out_of_memory
+from vlagents_ray.registry import require
+
+_ALIGNED = 16  # bytes: tensors of all types begin at a multiple, and a GPU copies in words of this size
+
+
+class StagedRow(dict[str, np.ndarray]):
+    """The arrays of a row by name, with one copy of all of them on the device; a pickle has the arrays alone."""
+
+    def __init__(self, arrays: Mapping[str, np.ndarray]) -> None:
+        super().__init__({name: np.asarray(array, order="C") for name, array in arrays.items()})
+        self.block: Any = None  # (bytes,) uint8, on the device
+        self.copied: Any = None  # the event after the copy, on a GPU
+
+    def __reduce__(self) -> tuple[type[StagedRow], tuple[dict[str, np.ndarray]]]:
+        return StagedRow, (dict(self),)
+
+    @property
+    def layout(self) -> list[tuple[str, tuple[int, ...], np.dtype[Any]]]:
+        """Name, shape and type of each array in their order in the block."""
+        return [(name, array.shape, array.dtype) for name, array in self.items()]
+
+
+class Staging:
+    """Copies rows to a device, and stacks them there."""
+
+    def __init__(self, device: Any) -> None:
+        torch = require("torch")
+        self.device = torch.device(device)
+        self._stream = torch.cuda.Stream(self.device) if self.device.type == "cuda" else None
+        self._batch: Any = None  # (rows, bytes) uint8: the memory of the last batch on a CPU
+
+    def upload(self, array: np.ndarray) -> Any:
+        """Return an array as a tensor on the device; on a GPU, the copy is part of the current stream."""
+        tensor = require("torch").from_numpy(array)
+        return (tensor if self._stream is None else tensor.pin_memory()).to(self.device, non_blocking=True)
+
+    def stage(self, arrays: Mapping[str, np.ndarray]) -> StagedRow:
+        """Begin to copy the arrays of one row to the device; several threads may call it.
+
+        Args:
+            arrays: Arrays of numbers by name, of any shapes and types. They must not change later.
+        """
+        row = StagedRow(arrays)
+        try:
+            self._copy(row)
+        except RuntimeError as error:
+            if not is_out_of_memory(error):  # otherwise `stack` copies it, where a policy frees memory
+                raise
+        return row
+
+    def stack(self, rows: Sequence[StagedRow], *, keep: bool = False) -> dict[str, Any]:
+        """Return tensors (B, …) on the device by name, from B rows; called on the policy's thread.
+
+        On a CPU they are valid until the next call.
+
+        Args:
+            rows: The rows of the batch.
+            keep: Whether later batches have them too, as those of a history; otherwise their copies are freed, so that
+                a GPU has those of waiting requests alone.
+
+        Raises:
+            ValueError: The rows have arrays of different names, shapes or types.
+        """
+        torch, layout = require("torch"), rows[0].layout
+        for row in rows:
+            if row.layout != layout:
+                raise ValueError(f"stack: got rows of {layout} and {row.layout}, want the same arrays in each")
+            if row.block is None:  # of an earlier batch, or of a session that another replica began
+                self._copy(row)
+        blocks = [row.block for row in rows]
+        if self._stream is not None:
+            current = torch.cuda.current_stream(self.device)
+            for row in rows:
+                current.wait_event(row.copied)
+                row.block.record_stream(current)  # its memory is the other stream's
+            batch = torch.stack(blocks)
+        elif self.device.type == "cpu":  # where fresh memory costs more than the copies
+            if self._batch is None or self._batch.shape[1] != len(blocks[0]) or len(self._batch) < len(blocks):
+                with torch.inference_mode(False):  # so that any later batch may be written
+                    self._batch = torch.empty(len(blocks), len(blocks[0]), dtype=torch.uint8)
+            batch = torch.stack(blocks, out=self._batch[: len(blocks)])
+        else:
+            batch = torch.stack(blocks)
+        for row in () if keep else rows:
+            row.block = row.copied = None
+        starts = zip(_starts(rows[0]), rows[0].items(), strict=False)
+        parts = {name: (batch[:, start : start + array.nbytes], array) for start, (name, array) in starts}
+        return {
+            name: part.view(getattr(torch, array.dtype.name)).view(len(rows), *array.shape)
+            for name, (part, array) in parts.items()
+        }
+
+    def _copy(self, row: StagedRow) -> None:
+        torch, starts = require("torch"), _starts(row)
+        host = torch.empty(starts[-1], dtype=torch.uint8, pin_memory=self._stream is not None)
+        for start, array in zip(starts, row.values(), strict=False):
+            host.numpy()[start : start + array.nbytes] = array.reshape(-1).view(np.uint8)
+        if self._stream is None:
+            row.block = host.to(self.device)
+            return
+        with torch.cuda.stream(self._stream):
+            row.block = host.to(self.device, non_blocking=True)
+            row.copied = self._stream.record_event()
+
+
+def _starts(row: StagedRow) -> list[int]:
+    """Return the place of each array in the block, bytes, and the block's length."""
+    starts = [0]
+    for array in row.values():
+        starts.append(starts[-1] + -(-array.nbytes // _ALIGNED) * _ALIGNED)
+    return starts
