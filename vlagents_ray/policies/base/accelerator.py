@@ -123,6 +123,11 @@ def is_device_failure(error: BaseException) -> bool:
 def free_memory() -> None:
     """Free memory at once: agents often contain reference cycles, and torch caches the GPU memory that it allocated."""
     gc.collect()
+    empty_cache()
+
+
+def empty_cache() -> None:
+    """Return the GPU memory that torch does not use to the device, for other processes; JAX keeps its own."""
     torch = sys.modules.get("torch")
     if torch is not None and torch.cuda.is_initialized():
         torch.cuda.empty_cache()
