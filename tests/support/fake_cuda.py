@@ -58,7 +58,10 @@ class FakeCuda:
             "synchronize": self.synchronize,
             "empty_cache": self._empty_cache,
             "CUDAGraph": lambda: Capture(self),
-            "Event": lambda enable_timing=False: Event(self),
+            "Event": lambda **_: Event(self),
+            "memory_allocated": lambda _=None: self.memory.allocated,
+            "memory_reserved": lambda _=None: self.memory.allocated,
+            "mem_get_info": lambda _=None: (self.memory.total - self.memory.allocated, self.memory.total),
             "graph": self._graph,
         }.items():
             patch.setattr(torch.cuda, name, value)
@@ -160,6 +163,7 @@ class Memory:
 
     def __init__(self) -> None:
         self.allocated = self.peak = 0
+        self.total = 80 * 10**9
         self._tensors: Counter[int] = Counter()  # by the address of their memory
 
     def add(self, tensor: GpuTensor) -> None:

@@ -150,6 +150,8 @@ class CudaGraph:
     is loaded on another thread than the one that acts with it.
     """
 
+    replays: ClassVar[int] = 0  # of all graphs of this process
+
     def __init__(self, function: Callable[..., Any], tensors: Sequence[Any]) -> None:
         """Capture a function of tensors on one GPU without other effects; raises `RuntimeError` if that fails."""
         torch = require("torch")
@@ -176,6 +178,7 @@ class CudaGraph:
         for held, tensor in zip(self._inputs, tensors, strict=True):
             held.copy_(tensor, non_blocking=True)
         self._graph.replay()
+        CudaGraph.replays += 1
         result = self._result
         return tuple(one.clone() for one in result) if isinstance(result, tuple) else result.clone()
 

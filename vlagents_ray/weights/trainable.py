@@ -352,10 +352,9 @@ def _is_equal(new: Any, held: Any) -> bool:
         return np.array_equal(new, held)
     if not _is_tensor(new):
         return bool((new == held).all())
-    if new.is_cuda and not held.is_cuda:
-        held = _copied(held, new)
     parts = zip(new.reshape(-1).split(_AT_ONCE), held.reshape(-1).split(_AT_ONCE), strict=True)
-    return all(bool((one == other).all()) for one, other in parts)
+    moved = new.is_cuda and not held.is_cuda
+    return all(bool((one == (_copied(other, one) if moved else other)).all()) for one, other in parts)
 
 
 def _digest(value: Any) -> bytes:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
 from typing import Any, ClassVar
 
 import numpy as np
@@ -21,6 +20,7 @@ pytestmark = pytest.mark.torch
 
 SIZE = 1000  # elements of a value
 MODEL = 4 * 4 * SIZE  # bytes: four values, one of which has two names
+KEEP = PushOptions("keep")
 PART = 4 * 100  # bytes that operations on a version need beside it
 
 
@@ -87,7 +87,7 @@ class Pushed:
         self.weights.begin(session, follows=follows)
         return session
 
-    def push(self, number: int, options: PushOptions = PushOptions("keep")) -> None:
+    def push(self, number: int, options: PushOptions = KEEP) -> None:
         values = {name: np.full(SIZE, number, np.float32) for name in [*"abcd", "tied"]}
         self.weights.stage(number, values, options, lambda: self.sessions)
         self.weights.commit(number, options, lambda: self.sessions)
@@ -161,8 +161,8 @@ def test_a_value_with_two_names_is_pushed_by_either(cuda: FakeCuda) -> None:
     pushed = Pushed(cuda, OnGpu(cuda))
     session = pushed.begin(follows=True)
     for number, name in enumerate(["a", "tied"], 1):
-        pushed.weights.stage(number, {name: np.full(SIZE, number)}, PushOptions(partial=True))
-        pushed.weights.commit(number, PushOptions("keep"), lambda: pushed.sessions)
+        pushed.weights.stage(number, {name: np.full(SIZE, number, np.float32)}, PushOptions(partial=True))
+        pushed.weights.commit(number, KEEP, lambda: pushed.sessions)
         assert session.weights is not None
         pushed.weights.use(session.weights)
         assert pushed.agent.act(Obs()).action.tolist() == [number, 0, 0, 0]
@@ -185,8 +185,6 @@ def test_copies_to_and_from_the_host_run_on_a_stream_of_their_own(cuda: FakeCuda
     [stream] = {stream for stream, _ in cuda.transfers}
     assert stream is not torch.cuda.current_stream()
     assert max(size for _, size in cuda.transfers) <= PART
-    acts = [size for stream, size in cuda.transfers if stream is torch.cuda.current_stream()]
-    assert acts == []
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.int64])
@@ -207,12 +205,8 @@ def test_values_of_any_length_and_type_arrive_bit_for_bit(cuda: FakeCuda, dtype:
     assert torch.equal(torch.from_numpy(portable(halves).view(np.int16)).view(torch.bfloat16), whole.bfloat16())
 
 
-@pytest.fixture
-def memory() -> Iterator[torch.Tensor]:
-    yield torch.randn(12, 4)
-
-
-def test_tensors_in_each_others_memory_are_not_swapped(memory: torch.Tensor) -> None:
+def test_tensors_in_each_others_memory_are_not_swapped() -> None:
+    memory = torch.randn(12, 4)
     assert are_apart({"a": memory[:6], "b": memory[6:], "tied": memory[:6]})
     assert not are_apart({"a": memory, "b": memory[6:]})
     assert not are_apart({"a": memory, "b": memory.t()})
