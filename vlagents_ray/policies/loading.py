@@ -28,7 +28,7 @@ class LoadingReport:
     most_rows: int | None = None  # of a forward pass, if memory limits it
     on_out_of_memory: Callable[[], None] = lambda: None  # called whenever a forward pass does not fit, even later
     on_gpu_ms: Callable[[float], None] = lambda _: None  # called with the time of each forward pass on a GPU
-    timer: AbstractContextManager[None] = field(default_factory=nullcontext)  # context of each forward pass
+    timer: Callable[[], AbstractContextManager[None]] = nullcontext  # returns the context of a forward pass
 
 
 _report: ContextVar[LoadingReport | None] = ContextVar("_report", default=None)

@@ -42,6 +42,7 @@ from vlagents_ray.weights.trainable import (
     completed,
     fingerprint,
     is_copied,
+    mapped,
     on_host,
     own_copy,
     portable,
@@ -124,13 +125,11 @@ class ModelWeights:
         else:
             self._refusal = None
             # An agent with its own `load_parameters` may copy values instead of keeping references to them.
-            policy: Agent = agent
-            while isinstance(policy, Wrapper) and type(policy).load_parameters is Wrapper.load_parameters:
+            policy: Any = agent
+            while type(policy).load_parameters is Wrapper.load_parameters:
                 policy = policy.agent
-            default = type(policy).load_parameters is Agent.load_parameters
-            copied = is_copied(values or {})
-            self._in_place = not default or copied
-            self._swaps = default and copied and are_apart(values or {})
+            own, copied = type(policy).load_parameters is not Agent.load_parameters, is_copied(values or {})
+            self._in_place, self._swaps = own or copied, copied and not own and are_apart(values or {})
             first = WeightsVersion(0, fingerprint(values or {}), None if self._in_place else values)
             self.gpu = gpu_of(values or {})
         self.newest = self.pinned = first
@@ -164,21 +163,21 @@ class ModelWeights:
         if version is self._live:
             return
         outgoing, self._live = None if self._live is None else ref(self._live), None
-        live = outgoing and outgoing()  # None if nothing else refers to it
-        keep = live if self._in_place and live is not None and live.values is None else None
-        if keep is not None and version.values is not None and self._swaps and not version.on_host:
+        live = None if outgoing is None else outgoing()  # None if nothing else refers to it
+        kept = live if self._in_place and live is not None and live.values is None else None
+        if kept is not None and version.values is not None and self._swaps and not version.on_host:
             swap(self._agent.parameters(), version.values)
-            keep.values = version.values
+            kept.values = version.values
         else:
-            if keep is not None:
-                keep.values = self._copies()
+            if kept is not None:
+                kept.values = mapped(own_copy, self._agent.parameters())
             if version.values is not None:  # otherwise the agent still has its own values
                 self._agent.load_parameters(version.values)
         self._live = version
         self._switches += 1
         if self._in_place:
             version.values, version.on_host = None, False
-            if keep is None:
+            if kept is None:
                 empty_cache()
 
     def read_header(self, header: bytes, options: PushOptions) -> dict[str, ValueSpec]:
@@ -316,7 +315,7 @@ class ModelWeights:
             self._timer = None
 
     def _held(self, version: WeightsVersion) -> dict[str, Any]:
-        """Return references to a version's values; those in the agent may change, but not their types and shapes."""
+        """Return references to values with the types, shapes and devices of the version's."""
         if (values := version.values) is not None and not version.on_host:
             return values
         with self._busy:
@@ -324,10 +323,8 @@ class ModelWeights:
 
     def _values(self, version: WeightsVersion) -> dict[str, Any]:
         with self._busy if self._in_place else nullcontext():  # another version could become the agent's
-            if version.values is None:
-                return self._copies()
-            own = self._swaps and not version.on_host  # its memory may get the values of another version
-            return {name: own_copy(value) for name, value in version.values.items()} if own else version.values
+            values = self._agent.parameters() if version.values is None else version.values
+            return mapped(own_copy, values) if self._in_place else values
 
     def _move_to_host(self, used: set[WeightsVersion | None]) -> None:
         """Move the pinned and the newest version out of the GPU's memory, unless it is the agent's or one of `used`."""
@@ -335,13 +332,10 @@ class ModelWeights:
             switches, values = self._switches, version.values
             if values is None or version.on_host:
                 continue
-            moved = {name: on_host(value) for name, value in values.items()}
+            moved = mapped(on_host, values)
             with self._busy:
                 if self._switches == switches:  # otherwise another version may have got its memory
                     version.values, version.on_host = moved, True
-
-    def _copies(self) -> dict[str, Any]:
-        return {name: own_copy(value) for name, value in self._agent.parameters().items()}
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,9 +7,10 @@ Torch and JAX are never imported here: their objects exist only if they have bee
 from __future__ import annotations
 
 import hashlib
+import itertools
 import sys
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any
@@ -17,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.errors import InvalidWeights, NotTrainable, UnchangedWeights
-from vlagents_ray.weights.pinned_copies import PINNED
+from vlagents_ray.weights.pinned_copies import copy
 
 _BFLOAT16 = np.dtype("V2")
 _SHOWN = 5  # faults in a message
@@ -83,11 +84,10 @@ def portable(value: Any) -> np.ndarray:
 
 def on_host(value: Any) -> Any:
     """Return a tensor in the memory of the host, contiguous; it is copied only if it is on a GPU, or not contiguous."""
-    if not value.is_cuda:
-        return value.detach().cpu().contiguous()
-    host = sys.modules["torch"].empty(value.shape, dtype=value.dtype)
-    PINNED.copy(value.detach(), host)
-    return host
+    value = value.detach()
+    if value.is_cuda:
+        return copy(value, sys.modules["torch"].empty(value.shape, dtype=value.dtype))
+    return value.cpu().contiguous()
 
 
 def swap(first: Mapping[str, Any], second: Mapping[str, Any]) -> None:
@@ -111,6 +111,13 @@ def memory_of(name: str, value: Any) -> Any:
     return value.device, value.data_ptr(), value.shape, value.stride(), value.dtype
 
 
+def mapped(function: Callable[[Any], Any], named: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the results of a function of values, by name; tied values are passed once, and so are their results."""
+    values = {memory_of(name, value): value for name, value in named.items()}
+    results = {place: function(value) for place, value in values.items()}
+    return {name: results[memory_of(name, value)] for name, value in named.items()}
+
+
 def own_copy(value: Any) -> Any:
     """Return a private copy of a value."""
     if _is_tensor(value):
@@ -126,31 +133,24 @@ def converted(value: Any, held: Any) -> Any:
     if _is_tensor(held):
         torch = sys.modules["torch"]
         if _is_tensor(value):
-            if held.is_cuda and not value.is_cuda:
-                return _copied(value.detach(), held)
-            copied = value.detach().to(held.device, held.dtype)
-            return copied.clone() if copied.data_ptr() == value.data_ptr() else copied
-        array = _unchanging(np.asarray(value))
-        is_bfloat16 = array.dtype.kind == "V"
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message=".*not writ", category=UserWarning)  # nothing here writes into it
-            tensor = torch.from_numpy(array.view(np.int16) if is_bfloat16 else array)
-        tensor = tensor.view(torch.bfloat16) if is_bfloat16 else tensor
-        return _copied(tensor, held) if held.is_cuda else tensor.to(held.device, held.dtype)
+            tensor = value.detach()
+        else:
+            array = _unchanging(np.asarray(value))
+            is_bfloat16 = array.dtype.kind == "V"
+            with warnings.catch_warnings():
+                warnings.filterwarnings("ignore", message=".*not writ", category=UserWarning)  # nothing writes into it
+                tensor = torch.from_numpy(array.view(np.int16) if is_bfloat16 else array)
+            tensor = tensor.view(torch.bfloat16) if is_bfloat16 else tensor
+        if held.is_cuda and not tensor.is_cuda:
+            return copy(tensor, torch.empty_like(held, memory_format=torch.contiguous_format))
+        new = tensor.to(held.device, held.dtype)
+        return new.clone() if _is_tensor(value) and new.data_ptr() == value.data_ptr() else new
     array = _to_numpy(value)
     if isinstance(held, np.ndarray):
         array = _unchanging(array) if array.dtype == held.dtype else array.astype(held.dtype)
         array.flags.writeable = False
         return array
     return sys.modules["jax"].device_put(array.astype(held.dtype), held.sharding)
-
-
-def _copied(value: Any, held: Any) -> Any:
-    """Return a tensor on the GPU of `held`, of its type, with values from the memory of the host."""
-    torch = sys.modules["torch"]
-    copied = torch.empty_like(held, memory_format=torch.contiguous_format, requires_grad=False)
-    PINNED.copy(value, copied)
-    return copied
 
 
 def dtype_name(value: Any) -> str:
@@ -176,7 +176,7 @@ def _set_tensors(module: Any, named: Mapping[str, Any]) -> None:
             if name in held and alias.device.type == "cpu":
                 held[name].data = named[name]
             else:
-                PINNED.copy(named[name], alias) if alias.is_contiguous() else alias.copy_(named[name])
+                copy(named[name], alias) if alias.is_contiguous() else alias.copy_(named[name])
 
 
 def _leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any, Any]]:
@@ -267,21 +267,17 @@ def completed(
             f"weights: all {len(new)} values equal those that the policy holds; push what the optimizer changes, "
             f"or allow it with allow_same=True"
         )
-    missing = {memory_of(name, value): value for name, value in held.items() if name not in new}
-    if in_place:
-        missing = {place: own_copy(value) for place, value in missing.items()}
-    return {name: new[name] if name in new else missing[memory_of(name, value)] for name, value in held.items()}
+    missing = {name: value for name, value in held.items() if name not in new}
+    all_values = {**new, **(mapped(own_copy, missing) if in_place else missing)}
+    return {name: all_values[name] for name in held}
 
 
 def are_apart(named: Mapping[str, Any]) -> bool:
     """Return whether tensors share no memory, other than tied ones, so that `swap` can exchange each of them."""
-    places = {memory_of(name, value): value for name, value in named.items() if value.numel()}
-    ends: dict[Any, int] = {}  # of the memory so far, by device
-    for value in sorted(places.values(), key=lambda value: value.data_ptr()):
-        if value.data_ptr() < ends.get(value.device, 0) or not value.is_contiguous():
-            return False
-        ends[value.device] = value.data_ptr() + value.nbytes
-    return True
+    values = {memory_of(name, value): value for name, value in named.items() if value.numel()}.values()
+    spans = sorted((str(value.device), value.data_ptr(), value.data_ptr() + value.nbytes) for value in values)
+    apart = all(one[0] != other[0] or one[2] <= other[1] for one, other in itertools.pairwise(spans))
+    return apart and all(value.is_contiguous() for value in values)
 
 
 def require_fit(held: Mapping[str, Any], pushed: Mapping[str, Any], *, partial: bool = False) -> None:
@@ -354,7 +350,7 @@ def _is_equal(new: Any, held: Any) -> bool:
         return bool((new == held).all())
     parts = zip(new.reshape(-1).split(_AT_ONCE), held.reshape(-1).split(_AT_ONCE), strict=True)
     moved = new.is_cuda and not held.is_cuda
-    return all(bool((one == (_copied(other, one) if moved else other)).all()) for one, other in parts)
+    return all(bool((one == (converted(other, one) if moved else other)).all()) for one, other in parts)
 
 
 def _digest(value: Any) -> bytes:

@@ -185,8 +185,8 @@ def test_a_checkpoint_that_does_not_fit_into_memory_waits_for_another_to_leave(
     ask(engine, "chosen", "close")
     assert waiting.get(timeout=10).error is None
     assert library.closed == ["b/2"]
-    assert "2 loaded checkpoints take 20 bytes, 5 are free" in caplog.text
-    assert "checkpoints: {loaded: 2}" in caplog.text
+    assert caplog.text.count("2 checkpoints are loaded, the next one waits") == 1
+    assert "'reserved': 20, 'free': 5} bytes); set checkpoints: {loaded: 2}" in caplog.text
 
 
 def test_ten_checkpoints_have_their_turns_with_room_for_two(

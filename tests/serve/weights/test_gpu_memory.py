@@ -13,14 +13,14 @@ from fake_cuda import FakeCuda
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.serve.weights import ModelWeights, PushOptions, WeightsVersion
 from vlagents_ray.weights import pinned_copies, trainable
-from vlagents_ray.weights.pinned_copies import PinnedCopies
+from vlagents_ray.weights.pinned_copies import copy
 from vlagents_ray.weights.trainable import are_apart, portable
 
 pytestmark = pytest.mark.torch
 
 SIZE = 1000  # elements of a value
 MODEL = 4 * 4 * SIZE  # bytes: four values, one of which has two names
-KEEP = PushOptions("keep")
+KEEP, PARTIAL = PushOptions("keep"), PushOptions(partial=True, allow_same=True)
 PART = 4 * 100  # bytes that operations on a version need beside it
 
 
@@ -30,7 +30,8 @@ def cuda(monkeypatch: pytest.MonkeyPatch) -> FakeCuda:
     fake.install(monkeypatch)
     monkeypatch.setattr(trainable, "_AT_ONCE", PART // 4)
     monkeypatch.setattr(pinned_copies, "_PART", PART)
-    monkeypatch.setattr(trainable, "PINNED", PinnedCopies())
+    monkeypatch.setattr(pinned_copies, "_PARTS", [])
+    monkeypatch.setattr(pinned_copies, "_STREAMS", {})
     return fake
 
 
@@ -168,6 +169,23 @@ def test_a_value_with_two_names_is_pushed_by_either(cuda: FakeCuda) -> None:
         assert pushed.agent.act(Obs()).action.tolist() == [number, 0, 0, 0]
 
 
+def test_a_part_of_the_values_completes_a_version_in_the_memory_of_the_host(cuda: FakeCuda) -> None:
+    pushed = Pushed(cuda, OnGpu(cuda))
+    session = pushed.begin(follows=True)
+    pushed.push(1, PushOptions())
+    for number in (2, 3):
+        pushed.weights.stage(number, {"d": np.full(SIZE, 9, np.float32)}, PARTIAL, lambda: pushed.sessions)
+        pushed.weights.commit(number, PushOptions(), list)
+    assert pushed.act(session) == 0
+    new = pushed.begin(follows=True)
+    for _ in range(2):
+        assert pushed.act(session) == 0
+        assert new.weights is not None
+        pushed.weights.use(new.weights)
+        assert pushed.agent.act(Obs()).action.tolist() == [1, 1, 1, 9]
+        assert float(pushed.agent.module.tied.detach().values[0]) == 1
+
+
 def test_an_agent_that_loads_parameters_itself_gets_those_of_a_version(cuda: FakeCuda) -> None:
     pushed = Pushed(cuda, OwnLoading(cuda))
     old, new = pushed.begin(follows=False), pushed.begin(follows=True)
@@ -189,18 +207,17 @@ def test_copies_to_and_from_the_host_run_on_a_stream_of_their_own(cuda: FakeCuda
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.int64])
 def test_values_of_any_length_and_type_arrive_bit_for_bit(cuda: FakeCuda, dtype: torch.dtype) -> None:
-    copies = PinnedCopies()
     for length in (0, 1, 99, 100, 500, 12_345):
         values = (100 * torch.randn(length)).to(dtype)
         target = cuda.tensor(torch.empty(length, dtype=dtype))
-        copies.copy(values, target)
+        copy(values, target)
         assert torch.equal(target.values, values)
         back = torch.empty(length, dtype=dtype)
-        copies.copy(target, back)
+        copy(target, back)
         assert torch.equal(back, values)
     whole = torch.randn(3, 50, 7)
     halves = cuda.tensor(torch.empty(3, 50, 7, dtype=torch.bfloat16))
-    copies.copy(whole, halves)
+    copy(whole, halves)
     assert torch.equal(halves.values, whole.bfloat16())
     assert torch.equal(torch.from_numpy(portable(halves).view(np.int16)).view(torch.bfloat16), whole.bfloat16())
 

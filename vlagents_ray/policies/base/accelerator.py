@@ -9,8 +9,8 @@ import os
 import re
 import sys
 from collections import Counter
-from collections.abc import Iterable, Mapping
-from contextlib import AbstractContextManager, nullcontext, suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -172,32 +172,30 @@ def gpu_memory(devices: Iterable[Mapping[str, Any]]) -> dict[str, int]:
     return dict(found)
 
 
-def batch_timer(report: LoadingReport) -> AbstractContextManager[None]:
-    """Return the context of a policy's forward passes, which reports the time of each on a GPU when the next begins.
+def gpu_timer(report: LoadingReport) -> Callable[[], AbstractContextManager[None]]:
+    """Return a context of each forward pass of a policy, which reports the time on a GPU when the next pass begins.
 
-    The time is that from its first operation to its last one, with the gaps between them. Nothing waits for the GPU.
+    The time is that from the first operation to the last one, with the gaps between them. Nothing waits for the GPU.
     """
-    torch = sys.modules.get("torch")
+    cuda = require("torch").cuda if "torch" in sys.modules else None
     device = next((one.get("device", "cuda") for one in report.devices if one["kind"] == "cuda"), None)
-    if device is None or torch is None or not torch.cuda.is_initialized():
-        return nullcontext()
-    events = [torch.cuda.Event(enable_timing=True) for _ in range(2)]
+    if device is None or cuda is None or not cuda.is_initialized():
+        return nullcontext
+    begin, end = (cuda.Event(enable_timing=True) for _ in range(2))
     timed = False
 
-    class Timer(AbstractContextManager[None]):
-        def __enter__(self) -> None:
-            nonlocal timed
-            if timed and events[1].query():
-                report.on_gpu_ms(events[0].elapsed_time(events[1]))
-            timed = False
-            events[0].record(torch.cuda.current_stream(device))
+    @contextmanager
+    def timer() -> Iterator[None]:
+        nonlocal timed
+        if timed and end.query():
+            report.on_gpu_ms(begin.elapsed_time(end))
+        timed = False
+        begin.record(cuda.current_stream(device))
+        yield
+        end.record(cuda.current_stream(device))
+        timed = True
 
-        def __exit__(self, error: object, *_: object) -> None:
-            nonlocal timed
-            events[1].record(torch.cuda.current_stream(device))
-            timed = error is None
-
-    return Timer()
+    return timer
 
 
 def ensure_torchvision() -> None:

@@ -311,19 +311,16 @@ class ModelManager:
 
     def _fits(self, loaded: int) -> bool:
         """Return whether the GPU has room for one more checkpoint: as much as each of the loaded ones takes."""
-        memory, known = self.gpu_memory() if loaded else {}, self._full
+        memory, full = self.gpu_memory() if loaded else {}, self._full
         self._full = bool(memory) and memory["free"] * loaded < memory["reserved"]
-        if not self._full or known:
-            return not self._full
-        logger.warning(
-            "%d loaded checkpoints take %d bytes, %d are free: the next one waits until one of them can be unloaded; "
-            "set checkpoints: {loaded: %d}, or smaller batch.sizes",
-            loaded,
-            memory["reserved"],
-            memory["free"],
-            loaded,
-        )
-        return False
+        if self._full and not full:
+            said = (
+                "%d checkpoints are loaded, the next one waits until one can be unloaded, as the GPU's memory is full "
+            )
+            logger.warning(
+                f"{said}(%s bytes); set checkpoints: {{loaded: %d}}, or smaller batch.sizes", loaded, memory, loaded
+            )
+        return not self._full
 
     def loading(self) -> PolicyUnavailable:
         """Return the error for clients while the first checkpoint is loaded, which names the step of loading."""
