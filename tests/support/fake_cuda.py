@@ -188,10 +188,13 @@ class Event:
 
     cuda: FakeCuda
     at_ms: float | None = None
+    index: int | None = None  # GPU of its first stream
 
     def record(self, stream: Stream | None = None) -> None:
-        """Record the event on a stream."""
+        """Record the event on a stream, always of the same GPU."""
         stream = stream or self.cuda.current_stream()
+        assert self.index in (None, stream.index), "Event device does not match recording stream's device"
+        self.index = stream.index
         stream.events += 1
         self.at_ms = float(stream.events)
 

@@ -34,21 +34,9 @@ from vlagents_ray.interface import POLICY, Agent
 from vlagents_ray.policies.base.accelerator import empty_cache
 from vlagents_ray.policies.compilation import CAPTURES
 from vlagents_ray.policies.wrapper import Wrapper
+from vlagents_ray.weights import trainable
 from vlagents_ray.weights.safetensors import ValueSpec, read_header
 from vlagents_ray.weights.shared_values import SharedValues, gpu_of, opened
-from vlagents_ray.weights.trainable import (
-    accepted,
-    are_apart,
-    completed,
-    fingerprint,
-    is_copied,
-    mapped,
-    on_host,
-    own_copy,
-    portable,
-    require_fit,
-    swap,
-)
 
 DIGITS = 16  # length of a checkpoint's digest that replaces a fingerprint, hexadecimal digits
 STAGED_S = 60.0  # time for which a staged version waits for its commit, s
@@ -128,9 +116,9 @@ class ModelWeights:
             policy: Any = agent
             while type(policy).load_parameters is Wrapper.load_parameters:
                 policy = policy.agent
-            own, copied = type(policy).load_parameters is not Agent.load_parameters, is_copied(values or {})
-            self._in_place, self._swaps = own or copied, copied and not own and are_apart(values or {})
-            first = WeightsVersion(0, fingerprint(values or {}), None if self._in_place else values)
+            own, copied = type(policy).load_parameters is not Agent.load_parameters, trainable.is_copied(values or {})
+            self._in_place, self._swaps = own or copied, copied and not own and trainable.are_apart(values or {})
+            first = WeightsVersion(0, trainable.fingerprint(values or {}), None if self._in_place else values)
             self.gpu = gpu_of(values or {})
         self.newest = self.pinned = first
         self._staged: WeightsVersion | None = None
@@ -166,11 +154,11 @@ class ModelWeights:
         live = None if outgoing is None else outgoing()  # None if nothing else refers to it
         kept = live if self._in_place and live is not None and live.values is None else None
         if kept is not None and version.values is not None and self._swaps and not version.on_host:
-            swap(self._agent.parameters(), version.values)
+            trainable.swap(self._agent.parameters(), version.values)
             kept.values = version.values
         else:
             if kept is not None:
-                kept.values = mapped(own_copy, self._agent.parameters())
+                kept.values = trainable.mapped(trainable.own_copy, self._agent.parameters())
             if version.values is not None:  # otherwise the agent still has its own values
                 self._agent.load_parameters(version.values)
         self._live = version
@@ -203,7 +191,7 @@ class ModelWeights:
                 f"weights: got a header of {len(header)} bytes, want at most {most} for the policy's {len(held)} names"
             )
         announced = read_header(header)
-        require_fit(held, announced, partial=options.partial)
+        trainable.require_fit(held, announced, partial=options.partial)
         return announced
 
     def stage(
@@ -246,12 +234,12 @@ class ModelWeights:
             with CAPTURES.pushes:
                 if self._swaps:
                     self._move_to_host({session.weights for session in sessions()})
-                new = accepted(self._held(newest), pushed, partial=options.partial)
+                new = trainable.accepted(self._held(newest), pushed, partial=options.partial)
                 with self._busy if self._in_place else nullcontext():  # another version could become the agent's
                     held = self._agent.parameters() if newest.values is None else newest.values
-                    values = completed(held, new, allow_same=options.allow_same, in_place=self._in_place)
+                    values = trainable.completed(held, new, allow_same=options.allow_same, in_place=self._in_place)
                 del held
-                staged = WeightsVersion(number, fingerprint(values), values)
+                staged = WeightsVersion(number, trainable.fingerprint(values), values)
         except BaseException:
             self.drop(number)
             raise
@@ -306,7 +294,7 @@ class ModelWeights:
     def portable_values(self, version: WeightsVersion) -> dict[str, Any]:
         """Return the values of a version as numpy arrays, for another process."""
         with CAPTURES.pushes:
-            return {name: portable(value) for name, value in self._values(version).items()}
+            return {name: trainable.portable(value) for name, value in self._values(version).items()}
 
     def _forget_staged(self) -> None:
         self._staged = None
@@ -324,7 +312,7 @@ class ModelWeights:
     def _values(self, version: WeightsVersion) -> dict[str, Any]:
         with self._busy if self._in_place else nullcontext():  # another version could become the agent's
             values = self._agent.parameters() if version.values is None else version.values
-            return mapped(own_copy, values) if self._in_place else values
+            return trainable.mapped(trainable.own_copy, values) if self._in_place else values
 
     def _move_to_host(self, used: set[WeightsVersion | None]) -> None:
         """Move the pinned and the newest version out of the GPU's memory, unless it is the agent's or one of `used`."""
@@ -332,7 +320,7 @@ class ModelWeights:
             switches, values = self._switches, version.values
             if values is None or version.on_host:
                 continue
-            moved = mapped(on_host, values)
+            moved = trainable.mapped(trainable.on_host, values)
             with self._busy:
                 if self._switches == switches:  # otherwise another version may have got its memory
                     version.values, version.on_host = moved, True

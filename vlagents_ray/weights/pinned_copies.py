@@ -12,8 +12,8 @@ from typing import Any
 
 _PART = 2**25  # bytes of each of two parts, one of which is filled while the other one is copied
 _LOCK = threading.Lock()
-_PARTS: list[tuple[Any, Any]] = []  # pinned memory, and the event at the end of its last copy
-_STREAMS: dict[Any, Any] = {}  # by device
+# By device: the stream, and two parts of pinned memory, each with the event at the end of its last copy.
+_USED: dict[Any, tuple[Any, list[tuple[Any, Any]]]] = {}
 
 
 def copy(source: Any, target: Any) -> Any:
@@ -29,16 +29,17 @@ def copy(source: Any, target: Any) -> Any:
         device, dtype = next((one.device, one.dtype) for one in (source, target) if one.is_cuda)
         length = _PART // dtype.itemsize
         with _LOCK, torch.cuda.device(device):
-            while len(_PARTS) < 2:
-                with torch.inference_mode(mode=False):  # otherwise it could not be written outside of that mode
-                    _PARTS.append((torch.empty(_PART, dtype=torch.uint8).pin_memory(), torch.cuda.Event()))
-            stream = _STREAMS.setdefault(device, torch.cuda.Stream(device))
+            if device not in _USED:
+                with torch.inference_mode(mode=False):  # otherwise they could not be written outside of that mode
+                    empty = [torch.empty(_PART, dtype=torch.uint8).pin_memory() for _ in range(2)]
+                _USED[device] = torch.cuda.Stream(device), [(memory, torch.cuda.Event()) for memory in empty]
+            stream, parts = _USED[device]
             stream.wait_stream(torch.cuda.current_stream(device))
             places = target.view(-1).split(length)
             try:
                 with torch.cuda.stream(stream):
                     for number, (part, place) in enumerate(zip(source.reshape(-1).split(length), places, strict=True)):
-                        memory, event = _PARTS[number % 2]
+                        memory, event = parts[number % 2]
                         event.synchronize()
                         pinned = memory[: len(part) * dtype.itemsize].view(dtype)
                         pinned.copy_(part, non_blocking=True)

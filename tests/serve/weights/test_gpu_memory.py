@@ -30,8 +30,7 @@ def cuda(monkeypatch: pytest.MonkeyPatch) -> FakeCuda:
     fake.install(monkeypatch)
     monkeypatch.setattr(trainable, "_AT_ONCE", PART // 4)
     monkeypatch.setattr(pinned_copies, "_PART", PART)
-    monkeypatch.setattr(pinned_copies, "_PARTS", [])
-    monkeypatch.setattr(pinned_copies, "_STREAMS", {})
+    monkeypatch.setattr(pinned_copies, "_USED", {})
     return fake
 
 
@@ -209,7 +208,7 @@ def test_copies_to_and_from_the_host_run_on_a_stream_of_their_own(cuda: FakeCuda
 def test_values_of_any_length_and_type_arrive_bit_for_bit(cuda: FakeCuda, dtype: torch.dtype) -> None:
     for length in (0, 1, 99, 100, 500, 12_345):
         values = (100 * torch.randn(length)).to(dtype)
-        target = cuda.tensor(torch.empty(length, dtype=dtype))
+        target = cuda.tensor(torch.empty(length, dtype=dtype), length % 2)
         copy(values, target)
         assert torch.equal(target.values, values)
         back = torch.empty(length, dtype=dtype)
