@@ -314,11 +314,9 @@ class ModelManager:
         memory, full = self.gpu_memory() if loaded else {}, self._full
         self._full = bool(memory) and memory["free"] * loaded < memory["reserved"]
         if self._full and not full:
-            said = (
-                "%d checkpoints are loaded, the next one waits until one can be unloaded, as the GPU's memory is full "
-            )
+            cure = f"set checkpoints: {{loaded: {loaded}}}, or smaller batch.sizes"
             logger.warning(
-                f"{said}(%s bytes); set checkpoints: {{loaded: %d}}, or smaller batch.sizes", loaded, memory, loaded
+                "the next checkpoint waits until one of %d leaves the GPU: %s bytes; %s", loaded, memory, cure
             )
         return not self._full
 
