@@ -19,6 +19,8 @@ from __future__ import annotations
 import sys
 import threading
 import warnings
+import weakref
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -47,7 +49,9 @@ class FakeCuda:
         self.clock_ms = 0.0  # of all GPUs
         self.captures: list[Capture] = []  # all that were begun
         self.replays: list[Capture] = []  # the graph of each replay
-        self.reserved = [0, 0]  # bytes of each device
+        self.reserved = [0, 0]  # bytes of the graphs on each device
+        self.memory = Memory()
+        self.transfers: list[tuple[Stream, int]] = []  # streams and bytes of copies between GPU and host
         self._local = threading.local()
         self._default = [Stream(self, index) for index in range(2)]
         self._capture_stream: Stream | None = None
@@ -66,11 +70,14 @@ class FakeCuda:
             "CUDAGraph": lambda: Capture(self),
             "Event": lambda **_: Event(self),
             "graph_pool_handle": object,
-            "memory_reserved": lambda device=None: self.reserved[self._index(device)],
+            "memory_allocated": lambda _=None: self.memory.allocated,
+            "memory_reserved": lambda device=None: self.memory.allocated + self.reserved[self._index(device)],
+            "mem_get_info": lambda _=None: (self.memory.total - self.memory.allocated, self.memory.total),
             "graph": self._graph,
         }.items():
             patch.setattr(torch.cuda, name, value)
         patch.setattr(torch, "compile", lambda function, **_: function)
+        patch.setattr(torch.Tensor, "pin_memory", lambda self: self)
 
     def install_copies(self, patch: pytest.MonkeyPatch) -> None:
         """Replace pinned memory and the copies from it; one that would wait for its stream is an error."""
@@ -193,6 +200,30 @@ class FakeCuda:
         return torch.device("cuda", stream.index)
 
 
+class Memory:
+    """The bytes of the tensors on all GPUs, each memory once, and their peak."""
+
+    def __init__(self) -> None:
+        self.allocated = self.peak = 0
+        self.total = 80 * 10**9
+        self._tensors: Counter[int] = Counter()  # by the address of their memory
+
+    def add(self, tensor: GpuTensor) -> None:
+        """Count a tensor until it is deleted."""
+        storage = tensor.values.untyped_storage()
+        address, size = storage.data_ptr(), storage.nbytes()
+        self._tensors[address] += 1
+        if self._tensors[address] == 1:
+            self.allocated += size
+            self.peak = max(self.peak, self.allocated)
+        weakref.finalize(tensor, self._deleted, address, size)
+
+    def _deleted(self, address: int, size: int) -> None:
+        self._tensors[address] -= 1
+        if not self._tensors[address]:
+            self.allocated -= size
+
+
 @dataclass(eq=False)
 class Stream:
     """A stream of one GPU, on which operations other than the copies of `install_copies` run at once."""
@@ -228,22 +259,30 @@ class Stream:
 
 @dataclass(eq=False)
 class Event:
-    """A `torch.cuda.Event`."""
+    """A `torch.cuda.Event`, which is over at once."""
 
     cuda: FakeCuda
-    ms: float = 0.0
-    stream: Stream | None = None
+    ms: float | None = None
+    stream: Stream | None = None  # the first one
 
-    def record(self, stream: Stream) -> None:
-        """Note the time, and the stream, on which nothing but copies is ever outstanding."""
+    def record(self, stream: Stream | None = None) -> None:
+        """Note the time, and the stream, always of the same GPU, on which nothing but copies is ever outstanding."""
+        stream = stream or self.cuda.current_stream()
         stream.synchronize()
+        assert self.stream is None or self.stream.index == stream.index, "Event device does not match the stream's"
         self.ms, self.stream = self.cuda.clock_ms, stream
+
+    def query(self) -> bool:
+        """Return that the event is over."""
+        return True
 
     def synchronize(self) -> None:
         """Do nothing, since the event has passed."""
 
     def elapsed_time(self, end: Event) -> float:
         """Return the time until another event, ms."""
+        assert self.ms is not None
+        assert end.ms is not None
         return end.ms - self.ms
 
 
@@ -328,11 +367,15 @@ class GpuTensor(torch.Tensor):
         )
         made.values, made.cuda_of, made.index = values, cuda, index
         made.streams = []
+        cuda.memory.add(made)
         return made
 
     def record_stream(self, stream: Any) -> None:
         """Keep the stream, before whose operations the memory is not used again."""
         self.streams.append(stream)
+
+    def data_ptr(self) -> int:
+        return self.values.data_ptr()
 
     @property
     def device(self) -> Any:  # type: ignore[override]
@@ -346,13 +389,17 @@ class GpuTensor(torch.Tensor):
     def __torch_dispatch__(cls, op: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         own = [one for one in tree_leaves((args, kwargs)) if isinstance(one, GpuTensor)]
         cuda, index = own[0].cuda_of, own[0].index
+        if op is torch.ops.aten.copy_.default and len(own) == 1:
+            cuda.transfers.append((cuda.current_stream(index), own[0].nbytes))
         args, kwargs = tree_map(_values, (args, kwargs or {}))
         inputs = [one.values for one in own]
         result = cuda.run(index, lambda: op(*args, **kwargs), inputs)
         wrappers = {id(one.values): one for one in own}  # of what an operation in place returns
 
+        on_host = {id(one) for one in tree_leaves((args, kwargs)) if isinstance(one, torch.Tensor)} - {*map(id, inputs)}
+
         def wrapped(one: Any) -> Any:
-            if not isinstance(one, torch.Tensor):
+            if not isinstance(one, torch.Tensor) or id(one) in on_host:
                 return one
             return wrappers[id(one)] if id(one) in wrappers else GpuTensor(one, cuda, index)
 

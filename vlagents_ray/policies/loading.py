@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from typing import Any
@@ -29,6 +29,8 @@ class LoadingReport:
     pads: bool = False  # whether the policy itself pads batches to its sizes, with fewer rows than a server knows of
     pass_s: dict[int, float] = field(default_factory=dict)  # shortest duration of a forward pass so far, s, by its rows
     on_out_of_memory: Callable[[], None] = lambda: None  # called whenever a forward pass does not fit, even later
+    on_gpu_ms: Callable[[float], None] = lambda _: None  # called with the time of each forward pass on a GPU
+    timer: Callable[[], AbstractContextManager[None]] = nullcontext  # returns the context of a forward pass
 
     @property
     def accelerated(self) -> bool:
@@ -48,9 +50,10 @@ def loading_report(
     on_progress: Callable[[str], None],
     batch_sizes: Sequence[int] = COMPILED_SIZES,
     on_out_of_memory: Callable[[], None] = lambda: None,
+    on_gpu_ms: Callable[[float], None] = lambda _: None,
 ) -> Iterator[LoadingReport]:
     """Yield the report of the policy that is loaded in this context; see the fields of `LoadingReport`."""
-    report = LoadingReport(on_progress, batch_sizes, on_out_of_memory=on_out_of_memory)
+    report = LoadingReport(on_progress, batch_sizes, on_out_of_memory=on_out_of_memory, on_gpu_ms=on_gpu_ms)
     token = _report.set(report)
     try:
         yield report

@@ -191,7 +191,8 @@ def test_the_graphs_of_a_policy_share_memory_and_the_largest_is_made_first(cuda:
         compilation.add_size(size, lambda size=size: act(numbers(cuda, size)))  # type: ignore[misc]
     assert len({id(graph.pool) for graph in cuda.captures}) == len({graph.stream for graph in cuda.captures}) == 1
     assert [len(graph.calls[0][1]) for graph in cuda.captures] == [4, 4, 2, 2]
-    assert compilation.graph_bytes == cuda.reserved[0] == (4 + 2) * 3 * DIM * 4
+    assert cuda.reserved[0] == (4 + 2) * 3 * DIM * 4
+    assert compilation.graph_bytes > cuda.reserved[0], "the inputs take memory, too"
     compiled(cuda, torch.tanh)
     assert len({id(graph.pool) for graph in cuda.captures}) == 2
     for rows in (1, 2, 3, 4, 2):  # each replay overwrites what all others left in the pool

@@ -22,7 +22,7 @@ from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, InvalidAction, InvalidObservation, NotReset, PolicyFailed
 from vlagents_ray.interface import BEHAVIOUR, DELAY, DISTRIBUTION, EXECUTED, LEFTOVER, Act, Agent, Obs
 from vlagents_ray.policies.adapters import ADAPTER, Adapters, require_base_alone
-from vlagents_ray.policies.base.accelerator import free_memory, is_out_of_memory, set_matmul
+from vlagents_ray.policies.base.accelerator import free_memory, gpu_timer, is_out_of_memory, set_matmul
 from vlagents_ray.policies.base.checkpoint import find_adapter, used_checkpoints
 from vlagents_ray.policies.base.checkpoint_files import weights_of
 from vlagents_ray.policies.base.config import ModelConfig
@@ -169,6 +169,7 @@ class ModelPolicy(Agent, abc.ABC):
         for device in self.report.devices:
             if device["kind"] == "cuda" and cores:
                 device["graphs_mib"] = round(self.compilation.graph_bytes / 2**20, 1)
+        self.report.timer = gpu_timer(self.report)
 
     def _decide_on_compiling(self) -> None:
         """Set `compile` to what it means for the loaded model and its device."""
@@ -378,7 +379,8 @@ class ModelPolicy(Agent, abc.ABC):
             spare = self.padded(part)[len(part) :]  # copies, so that their noise is not the session's
             filled = [*part, *(copy.deepcopy(row, {id(row.frames): row.frames}) for row in spare)]
             began = time.perf_counter()
-            results = self.predict(filled)
+            with self.report.timer():
+                results = self.predict(filled)
             self.report.record_pass(len(filled), time.perf_counter() - began)
             if len(results) != len(filled):
                 raise PolicyFailed(f"predict: got {len(filled)} rows, returned {len(results)} chunks")
