@@ -13,6 +13,8 @@
 #   make dist                                                       what a release publishes, checked, in dist
 #   make sbom [LOCK=server-sim]                                     what an image installs and its licences, in build/sbom
 #   make bench                                                      measure, and write the figures of docs/measured.md again
+#   make gpu [DRY=1] [GPU_PYTHON=python3] [STEPS="facts,tests"]     all that needs a GPU, in ten minutes, into build/gpu
+#   make gpu-pack                                                   what `make gpu` needs where there is no network
 #
 # Torch comes from wherever pip looks (its settings, PIP_INDEX_URL, PIP_FIND_LINKS). TORCH_INDEX_URL names
 # another index for torch alone: PyTorch's own install page gives the one with CPU-only wheels.
@@ -21,7 +23,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := setup
-.PHONY: setup demo bench check quick test integrations families docs verified extras locks dist sbom fmt lint type clean
+.PHONY: setup demo bench gpu gpu-pack check quick test integrations families docs verified extras locks dist sbom fmt lint type clean
 
 VENV ?= .venv
 TORCH ?= torch==2.13.0
@@ -70,6 +72,14 @@ bench: setup
 	$(BIN)/python -m benchmarks.report
 	$(BIN)/python -m benchmarks.evaluation --peers all --report benchmarks/latest.json
 	$(BIN)/python -m benchmarks.report --from-json
+
+# GPU_PYTHON is one with torch and transformers. With DRY=1 the steps run in small sizes on a CPU.
+GPU_PYTHON ?= $(VENV)-hf/bin/python
+gpu: $(if $(filter file default undefined,$(origin GPU_PYTHON)),$(VENV)-hf/.installed)
+	$(GPU_PYTHON) -m benchmarks.gpu $(if $(DRY),--dry) $(if $(STEPS),--steps '$(STEPS)')
+
+gpu-pack: setup
+	$(BIN)/python -m benchmarks.gpu.pack
 
 # Lint and types beside the tests, as each of them takes one core.
 check: $(TOOLS)/.installed

@@ -1,7 +1,8 @@
 """The speed of a policy on this machine by batch size, without Ray: bare, and behind a replica's batch queue.
 
 Bare is `act_batch` on full batches, one after another. Behind the queue, as many sessions as the batch has rows act
-again at each answer. The policy is loaded once for both.
+again at each answer. The network alone is the part of the bare time in the model's cores, and GPU busy is the part in
+which the GPU runs any kernel. The policy is loaded once for all.
 """
 
 from __future__ import annotations
@@ -14,18 +15,27 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
+from typing_extensions import Self
 
 from benchmarks.console import Json, Rounds, Seconds, parse_counts, save
 from benchmarks.figures import measured_on
-from vlagents_ray.bench.measured_policy import WARM, MeasuredPolicy, QueuedTurn, device_name, forget_peak, peak_mib
+from benchmarks.network import NetworkTimer, profile
+from vlagents_ray.bench.measured_policy import (
+    WARM,
+    MeasuredPolicy,
+    QueuedTurn,
+    cuda,
+    device_name,
+    forget_peak,
+    peak_mib,
+)
 from vlagents_ray.cli.console import errors, out, progress, table
 from vlagents_ray.cli.options import Set, StateDims, parse_dims, parse_settings
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.interface import Agent, Obs
+from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.policies.wrapper import build_agent
 from vlagents_ray.serve.config.deployment import ServerArgs
-from vlagents_ray.serve.launch.deployment_file import server_args
 from vlagents_ray.testing.agents import random_observation
 
 
@@ -42,18 +52,37 @@ class PolicyPlan:
 
 
 class BareAndQueued(MeasuredPolicy):
-    """A policy that is also measured without the queue."""
+    """A policy that is also measured without the queue, and of which the network is measured alone."""
+
+    def __enter__(self) -> Self:
+        self._network = NetworkTimer()
+        with self._network.loading():
+            return super().__enter__()
 
     def bare(self, size: int, seconds: float) -> dict[str, float]:
-        """Measure `act_batch` on full batches of that size, one after another, without the queue."""
-        views, sessions = self._views(size), self._sessions(range(size))
+        """Measure `act_batch` on full batches of that size, one after another, without the queue.
+
+        Returns:
+            "actions_per_s"; "batch_ms"; "network_ms": the time of the model's cores, 0 of a policy without any.
+        """
+        batch = self.batch(range(size))
         times: list[float] = []
+        networks: list[float] = []
         while len(times) < WARM + 1 or sum(times[WARM:]) < seconds:
             begun = time.perf_counter()
-            self._act(views, sessions)
+            networks.append(self._network.measure(batch) or 0.0)
             times.append(time.perf_counter() - begun)
-        times = times[WARM:]
-        return {"actions_per_s": size * len(times) / sum(times), "batch_ms": statistics.median(times) * 1e3}
+        times, network_ms = times[WARM:], statistics.median(networks[WARM:])
+        return {
+            "actions_per_s": size * len(times) / sum(times),
+            "batch_ms": statistics.median(times) * 1e3,
+            "network_ms": network_ms,
+        }
+
+    def batch(self, episodes: Sequence[int]) -> Callable[[], list[Act]]:
+        """Return a function that acts once with sessions of these episodes, in one batch."""
+        views, sessions = [self._view(self.engine.contract, i) for i in episodes], self._sessions(episodes)
+        return lambda: self._act(views, sessions)
 
 
 def measure_policy(plan: PolicyPlan, progress: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
@@ -80,6 +109,8 @@ def measure_policy(plan: PolicyPlan, progress: Callable[[str], None] = lambda _:
                 row.memory.append(peak_mib())
             rates = ", ".join(f"{row.size}: {row.bare[-1]['actions_per_s']:.1f}/s" for row in rows.values())
             progress(f"round {number + 1} of {plan.rounds}: {rates}")
+        for row in rows.values() if cuda() is not None else ():
+            row.busy_ms = profile(measured.batch(range(row.size)))["busy_ms"]
         contract = measured.engine.contract
     return {
         "policy": plan.args.policy,
@@ -98,20 +129,29 @@ class _SizedRow:
     bare: list[dict[str, float]] = field(default_factory=list)
     queued: list[QueuedTurn] = field(default_factory=list)
     memory: list[float] = field(default_factory=list)
+    busy_ms: float | None = None  # time of a batch in which the GPU ran a kernel
 
     def to_json(self) -> dict[str, Any]:
         """Return the medians of the rounds, the 99th percentile of all their round trips, and the rounds.
 
-        `queued_share` is the median of the rounds' actions a second behind the queue, divided by those without it.
+        `queued_share` is the median of the rounds' actions a second behind the queue, divided by those without it, and
+        `network_share` that of those of the network alone. `gpu_busy` is the share of the bare time.
         """
         queued = [_figures(turn) for turn in self.queued]
         shares = [ours["actions_per_s"] / bare["actions_per_s"] for ours, bare in zip(queued, self.bare, strict=True)]
+        networks = [
+            ours["actions_per_s"] * bare["network_ms"] / 1e3 / self.size
+            for ours, bare in zip(queued, self.bare, strict=True)
+        ]
+        bare_ms = statistics.median(one["batch_ms"] for one in self.bare)
         p99 = float(np.quantile([trip for turn in self.queued for trip in turn.trips_ms], 0.99))
         return {
             "batch": self.size,
             "bare": _medians(self.bare),
             "queued": _medians(queued) | {"p99_ms": p99},
             "queued_share": statistics.median(shares),
+            "network_share": statistics.median(networks) or None,
+            "gpu_busy": None if self.busy_ms is None else self.busy_ms / bare_ms,
             "peak_mib": max(self.memory),
             "rounds": {"bare": self.bare, "queued": queued},
         }
@@ -142,6 +182,8 @@ def main(
     json_file: Json = None,
 ) -> None:
     """Measure actions a second of one policy by batch size, bare and behind its batch queue, without Ray."""
+    from vlagents_ray.serve.launch.deployment_file import server_args  # which imports Ray for the schema of the file
+
     with errors():
         origin = measured_on("python -m benchmarks.policy")
         args, batches = server_args(file, app), parse_counts(batch, "--batch")
@@ -155,8 +197,8 @@ def main(
 def show_policy(found: Mapping[str, Any]) -> None:
     """Print a row for each batch size."""
     rows = table(
-        "batch", "bare actions/s", "ms a batch", "queued actions/s", "of bare", "round trip ms", "p99 ms",
-        "mean batch", "peak MiB",
+        "batch", "bare actions/s", "ms a batch", "network ms", "GPU busy", "queued actions/s", "of bare", "of network",
+        "round trip ms", "p99 ms", "mean batch", "peak MiB",
     )  # fmt: skip
     chunk = f", {found['chunk']} rows an action" if (found["chunk"] or 1) > 1 else ""
     rows.title = f"{found['policy']} on {found['device']}{chunk}"
@@ -164,10 +206,16 @@ def show_policy(found: Mapping[str, Any]) -> None:
         bare, queued = row["bare"], row["queued"]
         rows.add_row(
             str(row["batch"]), f"{bare['actions_per_s']:.1f}", f"{bare['batch_ms']:.2f}",
-            f"{queued['actions_per_s']:.1f}", f"{row['queued_share']:.1%}", f"{queued['round_trip_ms']:.2f}",
+            f"{bare['network_ms']:.2f}" if row["network_share"] else "", _percent(row["gpu_busy"]),
+            f"{queued['actions_per_s']:.1f}", f"{row['queued_share']:.1%}", _percent(row["network_share"]),
+            f"{queued['round_trip_ms']:.2f}",
             f"{queued['p99_ms']:.2f}", f"{queued['mean_batch']:.2f}", f"{row['peak_mib']:.0f}",
         )  # fmt: skip
     out.print(rows)
+
+
+def _percent(share: float | None) -> str:
+    return "" if share is None else f"{share:.1%}"
 
 
 if __name__ == "__main__":

@@ -1,0 +1,20 @@
+"""What the steps of `benchmarks.gpu` import, once for all: their processes are forked from one that has imported this.
+
+Nothing here may initialize CUDA, which does not survive a fork.
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+
+import benchmarks.gpu.runner  # noqa: F401
+
+with suppress(ImportError):  # the steps say what is missing
+    import torch  # noqa: F401
+
+    from vlagents_ray.policies.base.accelerator import ensure_torchvision
+
+    ensure_torchvision()
+    import transformers.models.pi0.image_processing_pi0
+    import transformers.models.pi0.modeling_pi0
+    import transformers.models.pi0.processing_pi0  # noqa: F401

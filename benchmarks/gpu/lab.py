@@ -1,0 +1,196 @@
+"""What the steps use: sizes, criteria, policies, and robots on threads."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import queue
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from typing_extensions import Self
+
+from benchmarks.policy import BareAndQueued
+from vlagents_ray.contract import Contract
+from vlagents_ray.errors import VLAgentsError
+from vlagents_ray.interface import Obs
+from vlagents_ray.policies.wrapper import build_agent
+from vlagents_ray.protocol.messages import Reply, Request
+from vlagents_ray.registry import require
+from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.models.checkpoints import Checkpoints
+from vlagents_ray.serve.requests import RANKS, PendingRequest
+from vlagents_ray.testing.agents import random_observation
+
+CAMERAS = {"base_0_rgb": "front", "left_wrist_0_rgb": "wrist", "right_wrist_0_rgb": "right_wrist"}
+INSTRUCTION = "pick up the cube"
+LATE_S = 120.0
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """The settings of a run."""
+
+    out: Path
+    scratch: Path  # for checkpoints, compiled programs, and what steps leave for later ones
+    dry: bool = False
+    seconds: float = 570.0  # for all steps together
+
+    def checkpoint(self, family: str) -> dict[str, Any]:
+        """Return the settings of a policy with the family's random checkpoint, which the step "checkpoint" wrote."""
+        found: dict[str, Any] = json.loads((self.scratch / f"{family}.json").read_text())
+        return found
+
+
+class Lab:
+    """What a step uses and finds; each finding is written at once, as the step may not live to its end."""
+
+    def __init__(self, plan: Plan, step: str) -> None:
+        self.plan, self.dry, self._file = plan, plan.dry, plan.scratch / f"step-{step}.json"
+        self.found: dict[str, Any] = {"figures": {}, "checks": []}
+
+    def show(self, **figures: Any) -> None:
+        """Write figures: numbers, texts, lists of texts, or lists of rows, which become a table."""
+        self.found["figures"] |= figures
+        self._file.write_text(json.dumps(self.found, default=float))
+
+    def check(self, name: str, got: Any, *, least: float | None = None, most: float | None = None,
+              equal: Any = None, speed: bool = False) -> None:  # fmt: skip
+        """Write a criterion; one of `speed` is not judged in a dry run."""
+        if least is not None:
+            want, passed = f"at least {least:g}", got >= least
+        elif most is not None:
+            want, passed = f"at most {most:g}", got <= most
+        else:
+            want, passed = f"{equal}", got == equal
+        judged = None if speed and self.dry else bool(passed)
+        self.found["checks"].append({"name": name, "got": got, "want": want, "passed": judged})
+        self.show()
+
+    def size(self, full: Any, dry: Any) -> Any:
+        """Return the size of this run."""
+        return dry if self.dry else full
+
+    @property
+    def device(self) -> str:
+        return self.size("cuda", "cpu")  # type: ignore[no-any-return]
+
+    @property
+    def graphs(self) -> bool | str:
+        """The mode of CUDA graphs of eager cores; a CPU has none, and takes the compiler that the runner sets."""
+        return self.size("graphs", True)  # type: ignore[no-any-return]
+
+    def settings(self, **changed: Any) -> dict[str, Any]:
+        """Return the settings of π0 with three cameras, in bfloat16."""
+        return {**self.plan.checkpoint("pi0"), "cameras": CAMERAS, "device": self.device, **changed}
+
+    def measured(self, policy: str = "pi0", config: Mapping[str, Any] | None = None, *, largest: int) -> BareAndQueued:
+        """Return a policy that is loaded as a context."""
+        config = self.settings(max_rows=largest) if config is None else config
+        return BareAndQueued(build_agent(policy, config), view, max_size=largest, patience=0.1)
+
+    @contextlib.contextmanager
+    def engine(self, **changed: Any) -> Iterator[Engine]:
+        """Yield an engine with π0, in CUDA graphs for one and eight rows, and a second checkpoint to choose."""
+        rows = self.size(8, 2)
+        config = self.settings(**{"compile": self.graphs, "batch_sizes": [1, rows], **changed})
+        offered = Checkpoints(partial(build_agent, "pi0"), config, {"other": {"seed": 1}}, loaded=2)
+        engine = Engine(offered, max_batch_size=rows, patience=0.1)
+        try:
+            engine.start()
+            yield engine
+        finally:
+            engine.close()
+
+
+def view(contract: Contract | None, seed: int) -> Obs:
+    """Return an observation that fits the contract."""
+    return random_observation(contract, seed, side=224)
+
+
+class Session:
+    """A session of an engine in this process."""
+
+    def __init__(self, engine: Engine, seed: int, **options: Any) -> None:
+        self._engine, self._name = engine, f"robot-{seed}"
+        self._view = view(engine.contract, seed)
+        self.ask("reset", instruction=INSTRUCTION, kwargs={"seed": seed, **options})
+
+    def ask(self, op: Any = "act", **given: Any) -> Reply:
+        """Make a request and wait for its reply; raises its error."""
+        replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
+        request = Request(op, self._view, rank="robot", **given)
+        self._engine.submit([PendingRequest(self._name, request, replies.put, RANKS["robot"])])
+        reply = replies.get(timeout=LATE_S)
+        if reply.error is not None:
+            raise reply.error
+        return reply
+
+
+class Acting:
+    """Robots that act one call after another, each on a thread, within this context."""
+
+    def __init__(self, acts: Sequence[Callable[[], object]]) -> None:
+        self._calls: list[tuple[float, float, str]] = []  # end, ms, error
+        self._over = threading.Event()
+        self._threads = [threading.Thread(target=self._act, args=[act], daemon=True) for act in acts]
+
+    def __enter__(self) -> Self:
+        for thread in self._threads:
+            thread.start()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._over.set()
+        for thread in self._threads:
+            thread.join(LATE_S)
+
+    def during(self, action: Callable[[], object], least: int = 1) -> dict[str, Any]:
+        """Run an action and wait for at least so many calls; return the figures of the calls that ended meanwhile."""
+        begun, before = time.perf_counter(), len(self._calls)
+        action()
+        took_s, ends = time.perf_counter() - begun, time.perf_counter() + LATE_S
+        while len(self._calls) < before + least and time.perf_counter() < ends:
+            self._over.wait(0.01)
+        calls = self._calls[before:]
+        times, errors = [ms for _, ms, _ in calls], sorted({error for _, _, error in calls if error})
+        if not calls:
+            raise TimeoutError(f"no act ended within {LATE_S:g} s")
+        return {
+            "seconds": took_s, "acts": len(calls), "failed": sum(bool(error) for _, _, error in calls),
+            "acts_per_s": len(calls) / (time.perf_counter() - begun), "median_ms": float(np.median(times)),
+            "p99_ms": float(np.quantile(times, 0.99)), "worst_ms": max(times), "errors": "; ".join(errors)[:300],
+        }  # fmt: skip
+
+    def _act(self, act: Callable[[], object]) -> None:
+        while not self._over.is_set():
+            begun, error = time.perf_counter(), ""
+            try:
+                act()
+            except VLAgentsError as failure:
+                error = f"{type(failure).__name__}: {failure}"
+            end = time.perf_counter()
+            self._calls.append((end, (end - begun) * 1e3, error))
+
+
+def seconds_of(lab: Lab, work: Callable[[], object], times: int = 10) -> float:
+    """Return the mean time of some work on the device, s, after one call that does not count."""
+    torch = require("torch")
+    wait = (lambda: None) if lab.dry else torch.cuda.synchronize
+    work(), wait()
+    begun = time.perf_counter()
+    for _ in range(times):
+        work()
+    wait()
+    return (time.perf_counter() - begun) / times
+
+
+def row_error(got: np.ndarray, want: np.ndarray) -> float:
+    """Return the largest error of a row (…, D), relative to the largest norm of a row."""
+    return float(np.linalg.norm(got - want, axis=-1).max() / np.linalg.norm(want, axis=-1).max())

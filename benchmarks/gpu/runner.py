@@ -1,0 +1,165 @@
+"""The processes of the steps, and the report."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import multiprocessing
+import os
+import signal
+import sys
+import time
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from multiprocessing.process import BaseProcess
+from typing import Any
+
+import typer
+
+from benchmarks.checkpoints import pi0
+from benchmarks.figures import measured_on
+from benchmarks.gpu.lab import Lab, Plan
+from benchmarks.gpu.steps import Step
+from vlagents_ray.bench.line_client import die_with_parent
+from vlagents_ray.policies.compilation import Compilation
+from vlagents_ray.registry import require
+
+_SPARE_S = 15.0  # without which no step is started
+
+
+def _child(plan: Plan, name: str, run: Callable[[Lab], None]) -> None:
+    """Run a step, as a process in a group of its own."""
+    die_with_parent()
+    os.setsid()
+    log = os.open(plan.out / "gpu.log", os.O_WRONLY | os.O_APPEND | os.O_CREAT)
+    os.dup2(log, 1), os.dup2(log, 2)
+    typer.echo(f"\n== {name}")
+    lab = Lab(plan, name)
+    try:
+        if plan.dry:
+            Compilation.backend = "eager"
+            pi0.SMALL = pi0.Pi0Size(width=64, expert_width=32, layers=2, vision_layers=1, patch=56)
+            require("torch").set_num_threads(1)  # for so small a model, threads only wait for one another
+        run(lab)
+    except BaseException as error:  # noqa: BLE001 - a step may raise any error, which is its result
+        traceback.print_exc()
+        lab.check("runs to its end", " ".join(f"{type(error).__name__}: {error}".split())[:400], equal="its end")
+        sys.stdout.flush()
+        os._exit(1)  # without waiting for the threads of a broken step
+
+
+class Runner:
+    """Runs the steps, and writes what was found after each."""
+
+    def __init__(self, plan: Plan, steps: Mapping[str, Step]) -> None:
+        self._plan, self._steps, self._results = plan, steps, dict[str, Any]()
+        self._context: Any = multiprocessing.get_context("forkserver")
+        self._context.set_forkserver_preload(["benchmarks.gpu.imports"])
+        self._begun = time.monotonic()
+        self._origin = measured_on("python -m benchmarks.gpu")
+
+    def run(self) -> bool:
+        """Run the steps; return whether all criteria were met."""
+        beside: tuple[str, BaseProcess, float] | None = None
+        for name, step in self._steps.items():
+            if self._left() < _SPARE_S:
+                self._record(name, {"figures": {}, "checks": [_unmet("runs", "no time was left", "it runs")]})
+                continue
+            started = (name, self._start(name), time.monotonic())
+            if step.beside:
+                beside = started
+                continue
+            self._finish(*started)
+            if beside is not None:
+                self._finish(*beside)
+                beside = None
+            if name == "facts" and not _passed(self._results[name]):  # CUDA may not survive the fork
+                self._context = multiprocessing.get_context("spawn")
+                self._finish(name, self._start(name), time.monotonic())
+        if beside is not None:
+            self._finish(*beside)
+        return all(map(_passed, self._results.values()))
+
+    def _left(self) -> float:
+        return self._plan.seconds - (time.monotonic() - self._begun)
+
+    def _start(self, name: str) -> BaseProcess:
+        process: BaseProcess = self._context.Process(target=_child, args=(self._plan, name, self._steps[name].run))
+        process.start()
+        return process
+
+    def _finish(self, name: str, process: BaseProcess, begun: float) -> None:
+        limit_s = min(self._steps[name].limit_s, self._left() + time.monotonic() - begun)
+        process.join(max(0.0, limit_s - (time.monotonic() - begun)))
+        over = process.is_alive()
+        if process.pid is not None:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+        process.kill()  # also if it has no group yet
+        process.join()
+        file = self._plan.scratch / f"step-{name}.json"
+        found = json.loads(file.read_text()) if file.is_file() else {"figures": {}, "checks": []}
+        if over:
+            found["checks"].append(_unmet("ends in time", f"not within {limit_s:.0f} s", "its end"))
+        elif process.exitcode and _passed(found):
+            found["checks"].append(_unmet("exit status", process.exitcode, "0"))
+        elif not found["checks"] and not found["figures"]:
+            found["checks"].append(_unmet("results", "none", "some"))
+        self._record(name, {**found, "seconds": time.monotonic() - begun})
+
+    def _record(self, name: str, found: Mapping[str, Any]) -> None:
+        self._results[name] = found
+        document = {**self._origin, "dry": self._plan.dry, "seconds": time.monotonic() - self._begun,
+                    "steps": self._results}  # fmt: skip
+        (self._plan.out / "gpu.json").write_text(json.dumps(document, indent=1) + "\n")
+        (self._plan.out / "gpu.md").write_text(to_markdown(document))
+        unmet = [check for check in found["checks"] if check["passed"] is False]
+        typer.echo(f"{name}: {found.get('seconds', 0):.1f} s, {'all met' if not unmet else f'{len(unmet)} not met'}")
+        for check in unmet:
+            typer.echo(f"  {check['name']}: got {check['got']}, want {check['want']}")
+
+
+def _passed(found: Mapping[str, Any]) -> bool:
+    return all(check["passed"] is not False for check in found["checks"])
+
+
+def _unmet(name: str, got: Any, want: str) -> dict[str, Any]:
+    return {"name": name, "got": got, "want": want, "passed": False}
+
+
+def to_markdown(document: Mapping[str, Any]) -> str:
+    """Return the report of a run."""
+    versions = ", ".join(f"{name} {version}" for name, version in document["versions"].items())
+    lines = [f"Measured {document['date']} by `{document['command']}` in {document['seconds']:.0f} s. {versions}.", ""]
+    if document["dry"]:
+        lines += ["A dry run on a CPU, in small sizes: its times mean nothing.", ""]
+    checks = [
+        {"step": name, "criterion": one["name"], "got": one["got"], "want": one["want"],
+         "met": {True: "yes", False: "**no**", None: "not judged"}[one["passed"]]}
+        for name, step in document["steps"].items() for one in step["checks"]
+    ]  # fmt: skip
+    lines += [*_table(checks), ""]
+    for name, step in document["steps"].items():
+        lines += [f"## {name}, {step.get('seconds', 0):.1f} s", ""]
+        tables = {key: value for key, value in step["figures"].items() if isinstance(value, list) and value}
+        lines += [f"- {key}: {_cell(value)}" for key, value in step["figures"].items() if key not in tables]
+        for key, rows in tables.items():
+            listed = _table(rows) if isinstance(rows[0], dict) else [f"- {row}" for row in rows]
+            lines += ["", f"{key}:", "", *listed]
+        lines.append("")
+    return "\n".join(lines)
+
+
+def _table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    head = list(dict.fromkeys(name for row in rows for name in row))
+    body = [" | ".join(_cell(row.get(name, "")) for name in head) for row in rows]
+    return [f"| {line} |" for line in (" | ".join(head), " | ".join("---" for _ in head), *body)]
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.3g}" if math.fabs(value) < 1000 else f"{value:,.0f}"
+    if isinstance(value, list):
+        value = "; ".join(map(str, value)) or "none"
+    return str(value).replace("|", "/")

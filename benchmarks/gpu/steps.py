@@ -1,0 +1,536 @@
+"""The steps. Each runs in a process of its own, and finds figures and criteria in a `Lab`."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import json
+import multiprocessing
+import os
+import shutil
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.checkpoints.recipes import FAMILIES, write_checkpoint
+from benchmarks.gpu.lab import INSTRUCTION, LATE_S, Acting, Lab, Session, row_error, seconds_of, view
+from benchmarks.network import profile, waits
+from benchmarks.policy import BareAndQueued
+from vlagents_ray.bench.line_client import die_with_parent
+from vlagents_ray.bench.measured_policy import forget_peak, peak_mib
+from vlagents_ray.contract import Contract
+from vlagents_ray.errors import MissingDependency, VLAgentsError
+from vlagents_ray.interface import BEHAVIOUR, DELAY, DISTRIBUTION, LEFTOVER, SAMPLES, WANT, Agent
+from vlagents_ray.policies.compilation import TOLERANCE
+from vlagents_ray.policies.wrapper import build_agent
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, PROTOCOL_VERSION
+from vlagents_ray.registry import require
+from vlagents_ray.serve.engine.engine import Engine
+
+ROOT = Path(__file__).resolve().parents[2]
+GPU_TESTS = ("tests/policies/compilation/test_cuda_graph.py", "tests/learn/test_one_gpu.py")  # they need no Ray
+PUBLISHED = (  # by others, for comparison
+    "π0.5 on an H100, 3 cameras, in process: 52.4, 65.1, 91.9, 147.4 ms for 1, 2, 4, 8 rows (SGLang 0.5.23)",
+    "the same, by WebSocket: 77 ms for 1 robot, 162 ms for 4 (SGLang 0.5.23)",
+    "π0 on an RTX 4090, 2 cameras: 40 to 50 ms in CUDA graphs, 27.3 ms with own kernels (arXiv 2510.26742)",
+)
+_H100_TFLOPS = 600  # of matrix products in bfloat16; about 800 were seen, and less says that something else is wrong
+
+
+def facts(lab: Lab) -> None:
+    """Device, versions, and the speed of matrix products and of copies."""
+    torch = require("torch")
+    lab.check("a GPU computes", lab.dry or torch.cuda.is_available(), equal=True)
+    program = shutil.which("nvidia-smi")
+    said = program and subprocess.run(
+        [program, "--query-gpu=name,driver_version,memory.total", "--format=csv,noheader"],
+        capture_output=True, text=True, check=False,
+    ).stdout.strip()  # fmt: skip
+    lab.show(
+        gpu=said or "none", torch=torch.__version__, cuda=torch.version.cuda, cores=os.cpu_count(),
+        triton=importlib.util.find_spec("triton") is not None, compiler=shutil.which("gcc") or shutil.which("cc"),
+        cudnn=None if lab.dry else torch.backends.cudnn.version(),
+    )  # fmt: skip
+    side, count = lab.size(8192, 256), lab.size(2**28, 2**20)
+    a = torch.randn(side, side, device=lab.device, dtype=torch.bfloat16)
+    tflops = 2 * side**3 / seconds_of(lab, lambda: a @ a) / 1e12
+    here, pinned = torch.empty(count, dtype=torch.uint8), torch.empty(count, dtype=torch.uint8, pin_memory=not lab.dry)
+    there = torch.empty(count, dtype=torch.uint8, device=lab.device)
+    copies = {
+        "on the device": (there.clone(), there), "to the device": (there, here), "from the device": (here, there),
+        "to the device, pinned": (there, pinned), "from the device, pinned": (pinned, there),
+    }  # fmt: skip
+    rates = {name: count / seconds_of(lab, partial(a.copy_, b)) / 1e9 for name, (a, b) in copies.items()}
+    lab.show(bf16_tflops=tflops, copies=[{"copy": name, "gb_per_s": rate} for name, rate in rates.items()])
+    if "H100" in str(said) or "H200" in str(said):
+        lab.check("matrix products in bfloat16, TFLOP/s", tflops, least=_H100_TFLOPS, speed=True)
+
+
+def gpu_tests(lab: Lab) -> None:
+    """The tests that need a GPU, but no Ray."""
+    words = ["--collect-only"] if lab.dry else ["--tb=short"]
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", *GPU_TESTS, "-m", "gpu", "-q", "--import-mode=importlib", "-W", "default",
+         "-p", "no:cacheprovider", *words],
+        cwd=ROOT, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    sys.stdout.write(done.stdout + done.stderr)
+    lab.show(pytest=(done.stdout.strip().splitlines() or ["nothing"])[-1])
+    lab.check("pytest's exit status", done.returncode, equal=0)
+
+
+def checkpoint(lab: Lab) -> None:
+    """Random π0 of its true size, and π0.5 where LeRobot is installed."""
+    for family in ("pi0", "pi05"):
+        begun, folder = time.perf_counter(), lab.plan.scratch / family
+        try:
+            made = write_checkpoint(family, folder, lab.size("full", "small"))
+        except MissingDependency as error:
+            lab.show(**{family: f"not installed: {str(error).partition(';')[0]}"})
+            continue
+        (lab.plan.scratch / f"{family}.json").write_text(json.dumps(made.config))
+        lab.show(**{family: f"{made.parameters:,} parameters in {time.perf_counter() - begun:.1f} s"})
+        if family == "pi0":
+            lab.check("parameters of π0, billions", round(made.parameters / 1e9, 2), equal=3.5, speed=True)
+
+
+def curve(lab: Lab, measured: BareAndQueued, sizes: Sequence[int]) -> list[dict[str, Any]]:
+    """Measure the network alone, the bare policy and the policy behind its queue, by batch size."""
+    rows, seconds = [], lab.size(1.0, 0.02)
+    for size in sizes:
+        forget_peak()
+        bare, queued = measured.bare(size, seconds), measured.queued(size, seconds, "robot")
+        rows.append({
+            "rows": size, "network_ms": bare["network_ms"], "bare_ms": bare["batch_ms"],
+            "queued_ms": 1e3 * size / max(queued.actions_per_s, 1e-9), "actions_per_s": queued.actions_per_s,
+            "mean_batch": queued.mean_batch, "peak_mib": peak_mib(),
+            "of_network": queued.actions_per_s * bare["network_ms"] / 1e3 / size,
+        })  # fmt: skip
+        lab.show(curve=rows)
+    return rows
+
+
+def one_act(lab: Lab, measured: BareAndQueued, sizes: Sequence[int], rows: Sequence[Mapping[str, Any]]) -> None:
+    """Look into one act of each size: launches, the time in which the GPU works, its gaps, and waits for it."""
+    looked = []
+    for size in sizes:
+        batch = measured.batch(range(size))
+        found = profile(batch)
+        bare_ms = next(row["bare_ms"] for row in rows if row["rows"] == size)
+        looked.append({"rows": size, **found, "busy_share": found["busy_ms"] / bare_ms})
+    places = waits(batch)
+    lab.show(acts=looked, waits=[f"{count} at {place}" for place, count in places.most_common(20)])
+    lab.check("waits of the CPU in an act; one is for the result", sum(places.values()), most=1)
+
+
+def neighbours(lab: Lab, measured: BareAndQueued, size: int) -> float:
+    """Compare acts of one episode: at each place of a full batch with other neighbours there, and with the one alone.
+
+    In one place, equal kernels compute a row, so that its neighbours change no bit; alone, other ones round elsewhere.
+
+    Returns:
+        The largest error of an act in a batch, relative to the one alone.
+    """
+    alone, changed, errors = measured.batch([0])()[0].action, 0, []
+    for place in range(size):
+        acts = []
+        for first in (1, 1 + size):
+            others = list(range(first, first + size - 1))
+            acts.append(measured.batch([*others[:place], 0, *others[place:]])()[place].action)
+        changed += not np.array_equal(acts[0], acts[1])
+        errors.append(row_error(acts[0], alone))
+    lab.show(error_of_an_act_in_a_batch=max(errors))
+    lab.check(f"places of {size} at which neighbours change an act", changed, equal=0)
+    return max(errors)
+
+
+def speed(lab: Lab, mode: bool | str) -> None:
+    """Load π0, eager or compiled; measure it by batch size, and compare its acts with the eager ones."""
+    mode = lab.graphs if mode == "graphs" else mode
+    sizes = lab.size([1, 4, 16], [1, 2])
+    every = sizes if mode else lab.size([1, 4, 8, 16, 32], [1, 2])
+    config = lab.settings(max_rows=every[-1], compile=mode, **({"batch_sizes": sizes} if mode else {}))
+    with lab.measured(config=config, largest=every[-1]) as measured:
+        memory = {} if lab.dry else require("torch").cuda.memory_stats()
+        held = {kind: memory.get(f"{kind}_bytes.all.current", 0) / 2**20 for kind in ("allocated", "reserved")}
+        lab.show(load_s=measured.load_s, **{f"{kind}_mib": value for kind, value in held.items()})
+        lab.check("parts that are not compiled", measured.engine.models.uncompiled, equal=[])
+        rows = curve(lab, measured, every)
+        acts = {f"rows_{size}": np.stack(measured.actions(size, size)) for size in sizes}
+        rounded = neighbours(lab, measured, sizes[-1])
+        one_act(lab, measured, [sizes[0], sizes[-1]], rows)
+    share = next(row["of_network"] for row in rows if row["rows"] == sizes[-1])
+    lab.check(f"queued, as a share of the network alone, {sizes[-1]} rows", share, least=0.95, speed=True)
+    file = lab.plan.scratch / "eager.npz"
+    if not mode:
+        np.savez(file, **{**acts, "rounded": np.array(rounded), "ms": np.array(rows[0]["bare_ms"])})  # type: ignore[arg-type]
+        return
+    eager = np.load(file)
+    lab.show(bit_equal_to_eager=all(np.array_equal(found, eager[name]) for name, found in acts.items()))
+    errors = [row_error(found, eager[name]) for name, found in acts.items()]
+    limit = max(TOLERANCE["bfloat16"], float(eager["rounded"]))  # or what another batch size changes
+    lab.check("error of compiled acts of other inputs", max(errors), most=limit)
+    lab.check("eager time over compiled time, one row", eager["ms"] / rows[0]["bare_ms"], least=2, speed=True)
+
+
+def again(lab: Lab) -> None:
+    """Load the compiled π0 in a second process, from the kept programs."""
+    sizes = lab.size([1, 4, 16], [1, 2])
+    config = lab.settings(max_rows=sizes[-1], compile=True, batch_sizes=sizes)
+    with lab.measured(config=config, largest=sizes[-1]) as measured:
+        lab.check("seconds until it acts, with kept programs", measured.load_s, most=60, speed=True)
+
+
+def loading(lab: Lab) -> None:
+    """Load a second checkpoint beside acting sessions."""
+    with lab.engine() as engine:
+        robots = [Session(engine, seed) for seed in range(lab.size(8, 2))]
+        with Acting([robot.ask for robot in robots]) as acting:
+            alone = acting.during(lambda: time.sleep(lab.size(2, 0)), 2 * len(robots))
+            beside = acting.during(lambda: Session(engine, 100, checkpoint="other").ask())
+        lab.show(acts=[{"while": "alone", **alone}, {"while": "a checkpoint loads", **beside}])
+        lab.check("failed acts", beside["failed"], equal=0)
+        lab.check("longest act, of the longest one without", beside["worst_ms"] / alone["worst_ms"], most=2, speed=True)
+
+
+def pushes(lab: Lab) -> None:
+    """Push weights of the model's size to acting sessions: from this process, through the CPU, from another process."""
+    from vlagents_ray.learn.publisher import Publisher
+    from vlagents_ray.serve.weights import PushOptions
+    from vlagents_ray.weights.trainable import own_copy
+
+    torch = require("torch")
+    with lab.engine() as engine:
+        live = engine.models.own_weights._agent.parameters()
+        first = {name: own_copy(value) for name, value in live.items()}
+        model_mib = sum(value.nbytes for value in first.values()) / 2**20
+        robots = [Session(engine, seed, weights="follow") for seed in range(lab.size(8, 2))]
+        fixed = Session(engine, 50, weights="follow")
+
+        def act() -> np.ndarray:
+            fixed.ask("reset", instruction=INSTRUCTION, kwargs={"seed": 50, "weights": "follow"})
+            return np.asarray(fixed.ask().act.action)  # type: ignore[union-attr]
+
+        def pushed(way: str, push: Callable[[], object]) -> None:
+            forget_peak()
+            with Acting([robot.ask for robot in robots]) as acting:
+                found = acting.during(push, 2 * len(robots))
+            reserved = {} if lab.dry else {"reserved_mib": torch.cuda.memory_reserved() / 2**20}
+            changed = not np.array_equal(act(), before)  # both alone, as batches of other sizes round differently
+            rows.append({"from": way, **found, "peak_mib": peak_mib(), **reserved, "changed": changed})
+            lab.show(model_mib=model_mib, pushes=rows)
+
+        def take(values: Any) -> None:
+            engine.weights.stage(9, values.others if lab.dry else values, PushOptions("keep"))
+            engine.weights.commit(9, PushOptions("keep"))
+
+        before, rows, publisher = act(), list[dict[str, Any]](), Publisher(engine)
+        on_cpu = {name: value.cpu() * 1.01 for name, value in first.items()}
+        pushed("no push", lambda: time.sleep(lab.size(1, 0)))
+        pushed("the CPU", lambda: publisher.push(on_cpu, mode="keep"))
+        with other_learner(lab, first) as values:
+            pushed("another process", lambda: take(values))
+        pushed("this process, the first ones", lambda: publisher.push(first, mode="keep"))
+        lab.check("failed acts", sum(row["failed"] for row in rows), equal=0)
+        lab.check(
+            "the acts change with the weights", [row["changed"] for row in rows], equal=[False, True, True, False]
+        )
+        lab.check("seconds of a push from another process", rows[2]["seconds"], most=0.3, speed=True)
+        held = max(row["peak_mib"] for row in rows) - model_mib  # without this step's copy of the first ones
+        lab.check("peak memory, times the model", held / model_mib, most=3.2, speed=True)
+
+
+@contextlib.contextmanager
+def other_learner(lab: Lab, like: Mapping[str, Any]) -> Iterator[Any]:
+    """Yield values that another process shares, of the names, shapes and types of `like`."""
+    shapes = {name: (tuple(value.shape), str(value.dtype).removeprefix("torch.")) for name, value in like.items()}
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe()
+    process = context.Process(target=_learn, args=(theirs, shapes, lab.device), daemon=True)
+    process.start()
+    theirs.close()
+    yield ours.recv()
+    ours.send(None)
+    process.join(LATE_S)
+
+
+def _learn(pipe: Any, shapes: Mapping[str, Any], device: str) -> None:
+    from vlagents_ray.weights.shared_values import shared
+
+    die_with_parent()
+    torch = require("torch")
+    values = {
+        name: torch.full(shape, 0.01, dtype=getattr(torch, kind), device=device)
+        for name, (shape, kind) in shapes.items()
+    }
+    with shared(values) as found:
+        pipe.send(found)
+        pipe.recv()  # when the policy has copied them
+
+
+@contextlib.contextmanager
+def http_server(engine: Engine) -> Iterator[str]:
+    """Yield the URL of an engine's server, whose robots use a WebSocket to the policy's thread."""
+    import asyncio
+
+    import uvicorn
+
+    from vlagents_ray.serve.access.api_keys import NoKey
+    from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
+    from vlagents_ray.serve.endpoints.http import build_http_app
+    from vlagents_ray.serve.endpoints.websocket import WebSocketServer
+    from vlagents_ray.serve.ports import free_port
+
+    own = WebSocketServer(engine, DEFAULT_LIMITS, "127.0.0.1", None, NoKey.OPEN)
+    own.open()
+    contract = engine.contract and engine.contract.to_json()
+    about = {"policy": "pi0", "version": "0", "protocol": PROTOCOL_VERSION, "contract": contract,
+             "stream": asdict(own.address)}  # fmt: skip
+    app, port = AccessMiddleware(build_http_app(engine, lambda: about, DEFAULT_LIMITS), None, "app"), free_port()
+    server = uvicorn.Server(uvicorn.Config(app, port=port, log_level="warning", lifespan="off"))
+    thread = threading.Thread(target=lambda: asyncio.run(server.serve()), daemon=True)
+    thread.start()
+    try:
+        yield f"http://127.0.0.1:{port}"
+    finally:
+        server.should_exit = server.force_exit = True
+        thread.join(LATE_S)
+        own.close()
+
+
+def _drive(pipe: Any, url: str, counts: Sequence[int], seconds: float, contract: Contract) -> None:
+    from vlagents_ray.client import RemoteAgent
+
+    die_with_parent()
+    rows = []
+    for count in counts:
+        agents = [RemoteAgent(url, transport="websocket", codec="jpeg", connect_timeout_s=60) for _ in range(count)]
+        views = [view(contract, seed) for seed in range(count)]
+        for seed, agent in enumerate(agents):
+            agent.reset(views[seed], INSTRUCTION, seed=seed)
+            agent.act(views[seed])
+        with Acting([partial(one.act, obs) for one, obs in zip(agents, views, strict=True)]) as acting:
+            rows.append({"robots": count, **acting.during(partial(time.sleep, seconds), 2 * count)})
+        for agent in agents:
+            agent.close()
+    pipe.send(rows)
+
+
+def served(lab: Lab) -> None:
+    """Robots in another process, with three cameras as JPEG, over a WebSocket."""
+    counts = lab.size([1, 4, 8], [1, 2])
+    config = lab.settings(max_rows=counts[-1], compile=lab.graphs, batch_sizes=counts)
+    with lab.measured(config=config, largest=counts[-1]) as measured:
+        network = {count: measured.bare(count, lab.size(0.5, 0.02))["network_ms"] for count in counts}
+        with http_server(measured.engine) as url:
+            context = multiprocessing.get_context("spawn")
+            ours, theirs = context.Pipe()
+            args = (theirs, url, counts, lab.size(4.0, 0.1), measured.engine.contract)
+            process = context.Process(target=_drive, args=args, daemon=True)
+            process.start()
+            theirs.close()
+            rows = ours.recv()
+            process.join(LATE_S)
+    for row in rows:
+        row["network_ms"] = network[row["robots"]]
+        row["of_network"] = row["acts_per_s"] * row["network_ms"] / 1e3 / row["robots"]
+    lab.show(robots=rows, published=PUBLISHED)
+    lab.check("failed acts", sum(row["failed"] for row in rows), equal=0)
+    lab.check(f"share of the network alone, {counts[-1]} robots", rows[-1]["of_network"], least=0.9, speed=True)
+
+
+def learning(lab: Lab) -> None:
+    """Samples, plans that continue, and log-probabilities in bfloat16 against those that a float32 learner computes."""
+    from vlagents_ray.policies.flow import logprob_of_chain
+    from vlagents_ray.policies.pi0 import flow_velocity
+
+    torch, count = require("torch"), lab.size(8, 2)
+    server, learner = (build_agent("pi0", lab.settings(dtype=dtype, noise_level=0.5, max_rows=1 + count))
+                       for dtype in ("bfloat16", "float32"))  # fmt: skip
+    for agent in (server, learner):
+        agent.initialize()
+    obs = view(server.contract, 0)
+    learner.reset(obs, INSTRUCTION, seed=0)
+
+    def timed(agent: Agent, **info: Any) -> tuple[Any, float]:
+        agent.reset(obs, INSTRUCTION, seed=0)
+        begun = time.perf_counter()
+        act = agent.act(replace(obs, info=info))
+        return act, (time.perf_counter() - begun) * 1e3
+
+    timed(server)  # the first one also loads kernels
+    plain, plain_ms = timed(server)
+    sampled, sampled_ms = timed(server, **{SAMPLES: count})
+    lab.show(act_ms=plain_ms, samples=count, samples_ms=sampled_ms)
+    lab.check("samples", len(sampled.info[DISTRIBUTION]["samples"]), equal=count)
+    plan = plain.action[2:]
+    guided, guided_ms = timed(server, **{LEFTOVER: plan, DELAY: 2})
+    lab.show(plan_ms=guided_ms)
+    lab.check("error of rows that are frozen", row_error(guided.action[:2], plan[:2]), most=TOLERANCE["bfloat16"])
+    stated, stated_ms = timed(server, **{WANT: ["logprob", "replay"]})
+    said, model = stated.info[BEHAVIOUR], learner.model  # type: ignore[attr-defined]
+    inputs = learner._inputs(learner._rows(obs, learner))  # type: ignore[attr-defined]
+    chain = torch.from_numpy(said["replay"]["chain"])[None].to(lab.device)
+    with torch.no_grad():
+        velocity = flow_velocity(model.network, inputs, torch.float32)
+        again = logprob_of_chain(velocity, chain, said["replay"]["noise_level"])[0, :, : plain.action.shape[-1]]
+    off = again.float().cpu().numpy() - said["logprob"]
+    lab.show(logprob_ms=stated_ms, log_ratio_std_of_a_number=float(off.std()), log_ratio_of_a_chunk=float(off.sum()))
+    lab.check("log-probabilities are finite", bool(np.isfinite(off).all()), equal=True)
+
+
+def numerics(lab: Lab) -> None:
+    """TF32, and weights of 8 bits."""
+    torch, side = require("torch"), lab.size(4096, 64)
+    a = torch.randn(side, side, device=lab.device)
+    rows = []
+    for precision in ("highest", "high"):
+        torch.set_float32_matmul_precision(precision)
+        error = float((a @ a - (a.double() @ a.double())).abs().max())
+        rows.append({"float32 products": precision, "tflops": 2 * side**3 / seconds_of(lab, lambda: a @ a) / 1e12,
+                     "largest_error": error})  # fmt: skip
+    torch.set_float32_matmul_precision("highest")
+    lab.show(products=rows)
+    if importlib.util.find_spec("torchao") is None:
+        lab.show(int8="not installed: torchao")
+        return
+    for kind in ("int8", "float8"):
+        try:
+            with lab.measured(config=lab.settings(max_rows=1, quantization=kind), largest=1) as measured:
+                bare = measured.bare(1, lab.size(1.0, 0.02))
+                acts = np.stack(measured.actions(1, 1))
+        except VLAgentsError as error:
+            lab.show(**{kind: str(error)[:300]})
+            continue
+        off = row_error(acts, np.load(lab.plan.scratch / "eager.npz")["rows_1"])
+        lab.show(**{kind: f"{bare['batch_ms']:.2f} ms, peak {peak_mib():.0f} MiB, off by {off:.3f}"})
+
+
+def jax_beside(lab: Lab) -> None:
+    """JAX beside torch in one process: the memory that it takes."""
+    torch = require("torch")
+    if importlib.util.find_spec("jax") is None:
+        lab.show(jax="not installed")
+        return
+    from vlagents_ray.policies.base.accelerator import jax_device
+
+    total = 1 if lab.dry else torch.cuda.mem_get_info()[1]
+    before = 0 if lab.dry else torch.cuda.mem_get_info()[0]
+    device = jax_device(lab.size("auto", "cpu"))
+    jax = require("jax")
+    with jax.default_device(device):
+        computed = float(jax.numpy.ones((64, 64)).sum())
+    taken = 0 if lab.dry else before - torch.cuda.mem_get_info()[0]
+    lab.show(jax=jax.__version__, device=str(device))
+    lab.check("JAX computes", computed, equal=64 * 64)
+    lab.check("share of the memory that JAX takes", taken / total, most=0.1, speed=True)
+
+
+def families(lab: Lab) -> None:
+    """Other families whose packages are installed, with random weights."""
+    rows = []
+    for family in FAMILIES:
+        if family in ("pi0", *lab.size([], ["openvla", "pi05"])):
+            continue
+        folder = lab.plan.scratch / f"family-{family}"
+        try:
+            made = write_checkpoint(family, folder, lab.size("full", "small"))
+        except MissingDependency as error:
+            lab.show(**{family: f"not installed: {str(error).partition(';')[0]}"})
+            continue
+        config = {**made.config, "device": lab.device, "max_rows": 8}
+        config |= {"actions": "chunk"} if family == "diffusion" else {}
+        with lab.measured(made.policy, config, largest=8) as measured:
+            for size in lab.size((1, 8), (1,)):
+                bare = measured.bare(size, lab.size(1.0, 0.02))
+                rows.append({"family": family, "parameters": made.parameters, "rows": size, **bare,
+                             "peak_mib": peak_mib()})  # fmt: skip
+                lab.show(families=rows)
+        shutil.rmtree(folder)
+    lab.check("families that were measured act", len(rows), least=0)
+
+
+def destruction(lab: Lab) -> None:
+    """Exhaust the memory, then fail the GPU: one row still acts, and the health check reports the failure."""
+    torch, largest = require("torch"), lab.size(16, 2)
+    with lab.engine(compile=False, batch_sizes=None, max_rows=largest) as engine:
+        agent: Any = engine.models.own_weights._agent
+        robots = [Session(engine, seed) for seed in range(largest)]
+        run, hogs = agent.predict, []
+
+        def full(rows: Sequence[Any]) -> Any:
+            if lab.dry and len(rows) > 1:
+                raise torch.OutOfMemoryError("CUDA out of memory")
+            if not lab.dry:  # 512 MiB are left: one row fits, and the layers of sixteen do not
+                torch.cuda.empty_cache()
+                free = max(0, torch.cuda.mem_get_info()[0] - 2**29)
+                hogs.append(torch.empty(free, dtype=torch.uint8, device=lab.device))
+            try:
+                return run(rows)
+            finally:
+                hogs.clear()
+
+        agent.predict = full
+        with Acting([robot.ask for robot in robots]) as acting:
+            found = acting.during(lambda: None, 3 * largest)
+        lab.show(rows_that_fit=agent.most_rows, out_of_memory=[found])
+        lab.check("failed acts, as fewer rows are tried again", found["failed"], equal=0)
+        del agent.predict
+        robots[0].ask()
+        lab.check("one row acts after memory was exhausted", True, equal=True)
+        engine.check_health()
+
+        def broken(rows: Sequence[Any]) -> Any:
+            if lab.dry:
+                raise RuntimeError("CUDA error: device-side assert triggered")
+            torch.zeros(1, device=lab.device)[torch.full((1,), 7, device=lab.device)]
+            return run(rows)
+
+        agent.predict = broken
+        with contextlib.suppress(VLAgentsError):
+            robots[0].ask()
+        said = ""
+        try:
+            engine.check_health()
+        except Exception as error:  # noqa: BLE001 - the health check may raise any error
+            said = f"{type(error).__name__}: {error}"
+        lab.show(health=said[:300])
+        lab.check("the health check reports the failure", bool(said), equal=True)
+        if not lab.dry:
+            os._exit(0)  # nothing can be freed on a failed GPU
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """A step, and the longest time that it may take, s."""
+
+    run: Callable[[Lab], None]
+    limit_s: float
+    beside: bool = False  # whether the next step runs at the same time
+
+
+STEPS = {
+    "facts": Step(facts, 60),
+    "checkpoint": Step(checkpoint, 200, beside=True),
+    "tests": Step(gpu_tests, 120),
+    "eager": Step(partial(speed, mode=False), 120),
+    "graphs": Step(partial(speed, mode="graphs"), 90),
+    "loading": Step(loading, 60),
+    "pushes": Step(pushes, 75),
+    "served": Step(served, 60),
+    "learning": Step(learning, 60),
+    "compiled": Step(partial(speed, mode=True), 200),
+    "compiled again": Step(again, 75),
+    "numerics": Step(numerics, 45),
+    "jax": Step(jax_beside, 40),
+    "families": Step(families, 90),
+    "destruction": Step(destruction, 45),
+}
