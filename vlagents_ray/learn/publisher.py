@@ -35,6 +35,7 @@ logger = logging.getLogger(__name__)
 
 _ANSWER_S = 10.0  # time limit for the request of the versions
 _PUSH_S = 600.0  # time limit for a push, which includes the transfer to all nodes
+_WINDOW = 16  # parts (MiB) in flight over the network: with one, each would take a round trip
 
 
 class Publisher:
@@ -232,19 +233,25 @@ class ServerTarget(WeightsTarget):
             raise InvalidWeights(f"weights: {len(values)} names take {len(header)} bytes, the limit is {MESSAGE_BYTES}")
         stated = {name: str(value).lower() for name, value in asdict(options).items() if value is not None}
         with closing(open_websocket(f"{self._url}?{urlencode(stated)}", self._credentials, _ANSWER_S)) as socket:
+            unanswered, most = 0, 1  # the header alone is answered before any value is sent
             for part in chain((header,), parts_of(values)):
-                answer = self._ask(socket, part)
-                if "code" in answer:
-                    raise read_error(answer)
+                with suppress(ConnectionClosed, OSError):  # the server has refused the push; its answer has the reason
+                    socket.send(part, _ANSWER_S)
+                unanswered += 1
+                if unanswered >= most:
+                    answer, unanswered, most = self._answer(socket), unanswered - 1, _WINDOW
+            for _ in range(unanswered):
+                answer = self._answer(socket)
         return int(answer["version"])
 
-    def _ask(self, socket: ProxiedSocket, part: bytes) -> dict[str, Any]:
+    def _answer(self, socket: ProxiedSocket) -> dict[str, Any]:
+        """Return the answer to the oldest part without one, and raise it if it is an error."""
         try:
-            with suppress(ConnectionClosed, OSError):  # the server has refused the push; its answer has the reason
-                socket.send(part, _ANSWER_S)
             answer: dict[str, Any] = json.loads(socket.recv(_PUSH_S))
         except (ConnectionClosed, OSError) as error:
             raise _unknown(self._url, error) from error
+        if "code" in answer:
+            raise read_error(answer)
         return answer
 
     def versions(self) -> list[int]:

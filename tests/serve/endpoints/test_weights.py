@@ -32,7 +32,7 @@ from vlagents_ray.errors import (
     VLAgentsError,
 )
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.learn import Publisher
+from vlagents_ray.learn import Publisher, publisher
 from vlagents_ray.protocol.frames import read_error
 from vlagents_ray.protocol.messages import Limits
 from vlagents_ray.serve import weights as versions
@@ -194,6 +194,37 @@ def test_a_key_that_loses_its_right_ends_the_push(serving: Serving, change: Any,
         assert answer(socket, first) == {"received": PART_BYTES}
         known.change("learner", **change)
         assert isinstance(read_error(answer(socket, second)), error)
+    assert server.engine.weights.number == 0
+
+
+def test_several_parts_are_on_their_way_at_once_but_none_before_the_header_is_accepted(
+    serving: Serving, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    server, steps = serving(), list[str]()
+    send, recv = ProxiedSocket.send, ProxiedSocket.recv
+    monkeypatch.setattr(ProxiedSocket, "send", lambda self, *of: (steps.append("s"), send(self, *of))[1])
+    monkeypatch.setattr(ProxiedSocket, "recv", lambda self, *of: (steps.append("r"), recv(self, *of))[1])
+    monkeypatch.setattr(publisher, "_WINDOW", 4)
+    Publisher(server.url).push(gains(1))  # a header and 13 parts
+    assert "".join(steps) == "sr" + "sss" + "sr" * 10 + "rrr"
+
+
+def test_a_push_that_is_refused_with_parts_on_their_way_says_why(
+    serving: Serving, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    known = ChangingKeys()
+    server = serving(keys=known.keys)
+    key, send, sent = known.add("learner", scopes=["weights"]), ProxiedSocket.send, list[int]()
+
+    def change_before_the_third(self: ProxiedSocket, part: Any, timeout_s: float) -> None:
+        sent.append(len(part))
+        if len(sent) == 3:
+            known.change("learner", revoked=True)
+        send(self, part, timeout_s)
+
+    monkeypatch.setattr(ProxiedSocket, "send", change_before_the_third)
+    with pytest.raises(Unauthorized):
+        Publisher(server.url, api_key=key).push(gains(1))
     assert server.engine.weights.number == 0
 
 

@@ -4,9 +4,10 @@
     GET  /v1/weights             the newest version of each replica
 
 One connection is one push, which ends with it, so that all of its parts reach one replica, and no data of a push remain
-if its learner dies. A learner sends a part when the previous one is acknowledged, so that no proxy on the way buffers
-many parts. The header is checked against the policy's own weights, whose size bounds the push, before memory is
-allocated. Keys need the scope "weights"; without keys, only processes of this machine may push.
+if its learner dies. A learner sends the values when the header is acknowledged, and has at most 16 parts of 1 MiB
+without an answer, so that no proxy on the way buffers many. The header is checked against the policy's own weights,
+whose size bounds the push, before memory is allocated. Keys need the scope "weights"; without keys, only processes of
+this machine may push.
 """
 
 from __future__ import annotations
