@@ -102,7 +102,7 @@ def converted(value: Any, held: Any) -> Any:
             warnings.filterwarnings("ignore", message=".*not writ", category=UserWarning)  # nothing here writes into it
             tensor = torch.from_numpy(array.view(np.int16) if is_bfloat16 else array)
         return (tensor.view(torch.bfloat16) if is_bfloat16 else tensor).to(held.device, held.dtype)
-    array = _to_numpy(value)
+    array = to_numpy(value)
     if isinstance(held, np.ndarray):
         array = _unchanging(array) if array.dtype == held.dtype else array.astype(held.dtype)
         array.flags.writeable = False
@@ -162,8 +162,8 @@ def _unchanging(array: np.ndarray) -> np.ndarray:
     return array.view() if owner is None or memoryview(owner).readonly else array.copy()
 
 
-def _to_numpy(value: Any) -> np.ndarray:
-    """Convert an array to a type that numpy has: a bfloat16 is the upper half of a float32."""
+def to_numpy(value: Any) -> np.ndarray:
+    """Convert an array or tensor to a type that numpy has: a bfloat16 is the upper half of a float32."""
     array = portable(value)
     if array.dtype != _BFLOAT16:
         return array
