@@ -9,6 +9,7 @@ A version is freed when no session acts with it and it is neither the newest nor
 from __future__ import annotations
 
 import threading
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import nullcontext
@@ -172,7 +173,7 @@ class ModelWeights:
         require_fit(held, announced, partial=options.partial)
         return announced
 
-    def stage(self, number: int, pushed: Mapping[str, Any], options: PushOptions) -> str:
+    def stage(self, number: int, pushed: Mapping[str, Any] | SharedValues, options: PushOptions) -> str:
         """Check a new version and hold it without using it; return its fingerprint.
 
         It is dropped unless it is committed within a minute, since its learner may have died.
@@ -202,10 +203,7 @@ class ModelWeights:
                 raise Overloaded("weights: another push is under way; push again when it is over")
             self._staged = placeholder
         try:
-            with CAPTURES.pushes:
-                before = self._values(newest)
-                values = fitted(before, pushed, partial=options.partial, allow_same=options.allow_same)
-                staged = WeightsVersion(number, fingerprint(values), values)
+            staged = self.make(number, newest, pushed, options)
         except BaseException:
             self.drop(number)
             raise
@@ -217,6 +215,23 @@ class ModelWeights:
             self._timer.daemon = True
             self._timer.start()
         return staged.fingerprint
+
+    def make(
+        self, number: int, newest: WeightsVersion, pushed: Mapping[str, Any] | SharedValues, options: PushOptions
+    ) -> WeightsVersion:
+        """Return a version of pushed values, which have been checked; missing names have the values of the newest."""
+        with CAPTURES.pushes, opened(pushed) if isinstance(pushed, SharedValues) else nullcontext(pushed) as named:
+            before = self._values(newest)
+            values = fitted(before, named, partial=options.partial, allow_same=options.allow_same)
+            return WeightsVersion(number, fingerprint(values), values)
+
+    def act_with(self, version: WeightsVersion, sessions: Iterable[FollowingSession]) -> None:
+        """Act with a version in all sessions and coming episodes, in a child process, whose replica decides on it."""
+        with self._lock:
+            self.newest = self.pinned = self._alive[version.number] = version
+            for session in sessions:
+                if session.weights is not None:
+                    session.weights = version
 
     def commit(self, number: int, options: PushOptions, sessions: Callable[[], Iterable[FollowingSession]]) -> None:
         """Use a staged version from now on. A repeated commit of the newest version does nothing.
@@ -273,6 +288,14 @@ class ModelWeights:
         return {name: own_copy(value) for name, value in self._agent.parameters().items()}
 
 
+class HoldsWeights(ABC):
+    """An agent that holds the versions of its weights itself, such as one in another process."""
+
+    @abstractmethod
+    def model_weights(self, busy: threading.Lock, digest: str, model: tuple[str, str]) -> ModelWeights:
+        """Return the versions; see `ModelWeights` for the arguments."""
+
+
 @dataclass(frozen=True, slots=True)
 class PushResult:
     """The result of a successful push."""
@@ -308,6 +331,7 @@ class WeightUpdates:
         self._own = own
         self._sessions = sessions
         self._pushes_ms: deque[float] = deque(maxlen=_COLLECTED)
+        self._given: dict[int, WeightsVersion] = {}  # in a child process: those that its replica refers to
 
     def pushed(self, took_ms: float) -> None:
         """Record the duration of a push that this replica coordinated, for the metrics."""
@@ -323,8 +347,7 @@ class WeightUpdates:
 
     def stage(self, number: int, pushed: Mapping[str, Any] | SharedValues, options: PushOptions) -> str:
         """Check and hold a new version, and return its fingerprint, as `ModelWeights.stage` does."""
-        with opened(pushed) if isinstance(pushed, SharedValues) else nullcontext(pushed) as named:
-            return self._own().stage(number, named, options)
+        return self._own().stage(number, pushed, options)
 
     def commit(self, number: int, options: PushOptions) -> None:
         """Use the staged version, as `ModelWeights.commit` does."""
@@ -340,6 +363,33 @@ class WeightUpdates:
     def drop(self, number: int) -> None:
         """Drop the staged version."""
         self._own().drop(number)
+
+    # In a child process: its replica decides which version acts, and when one is dropped. It names version 0 as 0, and
+    # others by numbers of its own, as a version may be pushed twice.
+
+    def make(
+        self, name: int, base: int, number: int, pushed: Mapping[str, Any] | SharedValues, options: PushOptions
+    ) -> str:
+        """Make a version from pushed values and those of `base`, and return its fingerprint."""
+        made = self._given[name] = self._own().make(number, self.given(base), pushed, options)
+        return made.fingerprint
+
+    def given(self, name: int) -> WeightsVersion:
+        """Return the version that the replica named so."""
+        if not self._given:
+            self._given[0] = self._own().newest
+        return self._given[name]
+
+    def portable_values(self, name: int) -> dict[str, Any]:
+        """Return the values of the version that the replica named so."""
+        return self._own().portable_values(self.given(name))
+
+    def obey(self, use: int | None = None, forget: int | None = None) -> None:
+        """Act with one version from now on, or drop one. Called on the policy's thread, between two batches."""
+        if use is not None:
+            self._own().act_with(self.given(use), self._sessions())
+        if forget is not None:
+            self._given.pop(forget, None)
 
     def describe(self) -> dict[str, dict[str, Any]] | None:
         """Return number and fingerprint of the newest and the pinned version, for the metadata; None while it loads."""

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import pytest
+from gain_policies import Doubled, Gain, gains, in_child
 from in_flight import answered
 
 from vlagents_ray.errors import (
@@ -26,40 +27,6 @@ from vlagents_ray.serve import weights as versions
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.weights import PushOptions
 from vlagents_ray.weights.trainable import fingerprint
-
-
-class Gain(Agent):
-    """Acts with its one parameter, and what a session has drawn."""
-
-    trainable: ClassVar[str | None] = "tree"
-
-    def initialize(self) -> None:
-        self.tree = {"layer": {"gain": np.zeros(2, np.float32)}}
-
-    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
-        self.rng = np.random.default_rng(kwargs.get("seed", 0))
-        return {"gain": float(self.tree["layer"]["gain"][0])}
-
-    def act(self, obs: Obs) -> Act:
-        return Act(np.append(self.tree["layer"]["gain"], self.rng.random()))
-
-
-class Doubled(Gain):
-    """Computes its actions from twice its parameter, which it computes once for each version, in place."""
-
-    def initialize(self) -> None:
-        super().initialize()
-        self.twice = np.zeros(2, np.float32)
-
-    def shared_objects(self) -> list[Any]:
-        return [*super().shared_objects(), self.twice]
-
-    def load_parameters(self, named: Mapping[str, Any]) -> None:
-        np.copyto(self.tree["layer"]["gain"], named["layer/gain"])
-        np.copyto(self.twice, 2 * named["layer/gain"])
-
-    def act(self, obs: Obs) -> Act:
-        return Act(np.append(self.twice / 2, self.rng.random()))
 
 
 class Served:
@@ -90,11 +57,9 @@ class Served:
         return digest
 
 
-def gains(gain: float) -> dict[str, Any]:
-    return {"layer/gain": np.full(2, gain, np.float32)}
-
-
-AGENTS = pytest.mark.parametrize("agent", [Gain, Doubled], ids=["by reference", "in place"])
+AGENTS = pytest.mark.parametrize(
+    "agent", [Gain, Doubled, in_child], ids=["by reference", "in place", "in a child process"]
+)
 
 
 @AGENTS

@@ -498,6 +498,8 @@ class Engine:
             self.transfer.adopt(session_id, request.kwargs)
         elif request.op == "observe":
             self._observe(pending)
+        elif request.op == "weights":
+            self.weights.obey(**request.kwargs)
         else:
             self.sessions.close(session_id)
             pending.origin.sessions.discard(session_id)
