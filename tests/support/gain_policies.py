@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 from collections.abc import Mapping
@@ -11,6 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.serve.weights import WeightsVersion
 
 
 class Gain(Agent):
@@ -45,6 +47,50 @@ class Doubled(Gain):
 
     def act(self, obs: Obs) -> Act:
         return Act(np.append(self.twice / 2, self.rng.random()))
+
+
+class DyingInAPush(Gain):
+    """Its process ends when a push reads its parameters, which a load and a loaded policy have done before."""
+
+    def initialize(self) -> None:
+        super().initialize()
+        self.read = 0
+
+    def parameters(self) -> dict[str, Any]:
+        self.read += 1
+        if self.read > 2:
+            os._exit(9)
+        return super().parameters()
+
+    def load_parameters(self, named: Mapping[str, Any]) -> None:
+        super().load_parameters(named)
+
+
+class Counting(Doubled):
+    """States how many versions its process holds."""
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        held = [one for one in gc.get_objects() if isinstance(one, WeightsVersion)]
+        return super().reset(obs, instruction, **kwargs) | {"versions": len(held)}
+
+
+class OnSharedMemory(Agent):
+    """Has a torch layer in memory of the CPU that takes the place of a GPU's."""
+
+    trainable: ClassVar[str | None] = "layer"
+
+    def initialize(self) -> None:
+        import torch
+        from shared_cpu_memory import SharedCpuMemory
+
+        SharedCpuMemory().install()
+        self.layer = torch.nn.Linear(2, 2)
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        return {"weight": float(self.layer.weight[0, 1])}
+
+    def act(self, obs: Obs) -> Act:
+        return Act(np.zeros(1))
 
 
 def gains(gain: float) -> dict[str, Any]:

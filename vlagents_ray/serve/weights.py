@@ -225,10 +225,14 @@ class ModelWeights:
             values = fitted(before, named, partial=options.partial, allow_same=options.allow_same)
             return WeightsVersion(number, fingerprint(values), values)
 
+    def admit(self, version: WeightsVersion) -> None:
+        """Let `find` return a version while it is held."""
+        self._alive[version.number] = version
+
     def act_with(self, version: WeightsVersion, sessions: Iterable[FollowingSession]) -> None:
         """Act with a version in all sessions and coming episodes, in a child process, whose replica decides on it."""
         with self._lock:
-            self.newest = self.pinned = self._alive[version.number] = version
+            self.newest = self.pinned = version
             for session in sessions:
                 if session.weights is not None:
                     session.weights = version
@@ -371,7 +375,9 @@ class WeightUpdates:
         self, name: int, base: int, number: int, pushed: Mapping[str, Any] | SharedValues, options: PushOptions
     ) -> str:
         """Make a version from pushed values and those of `base`, and return its fingerprint."""
-        made = self._given[name] = self._own().make(number, self.given(base), pushed, options)
+        own = self._own()
+        made = self._given[name] = own.make(number, self.given(base), pushed, options)
+        own.admit(made)
         return made.fingerprint
 
     def given(self, name: int) -> WeightsVersion:

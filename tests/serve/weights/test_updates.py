@@ -88,8 +88,9 @@ def test_an_episode_ends_with_the_weights_that_it_began_with_unless_they_are_pus
     assert digest == fingerprint(gains(5)), "of what the agent holds"
 
 
-def test_robots_keep_the_pinned_weights_unless_they_follow(serving: Callable[..., Engine]) -> None:
-    served = Served(serving(Gain()))
+@AGENTS
+def test_robots_keep_the_pinned_weights_unless_they_follow(serving: Callable[..., Engine], agent: type[Gain]) -> None:
+    served = Served(serving(agent()))
     for session, options in {"pinned": {}, "follows": {"weights": "follow"}}.items():
         served.reset(session, "robot", **options)
     served.reset("baseline", weights="pinned")
@@ -109,14 +110,15 @@ def test_robots_keep_the_pinned_weights_unless_they_follow(serving: Callable[...
         served.reset("pinned", weights=7)
 
 
+@AGENTS
 @pytest.mark.parametrize(
     ("pushed", "error"),
     [({}, InvalidWeights), ({"layer/gain": np.full(2, np.nan)}, InvalidWeights), (gains(1), UnchangedWeights)],
 )
 def test_what_is_refused_changes_nothing(
-    serving: Callable[..., Engine], pushed: dict[str, Any], error: type[Exception]
+    serving: Callable[..., Engine], agent: type[Gain], pushed: dict[str, Any], error: type[Exception]
 ) -> None:
-    served = Served(serving(Gain()))
+    served = Served(serving(agent()))
     served.push(1)
     before = served.learn.describe()
     with pytest.raises(error):
@@ -129,8 +131,11 @@ def test_what_is_refused_changes_nothing(
     served.push(2)
 
 
-def test_a_staged_version_does_not_act_and_a_second_one_has_to_wait(serving: Callable[..., Engine]) -> None:
-    served = Served(serving(Gain()))
+@AGENTS
+def test_a_staged_version_does_not_act_and_a_second_one_has_to_wait(
+    serving: Callable[..., Engine], agent: type[Gain]
+) -> None:
+    served = Served(serving(agent()))
     served.learn.stage(1, gains(1), PushOptions())
     served.reset("a")
     assert served.act("a") == (0, 0.0)
@@ -162,8 +167,11 @@ def test_a_learner_that_dies_between_the_phases_leaves_the_last_version(
     assert served.act("a") == (0, 0.0)
 
 
-def test_versions_never_go_back_and_no_act_fails_while_weights_are_pushed(serving: Callable[..., Engine]) -> None:
-    served = Served(serving(Gain()))
+@AGENTS
+def test_versions_never_go_back_and_no_act_fails_while_weights_are_pushed(
+    serving: Callable[..., Engine], agent: type[Gain]
+) -> None:
+    served = Served(serving(agent()))
     over = threading.Event()
     seen: dict[str, list[tuple[int, float]]] = {name: [] for name in "abc"}
     failed: list[BaseException] = []
@@ -191,8 +199,11 @@ def test_versions_never_go_back_and_no_act_fails_while_weights_are_pushed(servin
         assert all(gain == number for number, gain in acts)
 
 
-def test_a_moved_session_goes_on_with_its_version_and_not_where_that_is_missing(serving: Callable[..., Engine]) -> None:
-    here, there, without = Served(serving(Gain())), Served(serving(Gain())), Served(serving(Gain()))
+@AGENTS
+def test_a_moved_session_goes_on_with_its_version_and_not_where_that_is_missing(
+    serving: Callable[..., Engine], agent: type[Gain]
+) -> None:
+    here, there, without = Served(serving(agent())), Served(serving(agent())), Served(serving(agent()))
     here.push(1)
     here.reset("a")
     there.push(1)
