@@ -7,6 +7,8 @@ computes them again from the same tensors. The rules are CUDA's, or stricter:
 - A capture fails, on both threads, if another thread waits for its device or makes a tensor there.
 - An operation on another stream or device than the captured one runs at once and is not recorded.
 - `torch.cuda.graph` has one stream for all captures of a process, on the device of the first.
+- The graphs of a memory pool share memory: a replay overwrites the results of all others.
+- A GPU's time is the number of replayed operations, in milliseconds.
 - After `fail`, every call fails. A tensor of more than `most_rows` rows does not fit into memory.
 """
 
@@ -38,6 +40,10 @@ class FakeCuda:
         self.failure = ""
         self.most_rows = sys.maxsize
         self.emptied = 0  # calls of `empty_cache`
+        self.clock_ms = 0.0  # of all GPUs
+        self.captures: list[Capture] = []  # all that were begun
+        self.replays: list[Capture] = []  # the graph of each replay
+        self.reserved = [0, 0]  # bytes of each device
         self._local = threading.local()
         self._default = [Stream(self, index) for index in range(2)]
         self._capture_stream: Stream | None = None
@@ -54,6 +60,9 @@ class FakeCuda:
             "synchronize": self.synchronize,
             "empty_cache": self._empty_cache,
             "CUDAGraph": lambda: Capture(self),
+            "Event": lambda **_: Event(self),
+            "graph_pool_handle": object,
+            "memory_reserved": lambda device=None: self.reserved[self._index(device)],
             "graph": self._graph,
         }.items():
             patch.setattr(torch.cuda, name, value)
@@ -128,8 +137,10 @@ class FakeCuda:
 
     @contextmanager
     def _graph(
-        self, capture: Capture, stream: Stream | None = None, capture_error_mode: str = "global"
+        self, capture: Capture, pool: Any = None, stream: Stream | None = None, capture_error_mode: str = "global"
     ) -> Iterator[None]:
+        self.captures.append(capture)
+        capture.pool = pool
         self._capture_stream = self._capture_stream or Stream(self, self._index(None))
         capture.stream = stream or self._capture_stream
         self.synchronize()
@@ -166,6 +177,26 @@ class Stream:
 
 
 @dataclass(eq=False)
+class Event:
+    """A `torch.cuda.Event`."""
+
+    cuda: FakeCuda
+    ms: float = 0.0
+
+    def record(self, stream: Stream) -> None:
+        """Note the time, as nothing is ever outstanding."""
+        stream.synchronize()
+        self.ms = self.cuda.clock_ms
+
+    def synchronize(self) -> None:
+        """Do nothing, since the event has passed."""
+
+    def elapsed_time(self, end: Event) -> float:
+        """Return the time until another event, ms."""
+        return end.ms - self.ms
+
+
+@dataclass(eq=False)
 class Capture:
     """A `torch.cuda.CUDAGraph`."""
 
@@ -174,6 +205,7 @@ class Capture:
     broken: bool = False
     thread: int = 0
     stream: Any = None
+    pool: Any = None
 
     def end(self) -> None:
         """Raise if the capture was ended by another thread; overwrite all results, as none was computed."""
@@ -181,15 +213,32 @@ class Capture:
             raise torch.AcceleratorError("CUDA error: operation failed due to a previous error during capture", 901)
         if not self.calls:
             warnings.warn(_EMPTY, stacklevel=2)
+        self.cuda.reserved[self.stream.index] += sum(result.nbytes for result in self._results())
+        self.spoil()
+
+    def _results(self) -> Iterator[torch.Tensor]:
+        """Yield the tensors in memory of this graph's pool."""
         for _, result, inputs in self.calls:
             own = {one.untyped_storage().data_ptr() for one in inputs}
             for one in tree_leaves(result):
                 if isinstance(one, torch.Tensor) and one.untyped_storage().data_ptr() not in own:
-                    one.fill_(_GARBAGE)
+                    yield one
 
+    @torch.inference_mode()
+    def spoil(self) -> None:
+        """Overwrite all results."""
+        for one in self._results():
+            one.fill_(_GARBAGE)
+
+    @torch.inference_mode()  # in which the tensors may have been made
     def replay(self) -> None:
-        """Compute all results again, in their memory."""
+        """Compute all results again, in their memory, and overwrite those of other graphs in its pool."""
         self.cuda._require(self.stream.index)
+        for other in self.cuda.captures:
+            if other.pool is not None and other.pool is self.pool and other is not self:
+                other.spoil()
+        self.cuda.replays.append(self)
+        self.cuda.clock_ms += len(self.calls)
         for call, result, _ in self.calls:
             for old, new in zip(tree_leaves(result), tree_leaves(call()), strict=True):
                 if isinstance(old, torch.Tensor) and old.data_ptr() != new.data_ptr():

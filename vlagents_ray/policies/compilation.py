@@ -1,10 +1,10 @@
 """Pure cores of a model, compiled for a few batch sizes, and compared with the eager pass before they are used.
 
 A core is a function of tensors alone, whose first dimension is the batch and whose other dimensions are fixed; it
-returns such a tensor, or a tuple of them. `torch.compile` makes one program for each core and batch size, without graph
-breaks; on a GPU it is captured in a CUDA graph. All programs are made while the policy loads. A batch between two sizes
-is padded with copies of its last row, whose results are dropped; one for which there is no program, as its rows have
-another shape, or as it is too large, runs eagerly.
+returns such a tensor, or a tuple of them. On a GPU it is captured in a CUDA graph for each batch size, and so is what
+`torch.compile` makes of it, without graph breaks; the faster graph is used. On a CPU there is only torch's program. All
+programs are made while the policy loads. A batch between two sizes is padded with copies of its last row, whose results
+are dropped; one for which there is no program, as its rows have another shape, or as it is too large, runs eagerly.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import os
 import threading
 import time
 import warnings
+from bisect import insort
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from operator import attrgetter
@@ -143,6 +144,30 @@ class CaptureLock:
 CAPTURES = CaptureLock()
 
 
+class GraphMemory:
+    """The memory and the stream of all CUDA graphs of a policy on one device.
+
+    A replay may overwrite the results of all other graphs. That is safe, since the replays of a policy are serial and
+    on one stream, and a result is copied before the next one.
+    """
+
+    def __init__(self, device: Any) -> None:
+        torch = require("torch")
+        self._device, self.pool = device, torch.cuda.graph_pool_handle()
+        # torch's own stream for captures is on the device of the first capture of the process
+        self.stream = torch.cuda.Stream(device)
+        self._before = self._reserved()
+
+    def taken(self) -> int:
+        """Return the bytes that the process has reserved on the device since the first graph."""
+        return self._reserved() - self._before
+
+    def _reserved(self) -> int:
+        torch = require("torch")
+        torch.cuda.empty_cache()  # of memory that no tensor and no graph has
+        return int(torch.cuda.memory_reserved(self._device))
+
+
 class CudaGraph:
     """A function, captured once with inputs of one shape; calls copy their inputs to where the graph reads them.
 
@@ -150,46 +175,69 @@ class CudaGraph:
     is loaded on another thread than the one that acts with it.
     """
 
-    def __init__(self, function: Callable[..., Any], tensors: Sequence[Any]) -> None:
-        """Capture a function of tensors on one GPU without other effects; raises `RuntimeError` if that fails."""
-        torch = require("torch")
-        self._inputs, device = [tensor.clone() for tensor in tensors], tensors[0].device
-        # The stream is named, since torch's own one is on the device of the first capture of the process. The current
-        # one is entered again, since `torch.cuda.graph` leaves its own if the capture fails.
-        own, current = torch.cuda.Stream(device), torch.cuda.current_stream(device)
+    def __init__(self, function: Callable[..., Any], inputs: Sequence[Any], memory: GraphMemory | None = None) -> None:
+        """Capture a function of tensors on one GPU without other effects; raises `RuntimeError` if that fails.
+
+        Args:
+            function: The function. It is kept, since the graph reads constants of a compiled one.
+            inputs: Tensors from which each replay reads, and to which a call copies its own.
+            memory: That of the policy's graphs; None: of this graph alone.
+        """
+        torch, device = require("torch"), inputs[0].device
+        memory = memory or GraphMemory(device)
+        self._function, self._inputs = function, inputs
+        # The current stream is entered again, since `torch.cuda.graph` leaves its own if the capture fails.
+        own, current = memory.stream, torch.cuda.current_stream(device)
         with torch.cuda.device(device), torch.cuda.stream(current):
             own.wait_stream(current)
             with torch.cuda.stream(own):
                 for _ in range(_WARM_UP):
-                    function(*self._inputs)
+                    function(*inputs)
             current.wait_stream(own)
             self._graph = torch.cuda.CUDAGraph()
             with CAPTURES.capture(), warnings.catch_warnings(record=True) as said:
                 warnings.simplefilter("always")
                 # Other threads still prepare acts; their calls must not end the capture.
-                with torch.cuda.graph(self._graph, stream=own, capture_error_mode="thread_local"):
-                    self._result = function(*self._inputs)
+                with torch.cuda.graph(self._graph, memory.pool, own, capture_error_mode="thread_local"):
+                    self._result = function(*inputs)
         if any(_EMPTY in str(warning.message) for warning in said):
             raise RuntimeError("the CUDA graph is empty: all work ran on another stream, or on another device")
 
     def __call__(self, *tensors: Any) -> Any:
+        """Return the results of at most as many rows as were captured, in memory of their own."""
+        rows = len(tensors[0])
         for held, tensor in zip(self._inputs, tensors, strict=True):
-            held.copy_(tensor, non_blocking=True)
+            held[:rows].copy_(tensor, non_blocking=True)
+            if rows < len(held):
+                held[rows:].copy_(tensor[-1:], non_blocking=True)
         self._graph.replay()
-        result = self._result
-        return tuple(one.clone() for one in result) if isinstance(result, tuple) else result.clone()
+        results = tuple(one[:rows].clone() for one in _each(self._result))
+        return results if isinstance(self._result, tuple) else results[0]
+
+    def replay_ms(self) -> float:
+        """Replay the graph with its last inputs; return the GPU's time, milliseconds."""
+        torch = require("torch")
+        stream = torch.cuda.current_stream(self._inputs[0].device)
+        begin, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+        begin.record(stream)
+        self._graph.replay()
+        end.record(stream)
+        end.synchronize()
+        return float(begin.elapsed_time(end))
 
 
-CompileMode = bool | Literal["require"]
+CompileMode = bool | Literal["auto", "graphs", "require"]
 
 # Largest error of a row of a core's result, as a share of the row's norm, by the coarsest type that it computes with:
 # compiled sums run in another order, and merged kernels keep float32 where the eager pass rounds between them.
 TOLERANCE = {"float32": 1e-3, "float16": 1e-2, "bfloat16": 5e-2}
 _SHOWN = 300  # characters of a compiler's error in the log
+# A compiled program replaces the graph of the eager core if its replay takes at most this share of the time: a smaller
+# gain may be noise, and only the graph computes as the eager pass does.
+_FASTER = 0.97
+_REPLAYS = 5  # of each, of which the shortest counts
 
-
-class CompilationFailed(Exception):
-    """A core could not be compiled, or its program computes something else than the eager pass."""
+_GRAPH, _COMPILED = "CUDA graph", "torch.compile"  # tiers: the eager core, and torch's program, both in graphs on a GPU
 
 
 class Compilation:
@@ -198,14 +246,23 @@ class Compilation:
     backend: ClassVar[str] = "inductor"  # of torch.compile
 
     def __init__(self, mode: CompileMode) -> None:
+        """Begin to compile: False: nothing, "graphs": CUDA graphs of eager cores, True: `torch.compile` also.
+
+        "require" is True with an error for each failure. "auto" stays open until the policy is loaded.
+        """
         self.mode = mode
-        self.sizes: list[int] = []  # batch sizes for which all cores are compiled, ascending
+        self.sizes: list[int] = []  # batch sizes for which a core is compiled, ascending
         self.building: int | None = None  # the batch size whose programs are being made
+        self.capturing: str | None = None  # the tier of the program that is being made of a core with parts
         self.cores: list[Core] = []
-        if mode:
+        self.memories: dict[Any, GraphMemory] = {}  # by device
+        self.graph_bytes = 0  # which CUDA graphs took on all devices
+        if mode is True or mode == "require":
             keep_torch_programs()
 
-    def core(self, name: str, function: Callable[..., Any], rows: int | None = None) -> Callable[..., Any]:
+    def core(
+        self, name: str, function: Callable[..., Any], rows: int | None = None, parts: Sequence[Any] = ()
+    ) -> Callable[..., Any]:
         """Return a function's compiled form, or the function itself if nothing is compiled.
 
         Args:
@@ -214,100 +271,171 @@ class Compilation:
                 the model's weights, whose values may change.
             rows: The most rows of a call, if that does not follow from the batch size, such as those of a planner's
                 candidates: the core then has one program, for so many rows. None: those of each batch size.
+            parts: The cores that the function calls. It is then one CUDA graph with all of them; on a CPU, only they
+                are compiled.
         """
         if not self.mode:
             return function
-        self.cores.append(Core(self, name, function, rows))
+        self.cores.append(Core(self, name, function, rows, parts))
         return self.cores[-1]
 
     def add_size(self, size: int, forward: Callable[[], object]) -> None:
-        """Compile all cores for a batch size, larger than those before, and compare them twice with the eager pass.
+        """Make the programs of all cores for a batch size, and compare them twice with the eager pass.
 
-        If that fails, batches of this size use the programs of the next larger size, or run eagerly.
+        Sizes are added from the largest to the smallest, so that graphs of smaller ones fit into the memory of larger
+        ones. A core whose programs all fail uses that of the next larger size, or runs eagerly.
 
         Args:
             size: The number of rows.
             forward: Runs a forward pass of that many rows, of other values each time.
 
         Raises:
-            ConfigError: A core failed, and the mode is "require".
+            ConfigError: A program failed, and the mode is "require".
         """
         began, self.building = time.monotonic(), size
         try:
             forward()  # makes the programs
             forward()  # compares them after all of them were made
-        except CompilationFailed as failure:
-            for core in self.cores:
-                core.drop(size)
-            if self.mode == "require":
-                raise ConfigError(
-                    f"compile: require: {failure}; with `compile: true` it would run without compilation"
-                ) from failure
-            logger.warning("not compiled for %d rows: %s", size, failure)
-            report_uncompiled(f"{size} rows: {failure}")
-        else:
-            self.sizes.append(size)
-            logger.info("compiled for %d rows in %.1f s", size, time.monotonic() - began)
         finally:
             self.building = None
+        failures = [failure for core in self.cores for failure in core.settle(size)]
+        if failures and self.mode == "require":
+            raise ConfigError(
+                f"compile: require: {'; '.join(failures)}; with `compile: true` it would run without that"
+            )
+        if failures:
+            logger.warning("not compiled for %d rows: %s", size, "; ".join(failures))
+            report_uncompiled(f"{size} rows: {'; '.join(failures)}")
+        if used := {core.name: tier for core in self.cores if (tier := core.tier(size))}:
+            insort(self.sizes, size)
+            logger.info("compiled for %d rows in %.1f s: %s", size, time.monotonic() - began, used)
+        self.graph_bytes = sum(memory.taken() for memory in self.memories.values())
+
+    def memory(self, device: Any) -> GraphMemory:
+        """Return the memory of the policy's graphs on a device."""
+        if device not in self.memories:
+            self.memories[device] = GraphMemory(device)
+        return self.memories[device]
 
 
 class Core:
     """A core with its programs."""
 
-    def __init__(self, owner: Compilation, name: str, function: Callable[..., Any], rows: int | None) -> None:
-        self._owner, self._name, self._function, self._rows = owner, name, function, rows
-        self._programs: dict[int, Callable[..., Any]] = {}
-        self._shapes: dict[int, list[Any]] = {}  # of a row of each argument, for each program
+    def __init__(
+        self, owner: Compilation, name: str, function: Callable[..., Any], rows: int | None, parts: Sequence[Core]
+    ) -> None:
+        self.name = name
+        self._owner, self._function, self._rows, self._parts = owner, function, rows, parts
+        self._programs: dict[int, dict[str, Any]] = {}  # by rows and tier, of which one is left once settled
+        self._kinds: dict[int, list[Any]] = {}  # of the rows of arguments, for each program
+        self._compiled: dict[int, Callable[..., Any]] = {}  # torch's programs, by rows
+        self._held: list[Any] = []  # inputs of the graph with the most rows, of which others read the first rows
+        self._failures: list[str] = []  # of the batch size whose programs are being made
 
     def __call__(self, *tensors: Any) -> Any:
-        rows, building = len(tensors[0]), self._owner.building
-        tensors = tuple(map(_of_one_kind, tensors))
-        if building is not None and rows == (self._rows or building):
-            return self._compared(tensors)
-        sizes = self._owner.sizes if self._rows is None else [self._rows]
-        size = next((size for size in sizes if size >= rows and size in self._programs), None)
-        if size is None or building is not None or self._shapes[size] != _row_shapes(tensors):
+        rows, owner = len(tensors[0]), self._owner
+        if not owner.mode or (self._parts and tensors[0].device.type != "cuda"):
             return self._function(*tensors)
-        result = self._programs[size](*(_padded(tensor, size) for tensor in tensors))
+        if owner.capturing is not None:
+            compiled = owner.capturing == _COMPILED
+            return self._compiled[rows](*map(_of_one_kind, tensors)) if compiled else self._function(*tensors)
+        if owner.building is not None:
+            own = rows == (self._rows or owner.building)
+            return self._compared(list(map(_of_one_kind, tensors))) if own else self._function(*tensors)
+        sizes = owner.sizes if self._rows is None else [self._rows]
+        size = next((size for size in sizes if size >= rows and size in self._programs), None)
+        if size is None or self._kinds[size] != _row_kinds(tensors):
+            return self._function(*tensors)
+        [program] = self._programs[size].values()
+        if isinstance(program, CudaGraph):
+            return program(*tensors)
+        result = program(*(_padded(_of_one_kind(tensor), size) for tensor in tensors))
         return tuple(one[:rows] for one in result) if isinstance(result, tuple) else result[:rows]
 
-    def drop(self, size: int) -> None:
-        """Drop the program for a batch size, and one for a number of rows unless another batch size proved it."""
-        self._programs.pop(size if self._rows is None or self._owner.sizes else self._rows, None)
+    def tier(self, size: int) -> str | None:
+        """Return the tier of the program of a batch size; None if it has none."""
+        return next(iter(self._programs.get(self._rows or size, ())), None)
+
+    def settle(self, size: int) -> list[str]:
+        """Keep the fastest program of a batch size; return the reasons for which others failed."""
+        size, failures, self._failures = self._rows or size, self._failures, []
+        programs = self._programs.get(size, {})
+        if len(programs) > 1:  # both are graphs; they alternate, so that other work on the GPU slows both
+            times = [[program.replay_ms() for program in programs.values()] for _ in range(_REPLAYS)]
+            graph_ms, compiled_ms = map(min, zip(*times, strict=True))
+            logger.info("%r, %d rows: %.3f ms eager, %.3f ms compiled", self.name, size, graph_ms, compiled_ms)
+            del programs[_GRAPH if compiled_ms <= _FASTER * graph_ms else _COMPILED]
+        if not programs:
+            self._programs.pop(size, None)
+        return failures
 
     def _compared(self, tensors: Sequence[Any]) -> Any:
-        """Return the eager result, once the program is made and its result is near it."""
+        """Return the eager result, once the programs are made; keep those whose results are near it."""
         wanted, size = self._function(*tensors), len(tensors[0])
-        try:
-            if size not in self._programs:
-                self._programs[size], self._shapes[size] = self._compiled(tensors), _row_shapes(tensors)
-            error = _largest_error(self._programs[size](*tensors), wanted)
-        except Exception as failure:  # compilers raise any error
-            said = " ".join(str(failure).split())[:_SHOWN]
-            raise CompilationFailed(f"{self._name!r}: {type(failure).__name__}: {said}") from failure
+        missing = size not in self._programs
+        programs = self._programs.setdefault(size, {})
+        self._kinds.setdefault(size, _row_kinds(tensors))
         limit = _tolerance([*tensors, *_each(wanted)])
-        if not error <= limit:  # also if it is not a number
-            raise CompilationFailed(f"{self._name!r}: its results are off by {error:.2g}, want at most {limit:g}")
+        for tier in self._tiers(tensors) if missing else list(programs):
+            try:
+                program = self._made(tier, tensors) if missing else programs[tier]
+                error = _largest_error(program(*tensors), wanted)
+            except Exception as failure:  # noqa: BLE001 - compilers raise any error
+                said = f"{type(failure).__name__}: {' '.join(str(failure).split())[:_SHOWN]}"
+            else:
+                programs[tier] = program
+                if error <= limit:
+                    continue
+                said = f"its results are off by {error:.2g}, want at most {limit:g}"  # or it is not a number
+            programs.pop(tier, None)
+            self._failures.append(f"{self.name!r} by {tier}: {said}")
         return wanted
 
-    def _compiled(self, tensors: Sequence[Any]) -> Callable[..., Any]:
-        """Return the program for tensors of these shapes.
+    def _tiers(self, tensors: Sequence[Any]) -> list[str]:
+        """Return the tiers to try, slowest first."""
+        if tensors[0].device.type != "cuda":
+            return [_COMPILED]
+        size, mode = len(tensors[0]), self._owner.mode
+        both = mode != "graphs" and all(_COMPILED in part._programs.get(size, ()) for part in self._parts)
+        return [_GRAPH, _COMPILED] if both else [_GRAPH]
+
+    def _made(self, tier: str, tensors: Sequence[Any]) -> Any:
+        """Return a tier's program for tensors of these shapes.
 
         It is made with other values than those of a comparison: a CUDA graph that missed a part of the core returns the
         results of the values with which it was captured.
         """
+        function, owner, size, device = self._function, self._owner, len(tensors[0]), tensors[0].device
+        inputs = self._inputs(tensors)
+        if tier == _COMPILED and not self._parts:
+            function = self._compiled[size] = self._program(inputs)
+        if device.type != "cuda":
+            return function
+        owner.capturing = tier
+        try:
+            return CudaGraph(function, inputs, owner.memory(device))
+        finally:
+            owner.capturing = None
+
+    def _inputs(self, tensors: Sequence[Any]) -> list[Any]:
+        """Return zeros of these shapes, in the memory of the inputs of more rows if there are such."""
+        size = len(tensors[0])
+        if not self._held or len(self._held[0]) < size or _row_kinds(self._held) != _row_kinds(tensors):
+            self._held = [require("torch").zeros_like(tensor) for tensor in tensors]
+        return [held[:size].zero_() for held in self._held]
+
+    def _program(self, tensors: Sequence[Any]) -> Callable[..., Any]:
+        """Return torch's program for tensors of these shapes."""
         function, torch = self._function, require("torch")
-        tensors = [torch.zeros_like(tensor) for tensor in tensors]
 
         def core(*tensors: Any) -> Any:
             return function(*tensors)
 
         # torch counts the programs of each code object, and gives up after eight of them
-        core.__code__ = core.__code__.replace(co_name=f"{self._name}_{len(tensors[0])}".replace(" ", "_"))
+        core.__code__ = core.__code__.replace(co_name=f"{self.name}_{len(tensors[0])}".replace(" ", "_"))
         program: Callable[..., Any] = torch.compile(core, fullgraph=True, dynamic=False, backend=self._owner.backend)
         program(*tensors)
-        return CudaGraph(program, tensors) if tensors[0].device.type == "cuda" else program
+        return program
 
 
 def _of_one_kind(tensor: Any) -> Any:
@@ -323,8 +451,8 @@ def _padded(tensor: Any, size: int) -> Any:
     return require("torch").cat([tensor, tensor[-1:].expand(missing, *tensor.shape[1:])]) if missing else tensor
 
 
-def _row_shapes(tensors: Sequence[Any]) -> list[Any]:
-    return [tensor.shape[1:] for tensor in tensors]
+def _row_kinds(tensors: Sequence[Any]) -> list[Any]:
+    return [(tensor.shape[1:], tensor.dtype) for tensor in tensors]
 
 
 def _each(result: Any) -> Sequence[Any]:

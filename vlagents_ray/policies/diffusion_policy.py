@@ -106,7 +106,7 @@ class DiffusionPolicy(ModelPolicy):
     def load(self) -> DiffusionNetwork:
         network = DiffusionNetwork.load(self.config)
         self._cameras(network)
-        if self.config.compile:
+        if self.config.compile_on(network.device.type):
             compile_with(network, self.compilation)
         return network
 

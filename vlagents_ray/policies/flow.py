@@ -16,6 +16,7 @@ import math
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -238,15 +239,17 @@ def _weights(delay: int, length: int, horizon: int) -> np.ndarray:
 
 
 class FlowPasses(abc.ABC):
-    """The passes of a model: one over its inputs, and one for each step of the flow."""
+    """The passes of a model: one over its inputs, and one for each step of the flow, or one for all steps."""
 
     def __init__(self, model: Any, compilation: Compilation) -> None:
         """Use the passes of a model, in their compiled form if there is one."""
         self.model = model
         self.adapters = Adapters()  # of the policy
         self.module = sys.modules[type(model).__module__]  # with the functions of its authors' own passes
+        self._compilation = compilation
         self._encode = compilation.core("encode", self.encode)
         self._velocity = compilation.core("velocity", self.velocity)
+        self._flows: dict[int, Callable[..., Any]] = {}  # whole flows, by their steps
 
     def encode_images(self, images: Sequence[Any]) -> Sequence[Any]:
         """Return the input of `encode` for images (P, 3, H, W)."""
@@ -308,10 +311,19 @@ class FlowPasses(abc.ABC):
             index = torch.tensor(owners, device=mask.device)
             encoded, seen, state = encoded[index], seen[index], state[index]
 
+        if not changes and steps not in self._flows:
+            self._flows[steps] = self._compilation.core("flow", partial(self._flow, steps, ()), parts=[self._velocity])
+        flow = partial(self._flow, steps, changes) if changes else self._flows[steps]
+        with self.adapters.rows(fingerprints):
+            return flow(encoded, seen, state, noise)
+
+    def _flow(self, steps: int, changes: Sequence[Change], encoded: Any, seen: Any, state: Any, noise: Any) -> Any:
+        """Return actions (B, H, D): without changes, whose values differ for each batch, all steps are one core."""
+        torch = require("torch")
+
         def velocity(actions: Any, time: float) -> Any:
             times = torch.full((len(actions),), time, dtype=torch.float32, device=actions.device)
-            with self.adapters.rows(fingerprints):
-                return self._velocity(encoded, seen, state, actions, times)
+            return self._velocity(encoded, seen, state, actions, times)
 
         return follow(velocity, noise, steps, *changes)
 

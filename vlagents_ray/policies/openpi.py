@@ -229,7 +229,7 @@ class OpenPiConfig(ModelConfig):
     noise_level: NoiseLevel = 0.0
     batch_sizes: list[int] | None = Field(
         default=None,
-        description="the only numbers of rows to run; unset: for JAX or with `compile` those of the "
+        description="the only numbers of rows to run; unset: for JAX, or compiled, those of the "
         "deployment's `batch`, else any",
     )
 
@@ -524,7 +524,7 @@ class OpenPi(ModelPolicy):
         if (folder / "model.safetensors").is_file():
             model = load_torch(config, folder, self.config, self.compilation)
         elif (folder / "params").is_dir():
-            if self.config.compile:
+            if self.config.compile not in (False, "auto"):
                 raise ConfigError("compile: openpi's JAX models always are; leave it out")
             self.config = self.config.with_sizes(self.report.batch_sizes)
             model = load_jax(config, folder, self.config)

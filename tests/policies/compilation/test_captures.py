@@ -89,13 +89,15 @@ def elsewhere(cuda: FakeCuda, function: Callable[[Any], Any]) -> Callable[[Any],
 
 
 def test_a_graph_that_recorded_nothing_is_refused(cuda: FakeCuda) -> None:
-    with pytest.raises(ConfigError, match="compile: require: 'core': RuntimeError: the CUDA graph is empty"):
+    with pytest.raises(
+        ConfigError, match="compile: require: 'core' by CUDA graph: RuntimeError: the CUDA graph is empty"
+    ):
         compiled(cuda, elsewhere(cuda, lambda x: x.tanh()))
 
 
 def test_a_graph_that_missed_a_part_is_refused(cuda: FakeCuda) -> None:
     part = elsewhere(cuda, lambda x: x.tanh())
-    with pytest.raises(ConfigError, match="'core': its results are off by"):
+    with pytest.raises(ConfigError, match="'core' by CUDA graph: its results are off by"):
         compiled(cuda, lambda x: part(x) + x)
 
 

@@ -125,14 +125,14 @@ def test_batches_of_any_size_act_as_without_compilation(compiler: CountingCompil
 def test_programs_are_made_once_while_the_policy_loads(compiler: CountingCompiler) -> None:
     sizes = list(range(1, 13))  # more than torch allows for one function
     policy, report, steps = loaded(compile="require", batch_sizes=sizes)
-    assert (compiler.rows, policy.compilation.sizes, report.uncompiled) == (sizes, sizes, [])
-    assert steps == [f"compiling {size} rows ({size} of 12)" for size in sizes]
+    assert (compiler.rows, policy.compilation.sizes, report.uncompiled) == (sizes[::-1], sizes, [])
+    assert steps == [f"compiling {size} rows ({13 - size} of 12)" for size in sizes[::-1]]
     acted(policy, range(5))
     other = threading.Thread(target=acted, args=(policy, range(7)))  # the policy's thread is not always the loading one
     other.start()
     other.join()
     acted(policy, range(5), **{SAMPLES: 2})
-    assert compiler.rows == sizes
+    assert compiler.rows == sizes[::-1]
 
 
 def test_pushed_weights_act_at_once_without_another_program(compiler: CountingCompiler) -> None:
@@ -217,7 +217,7 @@ def test_a_program_with_other_results_is_not_used(
     policy, report, _ = loaded(compile=True, batch_sizes=[1, 2, 3])
     assert policy.compilation.sizes == [1, 3]
     [said] = report.uncompiled
-    assert said.startswith("2 rows: 'linear': its results are off by ")
+    assert said.startswith("2 rows: 'linear' by torch.compile: its results are off by ")
     assert "want at most 0.001" in caplog.text
     for one, other in zip(acted(made(), [0, 1]), acted(policy, [0, 1]), strict=True):
         np.testing.assert_allclose(one, other, atol=1e-6)
@@ -243,7 +243,7 @@ def test_a_program_that_keeps_an_input_of_its_first_call_is_not_used(
         return program
 
     monkeypatch.setattr(Compilation, "backend", staticmethod(stale))
-    with pytest.raises(ConfigError, match="compile: require: 'linear': its results are off by"):
+    with pytest.raises(ConfigError, match="compile: require: 'linear' by torch.compile: its results are off by"):
         made(compile="require", batch_sizes=[2])
     torch._dynamo.reset()
 
@@ -261,7 +261,7 @@ def test_a_program_is_not_made_with_the_inputs_with_which_it_is_compared(monkeyp
     monkeypatch.setattr(Compilation, "backend", staticmethod(stale))
     compilation, always = Compilation("require"), torch.ones(2, 3)
     core = compilation.core("sum", lambda numbers: numbers.sum(-1))
-    with pytest.raises(ConfigError, match="'sum': its results are off by"):
+    with pytest.raises(ConfigError, match="'sum' by torch.compile: its results are off by"):
         compilation.add_size(2, lambda: core(always))
     torch._dynamo.reset()
 

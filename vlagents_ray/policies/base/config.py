@@ -43,9 +43,11 @@ class ModelConfig(BaseModel, extra="forbid"):
         "usually set by the `checkpoints` of a deployment",
     )
     compile: CompileMode = Field(
-        default=False,
-        description="compile the forward pass for each of `batch_sizes`, as CUDA graphs on a GPU; what cannot be "
-        "compiled, or computes something else then, runs without; with 'require' it is an error",
+        default="auto",
+        description="'graphs': CUDA graphs of the forward pass for each of `batch_sizes`; true: on a GPU also of "
+        "what torch.compile makes of it, if that is faster, and on a CPU that alone; what fails, or computes something "
+        "else, runs without; 'require': true, with an error then; 'auto': 'graphs' on a GPU, false on a CPU, with "
+        "adapters, or if the family has none",
     )
     seed: int = Field(default=0, ge=0, description="mixed with the seed of each episode")
 
@@ -73,7 +75,7 @@ class ModelConfig(BaseModel, extra="forbid"):
     batch_sizes: list[int] | None = Field(
         default=None,
         description="the only numbers of rows to run, ascending; each is run, or compiled, when the model is loaded, "
-        "smaller batches are padded; unset: if `compile` is set those of the deployment's `batch`, else any",
+        "smaller batches are padded; unset: if the model is compiled those of the deployment's `batch`, else any",
     )
 
     @model_validator(mode="after")
@@ -87,7 +89,7 @@ class ModelConfig(BaseModel, extra="forbid"):
 
     @model_validator(mode="after")
     def _adapters_are_added_to_eager_whole_layers(self) -> Self:
-        for name, value in (("compile", self.compile), ("quantization", self.quantization)):
+        for name, value in (("compile", self.compile not in (False, "auto")), ("quantization", self.quantization)):
             if self.adapters and value:
                 raise ValueError(
                     f"adapters and {name}: got both, want one of them; merge an adapter into its base to have "
@@ -101,6 +103,11 @@ class ModelConfig(BaseModel, extra="forbid"):
         if sizes is not None and (not sizes or sizes[0] < 1 or sizes != sorted(set(sizes))):
             raise ValueError(f"got {sizes}, want ascending positive numbers, such as [1, 2, 4, 8, 16]")
         return sizes
+
+    def compile_on(self, device: str) -> CompileMode:
+        """Return `compile` for a model on a kind of device, such as "cuda", in the place of "auto"."""
+        graphs: CompileMode = "graphs" if device == "cuda" and not self.adapters else False
+        return graphs if self.compile == "auto" else self.compile
 
     def with_sizes(self, sizes: Sequence[int]) -> Self:
         """Return the settings with these `batch_sizes`, unless they name others."""

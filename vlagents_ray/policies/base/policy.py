@@ -140,24 +140,38 @@ class ModelPolicy(Agent, abc.ABC):
         first found by a robot.
         """
         with current_report() as self.report:
-            if self.config.compile:
-                self.config = self.config.with_sizes(self.report.batch_sizes)
             self.model = self._load_with_adapters() if self.config.adapters else self.load()
+        self._decide_on_compiling()
         if self.config.quantization:
             quantize(self, self.config.quantization)
         sizes = self.config.batch_sizes or []
         if not sizes and any(device["kind"] != "cpu" for device in self.report.devices):
             sizes = sorted({1, self.config.rows})
-        seeds = itertools.count()
-        for number, size in enumerate(sizes, 1):
+        seeds, cores = itertools.count(), self.compilation.mode and self.compilation.cores
+        for number, size in enumerate(reversed(sizes) if cores else sizes, 1):
             report_progress(
                 f"{'compiling' if self.config.compile else 'running'} {size} rows ({number} of {len(sizes)})"
             )
-            if self.compilation.cores:
+            if cores:
                 self.compilation.add_size(size, partial(self._run_examples, size, seeds))
             self._run_examples(size, seeds)
         if sizes:
             free_memory()  # which a full batch took, and usual ones do not need
+
+    def _decide_on_compiling(self) -> None:
+        """Set `compile` to what it means for the loaded model and its device."""
+        setting, has_cores = self.config.compile, bool(self.compilation.cores)
+        kind = next((device["kind"] for device in self.report.devices if device["kind"] != "cpu"), "cpu")
+        mode = self.config.compile_on(kind)
+        if setting == "auto":
+            mode = mode if has_cores else False
+            logger.info("compile: auto: %s, on %s, %s cores", mode or "false", kind, "with" if has_cores else "without")
+        elif setting == "graphs" and kind != "cuda":
+            raise ConfigError(f"compile: graphs: got a model on {kind!r}, want 'cuda'; leave it out")
+        self.compilation.mode = mode
+        self.config = self.config.model_copy(update={"compile": mode})
+        if mode:
+            self.config = self.config.with_sizes(self.report.batch_sizes)
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         """Begin the episode with `kwargs["seed"]`, an int, by default 0, and the adapter named `kwargs["adapter"]`."""

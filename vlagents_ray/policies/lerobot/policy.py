@@ -103,7 +103,7 @@ class LeRobot(ModelPolicy):
         policy = checkpoint.load(folder, self.config, torch_device(self.config.device))
         settings = policy.config
         kind = KINDS.get(settings.type, Kind)(policy, self.compilation)
-        if self.config.compile and not self.compilation.cores:
+        if self.config.compile not in (False, "auto") and not self.compilation.cores:
             raise ConfigError(
                 f"compile: not for LeRobot's {settings.type!r}; leave it out, or have LeRobot compile it, where its "
                 f"config has that: overrides: {{compile_model: true}}"

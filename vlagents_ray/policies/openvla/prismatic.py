@@ -216,7 +216,7 @@ def load_prismatic(config: PrismaticConfig, bounds: Bounds = "q99") -> Prismatic
         prompt=_PROMPT_V01 if "openvla-v01" in config.checkpoint else _PROMPT,
         device=device,
         dtype=dtype,
-        padded_tokens=config.compiled_tokens if config.compile else 0,
+        padded_tokens=config.compiled_tokens if config.compile_on(device.type) else 0,
     )
 
 
