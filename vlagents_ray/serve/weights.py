@@ -8,6 +8,7 @@ A version is freed when no session acts with it and it is neither the newest nor
 
 from __future__ import annotations
 
+import logging
 import threading
 from abc import ABC, abstractmethod
 from collections import deque
@@ -29,19 +30,34 @@ from vlagents_ray.errors import (
     WeightsNotStaged,
 )
 from vlagents_ray.interface import POLICY, Agent
+from vlagents_ray.policies.base.accelerator import free_memory, is_out_of_memory
 from vlagents_ray.policies.compilation import CAPTURES
 from vlagents_ray.weights.safetensors import ValueSpec, read_header
 from vlagents_ray.weights.shared_values import SharedValues, gpu_of, opened
-from vlagents_ray.weights.trainable import fingerprint, fitted, is_copied, own_copy, portable, require_fit
+from vlagents_ray.weights.trainable import (
+    fingerprint,
+    fitted,
+    from_host,
+    is_copied,
+    own_copy,
+    portable,
+    require_fit,
+    to_host,
+)
+
+logger = logging.getLogger(__name__)
 
 DIGITS = 16  # length of a checkpoint's digest that replaces a fingerprint, hexadecimal digits
 STAGED_S = 60.0  # time for which a staged version waits for its commit, s
 
 PushMode = Literal["keep", "next_episode"]
 """When a session changes to a new version: between two of its acts, or at its next reset."""
+RestStep = Literal["sleep", "restore", "wake"]
+"""No acts, and less memory; the memory back, still without acts; and acts again."""
 OPTION = "weights"  # option of a reset
 _COLLECTED = 1000  # maximum number of uncollected durations of pushes
 _LARGEST = 2**53 - 1  # largest version number, which JSON represents exactly
+_LONGEST_REST_S = 86_400.0
 _FOLLOW, _PINNED = "follow", "pinned"
 
 
@@ -76,6 +92,21 @@ class WeightsVersion:
     def describe(self) -> dict[str, Any]:
         """Return the number and the fingerprint, for the metadata."""
         return dict(self.info[POLICY])
+
+
+@dataclass(frozen=True, slots=True)
+class Rest:
+    """A step between acting and acting again."""
+
+    step: RestStep
+    offload: bool = True  # whether "sleep" moves weights to the memory of the host, and frees CUDA graphs
+    at_most_s: float = 600.0  # time after which a replica wakes by itself, since its learner may have died, s
+
+    def __post_init__(self) -> None:
+        if self.step not in get_args(RestStep):
+            raise InvalidInput(f"rest: got {self.step!r}, want one of {list(get_args(RestStep))}")
+        if not 0 < self.at_most_s <= _LONGEST_REST_S:
+            raise InvalidInput(f"at_most_s: got {self.at_most_s:g}, want seconds in (0, {_LONGEST_REST_S:g}]")
 
 
 class FollowingSession(Protocol):
@@ -116,6 +147,8 @@ class ModelWeights:
         self._timer: threading.Timer | None = None
         self._live: WeightsVersion | None = first  # version in the agent; None if loading one has failed
         self._alive = WeakValueDictionary({0: first})
+        self._asleep = False
+        self._moved: list[tuple[Any, Any]] = []  # memory of the host with the values of the GPU, while it sleeps
 
     def begin(self, session: FollowingSession, *, follows: bool) -> WeightsVersion:
         """Choose the newest or the pinned version for the session's next episode, and return it."""
@@ -221,6 +254,7 @@ class ModelWeights:
     ) -> WeightsVersion:
         """Return a version of pushed values, which have been checked; missing names have the values of the newest."""
         with CAPTURES.pushes, opened(pushed) if isinstance(pushed, SharedValues) else nullcontext(pushed) as named:
+            self._require_awake()
             before = self._values(newest)
             values = fitted(before, named, partial=options.partial, allow_same=options.allow_same)
             return WeightsVersion(number, fingerprint(values), values)
@@ -274,7 +308,51 @@ class ModelWeights:
     def portable_values(self, version: WeightsVersion) -> dict[str, Any]:
         """Return the values of a version as numpy arrays, for another process."""
         with CAPTURES.pushes:
+            self._require_awake()
             return {name: portable(value) for name, value in self._values(version).items()}
+
+    def sleep(self, *, offload: bool) -> None:
+        """Free the memory that torch has cached and, with `offload`, that of all versions and graphs, until `wake`.
+
+        The caller keeps the agent from acting meanwhile.
+
+        Raises:
+            NotTrainable: The agent names no parameters, which `offload` would move.
+        """
+        if offload and self._refusal is not None:
+            raise self._refusal
+        with CAPTURES.pushes, self._busy:
+            if offload:
+                self._asleep = True
+                self._agent.sleep()
+                held = [version.values for version in self._alive.values() if version.values is not None]
+                self._moved += to_host([self._agent.parameters(), *held])
+        free_memory()
+
+    def wake(self) -> None:
+        """Move the versions back, and make the graphs again; does nothing if the agent is awake.
+
+        Raises:
+            PolicyUnavailable: The GPU has too little memory; the agent still sleeps.
+        """
+        with CAPTURES.pushes, self._busy:
+            if not self._asleep:
+                return
+            try:
+                from_host(self._moved)
+                self._agent.wake()
+            except RuntimeError as error:
+                if not is_out_of_memory(error):
+                    raise
+                raise PolicyUnavailable(
+                    f"wake: the GPU has too little memory for the policy, which still sleeps; free the learner's, "
+                    f"with torch.cuda.empty_cache(), and call wake again ({error})"
+                ) from error
+            self._asleep = False
+
+    def _require_awake(self) -> None:
+        if self._asleep:
+            raise PolicyUnavailable("weights: the policy sleeps; give wake() the new values, or call it first")
 
     def _forget_staged(self) -> None:
         self._staged = None
@@ -330,10 +408,25 @@ class HeldVersion:
 class WeightUpdates:
     """Stages and commits new weights in one replica. Thread-safe."""
 
-    def __init__(self, own: Callable[[], ModelWeights], sessions: Callable[[], Sequence[FollowingSession]]) -> None:
-        """Update the weights that `own` returns, which the `sessions` of the replica act with."""
-        self._own = own
+    def __init__(
+        self,
+        own: Callable[[], ModelWeights],
+        sessions: Callable[[], Sequence[FollowingSession]],
+        acting: threading.Lock | None = None,
+    ) -> None:
+        """Update the weights of a replica.
+
+        Args:
+            own: Returns the weights, or raises `PolicyUnavailable` while the policy loads.
+            sessions: Returns the sessions, which act with them.
+            acting: The lock that the policy's thread holds while it runs a batch.
+        """
+        self.own = own
         self._sessions = sessions
+        self._acting = acting or threading.Lock()
+        self._resting = threading.RLock()  # held during each step of a rest
+        self._asleep: ModelWeights | None = None  # those of the policy that sleeps, for which `acting` is held
+        self._alarm: threading.Timer | None = None
         self._pushes_ms: deque[float] = deque(maxlen=_COLLECTED)
         self._given: dict[int, WeightsVersion] = {}  # in a child process: those that its replica refers to
 
@@ -347,26 +440,79 @@ class WeightUpdates:
 
     def read_header(self, header: bytes, options: PushOptions) -> dict[str, ValueSpec]:
         """Check the header of a push, as `ModelWeights.read_header` does."""
-        return self._own().read_header(header, options)
+        return self.own().read_header(header, options)
 
     def stage(self, number: int, pushed: Mapping[str, Any] | SharedValues, options: PushOptions) -> str:
         """Check and hold a new version, and return its fingerprint, as `ModelWeights.stage` does."""
-        return self._own().stage(number, pushed, options)
+        return self.own().stage(number, pushed, options)
 
     def commit(self, number: int, options: PushOptions) -> None:
         """Use the staged version, as `ModelWeights.commit` does."""
-        self._own().commit(number, options, self._sessions)
+        self.own().commit(number, options, self._sessions)
 
     def held(self) -> list[HeldVersion]:
         """Return the pinned and the newest version, the older one first, except for the checkpoint itself."""
-        own = self._own()
+        own = self.own()
         pinned, newest = own.pinned, own.newest
         pushed = dict.fromkeys(version for version in (pinned, newest) if version.number)
         return [HeldVersion(one.number, one is pinned, own.portable_values(one)) for one in pushed]
 
     def drop(self, number: int) -> None:
         """Drop the staged version."""
-        self._own().drop(number)
+        self.own().drop(number)
+
+    def rest(self, rest: Rest) -> None:
+        """Make the policy sleep after the running batch, restore its memory, or let it act again.
+
+        Requests wait in the queue meanwhile. "restore" and "wake" do nothing if it is awake.
+
+        Raises:
+            PolicyUnavailable: The policy loads, or its GPU has too little memory, so that it still sleeps.
+            Overloaded: It sleeps already.
+            NotTrainable: See `ModelWeights.sleep`.
+        """
+        own = self.own()
+        with self._resting:
+            if rest.step == "sleep":
+                self._sleep(own, rest)
+            elif self._asleep is not None:
+                self._asleep.wake()
+                if rest.step == "wake":
+                    self._asleep = None
+                    self._acting.release()
+                    if self._alarm is not None:
+                        self._alarm.cancel()
+
+    def _sleep(self, own: ModelWeights, rest: Rest) -> None:
+        if self._asleep is not None:
+            raise Overloaded("sleep: the policy sleeps already; call wake first")
+        self._acting.acquire()
+        try:
+            own.sleep(offload=rest.offload)
+        except BaseException:
+            try:
+                own.wake()
+            finally:
+                self._acting.release()
+            raise
+        self._asleep = own
+        self._set_alarm(rest.at_most_s)
+
+    def _set_alarm(self, seconds: float) -> None:
+        self._alarm = threading.Timer(seconds, self._oversleep, (seconds,))
+        self._alarm.daemon = True
+        self._alarm.start()
+
+    def _oversleep(self, seconds: float) -> None:
+        with self._resting:
+            if self._alarm is not threading.current_thread():
+                return
+            logger.warning("the policy slept for %g s, its limit, and wakes without its learner", seconds)
+            try:
+                self.rest(Rest("wake"))
+            except Exception:
+                logger.exception("the policy does not wake; tried again in %g s", seconds)
+                self._set_alarm(seconds)
 
     # In a child process: its replica decides which version acts, and when one is dropped. It names version 0 as 0, and
     # others by numbers of its own, as a version may be pushed twice.
@@ -375,7 +521,7 @@ class WeightUpdates:
         self, name: int, base: int, number: int, pushed: Mapping[str, Any] | SharedValues, options: PushOptions
     ) -> str:
         """Make a version from pushed values and those of `base`, and return its fingerprint."""
-        own = self._own()
+        own = self.own()
         made = self._given[name] = own.make(number, self.given(base), pushed, options)
         own.admit(made)
         return made.fingerprint
@@ -383,38 +529,38 @@ class WeightUpdates:
     def given(self, name: int) -> WeightsVersion:
         """Return the version that the replica named so."""
         if not self._given:
-            self._given[0] = self._own().newest
+            self._given[0] = self.own().newest
         return self._given[name]
 
     def portable_values(self, name: int) -> dict[str, Any]:
         """Return the values of the version that the replica named so."""
-        return self._own().portable_values(self.given(name))
+        return self.own().portable_values(self.given(name))
 
     def obey(self, use: int | None = None, forget: int | None = None) -> None:
         """Act with one version from now on, or drop one. Called on the policy's thread, between two batches."""
         if use is not None:
-            self._own().act_with(self.given(use), self._sessions())
+            self.own().act_with(self.given(use), self._sessions())
         if forget is not None:
             self._given.pop(forget, None)
 
     def describe(self) -> dict[str, dict[str, Any]] | None:
         """Return number and fingerprint of the newest and the pinned version, for the metadata; None while it loads."""
         try:
-            own = self._own()
+            own = self.own()
         except PolicyUnavailable:
             return None
         return {"newest": own.newest.describe(), "pinned": own.pinned.describe()}
 
     def newest(self) -> NewestVersion:
         """Return the newest version; raise `PolicyUnavailable` while the policy loads."""
-        own = self._own()
+        own = self.own()
         return NewestVersion(own.newest.number, own.model, own.gpu)
 
     @property
     def number(self) -> int:
         """Number of the newest version; 0 while the policy loads."""
         try:
-            return self._own().newest.number
+            return self.own().newest.number
         except PolicyUnavailable:
             return 0
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import sys
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any
@@ -178,6 +178,34 @@ def _is_tensor(value: Any) -> bool:
 def _is_module(value: Any) -> bool:
     torch = sys.modules.get("torch")
     return torch is not None and isinstance(value, torch.nn.Module)
+
+
+def to_host(groups: Iterable[Mapping[str, Any]]) -> list[tuple[Any, Any]]:
+    """Move torch tensors from GPUs to the host; return their memory, without bytes now, and that on the host.
+
+    The tensors stay the same objects, with the same views and ties; until `from_host` they must not be read.
+    """
+    tensors = [value for named in groups for value in named.values() if _is_tensor(value) and _on_gpu(value)]
+    storages = {value.untyped_storage().data_ptr(): value.untyped_storage() for value in tensors if value.numel()}
+    moved = []
+    for storage in storages.values():
+        if storage.resizable():  # otherwise it belongs to another library or process
+            moved.append((storage, storage.cpu() if storage.device.type != "cpu" else storage.clone()))
+            storage.resize_(0)
+    return moved
+
+
+def from_host(moved: list[tuple[Any, Any]]) -> None:
+    """Move tensors back, to other addresses; after an error, the list has those that were not moved yet."""
+    while moved:
+        storage, host = moved[-1]
+        storage.resize_(host.nbytes())
+        storage.copy_(host)
+        moved.pop()
+
+
+def _on_gpu(value: Any) -> bool:
+    return bool(value.device.type != "cpu")
 
 
 # Checks that pushed values fit those of a policy, and a digest of values.

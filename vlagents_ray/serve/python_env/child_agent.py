@@ -370,14 +370,14 @@ class ChildWeights(ModelWeights):
     def make(
         self, number: int, newest: WeightsVersion, pushed: Mapping[str, Any] | SharedValues, options: PushOptions
     ) -> WeightsVersion:
-        name, shared, values = next(self._numbers), None, pushed
+        name, shared = next(self._numbers), None
         if isinstance(pushed, SharedValues):
-            shared, values = pushed.to_json(), pushed.others
+            shared, pushed = pushed.to_json(), pushed.others
         else:
             require_fit(newest.values or {}, pushed, partial=options.partial)  # before anything is copied
         make = {"base": self._names[newest], "number": number, "options": asdict(options)}
         with _memory() as file:
-            write_values(file, {key: portable(value) for key, value in values.items()})
+            write_values(file, {key: portable(value) for key, value in pushed.items()})
             call = {"name": name, "values": _path(file), "make": make, "shared": shared}
             version = WeightsVersion(number, self._child.call_for_weights(**call)["fingerprint"], newest.values)
         self._name(version, name)
@@ -390,6 +390,12 @@ class ChildWeights(ModelWeights):
             if reply.error is not None:
                 raise reply.error
             self._live = version
+
+    def sleep(self, *, offload: bool) -> None:
+        self._child.call_for_weights(offload=offload)
+
+    def wake(self) -> None:
+        self._child.call_for_weights()
 
     def portable_values(self, version: WeightsVersion) -> dict[str, Any]:
         with _memory() as file:

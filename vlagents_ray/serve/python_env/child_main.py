@@ -187,9 +187,14 @@ def _read_calls(
 
 
 def _executed(
-    updates: WeightUpdates, name: int, values: str, make: dict[str, Any] | None = None, shared: Any = None
+    updates: WeightUpdates,
+    name: int = 0,
+    values: str = "",
+    make: dict[str, Any] | None = None,
+    shared: Any = None,
+    offload: bool | None = None,
 ) -> dict[str, Any]:
-    """Make a version of the weights, or write the values of one.
+    """Make a version of the weights, or write the values of one, or let the policy sleep or wake.
 
     Args:
         updates: The versions.
@@ -197,7 +202,12 @@ def _executed(
         values: The file in shared memory for its values, as safetensors.
         make: The arguments of `WeightUpdates.make`, to read the values; None to write them.
         shared: `SharedValues.to_json` of values that are not in the file.
+        offload: See `ModelWeights.sleep`; without a file, None lets the policy wake.
     """
+    if not values:
+        own = updates.own()
+        own.wake() if offload is None else own.sleep(offload=offload)
+        return {}
     with Path(values).open("r+b") as file:
         if make is None:
             write_values(file, updates.portable_values(name))

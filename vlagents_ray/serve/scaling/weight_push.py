@@ -16,7 +16,7 @@ from typing import Any, Protocol, TypeVar
 
 from vlagents_ray.errors import InvalidInput, InvalidWeights, PolicyUnavailable, VLAgentsError
 from vlagents_ray.serve.scaling.session_migration import PeerEnded, PeerUnreachable
-from vlagents_ray.serve.weights import NewestVersion, PushOptions, PushResult, WeightUpdates
+from vlagents_ray.serve.weights import NewestVersion, PushOptions, PushResult, Rest, WeightUpdates
 from vlagents_ray.weights.shared_values import NotShared, SharedValues
 
 T = TypeVar("T")
@@ -119,6 +119,28 @@ class WeightPusher:
             await self._own.weights(WeightUpdates.pushed, 1e3 * (time.perf_counter() - begun))
             acting = sorted(replica.name for replica, acts in zip(staged, done, strict=True) if acts)
             return PushResult(number, staged[self._own], tuple(acting))
+
+    async def rest(self, rest: Rest) -> None:
+        """Let all replicas take a step of a rest; if one cannot sleep, none does."""
+        async with self._pushing:
+            replicas = [self._own, *await self._loaded(await self._others())]
+            results = await asyncio.gather(
+                *(replica.weights(WeightUpdates.rest, rest) for replica in replicas), return_exceptions=True
+            )
+            answers = dict(zip(replicas, results, strict=True))
+            failed = {
+                one: error for one, error in answers.items() if error is not None and type(error) is not PeerEnded
+            }
+            if not failed:
+                return
+            if rest.step == "sleep":
+                asleep = [one for one in replicas if answers[one] is None]
+                wakes = (one.weights(WeightUpdates.rest, Rest("wake")) for one in asleep)
+                await asyncio.gather(*wakes, return_exceptions=True)
+            replica, error = next(iter(failed.items()))
+            if isinstance(error, PeerUnreachable):
+                raise _unreachable(replica) from error
+            raise error
 
     async def catch_up(self) -> int:
         """Get the newest versions of the other replicas if they are newer; then return this replica's newest version.
