@@ -17,6 +17,8 @@ from in_memory_keys import ChangingKeys
 from websockets.exceptions import ConnectionClosed
 
 from vlagents_ray.client.credentials import Credentials
+from vlagents_ray.client.transports.base import CodecChoice
+from vlagents_ray.client.transports.http import HttpTransport
 from vlagents_ray.client.transports.websocket import ProxiedSocket, open_websocket
 from vlagents_ray.errors import (
     Forbidden,
@@ -71,6 +73,7 @@ class Alone:
 
         self.read_header = engine.weights.read_header
         self._pusher = WeightPusher(own, others)
+        self.rest = self._pusher.rest
         self._engine = engine
 
     async def push_received(self, named: Mapping[str, Any], options: PushOptions) -> PushResult:
@@ -181,6 +184,26 @@ def test_keys_need_the_scope(serving: Serving) -> None:
     with pytest.raises(TooManyRequests):
         Publisher(server.url, api_key=learner).push(gains(2))
     assert server.engine.weights.number == 1
+
+
+def test_a_learner_elsewhere_lets_the_policy_rest_with_the_scope_for_pushes(serving: Serving) -> None:
+    known = ChangingKeys()
+    server = serving(keys=known.keys)
+    robot, key = known.add("robot"), known.add("learner", scopes=["weights"])
+    for refused in (lambda one: one.sleep(), lambda one: one.wake()):
+        with pytest.raises(Forbidden):
+            refused(Publisher(server.url, api_key=robot))
+    learner = Publisher(server.url, api_key=key)
+    learner.sleep(offload=False, at_most_s=60)
+    with pytest.raises(Overloaded, match="sleeps already"):
+        learner.sleep()
+    assert learner.wake(gains(1)) == 1
+    with pytest.raises(Forbidden):
+        Publisher(serving(insecure=True).url).sleep()
+    with closing(HttpTransport(server.url, CodecChoice("raw"), Credentials(key))) as http:
+        for path in ("nap", "sleep?offload=maybe", "sleep?at_most_s=nan", "sleep?at_most_s=1e99", "wake?level=2"):
+            with pytest.raises(InvalidInput):
+                http.get(f"/v1/weights/{path}", 10, method="POST")
 
 
 @pytest.mark.parametrize(("change", "error"), [({"revoked": True}, Unauthorized), ({"scopes": []}, Forbidden)])

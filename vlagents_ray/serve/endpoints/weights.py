@@ -100,7 +100,6 @@ class _WeightsEndpoint:
             self._scopes.require(_SCOPE)
             rest = _rest(http.path_params["step"], http.query_params)
             if isinstance(caller := current_caller(), Caller):
-                caller.admit()
                 caller.note("the policy's rest:", rest.step)
             await self._replicas.rest(rest)
             return JSONResponse({})
