@@ -33,7 +33,7 @@ from vlagents_ray.interface import POLICY, Agent
 from vlagents_ray.policies.base.accelerator import free_memory, is_out_of_memory
 from vlagents_ray.policies.compilation import CAPTURES
 from vlagents_ray.weights.safetensors import ValueSpec, read_header
-from vlagents_ray.weights.shared_values import SharedValues, gpu_of, opened
+from vlagents_ray.weights.shared_values import SharedValues, gpu_of, opened, readable_gpus
 from vlagents_ray.weights.trainable import (
     fingerprint,
     fitted,
@@ -135,13 +135,13 @@ class ModelWeights:
             values: dict[str, Any] | None = agent.parameters()
         except NotTrainable as error:
             self._refusal: NotTrainable | None = error
-            first, self._in_place, self.gpu = WeightsVersion(0, digest, None), False, ""
+            first, self._in_place, self.gpus = WeightsVersion(0, digest, None), False, ()
         else:
             self._refusal = None
             # An agent with its own `load_parameters` may copy values instead of keeping references to them.
             self._in_place = type(agent).load_parameters is not Agent.load_parameters or is_copied(values or {})
             first = WeightsVersion(0, fingerprint(values or {}), None if self._in_place else values)
-            self.gpu = gpu_of(values or {})
+            self.gpus = readable_gpus(gpu_of(values or {}))
         self.newest = self.pinned = first
         self._staged: WeightsVersion | None = None
         self._timer: threading.Timer | None = None
@@ -393,7 +393,8 @@ class NewestVersion:
 
     number: int
     model: tuple[str, str]  # equal in replicas that loaded the same checkpoint with the same settings
-    gpu: str = ""  # UUID of the GPU that holds all its weights; empty if there is no single one
+    # UUIDs of the GPUs whose memory it can copy: that of its weights, and its peers; none if there is no single GPU
+    gpus: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -554,7 +555,7 @@ class WeightUpdates:
     def newest(self) -> NewestVersion:
         """Return the newest version; raise `PolicyUnavailable` while the policy loads."""
         own = self.own()
-        return NewestVersion(own.newest.number, own.model, own.gpu)
+        return NewestVersion(own.newest.number, own.model, own.gpus)
 
     @property
     def number(self) -> int:

@@ -84,6 +84,11 @@ def gpu_of(named: Mapping[str, Any]) -> str:
     return gpus.pop() if len(gpus) == 1 else ""
 
 
+def readable_gpus(gpu: str) -> tuple[str, ...]:
+    """Return the UUIDs of the GPUs whose memory this process can copy to `gpu`, which is one; none without it."""
+    return _MEMORY.readable(gpu) if gpu else ()
+
+
 @contextmanager
 def shared(named: Mapping[str, Any]) -> Iterator[SharedValues]:
     """Yield values by name for another process, those on the GPU as handles; they must not change meanwhile.
@@ -185,6 +190,13 @@ class _GpuMemory:
         return torch.UntypedStorage._new_shared_cuda(
             devices[0], handle.allocation, handle.size, handle.begin, handle.counters, handle.counter, b"", False
         )
+
+    def readable(self, gpu: str) -> tuple[str, ...]:
+        """Return the UUIDs of the visible GPUs whose memory can be copied to `gpu` without the host."""
+        cuda = sys.modules["torch"].cuda
+        uuids = [self._uuid(device) for device in range(cuda.device_count())]
+        own = uuids.index(gpu)
+        return tuple(uuids[i] for i in range(len(uuids)) if i == own or cuda.can_device_access_peer(own, i))
 
     @staticmethod
     def _uuid(device: Any) -> str:

@@ -338,7 +338,7 @@ def test_handles_of_a_learners_gpu_are_opened_by_the_child(monkeypatch: pytest.M
 
     monkeypatch.setattr(shared_values, "_MEMORY", memory := SharedCpuMemory())
     served, _ = learner("OnSharedMemory")
-    assert served.weights.newest().gpu == GPU
+    assert served.weights.newest().gpus == (GPU,)
     with shared({"weight": torch.full((2, 2), 3.0).T, "bias": torch.ones(2)}) as handles:
         digest = served.weights.stage(1, handles, PushOptions())
         served.weights.commit(1, PushOptions())

@@ -360,7 +360,7 @@ class ChildWeights(ModelWeights):
         if "refusal" in trained:
             self._refusal = NotTrainable(trained["refusal"])
             return
-        self._refusal, self.gpu = None, trained["gpu"]
+        self._refusal, self.gpus = None, tuple(trained["gpus"])
         self._name(self.newest, 0)
         self.newest.values = {
             name: ValueSpec(np.dtype("V2" if dtype == "bfloat16" else dtype), tuple(shape))

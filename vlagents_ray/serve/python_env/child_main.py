@@ -160,7 +160,7 @@ def _trained(agent: Agent, updates: WeightUpdates) -> dict[str, Any]:
     except NotTrainable as error:
         return {"refusal": str(error)}
     newest = updates.newest()
-    return {"values": values, "fingerprint": updates.given(0).fingerprint, "gpu": newest.gpu}
+    return {"values": values, "fingerprint": updates.given(0).fingerprint, "gpus": newest.gpus}
 
 
 def _read_calls(

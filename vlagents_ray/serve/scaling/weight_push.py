@@ -201,11 +201,9 @@ class WeightPusher:
 
 def _require_gpu(gpu: str, replicas: Mapping[WeightsReplica, NewestVersion]) -> None:
     for replica, newest in replicas.items():
-        if newest.gpu != gpu:
-            raise NotShared(
-                f"replica {replica.name} has its weights on {f'GPU {newest.gpu}' if newest.gpu else 'no single GPU'}, "
-                f"the learner on GPU {gpu}"
-            )
+        if gpu not in newest.gpus:
+            reads = f"only memory of GPU {', '.join(newest.gpus)}" if newest.gpus else "no GPU's memory"
+            raise NotShared(f"replica {replica.name} can copy {reads}, and the learner's is on GPU {gpu}")
 
 
 def _unreachable(replica: WeightsReplica) -> PolicyUnavailable:
