@@ -17,6 +17,8 @@ from __future__ import annotations
 import sys
 import threading
 import warnings
+import weakref
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -44,6 +46,8 @@ class FakeCuda:
         self.captures: list[Capture] = []  # all that were begun
         self.replays: list[Capture] = []  # the graph of each replay
         self.reserved = [0, 0]  # bytes of each device
+        self.memory = Memory()
+        self.transfers: list[tuple[Stream, int]] = []  # streams and bytes of copies between GPU and host
         self._local = threading.local()
         self._default = [Stream(self, index) for index in range(2)]
         self._capture_stream: Stream | None = None
@@ -62,11 +66,14 @@ class FakeCuda:
             "CUDAGraph": lambda: Capture(self),
             "Event": lambda **_: Event(self),
             "graph_pool_handle": object,
-            "memory_reserved": lambda device=None: self.reserved[self._index(device)],
+            "memory_allocated": lambda _=None: self.memory.allocated,
+            "memory_reserved": lambda device=None: self.memory.allocated + self.reserved[self._index(device)],
+            "mem_get_info": lambda _=None: (self.memory.total - self.memory.allocated, self.memory.total),
             "graph": self._graph,
         }.items():
             patch.setattr(torch.cuda, name, value)
         patch.setattr(torch, "compile", lambda function, **_: function)
+        patch.setattr(torch.Tensor, "pin_memory", lambda self: self)
 
     def tensor(self, values: torch.Tensor, index: int = 0) -> GpuTensor:
         """Return a tensor of these values on a GPU."""
@@ -160,12 +167,63 @@ class FakeCuda:
         return torch.device("cuda", stream.index)
 
 
+class Memory:
+    """The bytes of the tensors on all GPUs, each memory once, and their peak."""
+
+    def __init__(self) -> None:
+        self.allocated = self.peak = 0
+        self.total = 80 * 10**9
+        self._tensors: Counter[int] = Counter()  # by the address of their memory
+
+    def add(self, tensor: GpuTensor) -> None:
+        """Count a tensor until it is deleted."""
+        storage = tensor.values.untyped_storage()
+        address, size = storage.data_ptr(), storage.nbytes()
+        self._tensors[address] += 1
+        if self._tensors[address] == 1:
+            self.allocated += size
+            self.peak = max(self.peak, self.allocated)
+        weakref.finalize(tensor, self._deleted, address, size)
+
+    def _deleted(self, address: int, size: int) -> None:
+        self._tensors[address] -= 1
+        if not self._tensors[address]:
+            self.allocated -= size
+
+
+@dataclass(eq=False)
+class Event:
+    """An event, which is over at once; the time of a stream is that of the GPUs, and 1 ms for each of its events."""
+
+    cuda: FakeCuda
+    ms: float = 0.0
+
+    def record(self, stream: Stream | None = None) -> None:
+        """Record the event on a stream."""
+        stream = stream or self.cuda.current_stream()
+        stream.synchronize()
+        stream.events += 1
+        self.ms = self.cuda.clock_ms + stream.events
+
+    def query(self) -> bool:
+        """Return that the event is over."""
+        return True
+
+    def synchronize(self) -> None:
+        """Do nothing, as the event is over."""
+
+    def elapsed_time(self, end: Event) -> float:
+        """Return the time from this event to another one, ms."""
+        return end.ms - self.ms
+
+
 @dataclass(eq=False)
 class Stream:
     """A stream of one GPU, on which operations run at once."""
 
     cuda: FakeCuda
     index: int
+    events: int = 0
 
     def wait_stream(self, other: Stream) -> None:
         """Do nothing, since no operation is ever outstanding."""
@@ -174,26 +232,6 @@ class Stream:
         """Wait for the stream, which is an error if it is captured."""
         if self.cuda.failure or (self.cuda.capture is not None and self.cuda.capture.stream is self):
             self.cuda._require(self.index)
-
-
-@dataclass(eq=False)
-class Event:
-    """A `torch.cuda.Event`."""
-
-    cuda: FakeCuda
-    ms: float = 0.0
-
-    def record(self, stream: Stream) -> None:
-        """Note the time, as nothing is ever outstanding."""
-        stream.synchronize()
-        self.ms = self.cuda.clock_ms
-
-    def synchronize(self) -> None:
-        """Do nothing, since the event has passed."""
-
-    def elapsed_time(self, end: Event) -> float:
-        """Return the time until another event, ms."""
-        return end.ms - self.ms
 
 
 @dataclass(eq=False)
@@ -259,7 +297,11 @@ class GpuTensor(torch.Tensor):
             cls, values.shape, strides=values.stride(), storage_offset=values.storage_offset(), dtype=values.dtype
         )
         made.values, made.cuda_of, made.index = values, cuda, index
+        cuda.memory.add(made)
         return made
+
+    def data_ptr(self) -> int:
+        return self.values.data_ptr()
 
     @property
     def device(self) -> Any:  # type: ignore[override]
@@ -277,13 +319,17 @@ class GpuTensor(torch.Tensor):
     def __torch_dispatch__(cls, op: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         own = [one for one in tree_leaves((args, kwargs)) if isinstance(one, GpuTensor)]
         cuda, index = own[0].cuda_of, own[0].index
+        if op is torch.ops.aten.copy_.default and len(own) == 1:
+            cuda.transfers.append((cuda.current_stream(index), own[0].nbytes))
         args, kwargs = tree_map(_values, (args, kwargs or {}))
         inputs = [one.values for one in own]
         result = cuda.run(index, lambda: op(*args, **kwargs), inputs)
         wrappers = {id(one.values): one for one in own}  # of what an operation in place returns
 
+        on_host = {id(one) for one in tree_leaves((args, kwargs)) if isinstance(one, torch.Tensor)} - {*map(id, inputs)}
+
         def wrapped(one: Any) -> Any:
-            if not isinstance(one, torch.Tensor):
+            if not isinstance(one, torch.Tensor) or id(one) in on_host:
                 return one
             return wrappers[id(one)] if id(one) in wrappers else GpuTensor(one, cuda, index)
 

@@ -13,10 +13,11 @@ from hypothesis import strategies as st
 from vlagents_ray.errors import InvalidWeights, NotTrainable, UnchangedWeights
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.weights.trainable import (
+    accepted,
+    completed,
     converted,
     dtype_name,
     fingerprint,
-    fitted,
     named_values,
     portable,
     set_values,
@@ -151,6 +152,10 @@ class TestTorch:
 HELD = {"w": np.zeros((2, 3), np.float32), "b": np.zeros(3, np.float16), "n": np.zeros((), np.int64)}
 LARGE = np.zeros(10_000, np.float32)
 NEW = {"w": np.ones((2, 3), np.float32), "b": np.ones(3, np.float16), "n": np.ones((), np.int64)}
+
+
+def fitted(held: Any, pushed: Any, *, partial: bool = False, allow_same: bool = False) -> dict[str, Any]:
+    return completed(held, accepted(held, pushed, partial=partial), allow_same=allow_same)
 
 
 @pytest.mark.parametrize(

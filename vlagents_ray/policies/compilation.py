@@ -175,6 +175,8 @@ class CudaGraph:
     is loaded on another thread than the one that acts with it.
     """
 
+    replays: ClassVar[int] = 0  # of all graphs of this process
+
     def __init__(self, function: Callable[..., Any], inputs: Sequence[Any], memory: GraphMemory | None = None) -> None:
         """Capture a function of tensors on one GPU without other effects; raises `RuntimeError` if that fails.
 
@@ -211,6 +213,7 @@ class CudaGraph:
             if rows < len(held):
                 held[rows:].copy_(tensor[-1:], non_blocking=True)
         self._graph.replay()
+        CudaGraph.replays += 1
         results = tuple(one[:rows].clone() for one in _each(self._result))
         return results if isinstance(self._result, tuple) else results[0]
 

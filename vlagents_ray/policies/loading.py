@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from typing import Any
@@ -27,6 +27,8 @@ class LoadingReport:
     devices: list[dict[str, Any]] = field(default_factory=list)  # of the models, see `accelerator.described`
     most_rows: int | None = None  # of a forward pass, if memory limits it
     on_out_of_memory: Callable[[], None] = lambda: None  # called whenever a forward pass does not fit, even later
+    on_gpu_ms: Callable[[float], None] = lambda _: None  # called with the time of each forward pass on a GPU
+    timer: Callable[[], AbstractContextManager[None]] = nullcontext  # returns the context of a forward pass
 
 
 _report: ContextVar[LoadingReport | None] = ContextVar("_report", default=None)
@@ -37,9 +39,10 @@ def loading_report(
     on_progress: Callable[[str], None],
     batch_sizes: Sequence[int] = COMPILED_SIZES,
     on_out_of_memory: Callable[[], None] = lambda: None,
+    on_gpu_ms: Callable[[float], None] = lambda _: None,
 ) -> Iterator[LoadingReport]:
     """Yield the report of the policy that is loaded in this context; see the fields of `LoadingReport`."""
-    report = LoadingReport(on_progress, batch_sizes, on_out_of_memory=on_out_of_memory)
+    report = LoadingReport(on_progress, batch_sizes, on_out_of_memory=on_out_of_memory, on_gpu_ms=on_gpu_ms)
     token = _report.set(report)
     try:
         yield report

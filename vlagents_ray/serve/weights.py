@@ -4,6 +4,9 @@ Version 0 is the loaded checkpoint. A learner stages a version, which is checked
 when all replicas hold it. A commit copies and loads nothing: before a batch, a reset or an observation, the policy's
 thread loads the sessions' version into the agent (`ModelWeights.use`), which takes no time if the agent has it already.
 A version is freed when no session acts with it and it is neither the newest nor the pinned one.
+
+On a GPU, the agent's version is that in its parameters, where another one takes its place. Two versions share its
+memory, the agent's and a staged one; those with which no session acts are in the memory of the host meanwhile.
 """
 
 from __future__ import annotations
@@ -16,7 +19,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol, get_args
-from weakref import WeakValueDictionary
+from weakref import WeakValueDictionary, ref
 
 import numpy as np
 
@@ -30,18 +33,24 @@ from vlagents_ray.errors import (
     WeightsNotStaged,
 )
 from vlagents_ray.interface import POLICY, Agent
-from vlagents_ray.policies.base.accelerator import free_memory, is_out_of_memory
+from vlagents_ray.policies.base.accelerator import empty_cache, free_memory, is_out_of_memory
 from vlagents_ray.policies.compilation import CAPTURES
+from vlagents_ray.policies.wrapper import Wrapper
 from vlagents_ray.weights.safetensors import ValueSpec, read_header
 from vlagents_ray.weights.shared_values import SharedValues, gpu_of, opened, readable_gpus
 from vlagents_ray.weights.trainable import (
+    accepted,
+    are_apart,
+    completed,
     fingerprint,
-    fitted,
     from_host,
     is_copied,
+    mapped,
+    on_host,
     own_copy,
     portable,
     require_fit,
+    swap,
     to_host,
 )
 
@@ -81,12 +90,13 @@ class PushOptions:
 class WeightsVersion:
     """One version of a model's weights."""
 
-    __slots__ = ("__weakref__", "fingerprint", "info", "number", "values")
+    __slots__ = ("__weakref__", "fingerprint", "info", "number", "on_host", "values")
 
     def __init__(self, number: int, digest: str, values: dict[str, Any] | None) -> None:
         self.number = number
         self.fingerprint = digest
         self.values = values  # by name; None if the agent alone holds them
+        self.on_host = False  # whether they were moved out of the GPU's memory
         self.info = {POLICY: {"version": number, "fingerprint": digest}}  # for the info of each act
 
     def describe(self) -> dict[str, Any]:
@@ -135,11 +145,15 @@ class ModelWeights:
             values: dict[str, Any] | None = agent.parameters()
         except NotTrainable as error:
             self._refusal: NotTrainable | None = error
-            first, self._in_place, self.gpus = WeightsVersion(0, digest, None), False, ()
+            first, self._in_place, self._swaps, self.gpus = WeightsVersion(0, digest, None), False, False, ()
         else:
             self._refusal = None
             # An agent with its own `load_parameters` may copy values instead of keeping references to them.
-            self._in_place = type(agent).load_parameters is not Agent.load_parameters or is_copied(values or {})
+            policy: Any = agent
+            while type(policy).load_parameters is Wrapper.load_parameters:
+                policy = policy.agent
+            own, copied = type(policy).load_parameters is not Agent.load_parameters, is_copied(values or {})
+            self._in_place, self._swaps = own or copied, copied and not own and are_apart(values or {})
             first = WeightsVersion(0, fingerprint(values or {}), None if self._in_place else values)
             self.gpus = readable_gpus(gpu_of(values or {}))
         self.newest = self.pinned = first
@@ -149,13 +163,19 @@ class ModelWeights:
         self._alive = WeakValueDictionary({0: first})
         self._asleep = False
         self._moved: list[tuple[Any, Any]] = []  # memory of the host with the values of the GPU, while it sleeps
+        self._counted = 1  # versions alive after the last commit or reset
+        self._switches = 0  # how often another version became the agent's
 
     def begin(self, session: FollowingSession, *, follows: bool) -> WeightsVersion:
         """Choose the newest or the pinned version for the session's next episode, and return it."""
         with self._lock:
             session.follows = follows
             session.weights = version = self.newest if follows else self.pinned
-            return version
+            alive = len(self._alive)
+            freed, self._counted = alive < self._counted, alive
+        if freed and self._in_place:
+            empty_cache()
+        return version
 
     def find(self, number: int, digest: str) -> WeightsVersion:
         """Return the version of a session from another replica; raise `UnknownSession` if it is not held here."""
@@ -168,14 +188,23 @@ class ModelWeights:
         """Load a version into the agent. Called with `busy` held, on the policy's thread."""
         if version is self._live:
             return
-        live, self._live = self._live, None
-        if self._in_place and live is not None and live.values is None:
-            live.values = self._copies()
-        if version.values is not None:  # otherwise the agent still has its own values
-            self._agent.load_parameters(version.values)
+        outgoing, self._live = None if self._live is None else ref(self._live), None
+        live = None if outgoing is None else outgoing()  # None if nothing else refers to it
+        kept = live if self._in_place and live is not None and live.values is None else None
+        if kept is not None and version.values is not None and self._swaps and not version.on_host:
+            swap(self._agent.parameters(), version.values)
+            kept.values = version.values
+        else:
+            if kept is not None:
+                kept.values = mapped(own_copy, self._agent.parameters())
+            if version.values is not None:  # otherwise the agent still has its own values
+                self._agent.load_parameters(version.values)
         self._live = version
+        self._switches += 1
         if self._in_place:
-            version.values = None
+            version.values, version.on_host = None, False
+            if kept is None:
+                empty_cache()
 
     def read_header(self, header: bytes, options: PushOptions) -> dict[str, ValueSpec]:
         """Check the header of a push, and return the types and shapes of the announced values.
@@ -192,10 +221,7 @@ class ModelWeights:
         """
         if self._refusal is not None:
             raise self._refusal
-        held = self.newest.values
-        if held is None:
-            with self._busy:
-                held = self._agent.parameters()
+        held = self._held(self.newest)
         # Each entry has its name, a type, numbers of up to 15 digits, and at most 60 further characters of JSON.
         most = 4096 + 2 * sum(len(name) + 90 + 16 * len(held[name].shape) for name in held)
         if len(header) > most:
@@ -206,7 +232,13 @@ class ModelWeights:
         require_fit(held, announced, partial=options.partial)
         return announced
 
-    def stage(self, number: int, pushed: Mapping[str, Any] | SharedValues, options: PushOptions) -> str:
+    def stage(
+        self,
+        number: int,
+        pushed: Mapping[str, Any] | SharedValues,
+        options: PushOptions,
+        sessions: Callable[[], Iterable[FollowingSession]] = tuple,
+    ) -> str:
         """Check a new version and hold it without using it; return its fingerprint.
 
         It is dropped unless it is committed within a minute, since its learner may have died.
@@ -215,6 +247,7 @@ class ModelWeights:
             number: The number of the version, above that of the newest one.
             pushed: Its values, by name.
             options: The options of the push.
+            sessions: Returns the sessions of the replica, without a lock.
 
         Raises:
             NotTrainable: The agent names no parameters.
@@ -236,7 +269,11 @@ class ModelWeights:
                 raise Overloaded("weights: another push is under way; push again when it is over")
             self._staged = placeholder
         try:
-            staged = self.make(number, newest, pushed, options)
+            with CAPTURES.pushes:
+                self._require_awake()
+                if self._swaps:
+                    self._move_to_host({session.weights for session in sessions()})
+                staged = self.make(number, newest, pushed, options)
         except BaseException:
             self.drop(number)
             raise
@@ -255,8 +292,11 @@ class ModelWeights:
         """Return a version of pushed values, which have been checked; missing names have the values of the newest."""
         with CAPTURES.pushes, opened(pushed) if isinstance(pushed, SharedValues) else nullcontext(pushed) as named:
             self._require_awake()
-            before = self._values(newest)
-            values = fitted(before, named, partial=options.partial, allow_same=options.allow_same)
+            new = accepted(self._held(newest), named, partial=options.partial)
+            with self._busy if self._in_place else nullcontext():  # another version could become the agent's
+                held = self._agent.parameters() if newest.values is None else newest.values
+                values = completed(held, new, allow_same=options.allow_same, in_place=self._in_place)
+            del held
             return WeightsVersion(number, fingerprint(values), values)
 
     def admit(self, version: WeightsVersion) -> None:
@@ -290,6 +330,7 @@ class ModelWeights:
                     f"weights: version {number} is not staged here; push it again, and commit within {STAGED_S:g} s"
                 )
             self.newest = self._alive[number] = self._staged
+            self._counted = len(self._alive)
             if options.pin:
                 self.pinned = self.newest
             self._forget_staged()
@@ -302,8 +343,12 @@ class ModelWeights:
     def drop(self, number: int) -> None:
         """Drop a staged version; the last committed one is kept."""
         with self._lock:
-            if self._staged is not None and self._staged.number == number:
-                self._forget_staged()
+            if self._staged is None or self._staged.number != number:
+                return
+            self._forget_staged()
+        if self._in_place:
+            with CAPTURES.pushes:
+                empty_cache()
 
     def portable_values(self, version: WeightsVersion) -> dict[str, Any]:
         """Return the values of a version as numpy arrays, for another process."""
@@ -360,14 +405,28 @@ class ModelWeights:
             self._timer.cancel()
             self._timer = None
 
-    def _values(self, version: WeightsVersion) -> dict[str, Any]:
-        if (values := version.values) is not None:
+    def _held(self, version: WeightsVersion) -> dict[str, Any]:
+        """Return references to values with the types, shapes and devices of the version's."""
+        if (values := version.values) is not None and not version.on_host:
             return values
-        with self._busy:  # otherwise another version could become the agent's own
-            return self._copies() if version.values is None else version.values
+        with self._busy:
+            return self._agent.parameters()
 
-    def _copies(self) -> dict[str, Any]:
-        return {name: own_copy(value) for name, value in self._agent.parameters().items()}
+    def _values(self, version: WeightsVersion) -> dict[str, Any]:
+        with self._busy if self._in_place else nullcontext():  # another version could become the agent's
+            values = self._agent.parameters() if version.values is None else version.values
+            return mapped(own_copy, values) if self._in_place else values
+
+    def _move_to_host(self, used: set[WeightsVersion | None]) -> None:
+        """Move the pinned and the newest version out of the GPU's memory, unless it is the agent's or one of `used`."""
+        for version in {self.pinned, self.newest} - used:
+            switches, values = self._switches, version.values
+            if values is None or version.on_host:
+                continue
+            moved = mapped(on_host, values)
+            with self._busy:
+                if self._switches == switches:  # otherwise another version may have got its memory
+                    version.values, version.on_host = moved, True
 
 
 class HoldsWeights(ABC):
@@ -445,7 +504,7 @@ class WeightUpdates:
 
     def stage(self, number: int, pushed: Mapping[str, Any] | SharedValues, options: PushOptions) -> str:
         """Check and hold a new version, and return its fingerprint, as `ModelWeights.stage` does."""
-        return self.own().stage(number, pushed, options)
+        return self.own().stage(number, pushed, options, self._sessions)
 
     def commit(self, number: int, options: PushOptions) -> None:
         """Use the staged version, as `ModelWeights.commit` does."""

@@ -7,9 +7,10 @@ Torch and JAX are never imported here: their objects exist only if they have bee
 from __future__ import annotations
 
 import hashlib
+import itertools
 import sys
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any
@@ -17,10 +18,12 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.errors import InvalidWeights, NotTrainable, UnchangedWeights
+from vlagents_ray.weights.pinned_copies import copy
 
 _BFLOAT16 = np.dtype("V2")
 _SHOWN = 5  # faults in a message
 _THREADS = 4  # threads that compute a fingerprint: hashing releases Python's lock
+_AT_ONCE = 2**24  # elements of a tensor for which operations on versions need further memory
 _KINDS = (("float", "bfloat"), ("int", "uint"), ("bool",), ("complex",))
 
 
@@ -71,12 +74,48 @@ def portable(value: Any) -> np.ndarray:
     A bfloat16, which numpy does not have, becomes two bytes of type `V2`, as `converted` and `dtype_name` expect.
     """
     if _is_tensor(value):
-        value = value.detach().cpu().contiguous()
+        value = on_host(value)
         if dtype_name(value) == "bfloat16":
             value = value.view(sys.modules["torch"].int16)
             return np.asarray(value).view(_BFLOAT16)
     array = np.asarray(value)
     return array.view(_BFLOAT16) if array.dtype.kind == "V" else array
+
+
+def on_host(value: Any) -> Any:
+    """Return a tensor in the memory of the host, contiguous; it is copied only if it is on a GPU, or not contiguous."""
+    value = value.detach()
+    if value.is_cuda:
+        return copy(value, sys.modules["torch"].empty(value.shape, dtype=value.dtype))
+    return value.cpu().contiguous()
+
+
+def swap(first: Mapping[str, Any], second: Mapping[str, Any]) -> None:
+    """Exchange contiguous tensors of equal names and devices in their memory, within little more than that.
+
+    Names of `first` that share memory (see `are_apart`) must share it in `second`, as in a result of `completed`.
+    """
+    with sys.modules["torch"].no_grad():
+        for name, value in {memory_of(name, value): (name, value) for name, value in first.items()}.values():
+            parts = [one.view(-1).split(_AT_ONCE) for one in (value, second[name])]
+            for one, other in zip(*parts, strict=True):
+                before = one.clone()
+                one.copy_(other)
+                other.copy_(before)
+
+
+def memory_of(name: str, value: Any) -> Any:
+    """Return a key that is equal for two values of a module that are tied, i.e. are in the same memory."""
+    if not _is_tensor(value) or value.layout != sys.modules["torch"].strided or not value.numel():
+        return name
+    return value.device, value.data_ptr(), value.shape, value.stride(), value.dtype
+
+
+def mapped(function: Callable[[Any], Any], named: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the results of a function of values, by name; tied values are passed once, and so are their results."""
+    values = {memory_of(name, value): value for name, value in named.items()}
+    results = {place: function(value) for place, value in values.items()}
+    return {name: results[memory_of(name, value)] for name, value in named.items()}
 
 
 def own_copy(value: Any) -> Any:
@@ -94,14 +133,18 @@ def converted(value: Any, held: Any) -> Any:
     if _is_tensor(held):
         torch = sys.modules["torch"]
         if _is_tensor(value):
-            copied = value.detach().to(held.device, held.dtype)
-            return copied.clone() if copied.data_ptr() == value.data_ptr() else copied
-        array = _unchanging(np.asarray(value))
-        is_bfloat16 = array.dtype.kind == "V"
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message=".*not writ", category=UserWarning)  # nothing here writes into it
-            tensor = torch.from_numpy(array.view(np.int16) if is_bfloat16 else array)
-        return (tensor.view(torch.bfloat16) if is_bfloat16 else tensor).to(held.device, held.dtype)
+            tensor = value.detach()
+        else:
+            array = _unchanging(np.asarray(value))
+            is_bfloat16 = array.dtype.kind == "V"
+            with warnings.catch_warnings():
+                warnings.filterwarnings("ignore", message=".*not writ", category=UserWarning)  # nothing writes into it
+                tensor = torch.from_numpy(array.view(np.int16) if is_bfloat16 else array)
+            tensor = tensor.view(torch.bfloat16) if is_bfloat16 else tensor
+        if held.is_cuda and not tensor.is_cuda:
+            return copy(tensor, torch.empty_like(held, memory_format=torch.contiguous_format))
+        new = tensor.to(held.device, held.dtype)
+        return new.clone() if _is_tensor(value) and new.data_ptr() == value.data_ptr() else new
     array = to_numpy(value)
     if isinstance(held, np.ndarray):
         array = _unchanging(array) if array.dtype == held.dtype else array.astype(held.dtype)
@@ -133,7 +176,7 @@ def _set_tensors(module: Any, named: Mapping[str, Any]) -> None:
             if name in held and alias.device.type == "cpu":
                 held[name].data = named[name]
             else:
-                alias.copy_(named[name])
+                copy(named[name], alias) if alias.is_contiguous() else alias.copy_(named[name])
 
 
 def _leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any, Any]]:
@@ -211,30 +254,58 @@ def _on_gpu(value: Any) -> bool:
 # Checks that pushed values fit those of a policy, and a digest of values.
 
 
-def fitted(
-    held: Mapping[str, Any], pushed: Mapping[str, Any], *, partial: bool = False, allow_same: bool = False
-) -> dict[str, Any]:
-    """Return the values of a new version with the types and devices of those held; missing names keep those held.
+def accepted(held: Mapping[str, Any], pushed: Mapping[str, Any], *, partial: bool = False) -> dict[str, Any]:
+    """Return pushed values with the types and devices of those held, of which only these and the shapes are read.
+
+    Names whose values are tied in `held` get the same value, the last one that was pushed.
 
     Args:
         held: The current values of the policy, by name.
         pushed: The new values, by name: numpy or JAX arrays or torch tensors, on any device.
         partial: Whether names may be missing, as in a push of adapters alone.
-        allow_same: Whether all values may equal those held.
 
     Raises:
         InvalidWeights: A name is unknown or missing, or a value has another shape or kind of type, or is not finite.
-        UnchangedWeights: All values equal those held, and `allow_same` is not set.
     """
     require_fit(held, pushed, partial=partial)
-    new = {name: converted(value, held[name]) for name, value in pushed.items()}
-    _refuse([f"{name!r}: got NaN or infinite values, want finite ones" for name in new if not _is_finite(new[name])])
+    places = {name: memory_of(name, value) for name, value in held.items()}
+    last = {places[name]: name for name in pushed}
+    new = {place: converted(pushed[name], held[name]) for place, name in last.items()}
+    faults = [name for place, name in last.items() if not _is_finite(new[place])]
+    _refuse([f"{name!r}: got NaN or infinite values, want finite ones" for name in faults])
+    return {name: new[place] for name, place in places.items() if place in new}
+
+
+def completed(
+    held: Mapping[str, Any], new: Mapping[str, Any], *, allow_same: bool = False, in_place: bool = False
+) -> dict[str, Any]:
+    """Return the values of a new version: the result of `accepted`, and the held values of the missing names.
+
+    Args:
+        held: The current values of the policy, by name.
+        new: The new ones.
+        allow_same: Whether all may equal those held.
+        in_place: Whether the values held will change in their memory, so that those of missing names are copied.
+
+    Raises:
+        UnchangedWeights: All values equal those held, and `allow_same` is not set.
+    """
     if not allow_same and all(_is_equal(value, held[name]) for name, value in new.items()):
         raise UnchangedWeights(
             f"weights: all {len(new)} values equal those that the policy holds; push what the optimizer changes, "
             f"or allow it with allow_same=True"
         )
-    return {name: new.get(name, value) for name, value in held.items()}
+    missing = {name: value for name, value in held.items() if name not in new}
+    all_values = {**new, **(mapped(own_copy, missing) if in_place else missing)}
+    return {name: all_values[name] for name in held}
+
+
+def are_apart(named: Mapping[str, Any]) -> bool:
+    """Return whether tensors share no memory, other than tied ones, so that `swap` can exchange each of them."""
+    values = {memory_of(name, value): value for name, value in named.items() if value.numel()}.values()
+    spans = sorted((str(value.device), value.data_ptr(), value.data_ptr() + value.nbytes) for value in values)
+    apart = all(one[0] != other[0] or one[2] <= other[1] for one, other in itertools.pairwise(spans))
+    return apart and all(value.is_contiguous() for value in values)
 
 
 def require_fit(held: Mapping[str, Any], pushed: Mapping[str, Any], *, partial: bool = False) -> None:
@@ -293,13 +364,21 @@ def _is_finite(value: Any) -> bool:
         with np.errstate(over="ignore", invalid="ignore"):
             # Minimum and maximum need no array of booleans, which would take a quarter of the value's memory.
             return bool(np.isfinite(value.min()) and np.isfinite(value.max()))
-    torch = sys.modules.get("torch")
-    library = torch if torch is not None and isinstance(value, torch.Tensor) else sys.modules["jax"].numpy
-    return bool(library.isfinite(value).all())
+    if not _is_tensor(value):
+        return bool(sys.modules["jax"].numpy.isfinite(value).all())
+    if value.is_complex():
+        value = sys.modules["torch"].view_as_real(value)
+    return all(bool(one.isfinite()) for one in value.aminmax())  # which need no memory, as above
 
 
 def _is_equal(new: Any, held: Any) -> bool:
-    return np.array_equal(new, held) if isinstance(new, np.ndarray) else bool((new == held).all())
+    if isinstance(new, np.ndarray):
+        return np.array_equal(new, held)
+    if not _is_tensor(new):
+        return bool((new == held).all())
+    parts = zip(new.reshape(-1).split(_AT_ONCE), held.reshape(-1).split(_AT_ONCE), strict=True)
+    moved = new.is_cuda and not held.is_cuda
+    return all(bool((one == (converted(other, one) if moved else other)).all()) for one, other in parts)
 
 
 def _digest(value: Any) -> bytes:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import os
 import re
 import sys
 from collections.abc import Sequence
@@ -12,13 +13,21 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from fake_cuda import FakeCuda
 
 from vlagents_ray import Obs
 from vlagents_ray.contract import ActionSpec, Contract, StateSpec
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import DISTRIBUTION, SAMPLES, Act
 from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row
-from vlagents_ray.policies.base.accelerator import is_device_failure, is_out_of_memory, jax_device, torch_device
+from vlagents_ray.policies.base.accelerator import (
+    GPU_SHARE,
+    gpu_memory,
+    is_device_failure,
+    is_out_of_memory,
+    jax_device,
+    torch_device,
+)
 from vlagents_ray.policies.base.model_inputs import state_vector
 from vlagents_ray.policies.loading import loading_report, report_device
 from vlagents_ray.serve.engine.engine import Engine
@@ -79,6 +88,59 @@ def test_what_a_gpu_is_is_reported(monkeypatch: Any) -> None:
         "memory_mib": 81920,
         "cuda": "13.0",
     }
+
+
+@pytest.fixture
+def no_limits(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in (GPU_SHARE, "XLA_PYTHON_CLIENT_PREALLOCATE", "XLA_PYTHON_CLIENT_MEM_FRACTION"):
+        monkeypatch.setenv(name, "restored afterwards")
+        monkeypatch.delenv(name)
+
+
+@pytest.mark.parametrize("share", [None, "0.5"])
+def test_a_share_of_a_gpu_is_a_limit_of_its_memory(no_limits: None, monkeypatch: Any, share: str | None) -> None:
+    cuda, limits = FakeCuda(), []
+    cuda.install(monkeypatch)
+    monkeypatch.setattr(torch, "empty", lambda *_, **__: None)
+    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda _: SimpleNamespace(name="", total_memory=0))
+    monkeypatch.setattr(torch.cuda, "set_per_process_memory_fraction", lambda *limit: limits.append(limit))
+    if share is not None:
+        monkeypatch.setenv(GPU_SHARE, share)
+    with loading_report(lambda _: None) as report:
+        torch_device()
+    assert limits == ([] if share is None else [(0.5, torch.device("cuda"))])
+    assert os.environ.get("XLA_PYTHON_CLIENT_MEM_FRACTION") == share, "beside torch, as in openpi's port"
+    tensors = [cuda.tensor(torch.zeros(10**6))]
+    free = (80 if share is None else 40) * 10**9 - 4 * 10**6
+    assert gpu_memory(report.devices) == {"allocated": 4 * 10**6, "reserved": 4 * 10**6, "free": free}
+    del tensors
+    assert gpu_memory([{"kind": "cpu", "device": "cpu"}]) == {}
+
+
+@pytest.mark.parametrize("chosen", [None, "true"])
+def test_jax_allocates_as_it_needs_unless_told_otherwise(no_limits: None, monkeypatch: Any, chosen: str | None) -> None:
+    class Jax(FakeJax):
+        def devices(self, kind: str = "cpu") -> list[Any]:
+            assert os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] == (chosen or "false"), "before its first use"
+            return super().devices(kind)
+
+    monkeypatch.setitem(sys.modules, "jax", Jax())
+    if chosen is not None:
+        monkeypatch.setenv("XLA_PYTHON_CLIENT_PREALLOCATE", chosen)
+    jax_device("cpu")
+    assert os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] == (chosen or "false")
+
+
+def test_the_memory_of_jax_is_that_of_its_device(monkeypatch: Any) -> None:
+    class Gpu:
+        def __str__(self) -> str:
+            return "cuda:0"
+
+        def memory_stats(self) -> dict[str, int]:
+            return {"bytes_in_use": 3, "bytes_limit": 10, "pool_bytes": 4}
+
+    monkeypatch.setitem(sys.modules, "jax", SimpleNamespace(local_devices=lambda: [Gpu()]))
+    assert gpu_memory([{"kind": "gpu", "device": "cuda:0"}]) == {"allocated": 3, "reserved": 4, "free": 7}
 
 
 class FakeJax:
@@ -189,11 +251,10 @@ def test_a_batch_that_does_not_fit_is_halved_and_acts_as_if_it_had(
     with monkeypatch.context() as patch:
         patch.setattr(Crowded, "fits", 8)
         policy = made(Crowded, max_rows=8, batch_sizes=sizes)
-    emptied: list[bool] = []
-    monkeypatch.setattr(torch.cuda, "is_initialized", lambda: True)
-    monkeypatch.setattr(torch.cuda, "empty_cache", lambda: emptied.append(True))
+    cuda = FakeCuda()
+    cuda.install(monkeypatch)
     acts = acted(policy, 5)
-    assert (policy.model["passes"], len(emptied)) == (passes, 1)
+    assert (policy.model["passes"], cuda.emptied) == (passes, 1)
     policy.model["passes"].clear()
     acted(policy, 5)
     assert policy.model["passes"] == later
@@ -223,3 +284,29 @@ def test_one_row_that_does_not_fit_is_an_error_and_counted(monkeypatch: pytest.M
         engine.check_health()
     finally:
         engine.close()
+
+
+def test_the_time_of_a_batch_on_the_gpu_is_reported_at_the_next_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    FakeCuda().install(monkeypatch)
+    stream = torch.cuda.current_stream()
+    predict = Crowded.predict
+
+    def predicted(self: Crowded, rows: Sequence[Row]) -> list[Prediction | Exception]:
+        stream.events += len(rows)
+        return predict(self, rows)
+
+    monkeypatch.setattr(Crowded, "predict", predicted)
+    policy = Crowded.from_config({"checkpoint": "none", "max_rows": 3})
+    engine = Engine(policy)
+    engine.start(threaded=False)
+    assert engine.stats.gpu_ms is None, "of the start"
+    for rows in (1, 3):
+        acted(policy, rows)
+    assert engine.stats.gpu_ms == 1 + 1, "the fake clock counts the end of the pass also"
+    monkeypatch.setattr(Crowded, "fits", 0)
+    with pytest.raises(torch.OutOfMemoryError):
+        acted(policy, 1)
+    assert engine.stats.gpu_ms == 3 + 1
+    monkeypatch.setattr(Crowded, "fits", 3)
+    acted(policy, 1)
+    assert engine.stats.collect().gpu_ms.seen == 2, "there is none of a pass that failed"

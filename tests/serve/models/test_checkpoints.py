@@ -163,6 +163,32 @@ def test_a_checkpoint_in_use_stays_until_an_episode_ends(serving: Callable[..., 
     assert library.closed == ["b/2"]
 
 
+def test_a_checkpoint_that_does_not_fit_into_memory_waits_for_another_to_leave(
+    serving: Callable[..., Engine],
+    library: Library,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    engine = serving(choices=["b/2", "c/3"], loaded=3)
+    size, total = 10, 25  # room for two
+
+    def memory(_: object) -> dict[str, int]:
+        reserved = size * len(library.alive)
+        return {"allocated": reserved, "reserved": reserved, "free": total - reserved}
+
+    monkeypatch.setattr(model_manager, "gpu_memory", memory)
+    reset(engine, "own")
+    reset(engine, "chosen", checkpoint="b")
+    waiting = begin(engine, "third", checkpoint="c")
+    assert [act(engine, "own"), act(engine, "chosen")] == [[1, 1], [2, 1]]
+    assert waiting.empty()
+    ask(engine, "chosen", "close")
+    assert waiting.get(timeout=10).error is None
+    assert library.closed == ["b/2"]
+    assert caplog.text.count("2 checkpoints are loaded, the next one waits") == 1
+    assert "'reserved': 20, 'free': 5} bytes); set checkpoints: {loaded: 2}" in caplog.text
+
+
 def test_ten_checkpoints_have_their_turns_with_room_for_two(
     serving: Callable[..., Engine], library: Library, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -8,7 +8,9 @@ import importlib.util
 import os
 import re
 import sys
-from contextlib import suppress
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +18,11 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.base import import_fixes
 from vlagents_ray.policies.base.config import DType
 from vlagents_ray.policies.compilation import keep_jax_programs
-from vlagents_ray.policies.loading import report_device
+from vlagents_ray.policies.loading import LoadingReport, report_device
 from vlagents_ray.registry import require
 
 VISIBLE = "CUDA_VISIBLE_DEVICES"  # Ray sets it in a process that it gives GPUs
+GPU_SHARE = "VLAGENTS_RAY_GPU_SHARE"  # share of its GPU's memory that a process may use; unset: all of it
 
 _DRIVER = Path("/proc/driver/nvidia/version")
 # Texts of errors of torch and of JAX, whose classes differ between their versions.
@@ -29,6 +32,7 @@ _GPU_ERROR = re.compile(r"CUDA error|CUDA_ERROR_|CUDNN_STATUS_|CUBLAS_STATUS_|HI
 
 def torch_device(name: str = "auto") -> Any:
     """Return the `torch.device` of a name; "auto" takes a CPU only where no GPU is meant; raises `ConfigError`."""
+    share = _limit_jax()
     torch = require("torch")
     given = name == "auto" and bool(_given_gpus())
     try:
@@ -42,8 +46,21 @@ def torch_device(name: str = "auto") -> Any:
             f"device {name!r}: not here ({said}); use 'auto' or 'cpu', or give the replica a GPU with "
             f"resources: {{num_gpus: 1}}"
         ) from error
+    if device.type == "cuda" and share:
+        torch.cuda.set_per_process_memory_fraction(share, device)
     report_device(_described(torch, device))
     return device
+
+
+def _limit_jax() -> float:
+    """Limit the memory of JAX, also beside torch, before its first use of a GPU; return this process's share, or 0.
+
+    By itself JAX allocates three quarters of the memory at once.
+    """
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+    if share := os.environ.get(GPU_SHARE, ""):
+        os.environ.setdefault("XLA_PYTHON_CLIENT_MEM_FRACTION", share)
+    return float(share or 0)
 
 
 def _given_gpus() -> str:
@@ -89,6 +106,7 @@ def jax_device(name: str = "auto") -> Any:
 
     From then on, the programs that JAX compiles for a device that is no CPU are kept for the next start.
     """
+    _limit_jax()
     jax = require("jax")
     kind, _, index = name.partition(":")
     try:
@@ -123,9 +141,61 @@ def is_device_failure(error: BaseException) -> bool:
 def free_memory() -> None:
     """Free memory at once: agents often contain reference cycles, and torch caches the GPU memory that it allocated."""
     gc.collect()
+    empty_cache()
+
+
+def empty_cache() -> None:
+    """Return the GPU memory that torch does not use to the device, for other processes; JAX keeps its own."""
     torch = sys.modules.get("torch")
     if torch is not None and torch.cuda.is_initialized():
         torch.cuda.empty_cache()
+
+
+def gpu_memory(devices: Iterable[Mapping[str, Any]]) -> dict[str, int]:
+    """Return the memory of this process's GPUs among `devices`, bytes: "allocated" for values, "reserved" and "free".
+
+    The result is empty if there is none, as when the policy runs in a child process.
+    """
+    found: Counter[str] = Counter()
+    torch, jax = sys.modules.get("torch"), sys.modules.get("jax")
+    for device in devices:
+        if device["kind"] == "cuda" and torch is not None and torch.cuda.is_initialized():
+            place, cuda = device.get("device", "cuda"), torch.cuda
+            reserved, (free, total) = cuda.memory_reserved(place), cuda.mem_get_info(place)
+            free = min(free, int(float(os.environ.get(GPU_SHARE) or 1) * total) - reserved)
+            found.update(allocated=cuda.memory_allocated(place), reserved=reserved, free=max(0, free))
+        elif device["kind"] == "gpu" and jax is not None:
+            stats = next(one for one in jax.local_devices() if str(one) == device["device"]).memory_stats() or {}
+            used = stats.get("bytes_in_use", 0)
+            free = stats.get("bytes_limit", used) - used
+            found.update(allocated=used, reserved=stats.get("pool_bytes", used), free=free)
+    return dict(found)
+
+
+def gpu_timer(report: LoadingReport) -> Callable[[], AbstractContextManager[None]]:
+    """Return a context of each forward pass of a policy, which reports the time on a GPU when the next pass begins.
+
+    The time is that from the first operation to the last one, with the gaps between them. Nothing waits for the GPU.
+    """
+    cuda = require("torch").cuda if "torch" in sys.modules else None
+    device = next((one.get("device", "cuda") for one in report.devices if one["kind"] == "cuda"), None)
+    if device is None or cuda is None or not cuda.is_initialized():
+        return nullcontext
+    begin, end = (cuda.Event(enable_timing=True) for _ in range(2))
+    timed = False
+
+    @contextmanager
+    def timer() -> Iterator[None]:
+        nonlocal timed
+        if timed and end.query():
+            report.on_gpu_ms(begin.elapsed_time(end))
+        timed = False
+        begin.record(cuda.current_stream(device))
+        yield
+        end.record(cuda.current_stream(device))
+        timed = True
+
+    return timer
 
 
 def ensure_torchvision() -> None:

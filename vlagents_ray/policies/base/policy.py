@@ -21,7 +21,7 @@ from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, InvalidAction, InvalidObservation, NotReset, PolicyFailed
 from vlagents_ray.interface import BEHAVIOUR, DELAY, DISTRIBUTION, EXECUTED, LEFTOVER, Act, Agent, Obs
 from vlagents_ray.policies.adapters import ADAPTER, Adapters, require_base_alone
-from vlagents_ray.policies.base.accelerator import free_memory, is_out_of_memory
+from vlagents_ray.policies.base.accelerator import free_memory, gpu_timer, is_out_of_memory
 from vlagents_ray.policies.base.checkpoint import find_adapter, used_checkpoints
 from vlagents_ray.policies.base.checkpoint_files import weights_of
 from vlagents_ray.policies.base.config import ModelConfig
@@ -160,6 +160,7 @@ class ModelPolicy(Agent, abc.ABC):
             self._run_examples(size, seeds)
         if sizes:
             free_memory()  # which a full batch took, and usual ones do not need
+        self.report.timer = gpu_timer(self.report)
 
     def _decide_on_compiling(self) -> None:
         """Set `compile` to what it means for the loaded model and its device."""
@@ -376,7 +377,8 @@ class ModelPolicy(Agent, abc.ABC):
             part = rows[start : start + most]
             spare = self.padded(part)[len(part) :]  # copies, so that their noise is not the session's
             filled = [*part, *(copy.deepcopy(row, {id(row.frames): row.frames}) for row in spare)]
-            results = self.predict(filled)
+            with self.report.timer():
+                results = self.predict(filled)
             if len(results) != len(filled):
                 raise PolicyFailed(f"predict: got {len(filled)} rows, returned {len(results)} chunks")
             found += results[: len(part)]

@@ -100,7 +100,7 @@ class Engine:
         loader = Loader(self._source, version, batch_sizes, max_batch_size, check, self.calls)
         self.models = ModelManager(self._source, loader, self.sessions)
         self.stats, self.admission = MetricsBuffer(), Admission(in_flight_bytes)
-        loader.on_out_of_memory = self.stats.out_of_memory
+        loader.on_out_of_memory, loader.on_gpu_ms = self.stats.out_of_memory, self.stats.gpu
         self._batch_sizes, self._reply_bytes = batch_sizes, reply_bytes
         self._preparations: Preparations | None = None  # None if the engine has no threads
         self._loading = self.models.loading()

@@ -48,6 +48,7 @@ class Collected:
 
     requests: dict[Kind, Sample[Times]] = field(default_factory=dict)
     batches: Sample[int] = field(default_factory=Sample)  # observations per forward pass
+    gpu_ms: Sample[float] = field(default_factory=Sample)  # time of forward passes on the GPU
     padding: int = 0  # number of padding rows in all batches
     out_of_memory: int = 0  # forward passes that did not fit into memory
     hung: Counter[str] = field(default_factory=Counter)  # calls of the policy that exceeded their limit, by op
@@ -57,6 +58,7 @@ class MetricsBuffer:
     """A bounded buffer of metrics, which records requests and batches only after `enable`. Thread-safe."""
 
     def __init__(self) -> None:
+        self.gpu_ms: float | None = None  # time of the last forward pass on a GPU
         self._enabled = False
         self._lock = threading.Lock()
         self._collected = Collected()
@@ -82,6 +84,12 @@ class MetricsBuffer:
         with self._lock:
             self._collected.batches.add(observations)
             self._collected.padding += rows - observations
+
+    def gpu(self, took_ms: float) -> None:
+        """Record the time of a forward pass on the GPU."""
+        self.gpu_ms = took_ms
+        with self._lock:
+            self._collected.gpu_ms.add(took_ms)
 
     def hung(self, op: str) -> None:
         """Record a call of the policy that has exceeded its limit."""

@@ -214,6 +214,7 @@ class Loader:
         self._calls = calls
         self.on_progress: Callable[[str], None] = lambda _: None  # called with each step of a long load
         self.on_out_of_memory: Callable[[], None] = lambda: None  # called each time that a model runs out of memory
+        self.on_gpu_ms: Callable[[float], None] = lambda _: None  # called with the time of forward passes on a GPU
 
     def load(self, choice: CheckpointChoice, settings: dict[str, Any], agent: Agent | None = None) -> LoadedModel:
         """Load a model into `agent`, by default a new one; the agent is closed if it cannot be served.
@@ -234,7 +235,7 @@ class Loader:
         try:
             with (
                 used_checkpoints() as found,
-                loading_report(self.on_progress, self._compiled_sizes, self.on_out_of_memory) as report,
+                loading_report(self.on_progress, self._compiled_sizes, self.on_out_of_memory, self.on_gpu_ms) as report,
             ):
                 agent.initialize()
             weights = agent.weights_id or weights_of(found)

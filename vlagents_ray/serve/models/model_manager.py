@@ -22,7 +22,7 @@ from typing import Any
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import CheckpointFailed, DeadlineExceeded, PolicyUnavailable, UnknownSession, VLAgentsError
 from vlagents_ray.interface import Agent
-from vlagents_ray.policies.base.accelerator import free_memory
+from vlagents_ray.policies.base.accelerator import free_memory, gpu_memory
 from vlagents_ray.policies.base.program import Program
 from vlagents_ray.serve.models.checkpoints import Checkpoints, resolved
 from vlagents_ray.serve.models.loaded_model import LoadedModel, Loader, key_of
@@ -79,14 +79,14 @@ class ModelCache:
       take turns in two slots, each for long enough to be worth loading.
     """
 
-    def __init__(self, source: Checkpoints) -> None:
+    def __init__(self, source: Checkpoints, fits: Callable[[int], bool] = lambda _: True) -> None:
         self.config = source.config  # the deployment's own settings in effect
         self.next: dict[str, Any] | None = None  # settings to swap to
         self.failure: str | None = None  # error of the last swap
         self.loaded: dict[str, LoadedModel] = {}  # models by the keys of their settings, the least recently used first
         self.waiting: list[Waiter] = []  # waiting sessions in order of arrival
         self.draining = ""  # key of the model that accepts no more episodes before its eviction
-        self._source = source
+        self._source, self._fits = source, fits  # whether one more fits beside so many
 
     def describe(self) -> dict[str, Any]:
         """Return the available choices, the loaded checkpoints and the state of the last swap, for the metadata."""
@@ -162,8 +162,11 @@ class ModelCache:
         if wanted is None:
             return None
         task, since = wanted
-        if len(self.loaded) < self._source.limit:
-            return task
+        limit = self._source.limit
+        if len(self.loaded) < limit:
+            if self._fits(len(self.loaded)):
+                return task
+            limit = len(self.loaded)
         old = None if self.next is None else self.config  # episodes begin with it during a swap: evicted last
         if idle:
             self.draining = min(idle, key=lambda model: model.settings == old).key
@@ -171,7 +174,7 @@ class ModelCache:
         oldest = min(self.loaded.values(), key=lambda model: (model.settings == old, model.since))
         if time.monotonic() - since > PATIENCE_S:
             self.draining = oldest.key
-        if self.next is not None and self._source.limit == 1:
+        if self.next is not None and limit == 1:
             return EvictTask(oldest.key, at_once=True)
         return None
 
@@ -228,8 +231,8 @@ class ModelManager:
         self._sessions = sessions
         self._first: Agent | None = None
         self._fingerprint = ""
-        self._cache = ModelCache(source)
-        self._begun = self._loaded = self._closed = False
+        self._cache = ModelCache(source, self._fits)
+        self._begun = self._loaded = self._closed = self._full = False
         self._changed = threading.Condition()
         self._thread = threading.Thread(target=self._loop, name="checkpoints", daemon=True)
 
@@ -301,6 +304,23 @@ class ModelManager:
         """Return the parts of the loaded models that run without compilation, although their settings request it."""
         with self._changed:
             return [what for model in self._cache.loaded.values() for what in model.report.uncompiled]
+
+    def gpu_memory(self) -> dict[str, int]:
+        """Return the memory of the GPUs of the deployment's own model, see `accelerator.gpu_memory`."""
+        return gpu_memory(self.devices)
+
+    def _fits(self, loaded: int) -> bool:
+        """Return whether the GPU has room for one more checkpoint: as much as each of the loaded ones takes."""
+        memory, full = self.gpu_memory() if loaded else {}, self._full
+        self._full = bool(memory) and memory["free"] * loaded < memory["reserved"]
+        if self._full and not full:
+            said = (
+                "%d checkpoints are loaded, the next one waits until one can be unloaded, as the GPU's memory is full "
+            )
+            logger.warning(
+                f"{said}(%s bytes); set checkpoints: {{loaded: %d}}, or smaller batch.sizes", loaded, memory, loaded
+            )
+        return not self._full
 
     def loading(self) -> PolicyUnavailable:
         """Return the error for clients while the first checkpoint is loaded, which names the step of loading."""

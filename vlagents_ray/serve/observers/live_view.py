@@ -17,6 +17,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from vlagents_ray.errors import ConfigError, UnknownSession
+from vlagents_ray.policies.compilation import CudaGraph
 from vlagents_ray.protocol.json_messages import plain_values
 from vlagents_ray.serve.config.deployment import LiveArgs
 from vlagents_ray.serve.engine.engine import Engine
@@ -170,6 +171,10 @@ class ReplicaView:
                 "digest": (metadata["weights"] or {}).get("digest"),
                 "weights": metadata["policy_version"],
                 "devices": engine.models.devices,
+                "uncompiled": engine.models.uncompiled,
+                "gpu_memory": engine.models.gpu_memory(),
+                "gpu_ms": engine.stats.gpu_ms,
+                "replays": CudaGraph.replays,
                 "ready": engine.ready,
                 "step": engine.models.step,
                 "session_limit": engine.sessions.limit,

@@ -10,6 +10,9 @@
 | `vlagents_queue_depth` | gauge | class; requests that wait now |
 | `vlagents_sessions` | gauge | transport; sessions that are held |
 | `vlagents_utilisation` | gauge | share of the last second in which the policy's thread was busy |
+| `vlagents_gpu_memory_bytes` | gauge | kind (allocated, reserved, free); only with a GPU in the replica's process |
+| `vlagents_gpu_ms` | histogram | forward pass on the GPU, first to last operation; as the line above |
+| `vlagents_graph_replays` | counter | replays of CUDA graphs |
 | `vlagents_policy_version` | gauge | newest version of the weights; 0 is the checkpoint that was loaded |
 | `vlagents_weight_push_ms` | histogram | from new weights at the replica that received them until all act with them |
 | `vlagents_uncompiled` | gauge | batch sizes that run without compilation, although the policy's `compile` is set |
@@ -36,6 +39,7 @@ from typing import Any, TypeVar
 from ray import serve
 from ray.util.metrics import Counter, Gauge, Histogram
 
+from vlagents_ray.policies.compilation import CudaGraph
 from vlagents_ray.serve.access.api_keys import Keys
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.metrics_buffer import STAGES, Collected
@@ -85,6 +89,9 @@ class Exporter:
         self._depth = make(Gauge, "queue_depth", "Requests that wait.", "class")
         self._sessions = make(Gauge, "sessions", "Sessions that are held.", "transport")
         self._utilisation = make(Gauge, "utilisation", "Busy share of the policy's thread.")
+        self._gpu_memory = make(Gauge, "gpu_memory_bytes", "Memory of the GPU.", "kind")
+        self._gpu_ms = make(Histogram, "gpu_ms", "Forward pass on the GPU.", boundaries=_MS)
+        self._replays = make(Counter, "graph_replays", "Replays of CUDA graphs.")
         self._version = make(Gauge, "policy_version", "Newest version of the weights.")
         self._pushes = make(Histogram, "weight_push_ms", "Time until all replicas act with weights.", boundaries=_MS)
         self._hung = make(Counter, "hung_calls", "Calls of the policy over their time limit.", "op")
@@ -94,6 +101,7 @@ class Exporter:
         self._recorded = make(Counter, "recorded_frames", "Acts of recorded sessions.", "outcome")
         self._recording = make(Gauge, "recording", "Whether sessions are recorded.")
         self._keys, self._recorder = keys, recorder
+        self._replayed = 0  # exported part of the replays
         self._frames = Counts[str]()  # exported part of the recorder's counts
         self._meter = LoadMeter(engine.queue)
         self._periodic = Periodic(PERIOD_S)
@@ -124,6 +132,11 @@ class Exporter:
             self._pushes.observe(took_ms)
         self._version.set(self._engine.weights.number)
         self._uncompiled.set(len(self._engine.models.uncompiled))
+        for kind, size in self._engine.models.gpu_memory().items():
+            self._gpu_memory.set(size, {"kind": kind})
+        if new := CudaGraph.replays - self._replayed:
+            self._replays.inc(new)
+            self._replayed += new
         self._unreadable.set(0.0 if self._keys is None else self._keys.unreadable_s)
         recorder = self._recorder
         self._recording.set(float(recorder is not None and recorder.ended is None))
@@ -146,6 +159,8 @@ class Exporter:
                         self._stage.observe(stage_ms, {"stage": stage, "transport": transport})
         for observations in _in_slices(collected.batches.values):
             self._batch.observe(observations)
+        for took_ms in _in_slices(collected.gpu_ms.values):
+            self._gpu_ms.observe(took_ms)
         for op, calls in collected.hung.items():
             self._hung.inc(calls, {"op": op})
         if collected.out_of_memory:

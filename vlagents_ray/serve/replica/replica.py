@@ -20,7 +20,7 @@ from starlette.types import ASGIApp
 
 from vlagents_ray.client.transports.serve_handle import ClientApi
 from vlagents_ray.errors import PolicyFailed, PolicyUnavailable, VLAgentsError
-from vlagents_ray.policies.base.accelerator import VISIBLE
+from vlagents_ray.policies.base.accelerator import GPU_SHARE, VISIBLE
 from vlagents_ray.policies.base.program import loaded_code
 from vlagents_ray.protocol.frames import Decoded, decode_requests
 from vlagents_ray.protocol.messages import PROTOCOL_VERSION, SERVERS_MACHINE, Limits, boot_id
@@ -393,6 +393,8 @@ class PolicyReplica(ClientApi, SiblingApi):
 
 def _engine(args: ServerArgs, limits: Limits, migrator: SessionMigrator) -> Engine:
     """Create the engine, without loading the policy."""
+    if 0 < args.resources.num_gpus < 1:
+        os.environ.setdefault(GPU_SHARE, str(args.resources.num_gpus))
     if VISIBLE not in args.environment.env_vars:
         hide_gpus(ray.get_runtime_context().get_accelerator_ids().get("GPU", []))
     return Engine(

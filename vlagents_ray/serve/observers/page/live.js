@@ -132,6 +132,17 @@ function count(said, now) {
   replicas.set(said.name, Object.assign(known, { said, time: now, since: known.since || now }));
 }
 
+function gpuFacts(said) {
+  const gb = (kind) => `${((said.gpu_memory[kind] || 0) / 1e9).toPrecision(3)} GB`;
+  return [
+    ...(said.devices || []).map((one) => one.name || one.device),
+    ...(said.gpu_memory && "free" in said.gpu_memory ? [`${gb("allocated")} used, ${gb("reserved")} reserved, ${gb("free")} free`] : []),
+    ...(said.gpu_ms == null ? [] : [`${said.gpu_ms.toFixed(1)} ms a batch on the GPU`]),
+    ...(said.replays ? [`${said.replays} replays`] : []),
+    ...((said.uncompiled || []).length ? [`not compiled: ${said.uncompiled.length}`] : []),
+  ].join(" · ");
+}
+
 function showFleet(now) {
   const policies = [...replicas.values()].map((one) => one.said);
   if (!policies.length) return;
@@ -151,7 +162,8 @@ function showFleet(now) {
     const busy = said.utilisation ?? 0;
     const meter = element("meter", { max: 1, value: busy, high: 0.9, ariaLabel: `busy ${Math.round(busy * 100)} %` });
     return element("tr", {},
-      element("th", { scope: "row" }, `${several ? `${said.policy}: ` : ""}${name} on ${said.node}`, said.ready ? "" : ` (loading${said.step ? `: ${said.step}` : ""})`),
+      element("th", { scope: "row" }, `${several ? `${said.policy}: ` : ""}${name} on ${said.node}`, said.ready ? "" : ` (loading${said.step ? `: ${said.step}` : ""})`,
+        element("small", { title: (said.uncompiled || []).join("\n") }, gpuFacts(said))),
       element("td", {}, meter, `${Math.round(busy * 100)} %`),
       ...[(events.reduce((sum, event) => sum + event.acts, 0) / seconds).toFixed(1), mean ? mean.toFixed(1) : "–",
         said.waiting.robot, said.waiting.simulation, `${said.sessions_held} of ${said.session_limit}`,

@@ -1,0 +1,229 @@
+"""The memory that pushes of weights need on a GPU of a fake torch, and the streams of their copies."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+import torch
+from fake_cuda import FakeCuda
+
+from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.serve.weights import ModelWeights, PushOptions, WeightsVersion
+from vlagents_ray.weights import pinned_copies, trainable
+from vlagents_ray.weights.pinned_copies import copy
+from vlagents_ray.weights.trainable import are_apart, portable
+
+pytestmark = pytest.mark.torch
+
+SIZE = 1000  # elements of a value
+MODEL = 4 * 4 * SIZE  # bytes: four values, one of which has two names
+KEEP, PARTIAL = PushOptions("keep"), PushOptions(partial=True, allow_same=True)
+PART = 4 * 100  # bytes that operations on a version need beside it
+
+
+@pytest.fixture
+def cuda(monkeypatch: pytest.MonkeyPatch) -> FakeCuda:
+    fake = FakeCuda()
+    fake.install(monkeypatch)
+    monkeypatch.setattr(trainable, "_AT_ONCE", PART // 4)
+    monkeypatch.setattr(pinned_copies, "_PART", PART)
+    monkeypatch.setattr(pinned_copies, "_PARTS", [])
+    monkeypatch.setattr(pinned_copies, "_STREAMS", {})
+    return fake
+
+
+class Module(torch.nn.Module):
+    """Four values on a GPU, the first of which is tied to a fifth name."""
+
+    def __init__(self, cuda: FakeCuda) -> None:
+        super().__init__()
+        for name in "abcd":
+            setattr(self, name, torch.nn.Parameter(cuda.tensor(torch.zeros(SIZE))))
+        self.tied = self.a
+
+
+class OnGpu(Agent):
+    """Holds its parameters on a GPU."""
+
+    trainable: ClassVar[str | None] = "module"
+
+    def __init__(self, cuda: FakeCuda) -> None:
+        self.module = Module(cuda)
+
+    def act(self, obs: Obs) -> Act:
+        return Act(np.array([float(getattr(self.module, name).detach().values[-1]) for name in "abcd"]))
+
+
+class OwnLoading(OnGpu):
+    """Loads parameters by itself."""
+
+    def load_parameters(self, named: Any) -> None:
+        super().load_parameters(named)
+
+
+class Robot:
+    """A session."""
+
+    def __init__(self) -> None:
+        self.weights: WeightsVersion | None = None
+        self.follows = True
+
+
+class Pushed:
+    """The weights of one model, with a learner and sessions."""
+
+    def __init__(self, cuda: FakeCuda, agent: OnGpu) -> None:
+        self.cuda, self.agent = cuda, agent
+        self.weights = ModelWeights(agent, threading.Lock())
+        self.sessions: list[Robot] = []
+        cuda.memory.peak = cuda.memory.allocated
+
+    def begin(self, *, follows: bool, session: Robot | None = None) -> Robot:
+        session = session or Robot()
+        session.weights = None  # as an engine does before a reset
+        self.sessions = [*{session: None, **dict.fromkeys(self.sessions)}]
+        self.weights.begin(session, follows=follows)
+        return session
+
+    def push(self, number: int, options: PushOptions = KEEP) -> None:
+        values = {name: np.full(SIZE, number, np.float32) for name in [*"abcd", "tied"]}
+        self.weights.stage(number, values, options, lambda: self.sessions)
+        self.weights.commit(number, options, lambda: self.sessions)
+
+    def act(self, session: Robot) -> int:
+        assert session.weights is not None
+        self.weights.use(session.weights)
+        [number] = set(self.agent.act(Obs()).action)
+        return int(number)
+
+    def peak(self) -> int:
+        """The largest memory since the last call, bytes."""
+        peak, self.cuda.memory.peak = self.cuda.memory.peak, self.cuda.memory.allocated
+        return peak
+
+
+def test_a_push_needs_the_model_twice_and_gives_one_back(cuda: FakeCuda) -> None:
+    pushed = Pushed(cuda, OnGpu(cuda))
+    session = pushed.begin(follows=True)
+    for number in range(1, 5):
+        pushed.push(number)
+        assert pushed.act(session) == number
+        assert 2 * MODEL <= pushed.peak() <= 2 * MODEL + 2 * PART
+        if number > 1:  # the loaded checkpoint, which is pinned, is in the memory of the host
+            assert cuda.memory.allocated == MODEL
+            assert cuda.emptied == number - 1
+    assert pushed.act(pushed.begin(follows=False)) == 0
+    assert pushed.act(session) == 4
+
+
+def test_sessions_with_two_versions_swap_them_in_their_memory(cuda: FakeCuda) -> None:
+    pushed = Pushed(cuda, OnGpu(cuda))
+    old, new = pushed.begin(follows=False), pushed.begin(follows=True)
+    pushed.push(1)
+    pushed.peak()
+    before = len(cuda.transfers)
+    for _ in range(3):
+        assert [pushed.act(one) for one in (old, new)] == [0, 1]
+    assert pushed.peak() <= 2 * MODEL + 2 * PART
+    assert len(cuda.transfers) == before, "none of the two is copied to the host"
+    emptied = cuda.emptied
+    pushed.begin(follows=True, session=old)
+    pushed.push(2, PushOptions("keep", pin=True))
+    assert [pushed.act(one) for one in (old, new)] == [2, 2]
+    assert cuda.memory.allocated == MODEL
+    assert cuda.emptied > emptied
+
+
+def test_two_pushes_without_an_act_between_them_need_no_more(cuda: FakeCuda) -> None:
+    pushed = Pushed(cuda, OnGpu(cuda))
+    session = pushed.begin(follows=True)
+    pushed.push(1, PushOptions())
+    pushed.push(2, PushOptions())
+    pushed.push(3, PushOptions())
+    assert pushed.peak() <= 2 * MODEL + 2 * PART
+    assert pushed.act(session) == 0
+    pushed.begin(follows=True, session=session)
+    assert pushed.act(session) == 3
+
+
+def test_a_dropped_version_gives_its_memory_back(cuda: FakeCuda) -> None:
+    pushed = Pushed(cuda, OnGpu(cuda))
+    pushed.weights.stage(1, {"a": np.ones(SIZE)}, PushOptions(partial=True))
+    assert cuda.memory.allocated == 2 * MODEL
+    assert pushed.peak() <= 2 * MODEL + 2 * PART, "values of missing names are copied once"
+    pushed.weights.drop(1)
+    assert (cuda.memory.allocated, cuda.emptied) == (MODEL, 1)
+
+
+def test_a_value_with_two_names_is_pushed_by_either(cuda: FakeCuda) -> None:
+    pushed = Pushed(cuda, OnGpu(cuda))
+    session = pushed.begin(follows=True)
+    for number, name in enumerate(["a", "tied"], 1):
+        pushed.weights.stage(number, {name: np.full(SIZE, number, np.float32)}, PushOptions(partial=True))
+        pushed.weights.commit(number, KEEP, lambda: pushed.sessions)
+        assert session.weights is not None
+        pushed.weights.use(session.weights)
+        assert pushed.agent.act(Obs()).action.tolist() == [number, 0, 0, 0]
+
+
+def test_a_part_of_the_values_completes_a_version_in_the_memory_of_the_host(cuda: FakeCuda) -> None:
+    pushed = Pushed(cuda, OnGpu(cuda))
+    session = pushed.begin(follows=True)
+    pushed.push(1, PushOptions())
+    for number in (2, 3):
+        pushed.weights.stage(number, {"d": np.full(SIZE, 9, np.float32)}, PARTIAL, lambda: pushed.sessions)
+        pushed.weights.commit(number, PushOptions(), list)
+    assert pushed.act(session) == 0
+    new = pushed.begin(follows=True)
+    for _ in range(2):
+        assert pushed.act(session) == 0
+        assert new.weights is not None
+        pushed.weights.use(new.weights)
+        assert pushed.agent.act(Obs()).action.tolist() == [1, 1, 1, 9]
+        assert float(pushed.agent.module.tied.detach().values[0]) == 1
+
+
+def test_an_agent_that_loads_parameters_itself_gets_those_of_a_version(cuda: FakeCuda) -> None:
+    pushed = Pushed(cuda, OwnLoading(cuda))
+    old, new = pushed.begin(follows=False), pushed.begin(follows=True)
+    pushed.push(1)
+    for _ in range(2):
+        assert [pushed.act(one) for one in (old, new)] == [0, 1]
+
+
+def test_copies_to_and_from_the_host_run_on_a_stream_of_their_own(cuda: FakeCuda) -> None:
+    pushed = Pushed(cuda, OnGpu(cuda))
+    session = pushed.begin(follows=True)
+    for number in (1, 2):
+        pushed.push(number)
+        assert pushed.act(session) == number
+    [stream] = {stream for stream, _ in cuda.transfers}
+    assert stream is not torch.cuda.current_stream()
+    assert max(size for _, size in cuda.transfers) <= PART
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.int64])
+def test_values_of_any_length_and_type_arrive_bit_for_bit(cuda: FakeCuda, dtype: torch.dtype) -> None:
+    for length in (0, 1, 99, 100, 500, 12_345):
+        values = (100 * torch.randn(length)).to(dtype)
+        target = cuda.tensor(torch.empty(length, dtype=dtype))
+        copy(values, target)
+        assert torch.equal(target.values, values)
+        back = torch.empty(length, dtype=dtype)
+        copy(target, back)
+        assert torch.equal(back, values)
+    whole = torch.randn(3, 50, 7)
+    halves = cuda.tensor(torch.empty(3, 50, 7, dtype=torch.bfloat16))
+    copy(whole, halves)
+    assert torch.equal(halves.values, whole.bfloat16())
+    assert torch.equal(torch.from_numpy(portable(halves).view(np.int16)).view(torch.bfloat16), whole.bfloat16())
+
+
+def test_tensors_in_each_others_memory_are_not_swapped() -> None:
+    memory = torch.randn(12, 4)
+    assert are_apart({"a": memory[:6], "b": memory[6:], "tied": memory[:6]})
+    assert not are_apart({"a": memory, "b": memory[6:]})
+    assert not are_apart({"a": memory, "b": memory.t()})
