@@ -592,10 +592,6 @@ class WeightUpdates:
             self._given[0] = self.own().newest
         return self._given[name]
 
-    def portable_values(self, name: int) -> dict[str, Any]:
-        """Return the values of the version that the replica named so."""
-        return self.own().portable_values(self.given(name))
-
     def obey(self, use: int | None = None, forget: int | None = None) -> None:
         """Act with one version from now on, or drop one. Called on the policy's thread, between two batches."""
         if use is not None:

@@ -210,7 +210,7 @@ def _executed(
         return {}
     with Path(values).open("r+b") as file:
         if make is None:
-            write_values(file, updates.portable_values(name))
+            write_values(file, updates.own().portable_values(updates.given(name)))
             return {}
         pushed = read_values(file)
     options = PushOptions(**make.pop("options"))
