@@ -81,7 +81,7 @@ def answers(columns: Mapping[str, np.ndarray]) -> np.ndarray:
 
 @dataclass(frozen=True, slots=True)
 class LogRatio:
-    """How far a learner's log-probabilities of acts are from those that the server stated, nats an act."""
+    """Differences of a learner's log-probabilities of acts from those that the server stated, nats an act."""
 
     mean: float
     std: float
@@ -98,6 +98,9 @@ def log_ratio(learner: Any, server: Any) -> LogRatio:
         learner: The learner's log-probabilities, (B, ...), nats: an array or a tensor, on any device.
         server: `info["behaviour"]["logprob"]` of the same acts, or their `columns["logprob"]`, of the same shape. An
             act is a row of the first dimension, over which all others are summed; rows with NaN are left out.
+
+    Returns:
+        Mean and standard deviation of learner - server over the acts.
 
     Raises:
         InvalidInput: The shapes differ, or no row is left.

@@ -139,13 +139,14 @@ class ModelWeights:
             model: A value that is equal in replicas with the same checkpoint and settings.
         """
         self.model = model
+        self.gpus: tuple[str, ...] = ()  # see `NewestVersion`
         self._agent, self._busy = agent, busy
         self._lock = threading.Lock()
         try:
             values: dict[str, Any] | None = agent.parameters()
         except NotTrainable as error:
             self._refusal: NotTrainable | None = error
-            first, self._in_place, self._swaps, self.gpus = WeightsVersion(0, digest, None), False, False, ()
+            first, self._in_place, self._swaps = WeightsVersion(0, digest, None), False, False
         else:
             self._refusal = None
             # An agent with its own `load_parameters` may copy values instead of keeping references to them.
