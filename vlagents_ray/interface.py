@@ -286,6 +286,15 @@ class Agent:
     def interrupt(self) -> None:
         """Drop the planned actions: the robot was stopped or moved, and did not execute the last action of `act`."""
 
+    def sleep(self) -> None:
+        """Free the memory of an accelerator that is not that of `parameters`, such as of CUDA graphs, until `wake`.
+
+        A server calls this when a learner needs the memory, and moves the parameters to the host itself.
+        """
+
+    def wake(self) -> None:
+        """Make what `sleep` freed; torch tensors of `parameters` are the same objects at other addresses."""
+
     def check_health(self) -> None:
         """Raise an exception if this agent can never act again, e.g. after the loss of its GPU.
 

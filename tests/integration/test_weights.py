@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from shared_ray import shared_server
 
 from tests.integration.conftest import deploy, states
 from vlagents_ray import Obs, RemoteAgent
-from vlagents_ray.errors import InvalidWeights, UnchangedWeights
+from vlagents_ray.errors import InvalidWeights, PolicyUnavailable, UnchangedWeights
 from vlagents_ray.learn import Publisher
 from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.serve.launch.server import Server
@@ -69,6 +70,18 @@ def test_a_push_over_the_network_reaches_both_replicas(server: Server) -> None:
         assert [acts(server, "http") for _ in range(4)] == [(version, 5.0)] * 4
         with pytest.raises(UnchangedWeights):
             weights.push(gain(5))
+
+
+@pytest.mark.parametrize("target", ["serve://Trainable", "URL"])
+def test_both_replicas_sleep_and_wake_with_new_weights(server: Server, target: str) -> None:
+    with Publisher(server.url if target == "URL" else target) as weights, ThreadPoolExecutor(4) as threads:
+        weights.sleep()
+        waiting = [threads.submit(acts, server, "http") for _ in range(4)]
+        with pytest.raises(PolicyUnavailable, match="the policy sleeps"):
+            weights.push(gain(20))
+        newest = 20.0 + len(target)
+        version = weights.wake(gain(newest))
+        assert [act.result() for act in waiting] == [(version, newest)] * 4
 
 
 def test_a_replica_that_starts_later_has_the_weights_of_the_others(server: Server) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable, Iterator
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from vlagents_ray.learn.publisher import AppTarget
 from vlagents_ray.serve.scaling.weight_push import WeightPusher
 from vlagents_ray.serve.weights import PushOptions, WeightUpdates
 from vlagents_ray.weights import shared_values
-from vlagents_ray.weights.shared_values import NotShared, SharedValues, opened, shared
+from vlagents_ray.weights.shared_values import NotShared, SharedValues, opened, readable_gpus, shared
 from vlagents_ray.weights.trainable import portable
 
 pytestmark = pytest.mark.torch
@@ -167,7 +168,7 @@ def test_without_a_gpu_in_common_the_object_store_is_used_and_the_log_says_why(
     assert app.push(learner.state_dict(), PIN) == 1
     np.testing.assert_equal(replica.ask("values"), pushed)
     assert [type(sent) for sent in app.sent] == [SharedValues, list]
-    assert f"replica replica has its weights on GPU {GPU}, the learner on GPU GPU-another" in caplog.text
+    assert f"replica replica can copy only memory of GPU {GPU}, and the learner's is on GPU GPU-another" in caplog.text
     assert another.handles == 0
 
 
@@ -179,3 +180,25 @@ def test_memory_that_cannot_be_opened_is_said_to_be_so(device: str, memory: Shar
         message = f"the learner's memory on GPU {GPU} cannot be opened: this process does not use that GPU"
         with pytest.raises(NotShared, match=message), opened(values):
             pass
+
+
+def test_memory_of_a_peer_gpu_is_copied_from_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shared_values, "_MEMORY", SharedCpuMemory("GPU-of-the-learner"))
+    with ReplicaProcess("cpu", gpu=f"{GPU} GPU-of-the-learner") as replica:
+        app, learner = Application(replica), model("cpu")
+        pushed = changed(learner)
+        app.push(learner.state_dict(), PIN)
+        np.testing.assert_equal(replica.ask("values"), pushed)
+        assert [type(values) for values in app.sent] == [SharedValues]
+
+
+def test_the_gpus_that_can_be_read_are_the_visible_ones_with_access(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 3)
+    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: SimpleNamespace(uuid=f"GPU-{device}"))
+    monkeypatch.setattr(torch.cuda, "can_device_access_peer", lambda own, other: {own, other} == {0, 1})
+    assert [readable_gpus(gpu) for gpu in ("GPU-0", "GPU-1", "GPU-2", "")] == [
+        ("GPU-0", "GPU-1"),
+        ("GPU-0", "GPU-1"),
+        ("GPU-2",),
+        (),
+    ]

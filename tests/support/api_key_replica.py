@@ -519,6 +519,9 @@ class _Receiving:
             self._replica.ranks[mark] = "ROBOT"
         return PushResult(1, "", ("replica",))
 
+    async def rest(self, rest: Any) -> None:
+        """It is awake."""
+
     async def versions_of_weights(self) -> list[int]:
         return [1]
 
@@ -591,6 +594,8 @@ WAYS: dict[str, Way] = {
     "`WS /vla-eval`": over_websocket("/vla-eval", _see, _read_vla_eval),
     "`GET /v1/weights`": over_http("GET", "/v1/weights"),
     "`GET /v1/weights`, scope `weights`": _with_scope("weights", over_http("GET", "/v1/weights")),
+    "`POST /v1/weights/{step}`": over_http("POST", "/v1/weights/wake"),
+    "`POST /v1/weights/{step}`, scope `weights`": _with_scope("weights", over_http("POST", "/v1/weights/wake")),
     "`WS /v1/weights`": over_websocket("/v1/weights", _weights, _read_pushed),
     "`WS /v1/weights`, scope `weights`": _with_scope("weights", over_websocket("/v1/weights", _weights, _read_pushed)),
     "`GET /live`": over_http("GET", "/live"),

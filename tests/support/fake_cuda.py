@@ -385,6 +385,10 @@ class GpuTensor(torch.Tensor):
     def is_cuda(self) -> bool:  # type: ignore[override]
         return True
 
+    def untyped_storage(self) -> Any:
+        """Return the memory on the CPU."""
+        return self.values.untyped_storage()
+
     @classmethod
     def __torch_dispatch__(cls, op: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         own = [one for one in tree_leaves((args, kwargs)) if isinstance(one, GpuTensor)]

@@ -58,7 +58,7 @@ class _Replica:
 
     def __init__(self, device: str, gpu: str) -> None:
         if gpu:
-            SharedCpuMemory(gpu).install()
+            SharedCpuMemory(*gpu.split()).install()
         self.agent = Served(device)
         self.agent.initialize()
         self.left_open: set[str] = set()

@@ -17,8 +17,8 @@ GPU = "GPU-of-the-test"
 class SharedCpuMemory:
     """Takes the CPU for one GPU."""
 
-    def __init__(self, gpu: str = GPU) -> None:
-        self.uuid = gpu
+    def __init__(self, gpu: str = GPU, *peers: str) -> None:
+        self.uuid, self.peers = gpu, peers
         self.handles = 0  # that this process has handed out and not taken back
 
     def install(self) -> None:
@@ -28,6 +28,9 @@ class SharedCpuMemory:
     def gpu(self, value: Any) -> str:
         torch = sys.modules.get("torch")
         return self.uuid if torch is not None and isinstance(value, torch.Tensor) and value.numel() else ""
+
+    def readable(self, gpu: str) -> tuple[str, ...]:
+        return gpu, *self.peers
 
     def finish(self, device: Any) -> None:
         assert str(device) == "cpu"
@@ -44,7 +47,7 @@ class SharedCpuMemory:
     def opened(self, gpu: str, handle: StorageHandle) -> Any:
         import torch
 
-        if gpu != self.uuid:
+        if gpu not in self.readable(self.uuid):
             raise RuntimeError("this process does not use that GPU")
         return torch.UntypedStorage._new_shared_filename_cpu(handle.counters, handle.allocation, handle.size)
 

@@ -1,7 +1,7 @@
 """Learning with served policies: new weights, evaluations while they are trained, transitions, vector environments.
 
-All but `Publisher` and `TrainingEvaluation` needs the extra "learn" (pyarrow, gymnasium). Modules are loaded when their
-names are first used.
+All but `Publisher`, `TrainingEvaluation` and `log_ratio` needs the extra "learn" (pyarrow, gymnasium). Modules are
+loaded when their names are first used.
 """
 
 from __future__ import annotations
@@ -10,14 +10,14 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from vlagents_ray.learn.columns import answers, arrays
+    from vlagents_ray.learn.columns import LogRatio, answers, arrays, log_ratio
     from vlagents_ray.learn.publisher import Publisher
     from vlagents_ray.learn.rollouts import RolloutPlan, Rollouts, RolloutStats
     from vlagents_ray.learn.training_evaluation import TrainingEvaluation
     from vlagents_ray.learn.vector_env import BatchVectorEnv, as_vector_env
 
 _LATE = {
-    "columns": ("answers", "arrays"),
+    "columns": ("LogRatio", "answers", "arrays", "log_ratio"),
     "publisher": ("Publisher",),
     "rollouts": ("RolloutPlan", "RolloutStats", "Rollouts"),
     "training_evaluation": ("TrainingEvaluation",),
@@ -26,6 +26,7 @@ _LATE = {
 
 __all__ = [
     "BatchVectorEnv",
+    "LogRatio",
     "Publisher",
     "RolloutPlan",
     "RolloutStats",
@@ -34,6 +35,7 @@ __all__ = [
     "answers",
     "arrays",
     "as_vector_env",
+    "log_ratio",
 ]
 
 

@@ -37,11 +37,14 @@ chunk. `answers` returns the answer of each step.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from vlagents_ray.errors import InvalidInput
 from vlagents_ray.registry import require
+from vlagents_ray.weights.trainable import to_numpy
 
 EXTRA = "learn"  # of the package, with pyarrow and gymnasium
 FINAL = "final."
@@ -74,6 +77,42 @@ def answers(columns: Mapping[str, np.ndarray]) -> np.ndarray:
     """
     begun: np.ndarray = (columns["t"] == 0) | (np.diff(columns["act"], prepend=-1) != 0)
     return np.cumsum(begun) - 1
+
+
+@dataclass(frozen=True, slots=True)
+class LogRatio:
+    """Differences of a learner's log-probabilities of acts from those that the server stated, nats an act."""
+
+    mean: float
+    std: float
+    acts: int  # number of acts compared
+
+
+def log_ratio(learner: Any, server: Any) -> LogRatio:
+    """Compare the log-probabilities of the same acts, under the same weights, of a learner and of the server.
+
+    Before the first step of an optimizer the ratio of a policy gradient should be 1. Differences of precision, kernels
+    or preprocessing change it, and grow with the number of values of an act.
+
+    Args:
+        learner: The learner's log-probabilities, (B, ...), nats: an array or a tensor, on any device.
+        server: `info["behaviour"]["logprob"]` of the same acts, or their `columns["logprob"]`, of the same shape. An
+            act is a row of the first dimension, over which all others are summed; rows with NaN are left out.
+
+    Returns:
+        Mean and standard deviation of learner - server over the acts.
+
+    Raises:
+        InvalidInput: The shapes differ, or no row is left.
+    """
+    own, stated = (to_numpy(values).astype(np.float64) for values in (learner, server))
+    if own.shape != stated.shape or not own.ndim:
+        raise InvalidInput(f"log_ratio: got shapes {own.shape} and {stated.shape}, want one shape (B, ...) of both")
+    ratios = (own - stated).reshape(len(own), -1).sum(1)
+    ratios = ratios[~np.isnan(ratios)]
+    if not ratios.size:
+        raise InvalidInput('log_ratio: got no act with log-probabilities; request them with want=["logprob"]')
+    return LogRatio(float(ratios.mean()), float(ratios.std()), ratios.size)
 
 
 def _view(pa: Any, column: Any) -> np.ndarray:

@@ -26,7 +26,7 @@ from vlagents_ray.protocol.frames import read_error
 from vlagents_ray.serve.endpoints.weights import PATH
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.scaling.weight_push import ThisReplica, Values, WeightPusher, WeightsReplica
-from vlagents_ray.serve.weights import PushMode, PushOptions, PushResult
+from vlagents_ray.serve.weights import PushMode, PushOptions, PushResult, Rest
 from vlagents_ray.weights.safetensors import MESSAGE_BYTES, header_of, parts_of
 from vlagents_ray.weights.shared_values import NotShared, gpu_of, shared
 from vlagents_ray.weights.trainable import is_array, portable
@@ -35,6 +35,7 @@ logger = logging.getLogger(__name__)
 
 _ANSWER_S = 10.0  # time limit for the request of the versions
 _PUSH_S = 600.0  # time limit for a push, which includes the transfer to all nodes
+_WINDOW = 16  # parts (MiB) in flight over the network: with one, each would take a round trip
 
 
 class Publisher:
@@ -114,6 +115,43 @@ class Publisher:
             raise InvalidWeights(f"weights: got {type(named).__name__}, want values by name, such as a state_dict")
         return self._target.push(named, PushOptions(mode, partial, allow_same, pin, version))
 
+    def sleep(self, *, offload: bool = True, at_most_s: float = 600.0) -> None:
+        """Let the policy rest while the learner needs the GPU, after the running batches; requests wait until `wake`.
+
+        Args:
+            offload: Whether weights move to the memory of the host, and CUDA graphs are freed. Otherwise both stay, and
+                only unused memory is freed.
+            at_most_s: Time after which the policy wakes by itself, since its learner may have died, s.
+
+        Raises:
+            NotTrainable: The policy names no parameters, which `offload` would move.
+            Overloaded: It sleeps already.
+            PolicyUnavailable: A replica cannot be reached; the others are awake.
+            Forbidden: The API key lacks the scope "weights".
+        """
+        self._target.rest(Rest("sleep", offload, at_most_s))
+
+    def wake(self, named: Mapping[str, Any] | None = None, *, mode: PushMode = "keep", **options: Any) -> int | None:
+        """Let the policy act again after `sleep`, with the same weights or new ones; free the learner's memory first.
+
+        Args:
+            named: New weights, with which all acts from now on are made; None to keep those before.
+            mode: As for `push`.
+            options: Further options of `push`.
+
+        Returns:
+            The version of the new weights; None without new ones.
+
+        Raises:
+            VLAgentsError: Those of `push`: the policy then acts with the weights before. `PolicyUnavailable` if the GPU
+                has too little memory: the policy still sleeps.
+        """
+        self._target.rest(Rest("restore"))
+        try:
+            return None if named is None else self.push(named, mode=mode, **options)
+        finally:
+            self._target.rest(Rest("wake"))
+
     def acknowledged(self, version: int) -> int:
         """Return the number of replicas that act with this version, or with a later one.
 
@@ -140,6 +178,10 @@ class WeightsTarget(ABC):
         """Push new weights to the policy, and return their version; see `Publisher.push`."""
 
     @abstractmethod
+    def rest(self, rest: Rest) -> None:
+        """Let all replicas take a step of a rest."""
+
+    @abstractmethod
     def versions(self) -> list[int]:
         """Return the newest version of each replica."""
 
@@ -152,9 +194,13 @@ class EngineTarget(WeightsTarget):
         self._engine = engine
 
     def push(self, named: Mapping[str, Any], options: PushOptions) -> int:
-        return asyncio.run(
-            WeightPusher(ThisReplica("this process", self._engine.weights), _no_siblings).push(named, options)
-        ).version
+        return asyncio.run(self._pusher().push(named, options)).version
+
+    def rest(self, rest: Rest) -> None:
+        asyncio.run(self._pusher().rest(rest))
+
+    def _pusher(self) -> WeightPusher:
+        return WeightPusher(ThisReplica("this process", self._engine.weights), _no_siblings)
 
     def versions(self) -> list[int]:
         return [self._engine.weights.number]
@@ -190,6 +236,9 @@ class AppTarget(WeightsTarget):
     def _push(self, values: Values, options: PushOptions) -> int:
         result: PushResult = self._call("push_weights", values, options, timeout_s=_PUSH_S)
         return result.version
+
+    def rest(self, rest: Rest) -> None:
+        self._call("rest", rest, timeout_s=_PUSH_S)
 
     def versions(self) -> list[int]:
         found: list[int] = self._call("versions_of_weights", timeout_s=_ANSWER_S)
@@ -232,20 +281,31 @@ class ServerTarget(WeightsTarget):
             raise InvalidWeights(f"weights: {len(values)} names take {len(header)} bytes, the limit is {MESSAGE_BYTES}")
         stated = {name: str(value).lower() for name, value in asdict(options).items() if value is not None}
         with closing(open_websocket(f"{self._url}?{urlencode(stated)}", self._credentials, _ANSWER_S)) as socket:
+            unanswered, most = 0, 1  # the header alone is answered before any value is sent
             for part in chain((header,), parts_of(values)):
-                answer = self._ask(socket, part)
-                if "code" in answer:
-                    raise read_error(answer)
+                with suppress(ConnectionClosed, OSError):  # the server has refused the push; its answer has the reason
+                    socket.send(part, _ANSWER_S)
+                unanswered += 1
+                if unanswered >= most:
+                    answer, unanswered, most = self._answer(socket), unanswered - 1, _WINDOW
+            for _ in range(unanswered):
+                answer = self._answer(socket)
         return int(answer["version"])
 
-    def _ask(self, socket: ProxiedSocket, part: bytes) -> dict[str, Any]:
+    def _answer(self, socket: ProxiedSocket) -> dict[str, Any]:
+        """Return the answer to the oldest part without one, and raise it if it is an error."""
         try:
-            with suppress(ConnectionClosed, OSError):  # the server has refused the push; its answer has the reason
-                socket.send(part, _ANSWER_S)
             answer: dict[str, Any] = json.loads(socket.recv(_PUSH_S))
         except (ConnectionClosed, OSError) as error:
             raise _unknown(self._url, error) from error
+        if "code" in answer:
+            raise read_error(answer)
         return answer
+
+    def rest(self, rest: Rest) -> None:
+        query = urlencode({"offload": str(rest.offload).lower(), "at_most_s": rest.at_most_s})
+        with closing(HttpTransport(self._base, CodecChoice("raw"), self._credentials)) as http:
+            http.get(f"{PATH}/{rest.step}?{query}", _PUSH_S, method="POST")
 
     def versions(self) -> list[int]:
         with closing(HttpTransport(self._base, CodecChoice("raw"), self._credentials)) as http:

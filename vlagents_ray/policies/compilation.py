@@ -310,6 +310,16 @@ class Compilation:
             logger.info("compiled for %d rows in %.1f s: %s", size, time.monotonic() - began, used)
         self.graph_bytes = sum(memory.taken() for memory in self.memories.values())
 
+    def drop_graphs(self) -> None:
+        """Free all CUDA graphs, since they read weights at fixed addresses; `add_size` makes them again."""
+        if not self.memories:
+            return
+        self.sizes.clear()
+        self.memories.clear()
+        self.graph_bytes = 0
+        for core in self.cores:
+            core.drop_graphs()
+
 
 class Core:
     """A core with its programs."""
@@ -348,6 +358,12 @@ class Core:
     def tier(self, size: int) -> str | None:
         """Return the tier of the program of a batch size; None if it has none."""
         return next(iter(self._programs.get(self._rows or size, ())), None)
+
+    def drop_graphs(self) -> None:
+        """Free the graphs, and their inputs; torch's programs read no fixed addresses, and are kept."""
+        self._programs.clear()
+        self._kinds.clear()
+        self._held.clear()
 
     def settle(self, size: int) -> list[str]:
         """Keep the fastest program of a batch size; return the reasons for which others failed."""
@@ -397,7 +413,7 @@ class Core:
         function, owner, size, device = self._function, self._owner, len(tensors[0]), tensors[0].device
         inputs = self._inputs(tensors)
         if tier == _COMPILED and not self._parts:
-            function = self._compiled[size] = self._program(inputs)
+            function = self._compiled[size] = self._compiled.get(size) or self._program(inputs)
         if device.type != "cuda":
             return function
         if tier == _GRAPH:

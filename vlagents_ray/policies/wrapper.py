@@ -85,6 +85,12 @@ class Wrapper(Agent, abc.ABC):
             results[i] = act
         return results
 
+    def sleep(self) -> None:
+        self.agent.sleep()
+
+    def wake(self) -> None:
+        self.agent.wake()
+
     def check_health(self) -> None:
         self.agent.check_health()
 

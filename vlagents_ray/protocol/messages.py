@@ -33,10 +33,10 @@ def is_name(text: str) -> bool:
     return text.isascii() and text.isprintable() and " " not in text and len(text) <= NAME_CHARACTERS
 
 
-Op = Literal["reset", "act", "close", "observe", "export", "adopt", "release"]
+Op = Literal["reset", "act", "close", "observe", "export", "adopt", "weights", "release"]
 OPS: tuple[Op, ...] = ("reset", "act", "close")
 # Only a replica may send these, to the process that runs its policy; "export" and "adopt" contain pickles.
-INNER_OPS: tuple[Op, ...] = (*OPS, "observe", "export", "adopt")
+INNER_OPS: tuple[Op, ...] = (*OPS, "observe", "export", "adopt", "weights")
 RankName = Literal["robot", "simulation"]  # the class of a request; robots are scheduled first
 RANKS: tuple[RankName, ...] = ("robot", "simulation")
 
@@ -52,7 +52,9 @@ class Request:
     op: Op
     obs: Obs | None = None  # for reset, act and observe
     instruction: str | None = None  # reset only
-    kwargs: dict[str, Any] = field(default_factory=dict)  # for reset: `seed`, ...; for adopt: the reply to export
+    kwargs: dict[str, Any] = field(
+        default_factory=dict
+    )  # for reset: `seed`, ...; for adopt: the reply to export; for weights: see `WeightUpdates.obey`
     # reset only: the contract of the robot or the environment, which the server checks against the policy's
     contract: dict[str, Any] | None = None
     history: list[Obs] = field(default_factory=list)  # reset only: earlier observations of the session, oldest first

@@ -11,7 +11,9 @@ memory, the agent's and a staged one; those with which no session acts are in th
 
 from __future__ import annotations
 
+import logging
 import threading
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import nullcontext
@@ -31,21 +33,40 @@ from vlagents_ray.errors import (
     WeightsNotStaged,
 )
 from vlagents_ray.interface import POLICY, Agent
-from vlagents_ray.policies.base.accelerator import empty_cache
+from vlagents_ray.policies.base.accelerator import empty_cache, free_memory, is_out_of_memory
 from vlagents_ray.policies.compilation import CAPTURES
 from vlagents_ray.policies.wrapper import Wrapper
-from vlagents_ray.weights import trainable
 from vlagents_ray.weights.safetensors import ValueSpec, read_header
-from vlagents_ray.weights.shared_values import SharedValues, gpu_of, opened
+from vlagents_ray.weights.shared_values import SharedValues, gpu_of, opened, readable_gpus
+from vlagents_ray.weights.trainable import (
+    accepted,
+    are_apart,
+    completed,
+    fingerprint,
+    from_host,
+    is_copied,
+    mapped,
+    on_host,
+    own_copy,
+    portable,
+    require_fit,
+    swap,
+    to_host,
+)
+
+logger = logging.getLogger(__name__)
 
 DIGITS = 16  # length of a checkpoint's digest that replaces a fingerprint, hexadecimal digits
 STAGED_S = 60.0  # time for which a staged version waits for its commit, s
 
 PushMode = Literal["keep", "next_episode"]
 """When a session changes to a new version: between two of its acts, or at its next reset."""
+RestStep = Literal["sleep", "restore", "wake"]
+"""No acts, and less memory; the memory back, still without acts; and acts again."""
 OPTION = "weights"  # option of a reset
 _COLLECTED = 1000  # maximum number of uncollected durations of pushes
 _LARGEST = 2**53 - 1  # largest version number, which JSON represents exactly
+_LONGEST_REST_S = 86_400.0
 _FOLLOW, _PINNED = "follow", "pinned"
 
 
@@ -83,6 +104,21 @@ class WeightsVersion:
         return dict(self.info[POLICY])
 
 
+@dataclass(frozen=True, slots=True)
+class Rest:
+    """A step between acting and acting again."""
+
+    step: RestStep
+    offload: bool = True  # whether "sleep" moves weights to the memory of the host, and frees CUDA graphs
+    at_most_s: float = 600.0  # time after which a replica wakes by itself, since its learner may have died, s
+
+    def __post_init__(self) -> None:
+        if self.step not in get_args(RestStep):
+            raise InvalidInput(f"rest: got {self.step!r}, want one of {list(get_args(RestStep))}")
+        if not 0 < self.at_most_s <= _LONGEST_REST_S:
+            raise InvalidInput(f"at_most_s: got {self.at_most_s:g}, want seconds in (0, {_LONGEST_REST_S:g}]")
+
+
 class FollowingSession(Protocol):
     """The part of a session's interface that concerns weights."""
 
@@ -103,28 +139,31 @@ class ModelWeights:
             model: A value that is equal in replicas with the same checkpoint and settings.
         """
         self.model = model
+        self.gpus: tuple[str, ...] = ()  # see `NewestVersion`
         self._agent, self._busy = agent, busy
         self._lock = threading.Lock()
         try:
             values: dict[str, Any] | None = agent.parameters()
         except NotTrainable as error:
             self._refusal: NotTrainable | None = error
-            first, self._in_place, self._swaps, self.gpu = WeightsVersion(0, digest, None), False, False, ""
+            first, self._in_place, self._swaps = WeightsVersion(0, digest, None), False, False
         else:
             self._refusal = None
             # An agent with its own `load_parameters` may copy values instead of keeping references to them.
             policy: Any = agent
             while type(policy).load_parameters is Wrapper.load_parameters:
                 policy = policy.agent
-            own, copied = type(policy).load_parameters is not Agent.load_parameters, trainable.is_copied(values or {})
-            self._in_place, self._swaps = own or copied, copied and not own and trainable.are_apart(values or {})
-            first = WeightsVersion(0, trainable.fingerprint(values or {}), None if self._in_place else values)
-            self.gpu = gpu_of(values or {})
+            own, copied = type(policy).load_parameters is not Agent.load_parameters, is_copied(values or {})
+            self._in_place, self._swaps = own or copied, copied and not own and are_apart(values or {})
+            first = WeightsVersion(0, fingerprint(values or {}), None if self._in_place else values)
+            self.gpus = readable_gpus(gpu_of(values or {}))
         self.newest = self.pinned = first
         self._staged: WeightsVersion | None = None
         self._timer: threading.Timer | None = None
         self._live: WeightsVersion | None = first  # version in the agent; None if loading one has failed
         self._alive = WeakValueDictionary({0: first})
+        self._asleep = False
+        self._moved: list[tuple[Any, Any]] = []  # memory of the host with the values of the GPU, while it sleeps
         self._counted = 1  # versions alive after the last commit or reset
         self._switches = 0  # how often another version became the agent's
 
@@ -154,11 +193,11 @@ class ModelWeights:
         live = None if outgoing is None else outgoing()  # None if nothing else refers to it
         kept = live if self._in_place and live is not None and live.values is None else None
         if kept is not None and version.values is not None and self._swaps and not version.on_host:
-            trainable.swap(self._agent.parameters(), version.values)
+            swap(self._agent.parameters(), version.values)
             kept.values = version.values
         else:
             if kept is not None:
-                kept.values = trainable.mapped(trainable.own_copy, self._agent.parameters())
+                kept.values = mapped(own_copy, self._agent.parameters())
             if version.values is not None:  # otherwise the agent still has its own values
                 self._agent.load_parameters(version.values)
         self._live = version
@@ -191,13 +230,13 @@ class ModelWeights:
                 f"weights: got a header of {len(header)} bytes, want at most {most} for the policy's {len(held)} names"
             )
         announced = read_header(header)
-        trainable.require_fit(held, announced, partial=options.partial)
+        require_fit(held, announced, partial=options.partial)
         return announced
 
     def stage(
         self,
         number: int,
-        pushed: Mapping[str, Any],
+        pushed: Mapping[str, Any] | SharedValues,
         options: PushOptions,
         sessions: Callable[[], Iterable[FollowingSession]] = tuple,
     ) -> str:
@@ -232,14 +271,10 @@ class ModelWeights:
             self._staged = placeholder
         try:
             with CAPTURES.pushes:
+                self._require_awake()
                 if self._swaps:
                     self._move_to_host({session.weights for session in sessions()})
-                new = trainable.accepted(self._held(newest), pushed, partial=options.partial)
-                with self._busy if self._in_place else nullcontext():  # another version could become the agent's
-                    held = self._agent.parameters() if newest.values is None else newest.values
-                    values = trainable.completed(held, new, allow_same=options.allow_same, in_place=self._in_place)
-                del held
-                staged = WeightsVersion(number, trainable.fingerprint(values), values)
+                staged = self.make(number, newest, pushed, options)
         except BaseException:
             self.drop(number)
             raise
@@ -251,6 +286,31 @@ class ModelWeights:
             self._timer.daemon = True
             self._timer.start()
         return staged.fingerprint
+
+    def make(
+        self, number: int, newest: WeightsVersion, pushed: Mapping[str, Any] | SharedValues, options: PushOptions
+    ) -> WeightsVersion:
+        """Return a version of pushed values, which have been checked; missing names have the values of the newest."""
+        with CAPTURES.pushes, opened(pushed) if isinstance(pushed, SharedValues) else nullcontext(pushed) as named:
+            self._require_awake()
+            new = accepted(self._held(newest), named, partial=options.partial)
+            with self._busy if self._in_place else nullcontext():  # another version could become the agent's
+                held = self._agent.parameters() if newest.values is None else newest.values
+                values = completed(held, new, allow_same=options.allow_same, in_place=self._in_place)
+            del held
+            return WeightsVersion(number, fingerprint(values), values)
+
+    def admit(self, version: WeightsVersion) -> None:
+        """Let `find` return a version while it is held."""
+        self._alive[version.number] = version
+
+    def act_with(self, version: WeightsVersion, sessions: Iterable[FollowingSession]) -> None:
+        """Act with a version in all sessions and coming episodes, in a child process, whose replica decides on it."""
+        with self._lock:
+            self.newest = self.pinned = version
+            for session in sessions:
+                if session.weights is not None:
+                    session.weights = version
 
     def commit(self, number: int, options: PushOptions, sessions: Callable[[], Iterable[FollowingSession]]) -> None:
         """Use a staged version from now on. A repeated commit of the newest version does nothing.
@@ -294,7 +354,51 @@ class ModelWeights:
     def portable_values(self, version: WeightsVersion) -> dict[str, Any]:
         """Return the values of a version as numpy arrays, for another process."""
         with CAPTURES.pushes:
-            return {name: trainable.portable(value) for name, value in self._values(version).items()}
+            self._require_awake()
+            return {name: portable(value) for name, value in self._values(version).items()}
+
+    def sleep(self, *, offload: bool) -> None:
+        """Free the memory that torch has cached and, with `offload`, that of all versions and graphs, until `wake`.
+
+        The caller keeps the agent from acting meanwhile.
+
+        Raises:
+            NotTrainable: The agent names no parameters, which `offload` would move.
+        """
+        if offload and self._refusal is not None:
+            raise self._refusal
+        with CAPTURES.pushes, self._busy:
+            if offload:
+                self._asleep = True
+                self._agent.sleep()
+                held = [version.values for version in self._alive.values() if version.values is not None]
+                self._moved += to_host([self._agent.parameters(), *held])
+        free_memory()
+
+    def wake(self) -> None:
+        """Move the versions back, and make the graphs again; does nothing if the agent is awake.
+
+        Raises:
+            PolicyUnavailable: The GPU has too little memory; the agent still sleeps.
+        """
+        with CAPTURES.pushes, self._busy:
+            if not self._asleep:
+                return
+            try:
+                from_host(self._moved)
+                self._agent.wake()
+            except RuntimeError as error:
+                if not is_out_of_memory(error):
+                    raise
+                raise PolicyUnavailable(
+                    f"wake: the GPU has too little memory for the policy, which still sleeps; free the learner's, "
+                    f"with torch.cuda.empty_cache(), and call wake again ({error})"
+                ) from error
+            self._asleep = False
+
+    def _require_awake(self) -> None:
+        if self._asleep:
+            raise PolicyUnavailable("weights: the policy sleeps; give wake() the new values, or call it first")
 
     def _forget_staged(self) -> None:
         self._staged = None
@@ -312,7 +416,7 @@ class ModelWeights:
     def _values(self, version: WeightsVersion) -> dict[str, Any]:
         with self._busy if self._in_place else nullcontext():  # another version could become the agent's
             values = self._agent.parameters() if version.values is None else version.values
-            return trainable.mapped(trainable.own_copy, values) if self._in_place else values
+            return mapped(own_copy, values) if self._in_place else values
 
     def _move_to_host(self, used: set[WeightsVersion | None]) -> None:
         """Move the pinned and the newest version out of the GPU's memory, unless it is the agent's or one of `used`."""
@@ -320,10 +424,18 @@ class ModelWeights:
             switches, values = self._switches, version.values
             if values is None or version.on_host:
                 continue
-            moved = trainable.mapped(trainable.on_host, values)
+            moved = mapped(on_host, values)
             with self._busy:
                 if self._switches == switches:  # otherwise another version may have got its memory
                     version.values, version.on_host = moved, True
+
+
+class HoldsWeights(ABC):
+    """An agent that holds the versions of its weights itself, such as one in another process."""
+
+    @abstractmethod
+    def model_weights(self, busy: threading.Lock, digest: str, model: tuple[str, str]) -> ModelWeights:
+        """Return the versions; see `ModelWeights` for the arguments."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -341,7 +453,8 @@ class NewestVersion:
 
     number: int
     model: tuple[str, str]  # equal in replicas that loaded the same checkpoint with the same settings
-    gpu: str = ""  # UUID of the GPU that holds all its weights; empty if there is no single one
+    # UUIDs of the GPUs whose memory it can copy: that of its weights, and its peers; none if there is no single GPU
+    gpus: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -356,11 +469,27 @@ class HeldVersion:
 class WeightUpdates:
     """Stages and commits new weights in one replica. Thread-safe."""
 
-    def __init__(self, own: Callable[[], ModelWeights], sessions: Callable[[], Sequence[FollowingSession]]) -> None:
-        """Update the weights that `own` returns, which the `sessions` of the replica act with."""
-        self._own = own
+    def __init__(
+        self,
+        own: Callable[[], ModelWeights],
+        sessions: Callable[[], Sequence[FollowingSession]],
+        acting: threading.Lock | None = None,
+    ) -> None:
+        """Update the weights of a replica.
+
+        Args:
+            own: Returns the weights, or raises `PolicyUnavailable` while the policy loads.
+            sessions: Returns the sessions, which act with them.
+            acting: The lock that the policy's thread holds while it runs a batch.
+        """
+        self.own = own
         self._sessions = sessions
+        self._acting = acting or threading.Lock()
+        self._resting = threading.RLock()  # held during each step of a rest
+        self._asleep: ModelWeights | None = None  # those of the policy that sleeps, for which `acting` is held
+        self._alarm: threading.Timer | None = None
         self._pushes_ms: deque[float] = deque(maxlen=_COLLECTED)
+        self._given: dict[int, WeightsVersion] = {}  # in a child process: those that its replica refers to
 
     def pushed(self, took_ms: float) -> None:
         """Record the duration of a push that this replica coordinated, for the metrics."""
@@ -372,46 +501,123 @@ class WeightUpdates:
 
     def read_header(self, header: bytes, options: PushOptions) -> dict[str, ValueSpec]:
         """Check the header of a push, as `ModelWeights.read_header` does."""
-        return self._own().read_header(header, options)
+        return self.own().read_header(header, options)
 
     def stage(self, number: int, pushed: Mapping[str, Any] | SharedValues, options: PushOptions) -> str:
         """Check and hold a new version, and return its fingerprint, as `ModelWeights.stage` does."""
-        with opened(pushed) if isinstance(pushed, SharedValues) else nullcontext(pushed) as named:
-            return self._own().stage(number, named, options, self._sessions)
+        return self.own().stage(number, pushed, options, self._sessions)
 
     def commit(self, number: int, options: PushOptions) -> None:
         """Use the staged version, as `ModelWeights.commit` does."""
-        self._own().commit(number, options, self._sessions)
+        self.own().commit(number, options, self._sessions)
 
     def held(self) -> list[HeldVersion]:
         """Return the pinned and the newest version, the older one first, except for the checkpoint itself."""
-        own = self._own()
+        own = self.own()
         pinned, newest = own.pinned, own.newest
         pushed = dict.fromkeys(version for version in (pinned, newest) if version.number)
         return [HeldVersion(one.number, one is pinned, own.portable_values(one)) for one in pushed]
 
     def drop(self, number: int) -> None:
         """Drop the staged version."""
-        self._own().drop(number)
+        self.own().drop(number)
+
+    def rest(self, rest: Rest) -> None:
+        """Make the policy sleep after the running batch, restore its memory, or let it act again.
+
+        Requests wait in the queue meanwhile. "restore" and "wake" do nothing if it is awake.
+
+        Raises:
+            PolicyUnavailable: The policy loads, or its GPU has too little memory, so that it still sleeps.
+            Overloaded: It sleeps already.
+            NotTrainable: See `ModelWeights.sleep`.
+        """
+        own = self.own()
+        with self._resting:
+            if rest.step == "sleep":
+                self._sleep(own, rest)
+            elif self._asleep is not None:
+                self._asleep.wake()
+                if rest.step == "wake":
+                    self._asleep = None
+                    self._acting.release()
+                    if self._alarm is not None:
+                        self._alarm.cancel()
+
+    def _sleep(self, own: ModelWeights, rest: Rest) -> None:
+        if self._asleep is not None:
+            raise Overloaded("sleep: the policy sleeps already; call wake first")
+        self._acting.acquire()
+        try:
+            own.sleep(offload=rest.offload)
+        except BaseException:
+            try:
+                own.wake()
+            finally:
+                self._acting.release()
+            raise
+        self._asleep = own
+        self._set_alarm(rest.at_most_s)
+
+    def _set_alarm(self, seconds: float) -> None:
+        self._alarm = threading.Timer(seconds, self._oversleep, (seconds,))
+        self._alarm.daemon = True
+        self._alarm.start()
+
+    def _oversleep(self, seconds: float) -> None:
+        with self._resting:
+            if self._alarm is not threading.current_thread():
+                return
+            logger.warning("the policy slept for %g s, its limit, and wakes without its learner", seconds)
+            try:
+                self.rest(Rest("wake"))
+            except Exception:
+                logger.exception("the policy does not wake; tried again in %g s", seconds)
+                self._set_alarm(seconds)
+
+    # In a child process: its replica decides which version acts, and when one is dropped. It names version 0 as 0, and
+    # others by numbers of its own, as a version may be pushed twice.
+
+    def make(
+        self, name: int, base: int, number: int, pushed: Mapping[str, Any] | SharedValues, options: PushOptions
+    ) -> str:
+        """Make a version from pushed values and those of `base`, and return its fingerprint."""
+        own = self.own()
+        made = self._given[name] = own.make(number, self.given(base), pushed, options)
+        own.admit(made)
+        return made.fingerprint
+
+    def given(self, name: int) -> WeightsVersion:
+        """Return the version that the replica named so."""
+        if not self._given:
+            self._given[0] = self.own().newest
+        return self._given[name]
+
+    def obey(self, use: int | None = None, forget: int | None = None) -> None:
+        """Act with one version from now on, or drop one. Called on the policy's thread, between two batches."""
+        if use is not None:
+            self.own().act_with(self.given(use), self._sessions())
+        if forget is not None:
+            self._given.pop(forget, None)
 
     def describe(self) -> dict[str, dict[str, Any]] | None:
         """Return number and fingerprint of the newest and the pinned version, for the metadata; None while it loads."""
         try:
-            own = self._own()
+            own = self.own()
         except PolicyUnavailable:
             return None
         return {"newest": own.newest.describe(), "pinned": own.pinned.describe()}
 
     def newest(self) -> NewestVersion:
         """Return the newest version; raise `PolicyUnavailable` while the policy loads."""
-        own = self._own()
-        return NewestVersion(own.newest.number, own.model, own.gpu)
+        own = self.own()
+        return NewestVersion(own.newest.number, own.model, own.gpus)
 
     @property
     def number(self) -> int:
         """Number of the newest version; 0 while the policy loads."""
         try:
-            return self._own().newest.number
+            return self.own().newest.number
         except PolicyUnavailable:
             return 0
 

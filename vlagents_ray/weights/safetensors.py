@@ -12,7 +12,7 @@ import struct
 from collections import deque
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -187,3 +187,19 @@ class ValuesReader:
         name, spec = self._left.popleft()
         value = self._values[name] = np.empty(spec.shape, spec.dtype)
         self._room = value.reshape(-1).view(np.uint8)
+
+
+def write_values(file: BinaryIO, named: Mapping[str, np.ndarray]) -> None:
+    """Write values into a file, from its place on; raises `InvalidWeights` for a type that the format lacks."""
+    file.write(header_of(named))
+    file.writelines(parts_of(named))
+    file.flush()
+
+
+def read_values(file: BinaryIO) -> Mapping[str, np.ndarray]:
+    """Return the values of a file, read-only, as `write_values` wrote them; raises `MalformedMessage`."""
+    length = file.read(_LENGTH.size)
+    reader = ValuesReader(read_header(length + file.read(*_LENGTH.unpack(length))))
+    while part := file.read(PART_BYTES):
+        reader.add(part)
+    return reader.values()

@@ -10,7 +10,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import Any
 
 from vlagents_ray.errors import PolicyUnavailable
@@ -50,13 +50,43 @@ class SharedValues:
     gpu: str  # UUID
     storages: dict[int, StorageHandle]  # by their addresses in the learner's process
     views: dict[str, ValueView]
-    others: dict[str, Any]  # values that are not on a GPU, as returned by `portable`
+    others: Mapping[str, Any]  # values that are not on a GPU, as returned by `portable`
+
+    def to_json(self) -> dict[str, Any]:
+        """Return JSON values of all but `others`, from which `from_json` makes the handles again."""
+        storages = {
+            key: [one.allocation.hex(), one.size, one.begin, one.counters.hex(), one.counter]
+            for key, one in self.storages.items()
+        }
+        return {
+            "gpu": self.gpu,
+            "storages": storages,
+            "views": {name: astuple(one) for name, one in self.views.items()},
+        }
+
+    @classmethod
+    def from_json(cls, node: dict[str, Any], others: Mapping[str, Any]) -> SharedValues:
+        """Return the handles that `to_json` described, with the other values."""
+        storages = {
+            int(key): StorageHandle(bytes.fromhex(allocation), size, begin, bytes.fromhex(counters), counter)
+            for key, (allocation, size, begin, counters, counter) in node["storages"].items()
+        }
+        views = {
+            name: ValueView(storage, dtype, begin, tuple(shape), tuple(stride))
+            for name, (storage, dtype, begin, shape, stride) in node["views"].items()
+        }
+        return cls(node["gpu"], storages, views, others)
 
 
 def gpu_of(named: Mapping[str, Any]) -> str:
     """Return the UUID of the GPU that holds all values; empty if there is no single one."""
     gpus = {_MEMORY.gpu(value) for value in named.values()} - {""}
     return gpus.pop() if len(gpus) == 1 else ""
+
+
+def readable_gpus(gpu: str) -> tuple[str, ...]:
+    """Return the UUIDs of the GPUs whose memory this process can copy to `gpu`, which is one; none without it."""
+    return _MEMORY.readable(gpu) if gpu else ()
 
 
 @contextmanager
@@ -69,10 +99,11 @@ def shared(named: Mapping[str, Any]) -> Iterator[SharedValues]:
         NotShared: CUDA cannot share this kind of memory.
     """
     with ExitStack() as stack:
-        values, devices = SharedValues(gpu_of(named), {}, {}, {}), set()
+        others: dict[str, Any] = {}
+        values, devices = SharedValues(gpu_of(named), {}, {}, others), set()
         for name, value in named.items():
             if not _MEMORY.gpu(value):
-                values.others[name] = portable(value) if is_array(value) else value
+                others[name] = portable(value) if is_array(value) else value
                 continue
             devices.add(value.device)
             storage = value.untyped_storage()
@@ -159,6 +190,13 @@ class _GpuMemory:
         return torch.UntypedStorage._new_shared_cuda(
             devices[0], handle.allocation, handle.size, handle.begin, handle.counters, handle.counter, b"", False
         )
+
+    def readable(self, gpu: str) -> tuple[str, ...]:
+        """Return the UUIDs of the visible GPUs whose memory can be copied to `gpu` without the host."""
+        cuda = sys.modules["torch"].cuda
+        uuids = [self._uuid(device) for device in range(cuda.device_count())]
+        own = uuids.index(gpu)
+        return tuple(uuids[i] for i in range(len(uuids)) if i == own or cuda.can_device_access_peer(own, i))
 
     @staticmethod
     def _uuid(device: Any) -> str:

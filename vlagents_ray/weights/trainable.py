@@ -10,7 +10,7 @@ import hashlib
 import itertools
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any
@@ -145,7 +145,7 @@ def converted(value: Any, held: Any) -> Any:
             return copy(tensor, torch.empty_like(held, memory_format=torch.contiguous_format))
         new = tensor.to(held.device, held.dtype)
         return new.clone() if _is_tensor(value) and new.data_ptr() == value.data_ptr() else new
-    array = _to_numpy(value)
+    array = to_numpy(value)
     if isinstance(held, np.ndarray):
         array = _unchanging(array) if array.dtype == held.dtype else array.astype(held.dtype)
         array.flags.writeable = False
@@ -205,8 +205,8 @@ def _unchanging(array: np.ndarray) -> np.ndarray:
     return array.view() if owner is None or memoryview(owner).readonly else array.copy()
 
 
-def _to_numpy(value: Any) -> np.ndarray:
-    """Convert an array to a type that numpy has: a bfloat16 is the upper half of a float32."""
+def to_numpy(value: Any) -> np.ndarray:
+    """Convert an array or tensor to a type that numpy has: a bfloat16 is the upper half of a float32."""
     array = portable(value)
     if array.dtype != _BFLOAT16:
         return array
@@ -221,6 +221,34 @@ def _is_tensor(value: Any) -> bool:
 def _is_module(value: Any) -> bool:
     torch = sys.modules.get("torch")
     return torch is not None and isinstance(value, torch.nn.Module)
+
+
+def to_host(groups: Iterable[Mapping[str, Any]]) -> list[tuple[Any, Any]]:
+    """Move torch tensors from GPUs to the host; return their memory, without bytes now, and that on the host.
+
+    The tensors stay the same objects, with the same views and ties; until `from_host` they must not be read.
+    """
+    tensors = [value for named in groups for value in named.values() if _is_tensor(value) and _on_gpu(value)]
+    storages = {value.untyped_storage().data_ptr(): value.untyped_storage() for value in tensors if value.numel()}
+    moved = []
+    for storage in storages.values():
+        if storage.resizable():  # otherwise it belongs to another library or process
+            moved.append((storage, storage.cpu() if storage.device.type != "cpu" else storage.clone()))
+            storage.resize_(0)
+    return moved
+
+
+def from_host(moved: list[tuple[Any, Any]]) -> None:
+    """Move tensors back, to other addresses; after an error, the list has those that were not moved yet."""
+    while moved:
+        storage, host = moved[-1]
+        storage.resize_(host.nbytes())
+        storage.copy_(host)
+        moved.pop()
+
+
+def _on_gpu(value: Any) -> bool:
+    return bool(value.device.type != "cpu")
 
 
 # Checks that pushed values fit those of a policy, and a digest of values.

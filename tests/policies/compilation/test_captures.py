@@ -26,6 +26,7 @@ from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.weights import ModelWeights, PushOptions
 from vlagents_ray.weights.shared_values import _GpuMemory
+from vlagents_ray.weights.trainable import from_host, to_host
 
 pytestmark = pytest.mark.torch
 
@@ -436,7 +437,7 @@ class OnGpu(ModelPolicy):
         report_device({"kind": self.kind})
         w = self.cuda.tensor(torch.eye(DIM))
         self.core = self.compilation.core("layer", lambda x: x @ w)
-        return {}
+        return {"w": w}
 
     def perceive(self, obs: Obs) -> None:
         return None
@@ -447,6 +448,28 @@ class OnGpu(ModelPolicy):
             chunks = self.core(noise)
         torch.cuda.current_stream().synchronize()
         return [Prediction(chunk[None]) for chunk in chunks.values.numpy()]
+
+
+def test_a_model_that_sleeps_frees_its_graphs_and_weights_and_acts_the_same_when_it_wakes(cuda: FakeCuda) -> None:
+    OnGpu.cuda = cuda
+    policy = OnGpu.from_config({"checkpoint": "none", "compile": "require", "batch_sizes": [1, 2]})
+    policy.initialize()
+
+    def act() -> Any:
+        policy.reset(Obs(), "go", seed=3)
+        return policy.act(Obs()).action
+
+    first, made = act(), len(cuda.captures)
+    policy.sleep()
+    moved = to_host([policy.model, policy.model])
+    assert [memory.nbytes() for memory, _ in moved] == [0]
+    assert (policy.compilation.sizes, policy.compilation.memories) == ([], {})
+    from_host(moved)
+    policy.wake()
+    assert (len(cuda.captures), policy.compilation.sizes) == (2 * made, [1, 2])
+    replayed = len(cuda.replays)
+    np.testing.assert_array_equal(act(), first)
+    assert len(cuda.replays) == replayed + 1, "from a graph"
 
 
 def test_a_model_on_a_gpu_acts_from_graphs_in_less_memory_and_until_the_gpu_fails(cuda: FakeCuda) -> None:

@@ -17,6 +17,8 @@ from in_memory_keys import ChangingKeys
 from websockets.exceptions import ConnectionClosed
 
 from vlagents_ray.client.credentials import Credentials
+from vlagents_ray.client.transports.base import CodecChoice
+from vlagents_ray.client.transports.http import HttpTransport
 from vlagents_ray.client.transports.websocket import ProxiedSocket, open_websocket
 from vlagents_ray.errors import (
     Forbidden,
@@ -32,7 +34,7 @@ from vlagents_ray.errors import (
     VLAgentsError,
 )
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.learn import Publisher
+from vlagents_ray.learn import Publisher, publisher
 from vlagents_ray.protocol.frames import read_error
 from vlagents_ray.protocol.messages import Limits
 from vlagents_ray.serve import weights as versions
@@ -71,6 +73,7 @@ class Alone:
 
         self.read_header = engine.weights.read_header
         self._pusher = WeightPusher(own, others)
+        self.rest = self._pusher.rest
         self._engine = engine
 
     async def push_received(self, named: Mapping[str, Any], options: PushOptions) -> PushResult:
@@ -183,6 +186,26 @@ def test_keys_need_the_scope(serving: Serving) -> None:
     assert server.engine.weights.number == 1
 
 
+def test_a_learner_elsewhere_lets_the_policy_rest_with_the_scope_for_pushes(serving: Serving) -> None:
+    known = ChangingKeys()
+    server = serving(keys=known.keys)
+    robot, key = known.add("robot"), known.add("learner", scopes=["weights"])
+    for refused in (lambda one: one.sleep(), lambda one: one.wake()):
+        with pytest.raises(Forbidden):
+            refused(Publisher(server.url, api_key=robot))
+    learner = Publisher(server.url, api_key=key)
+    learner.sleep(offload=False, at_most_s=60)
+    with pytest.raises(Overloaded, match="sleeps already"):
+        learner.sleep()
+    assert learner.wake(gains(1)) == 1
+    with pytest.raises(Forbidden):
+        Publisher(serving(insecure=True).url).sleep()
+    with closing(HttpTransport(server.url, CodecChoice("raw"), Credentials(key))) as http:
+        for path in ("nap", "sleep?offload=maybe", "sleep?at_most_s=nan", "sleep?at_most_s=1e99", "wake?level=2"):
+            with pytest.raises(InvalidInput):
+                http.get(f"/v1/weights/{path}", 10, method="POST")
+
+
 @pytest.mark.parametrize(("change", "error"), [({"revoked": True}, Unauthorized), ({"scopes": []}, Forbidden)])
 def test_a_key_that_loses_its_right_ends_the_push(serving: Serving, change: Any, error: type[Exception]) -> None:
     known = ChangingKeys()
@@ -194,6 +217,37 @@ def test_a_key_that_loses_its_right_ends_the_push(serving: Serving, change: Any,
         assert answer(socket, first) == {"received": PART_BYTES}
         known.change("learner", **change)
         assert isinstance(read_error(answer(socket, second)), error)
+    assert server.engine.weights.number == 0
+
+
+def test_several_parts_are_on_their_way_at_once_but_none_before_the_header_is_accepted(
+    serving: Serving, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    server, steps = serving(), list[str]()
+    send, recv = ProxiedSocket.send, ProxiedSocket.recv
+    monkeypatch.setattr(ProxiedSocket, "send", lambda self, *of: (steps.append("s"), send(self, *of))[1])
+    monkeypatch.setattr(ProxiedSocket, "recv", lambda self, *of: (steps.append("r"), recv(self, *of))[1])
+    monkeypatch.setattr(publisher, "_WINDOW", 4)
+    Publisher(server.url).push(gains(1))  # a header and 13 parts
+    assert "".join(steps) == "sr" + "sss" + "sr" * 10 + "rrr"
+
+
+def test_a_push_that_is_refused_with_parts_on_their_way_says_why(
+    serving: Serving, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    known = ChangingKeys()
+    server = serving(keys=known.keys)
+    key, send, sent = known.add("learner", scopes=["weights"]), ProxiedSocket.send, list[int]()
+
+    def change_before_the_third(self: ProxiedSocket, part: Any, timeout_s: float) -> None:
+        sent.append(len(part))
+        if len(sent) == 3:
+            known.change("learner", revoked=True)
+        send(self, part, timeout_s)
+
+    monkeypatch.setattr(ProxiedSocket, "send", change_before_the_third)
+    with pytest.raises(Unauthorized):
+        Publisher(server.url, api_key=key).push(gains(1))
     assert server.engine.weights.number == 0
 
 

@@ -15,8 +15,10 @@ import numpy as np
 import psutil
 import pytest
 from eval_fakes import wait_for
+from gain_policies import gains, in_child
 from in_flight import checked, submit
 from in_process_replicas import export
+from shared_cpu_memory import GPU, SharedCpuMemory
 from virtual_environments import ended
 
 from vlagents_ray import Act, Obs
@@ -29,13 +31,16 @@ from vlagents_ray.errors import (
     PolicyUnavailable,
     VLAgentsError,
 )
+from vlagents_ray.learn import Publisher
 from vlagents_ray.policies.loading import loading_report
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.python_env.child_agent import Child, ChildAgent
 from vlagents_ray.serve.python_env.child_main import Settings
 from vlagents_ray.serve.queue.call_limits import CallLimits
-from vlagents_ray.serve.weights import ModelWeights, PushOptions
+from vlagents_ray.serve.weights import PushOptions
+from vlagents_ray.weights import shared_values
+from vlagents_ray.weights.shared_values import NotShared, shared
 
 SUPPORT = Path(__file__).parents[2] / "support"
 ROOT = Path(__file__).parents[3]
@@ -286,11 +291,64 @@ def test_the_child_ends_with_its_replica_that_is_killed() -> None:
         wait_for(lambda: ended(pid))
 
 
-def test_the_weights_of_a_policy_in_a_child_process_are_out_of_reach() -> None:
-    weights = ModelWeights(agent(), threading.Lock(), "9f3c")
-    with pytest.raises(NotTrainable, match=r"runs in a child process.* `environment: \{process: replica\}`"):
-        weights.stage(1, {"w": np.zeros(1)}, PushOptions())
-    assert weights.newest.describe() == {"version": 0, "fingerprint": "9f3c"}
+def test_a_policy_without_parameters_is_not_trainable_there_either(engine: Engine) -> None:
+    with pytest.raises(NotTrainable, match="Telling: names no parameters to train"):
+        engine.weights.stage(1, {"w": np.zeros(1)}, PushOptions())
+    assert engine.weights.describe()["newest"]["version"] == 0
+
+
+def learner(policy: str = "Gain", **config: Any) -> tuple[Engine, Child]:
+    """A trained policy in a child process."""
+    one = in_child(policy, **config)
+    served = Engine(one)
+    served.start()
+    return served, one._child
+
+
+def test_a_push_to_a_child_that_dies_is_refused_and_leaves_nothing() -> None:
+    served, child = learner("DyingInAPush")
+    files = Path(f"/proc/{os.getpid()}/fd")
+    before = len(list(files.iterdir()))
+    with pytest.raises(PolicyUnavailable, match="exit status 9, so that nothing was changed; push again"):
+        Publisher(served).push(gains(1))
+    assert len(list(files.iterdir())) <= before
+    assert served.weights.number == 0
+    assert not served.ready
+    with pytest.raises(PolicyUnavailable):
+        child.call_for_weights(name=0, values="")
+    served.close()
+
+
+def test_the_child_drops_versions_that_nobody_acts_with_and_gives_others_to_new_replicas() -> None:
+    served, _ = learner("Counting")
+    weights = Publisher(served)
+    for number in range(1, 5):
+        weights.push(gains(number), pin=True)
+        reply = ask(served, "a", "reset", rank="simulation")
+        assert (info(reply)["gain"], info(ask(served, "a", "act"))["policy"]["version"]) == (number, number)
+    [held] = served.weights.held()
+    np.testing.assert_equal(held.values, gains(4))
+    wait_for(lambda: info(ask(served, "a", "reset", rank="simulation"))["versions"] == 1)
+    served.close()
+
+
+@pytest.mark.torch
+def test_handles_of_a_learners_gpu_are_opened_by_the_child(monkeypatch: pytest.MonkeyPatch) -> None:
+    import torch
+
+    monkeypatch.setattr(shared_values, "_MEMORY", memory := SharedCpuMemory())
+    served, _ = learner("OnSharedMemory")
+    assert served.weights.newest().gpus == (GPU,)
+    with shared({"weight": torch.full((2, 2), 3.0).T, "bias": torch.ones(2)}) as handles:
+        digest = served.weights.stage(1, handles, PushOptions())
+        served.weights.commit(1, PushOptions())
+    assert memory.handles == 0
+    reply = info(ask(served, "a", "reset", rank="simulation"))
+    assert (reply["weight"], digest) == (3.0, served.weights.describe()["newest"]["fingerprint"])
+    monkeypatch.setattr(memory, "uuid", "another")
+    with shared({"weight": torch.ones(2, 2), "bias": torch.ones(2)}) as handles, pytest.raises(NotShared):
+        served.weights.stage(2, handles, PushOptions())
+    served.close()
 
 
 def test_a_policy_in_a_child_process_says_whether_its_chunks_go_on_from_a_plan() -> None:

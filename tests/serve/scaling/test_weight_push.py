@@ -16,7 +16,7 @@ from vlagents_ray.protocol.messages import Request
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.scaling.session_migration import PeerEnded, PeerUnreachable
 from vlagents_ray.serve.scaling.weight_push import ThisReplica, WeightPusher, WeightsReplica
-from vlagents_ray.serve.weights import PushOptions, PushResult
+from vlagents_ray.serve.weights import PushOptions, PushResult, Rest
 
 T = TypeVar("T")
 
@@ -167,6 +167,22 @@ def test_if_one_replica_cannot_be_reached_none_acts_with_it(app: Application) ->
     far.fails.clear()
     assert app.gains() == [(0, 0.0)] * 2
     app.push(5)
+
+
+def test_if_one_replica_cannot_sleep_none_does_and_all_wake_together(app: Application) -> None:
+    app.start(Gain(), Gain(), Gain())
+    pusher = app.pusher(app.replicas[0])
+    app.replicas[1].fails["rest"] = PeerUnreachable("away")
+    with pytest.raises(PolicyUnavailable, match="replica r1 cannot be reached"):
+        asyncio.run(pusher.rest(Rest("sleep")))
+    assert app.gains() == [(0, 0.0)] * len(app.replicas)
+    app.replicas[1].fails.clear()
+    asyncio.run(pusher.rest(Rest("sleep")))
+    for replica in app.replicas:
+        with pytest.raises(Overloaded, match="sleeps already"):
+            replica.engine.weights.rest(Rest("sleep"))
+    asyncio.run(pusher.rest(Rest("wake")))
+    assert app.gains() == [(0, 0.0)] * len(app.replicas)
 
 
 @pytest.mark.parametrize("phase", ["newest", "stage", "commit"])

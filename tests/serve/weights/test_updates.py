@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import pytest
+from gain_policies import Doubled, Gain, gains, in_child
 from in_flight import answered
 
 from vlagents_ray.errors import (
@@ -26,40 +27,6 @@ from vlagents_ray.serve import weights as versions
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.weights import PushOptions
 from vlagents_ray.weights.trainable import fingerprint
-
-
-class Gain(Agent):
-    """Acts with its one parameter, and what a session has drawn."""
-
-    trainable: ClassVar[str | None] = "tree"
-
-    def initialize(self) -> None:
-        self.tree = {"layer": {"gain": np.zeros(2, np.float32)}}
-
-    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
-        self.rng = np.random.default_rng(kwargs.get("seed", 0))
-        return {"gain": float(self.tree["layer"]["gain"][0])}
-
-    def act(self, obs: Obs) -> Act:
-        return Act(np.append(self.tree["layer"]["gain"], self.rng.random()))
-
-
-class Doubled(Gain):
-    """Computes its actions from twice its parameter, which it computes once for each version, in place."""
-
-    def initialize(self) -> None:
-        super().initialize()
-        self.twice = np.zeros(2, np.float32)
-
-    def shared_objects(self) -> list[Any]:
-        return [*super().shared_objects(), self.twice]
-
-    def load_parameters(self, named: Mapping[str, Any]) -> None:
-        np.copyto(self.tree["layer"]["gain"], named["layer/gain"])
-        np.copyto(self.twice, 2 * named["layer/gain"])
-
-    def act(self, obs: Obs) -> Act:
-        return Act(np.append(self.twice / 2, self.rng.random()))
 
 
 class Served:
@@ -90,11 +57,9 @@ class Served:
         return digest
 
 
-def gains(gain: float) -> dict[str, Any]:
-    return {"layer/gain": np.full(2, gain, np.float32)}
-
-
-AGENTS = pytest.mark.parametrize("agent", [Gain, Doubled], ids=["by reference", "in place"])
+AGENTS = pytest.mark.parametrize(
+    "agent", [Gain, Doubled, in_child], ids=["by reference", "in place", "in a child process"]
+)
 
 
 @AGENTS
@@ -123,8 +88,9 @@ def test_an_episode_ends_with_the_weights_that_it_began_with_unless_they_are_pus
     assert digest == fingerprint(gains(5)), "of what the agent holds"
 
 
-def test_robots_keep_the_pinned_weights_unless_they_follow(serving: Callable[..., Engine]) -> None:
-    served = Served(serving(Gain()))
+@AGENTS
+def test_robots_keep_the_pinned_weights_unless_they_follow(serving: Callable[..., Engine], agent: type[Gain]) -> None:
+    served = Served(serving(agent()))
     for session, options in {"pinned": {}, "follows": {"weights": "follow"}}.items():
         served.reset(session, "robot", **options)
     served.reset("baseline", weights="pinned")
@@ -144,14 +110,15 @@ def test_robots_keep_the_pinned_weights_unless_they_follow(serving: Callable[...
         served.reset("pinned", weights=7)
 
 
+@AGENTS
 @pytest.mark.parametrize(
     ("pushed", "error"),
     [({}, InvalidWeights), ({"layer/gain": np.full(2, np.nan)}, InvalidWeights), (gains(1), UnchangedWeights)],
 )
 def test_what_is_refused_changes_nothing(
-    serving: Callable[..., Engine], pushed: dict[str, Any], error: type[Exception]
+    serving: Callable[..., Engine], agent: type[Gain], pushed: dict[str, Any], error: type[Exception]
 ) -> None:
-    served = Served(serving(Gain()))
+    served = Served(serving(agent()))
     served.push(1)
     before = served.learn.describe()
     with pytest.raises(error):
@@ -164,8 +131,11 @@ def test_what_is_refused_changes_nothing(
     served.push(2)
 
 
-def test_a_staged_version_does_not_act_and_a_second_one_has_to_wait(serving: Callable[..., Engine]) -> None:
-    served = Served(serving(Gain()))
+@AGENTS
+def test_a_staged_version_does_not_act_and_a_second_one_has_to_wait(
+    serving: Callable[..., Engine], agent: type[Gain]
+) -> None:
+    served = Served(serving(agent()))
     served.learn.stage(1, gains(1), PushOptions())
     served.reset("a")
     assert served.act("a") == (0, 0.0)
@@ -197,8 +167,11 @@ def test_a_learner_that_dies_between_the_phases_leaves_the_last_version(
     assert served.act("a") == (0, 0.0)
 
 
-def test_versions_never_go_back_and_no_act_fails_while_weights_are_pushed(serving: Callable[..., Engine]) -> None:
-    served = Served(serving(Gain()))
+@AGENTS
+def test_versions_never_go_back_and_no_act_fails_while_weights_are_pushed(
+    serving: Callable[..., Engine], agent: type[Gain]
+) -> None:
+    served = Served(serving(agent()))
     over = threading.Event()
     seen: dict[str, list[tuple[int, float]]] = {name: [] for name in "abc"}
     failed: list[BaseException] = []
@@ -226,8 +199,11 @@ def test_versions_never_go_back_and_no_act_fails_while_weights_are_pushed(servin
         assert all(gain == number for number, gain in acts)
 
 
-def test_a_moved_session_goes_on_with_its_version_and_not_where_that_is_missing(serving: Callable[..., Engine]) -> None:
-    here, there, without = Served(serving(Gain())), Served(serving(Gain())), Served(serving(Gain()))
+@AGENTS
+def test_a_moved_session_goes_on_with_its_version_and_not_where_that_is_missing(
+    serving: Callable[..., Engine], agent: type[Gain]
+) -> None:
+    here, there, without = Served(serving(agent())), Served(serving(agent())), Served(serving(agent()))
     here.push(1)
     here.reset("a")
     there.push(1)

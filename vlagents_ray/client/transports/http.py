@@ -94,9 +94,11 @@ class HttpTransport:
             raise ConfigError(f"{self._url.geturl()}: answers, but is no vlagents_ray server ({str(metadata)[:80]})")
         return metadata
 
-    def get(self, path: str, timeout_s: float, headers: dict[str, str] | None = None) -> dict[str, Any]:
-        """Return the JSON document at a path of the server."""
-        status, kind, body = self._exchange("GET", path, None, headers or {}, timeout_s)
+    def get(
+        self, path: str, timeout_s: float, headers: dict[str, str] | None = None, *, method: str = "GET"
+    ) -> dict[str, Any]:
+        """Return the JSON document at a path of the server, or that which answers another method, without a body."""
+        status, kind, body = self._exchange(method, path, None, headers or {}, timeout_s)
         if status != 200:
             raise refusal(status, kind, body)
         document = _json(body)

@@ -150,6 +150,9 @@ class ModelPolicy(Agent, abc.ABC):
         self._decide_on_compiling()
         if self.config.quantization:
             quantize(self, self.config.quantization)
+        self._warm_up()
+
+    def _warm_up(self) -> None:
         sizes = self.config.batch_sizes or []
         self.report.pads = bool(sizes)
         if not sizes and self.report.accelerated:
@@ -227,6 +230,13 @@ class ModelPolicy(Agent, abc.ABC):
             done if done is not None else self._act(session, found)  # type: ignore[arg-type]
             for done, session, found in zip(results, sessions, predictions, strict=True)
         ]
+
+    def sleep(self) -> None:
+        self.compilation.drop_graphs()
+
+    def wake(self) -> None:
+        if self.compilation.mode and not self.compilation.sizes:
+            self._warm_up()
 
     def close(self) -> None:
         self.model, self.adapters, self.compilation = None, Adapters(), Compilation(self.config.compile)

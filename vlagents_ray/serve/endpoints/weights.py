@@ -2,11 +2,15 @@
 
     WS   /v1/weights?mode=keep   a header, then the bytes of the values in parts; each is acknowledged
     GET  /v1/weights             the newest version of each replica
+    POST /v1/weights/sleep       no acts, and less memory, until "wake"; see `vlagents_ray.serve.weights.Rest`
+    POST /v1/weights/restore     the memory back, still without acts
+    POST /v1/weights/wake        acts again
 
 One connection is one push, which ends with it, so that all of its parts reach one replica, and no data of a push remain
-if its learner dies. A learner sends a part when the previous one is acknowledged, so that no proxy on the way buffers
-many parts. The header is checked against the policy's own weights, whose size bounds the push, before memory is
-allocated. Keys need the scope "weights"; without keys, only processes of this machine may push.
+if its learner dies. A learner sends the values when the header is acknowledged, and has at most 16 parts of 1 MiB
+without an answer, so that no proxy on the way buffers many. The header is checked against the policy's own weights,
+whose size bounds the push, before memory is allocated. Keys need the scope "weights"; without keys, only processes of
+this machine may push.
 """
 
 from __future__ import annotations
@@ -15,7 +19,7 @@ import asyncio
 import json
 import logging
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import fields
 from typing import Any, Protocol
@@ -29,7 +33,7 @@ from vlagents_ray.errors import InvalidInput, MalformedMessage, MessageTooLarge,
 from vlagents_ray.protocol.json_messages import problem
 from vlagents_ray.serve.access.api_keys import Caller, ScopeCheck, current_caller
 from vlagents_ray.serve.endpoints.http_messages import deny, problem_response, request_id
-from vlagents_ray.serve.weights import PushOptions, PushResult
+from vlagents_ray.serve.weights import PushOptions, PushResult, Rest
 from vlagents_ray.weights.safetensors import MESSAGE_BYTES, ValueSpec, ValuesReader
 
 logger = logging.getLogger(__name__)
@@ -52,6 +56,10 @@ class ReceivesWeights(Protocol):
         """Make all replicas act with new weights."""
         ...
 
+    async def rest(self, rest: Rest) -> None:
+        """Let all replicas take a step of a rest."""
+        ...
+
     async def versions_of_weights(self) -> list[int]:
         """Return the newest version of each replica."""
         ...
@@ -66,7 +74,11 @@ def weights_routes(replicas: ReceivesWeights, slow_s: float, *, open_to_network:
         open_to_network: Whether other machines reach this server without a key; pushes are then refused.
     """
     endpoint = _WeightsEndpoint(replicas, slow_s, open_to_network)
-    return [Route(PATH, endpoint.show), WebSocketRoute(PATH, endpoint.receive)]
+    return [
+        Route(PATH, endpoint.show),
+        Route(PATH + "/{step}", endpoint.rest, methods=["POST"]),
+        WebSocketRoute(PATH, endpoint.receive),
+    ]
 
 
 class _WeightsEndpoint:
@@ -80,6 +92,17 @@ class _WeightsEndpoint:
         try:
             self._scopes.require(_SCOPE)
             return JSONResponse({"versions": await self._replicas.versions_of_weights()})
+        except VLAgentsError as error:
+            return problem_response(error, request_id(http))
+
+    async def rest(self, http: HttpRequest) -> Response:
+        try:
+            self._scopes.require(_SCOPE)
+            rest = _rest(http.path_params["step"], http.query_params)
+            if isinstance(caller := current_caller(), Caller):
+                caller.note("the policy's rest:", rest.step)
+            await self._replicas.rest(rest)
+            return JSONResponse({})
         except VLAgentsError as error:
             return problem_response(error, request_id(http))
 
@@ -150,6 +173,18 @@ class _WeightsEndpoint:
         if not part:
             raise MalformedMessage("weights: got an empty message, want a header or a part of the values")
         return part
+
+
+def _rest(step: Any, query: Mapping[str, str]) -> Rest:
+    """Return a step of a rest, with the options in the query of its URL, such as `offload=false&at_most_s=60`."""
+    read: dict[str, Callable[[str], Any]] = {"offload": _TRUTH.__getitem__, "at_most_s": float}
+    try:
+        return Rest(step, **{name: read[name](value) for name, value in query.items()})
+    except (KeyError, ValueError) as error:
+        raise InvalidInput(
+            f"rest: got {step[:20]!r}, {dict(query)!r:.99}, want sleep, restore or wake, offload=true or false, and "
+            f"at_most_s=SECONDS"
+        ) from error
 
 
 def _options(query: Mapping[str, str]) -> PushOptions:

@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
@@ -41,7 +42,7 @@ from vlagents_ray.serve.queue.poller import Poller
 from vlagents_ray.serve.queue.preparation import Preparations
 from vlagents_ray.serve.requests import Opening, PendingRequest, Rank
 from vlagents_ray.serve.sessions import DrainList, Session, SessionFinder, SessionTable
-from vlagents_ray.serve.weights import WeightsVersion, WeightUpdates, follows
+from vlagents_ray.serve.weights import Rest, WeightsVersion, WeightUpdates, follows
 
 logger = logging.getLogger(__name__)
 
@@ -124,7 +125,8 @@ class Engine:
         self._alive = False  # whether a thread takes batches from the queue
         self._unsent: list[tuple[PendingRequest, Reply]] = []  # sent by another thread while the next batch runs
         self._answers = ThreadPoolExecutor(1, "policy-answers")
-        self.weights = WeightUpdates(lambda: self.models.own_weights, self.sessions.all)
+        self._acting = threading.Lock()  # held while the policy's thread runs a batch, and while the policy sleeps
+        self.weights = WeightUpdates(lambda: self.models.own_weights, self.sessions.all, self._acting)
         self.transfer = SessionTransfer(self.sessions, self.models, self.require_ready)
         self.observers = Observers()
 
@@ -175,7 +177,15 @@ class Engine:
                 if self._unsent:
                     unsent, self._unsent = self._unsent, []
                     self._answers.submit(_send, unsent)
-                self.run(taken)
+                if not self._acting.acquire(blocking=False):
+                    self._acting.acquire()  # the policy has slept
+                    now = self.clock()
+                    late = [pending for pending in taken.batch if pending.expired(now)]
+                    taken = Taken([one for one in taken.batch if one not in late], [*taken.expired, *late])
+                try:
+                    self.run(taken)
+                finally:
+                    self._acting.release()
                 del taken  # their observations may be in the sender's memory
             _send(self._unsent)
             self._answers.shutdown()
@@ -256,6 +266,8 @@ class Engine:
 
     def stop(self, timeout_s: float) -> None:
         """Refuse all requests except those of the running batch, and wait at most `timeout_s` for its end."""
+        with suppress(Exception):  # the policy is loading, or its GPU has too little memory for it to wake
+            self.weights.rest(Rest("wake"))
         for pending in self.queue.close():
             self._fail(pending, PolicyUnavailable("the replica is stopping; connect again"))
         if self._thread.ident is None:
@@ -500,6 +512,8 @@ class Engine:
             self.transfer.adopt(session_id, request.kwargs)
         elif request.op == "observe":
             self._observe(pending)
+        elif request.op == "weights":
+            self.weights.obey(**request.kwargs)
         else:
             self.sessions.close(session_id)
             pending.origin.sessions.discard(session_id)

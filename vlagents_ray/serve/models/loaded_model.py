@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 from vlagents_ray.contract import Contract, require_match
@@ -27,7 +28,7 @@ from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.serve.models.checkpoints import CHOICE, Checkpoints, resolved
 from vlagents_ray.serve.queue.call_limits import LOAD, PolicyCall, PolicyCalls
 from vlagents_ray.serve.requests import CheckpointChoice
-from vlagents_ray.serve.weights import DIGITS, ModelWeights
+from vlagents_ray.serve.weights import DIGITS, HoldsWeights, ModelWeights
 from vlagents_ray.validation import check_observation
 
 logger = logging.getLogger(__name__)
@@ -259,7 +260,8 @@ class Loader:
             logger.info("weights: %s, revision: %s", weights["digest"], weights.get("revision"))
         busy = threading.Lock()
         digest = ((weights or {}).get("digest") or "").rpartition(":")[2][:DIGITS]
-        parameters = ModelWeights(agent, busy, digest, version)
+        make = agent.model_weights if isinstance(agent, HoldsWeights) else partial(ModelWeights, agent)
+        parameters = make(busy, digest, version)
         calls = self._calls
         return LoadedModel(
             choice, settings, agent, contract, copies, padding, weights, files, version, calls, parameters, busy, report

@@ -13,7 +13,10 @@ import threading
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from typing import Any, ClassVar
+from typing import Any, BinaryIO, ClassVar
+from weakref import WeakKeyDictionary, finalize
+
+import numpy as np
 
 from vlagents_ray.client.transports.shm import ShmTransport
 from vlagents_ray.contract import Contract
@@ -28,10 +31,15 @@ from vlagents_ray.errors import (
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.policies.loading import report_device, report_progress, report_uncompiled
 from vlagents_ray.policies.wrapper import build_agent
+from vlagents_ray.protocol.frames import read_error
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.python_env import child_main
 from vlagents_ray.serve.python_env.child_main import Settings
+from vlagents_ray.serve.weights import HoldsWeights, ModelWeights, PushOptions, WeightsVersion
+from vlagents_ray.weights.safetensors import ValueSpec, read_values, write_values
+from vlagents_ray.weights.shared_values import NotShared, SharedValues
+from vlagents_ray.weights.trainable import portable, require_fit
 
 _FOREVER_S = 1e6  # no limit here: as for any policy, a replica with an overdue call is replaced
 _CONNECT_S = 10.0
@@ -53,6 +61,7 @@ class Child:
         self.contract: Contract | None = None  # contract of the policy, set by `start`
         self.weights: dict[str, Any] | None = None  # identity of the weights, set by `start`
         self.continues_plans = False  # whether the policy's chunks continue a plan, set by `start`
+        self.trained: dict[str, Any] = {}  # the values that a learner trains, set by `start`: see `child_main`
         self.sessions: set[str] = set()  # names of the sessions in the child
         self._python = python
         self._settings = settings
@@ -62,10 +71,11 @@ class Child:
         self._last_words: deque[str] = deque(maxlen=_LAST_WORDS)
         self._transport: ShmTransport | None = None
         self._lock = threading.Lock()
+        self._calling = threading.Lock()  # held during a call for the weights
         self._requests = itertools.count(1)
         self._names = itertools.count(1)
         self._free: deque[str] = deque()
-        self._left: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+        self._left: queue.SimpleQueue[str | int | None] = queue.SimpleQueue()  # sessions, and versions of weights
         self._closed = False
 
     def start(self) -> None:
@@ -91,6 +101,7 @@ class Child:
             raise
         self.contract = None if said["contract"] is None else Contract.from_json(said["contract"])
         self.weights, self.continues_plans = said["weights"], said["continues_plans"]
+        self.trained = said["trained"]
         threading.Thread(target=self._close_sessions, name="policy-process-sessions", daemon=True).start()
 
     def call(self, requests: Sequence[Request]) -> list[Reply]:
@@ -120,6 +131,26 @@ class Child:
     def close_session(self, name: str) -> None:
         """Close a session soon; return at once, as the garbage collector may call this at any moment."""
         self._left.put(name)
+
+    def forget_weights(self, name: int) -> None:
+        """Drop a version of the weights soon, as `close_session` does."""
+        self._left.put(name)
+
+    def call_for_weights(self, **call: Any) -> dict[str, Any]:
+        """Let the process execute a call (see `child_main`) while it acts, and return the result or raise its error."""
+        with self._calling:
+            process = self._process
+            if process is None or process.stdout is None:
+                raise PolicyUnavailable(self._ended())
+            _write(process, json.dumps(call).encode() + b"\n")
+            line = process.stdout.readline()
+        if not line:
+            raise PolicyUnavailable(f"weights: {self._ended()}, so that nothing was changed; push again")
+        answer: dict[str, Any] = json.loads(line)
+        if "code" in answer:
+            error = read_error(answer)
+            raise NotShared(str(error)) if answer.get("not_shared") else error
+        return answer
 
     def require_alive(self) -> None:
         """Raise `PolicyUnavailable` if the process has ended."""
@@ -192,6 +223,9 @@ class Child:
     def _close_sessions(self) -> None:
         while (name := self._left.get()) is not None:
             try:
+                if isinstance(name, int):
+                    self.call([Request("weights", kwargs={"forget": name})])
+                    continue
                 self.call([Request("close", session=name)])
             except VLAgentsError:  # the process has ended, and its sessions with it
                 return
@@ -236,7 +270,7 @@ def version_of(args: ServerArgs) -> str:
     return json.dumps([args.policy, args.wrappers, args.environment.model_dump()], sort_keys=True)
 
 
-class ChildAgent(Agent):
+class ChildAgent(Agent, HoldsWeights):
     """Proxy for the policy in a child process; a copy is one of its sessions and moves to another child by pickling."""
 
     shared: ClassVar[tuple[str, ...]] = ("_child",)
@@ -254,11 +288,10 @@ class ChildAgent(Agent):
         self.weights_id = self._child.weights
 
     def parameters(self) -> dict[str, Any]:
-        raise NotTrainable(
-            "the policy runs in a child process, with a Python environment of its own, where its weights are out of "
-            "reach; with the Python minor and the Ray of the cluster in that environment, `environment: {process: "
-            "replica}` lets the replica itself run there"
-        )
+        raise NotTrainable("the weights are in the policy's own process; a server replaces them there")
+
+    def model_weights(self, busy: threading.Lock, digest: str, model: tuple[str, str]) -> ModelWeights:
+        return ChildWeights(self, self._child, busy, digest, model)
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         if self._session is None:
@@ -308,3 +341,76 @@ class ChildAgent(Agent):
     def __del__(self) -> None:
         if (session := getattr(self, "_session", None)) is not None:
             self._child.close_session(session)
+
+
+class ChildWeights(ModelWeights):
+    """The versions of the weights in a child process, whose values stay there, on its GPU.
+
+    This process decides which version acts, and the child makes versions while the policy acts.
+    """
+
+    def __init__(
+        self, agent: ChildAgent, child: Child, busy: threading.Lock, digest: str, model: tuple[str, str]
+    ) -> None:
+        trained = child.trained
+        super().__init__(agent, busy, trained.get("fingerprint", digest), model)
+        self._child = child
+        self._numbers = itertools.count(1)
+        self._names: WeakKeyDictionary[WeightsVersion, int] = WeakKeyDictionary()  # in the child
+        if "refusal" in trained:
+            self._refusal = NotTrainable(trained["refusal"])
+            return
+        self._refusal, self.gpus = None, tuple(trained["gpus"])
+        self._name(self.newest, 0)
+        self.newest.values = {
+            name: ValueSpec(np.dtype("V2" if dtype == "bfloat16" else dtype), tuple(shape))
+            for name, (dtype, shape) in trained["values"].items()
+        }
+
+    def make(
+        self, number: int, newest: WeightsVersion, pushed: Mapping[str, Any] | SharedValues, options: PushOptions
+    ) -> WeightsVersion:
+        name, shared = next(self._numbers), None
+        if isinstance(pushed, SharedValues):
+            shared, pushed = pushed.to_json(), pushed.others
+        else:
+            require_fit(newest.values or {}, pushed, partial=options.partial)  # before anything is copied
+        make = {"base": self._names[newest], "number": number, "options": asdict(options)}
+        with _memory() as file:
+            write_values(file, {key: portable(value) for key, value in pushed.items()})
+            call = {"name": name, "values": _path(file), "make": make, "shared": shared}
+            version = WeightsVersion(number, self._child.call_for_weights(**call)["fingerprint"], newest.values)
+        self._name(version, name)
+        return version
+
+    def use(self, version: WeightsVersion) -> None:
+        if version is not self._live and version in self._names:
+            self._live = None
+            [reply] = self._child.call([Request("weights", kwargs={"use": self._names[version]})])
+            if reply.error is not None:
+                raise reply.error
+            self._live = version
+
+    def sleep(self, *, offload: bool) -> None:
+        self._child.call_for_weights(offload=offload)
+
+    def wake(self) -> None:
+        self._child.call_for_weights()
+
+    def portable_values(self, version: WeightsVersion) -> dict[str, Any]:
+        with _memory() as file:
+            self._child.call_for_weights(name=self._names[version], values=_path(file))
+            return dict(read_values(file))
+
+    def _name(self, version: WeightsVersion, name: int) -> None:
+        self._names[version] = name
+        finalize(version, self._child.forget_weights, name).atexit = False
+
+
+def _memory() -> BinaryIO:
+    """Return a file in memory that is freed when it is closed, however the other process ends."""
+    return os.fdopen(os.memfd_create("vlagents_weights"), "w+b")
+
+
+def _path(file: BinaryIO) -> str:
+    return f"/proc/{os.getpid()}/fd/{file.fileno()}"

@@ -4,8 +4,10 @@
 
 It needs the light install and pydantic, not Ray. The first line of its standard input is `Settings`, as JSON. It writes
 a line of JSON for each step of a long load and, when the policy is loaded, a line with the contract and the address of
-its `ShmServer`, which receives all requests; if the policy does not load, that line contains the error. A further byte
-of input makes it close the policy and end. The end of its input, or the death of its parent, ends it at once.
+its `ShmServer`, which receives all requests; if the policy does not load, that line contains the error. Each further
+line of input is a call for new weights (see `_executed`), which is answered with a line of output while the policy
+acts; an empty line makes it close the policy and end. The end of its input, or the death of its parent, ends it at
+once.
 """
 
 from __future__ import annotations
@@ -19,17 +21,23 @@ import sys
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields
+from pathlib import Path
 from typing import Any
 
 from vlagents_ray.contract import Contract
-from vlagents_ray.errors import ConfigError, PolicyFailed, PolicyUnavailable, VLAgentsError
+from vlagents_ray.errors import ConfigError, NotTrainable, PolicyFailed, PolicyUnavailable, VLAgentsError
 from vlagents_ray.interface import Agent
 from vlagents_ray.policies.wrapper import build_agent
+from vlagents_ray.protocol.json_messages import problem
 from vlagents_ray.protocol.messages import INNER_OPS, Limits
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.queue.call_limits import CallLimits
+from vlagents_ray.serve.weights import PushOptions, WeightUpdates
+from vlagents_ray.weights.safetensors import read_values, write_values
+from vlagents_ray.weights.shared_values import NotShared, SharedValues
+from vlagents_ray.weights.trainable import dtype_name
 
 _PR_SET_PDEATHSIG = 1
 # The replica checks requests, removes idle sessions and detects calls that take too long, so the child does not.
@@ -82,11 +90,14 @@ def run() -> None:
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
     settings = Settings(**json.loads(_line()))
     over = threading.Event()
-    threading.Thread(target=_wait_for_the_end, args=[over.set], daemon=True).start()
 
     def answer(said: dict[str, Any]) -> None:
         print(json.dumps(said), file=answers, flush=True)
 
+    def execute(call: dict[str, Any]) -> dict[str, Any]:
+        return _executed(engine.weights, **call)
+
+    threading.Thread(target=_read_calls, args=[execute, answer, over], daemon=True).start()
     try:
         agent = build_agent(settings.policy, settings.config, settings.wrappers)
         engine = Engine(
@@ -118,6 +129,7 @@ def run() -> None:
             "continues_plans": models.continues_plans,
             "uncompiled": models.uncompiled,
             "devices": models.devices,
+            "trained": _trained(agent, engine.weights),
         }
     )
     while not over.wait(_CHECK_S):
@@ -141,12 +153,69 @@ def _line() -> bytes:
     return line
 
 
-def _wait_for_the_end(end: Callable[[], None]) -> None:
-    if not os.read(0, 1):
-        os._exit(1)
-    end()
-    os.read(0, 1)  # at the end of the input the replica no longer waits
+def _trained(agent: Agent, updates: WeightUpdates) -> dict[str, Any]:
+    """Return types and shapes of the values that a learner trains, by name, or the reason why there are none."""
+    try:
+        values = {name: [dtype_name(value), list(value.shape)] for name, value in agent.parameters().items()}
+    except NotTrainable as error:
+        return {"refusal": str(error)}
+    newest = updates.newest()
+    return {"values": values, "fingerprint": updates.given(0).fingerprint, "gpus": newest.gpus}
+
+
+def _read_calls(
+    execute: Callable[[dict[str, Any]], dict[str, Any]],
+    answer: Callable[[dict[str, Any]], None],
+    over: threading.Event,
+) -> None:
+    """Execute the calls that the replica writes, until it writes an empty line; then only the end of input is left."""
+    with os.fdopen(0, "rb", closefd=False) as calls:
+        while (line := calls.readline()) and not over.is_set():
+            if not line.strip():
+                over.set()
+                continue
+            try:
+                answer(execute(json.loads(line)))
+            except VLAgentsError as error:
+                answer({**problem(error), "not_shared": isinstance(error, NotShared)})
+            except Exception as error:
+                logging.getLogger(__name__).exception("a call for the weights failed")
+                answer(
+                    problem(PolicyFailed(f"weights: the policy raised {type(error).__name__}; see the server's log"))
+                )
     os._exit(1)
+
+
+def _executed(
+    updates: WeightUpdates,
+    name: int = 0,
+    values: str = "",
+    make: dict[str, Any] | None = None,
+    shared: Any = None,
+    offload: bool | None = None,
+) -> dict[str, Any]:
+    """Make a version of the weights, or write the values of one, or let the policy sleep or wake.
+
+    Args:
+        updates: The versions.
+        name: The name of the version.
+        values: The file in shared memory for its values, as safetensors.
+        make: The arguments of `WeightUpdates.make`, to read the values; None to write them.
+        shared: `SharedValues.to_json` of values that are not in the file.
+        offload: See `ModelWeights.sleep`; without a file, None lets the policy wake.
+    """
+    if not values:
+        own = updates.own()
+        own.wake() if offload is None else own.sleep(offload=offload)
+        return {}
+    with Path(values).open("r+b") as file:
+        if make is None:
+            write_values(file, updates.own().portable_values(updates.given(name)))
+            return {}
+        pushed = read_values(file)
+    options = PushOptions(**make.pop("options"))
+    given = pushed if shared is None else SharedValues.from_json(shared, pushed)
+    return {"fingerprint": updates.make(name, pushed=given, options=options, **make)}
 
 
 if __name__ == "__main__":

@@ -54,7 +54,7 @@ from vlagents_ray.serve.scaling.rebalancer import ClientLocation, Rebalancer, Re
 from vlagents_ray.serve.scaling.session_migration import HeldSessions, SessionMigrator
 from vlagents_ray.serve.scaling.sibling_replicas import PEER_METHODS, SiblingApi, SiblingReplicas
 from vlagents_ray.serve.scaling.weight_push import ThisReplica, Values, WeightPusher, WeightsReplica
-from vlagents_ray.serve.weights import NewestVersion, PushOptions, PushResult, WeightUpdates
+from vlagents_ray.serve.weights import NewestVersion, PushOptions, PushResult, Rest, WeightUpdates
 from vlagents_ray.weights.safetensors import ValueSpec
 
 logger = logging.getLogger(__name__)
@@ -328,6 +328,10 @@ class PolicyReplica(ClientApi, SiblingApi):
     async def push_weights(self, values: Values, options: PushOptions) -> PushResult:
         """Make all replicas act with new weights; called by a learner."""
         return await self._pusher.push(values, options)
+
+    async def rest(self, rest: Rest) -> None:
+        """Let all replicas sleep, restore their memory, or wake; called by a learner."""
+        await self._pusher.rest(rest)
 
     async def push_received(self, named: Mapping[str, Any], options: PushOptions) -> PushResult:
         """Make all replicas act with new weights, which this one has received over the network."""

@@ -67,6 +67,7 @@ PEER_METHODS = {
         PeerMethod(WeightUpdates, WeightUpdates.commit, _ANSWER_S),
         PeerMethod(WeightUpdates, WeightUpdates.drop, _ANSWER_S),
         PeerMethod(WeightUpdates, WeightUpdates.held, _TRANSFER_S),
+        PeerMethod(WeightUpdates, WeightUpdates.rest, _TRANSFER_S),
         PeerMethod(Rebalancer, Rebalancer.load, _QUICK_S),
         PeerMethod(ReplicaView, ReplicaView.read, _VIEW_ANSWER_S),
         PeerMethod(ReplicaView, ReplicaView.press, _ANSWER_S),

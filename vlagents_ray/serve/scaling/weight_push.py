@@ -16,7 +16,7 @@ from typing import Any, Protocol, TypeVar
 
 from vlagents_ray.errors import InvalidInput, InvalidWeights, PolicyUnavailable, VLAgentsError
 from vlagents_ray.serve.scaling.session_migration import PeerEnded, PeerUnreachable
-from vlagents_ray.serve.weights import NewestVersion, PushOptions, PushResult, WeightUpdates
+from vlagents_ray.serve.weights import NewestVersion, PushOptions, PushResult, Rest, WeightUpdates
 from vlagents_ray.weights.shared_values import NotShared, SharedValues
 
 T = TypeVar("T")
@@ -120,6 +120,28 @@ class WeightPusher:
             acting = sorted(replica.name for replica, acts in zip(staged, done, strict=True) if acts)
             return PushResult(number, staged[self._own], tuple(acting))
 
+    async def rest(self, rest: Rest) -> None:
+        """Let all replicas take a step of a rest; if one cannot sleep, none does."""
+        async with self._pushing:
+            replicas = [self._own, *await self._loaded(await self._others())]
+            results = await asyncio.gather(
+                *(replica.weights(WeightUpdates.rest, rest) for replica in replicas), return_exceptions=True
+            )
+            answers = dict(zip(replicas, results, strict=True))
+            failed = {
+                one: error for one, error in answers.items() if error is not None and type(error) is not PeerEnded
+            }
+            if not failed:
+                return
+            if rest.step == "sleep":
+                asleep = [one for one in replicas if answers[one] is None]
+                wakes = (one.weights(WeightUpdates.rest, Rest("wake")) for one in asleep)
+                await asyncio.gather(*wakes, return_exceptions=True)
+            replica, error = next(iter(failed.items()))
+            if isinstance(error, PeerUnreachable):
+                raise _unreachable(replica) from error
+            raise error
+
     async def catch_up(self) -> int:
         """Get the newest versions of the other replicas if they are newer; then return this replica's newest version.
 
@@ -179,11 +201,9 @@ class WeightPusher:
 
 def _require_gpu(gpu: str, replicas: Mapping[WeightsReplica, NewestVersion]) -> None:
     for replica, newest in replicas.items():
-        if newest.gpu != gpu:
-            raise NotShared(
-                f"replica {replica.name} has its weights on {f'GPU {newest.gpu}' if newest.gpu else 'no single GPU'}, "
-                f"the learner on GPU {gpu}"
-            )
+        if gpu not in newest.gpus:
+            reads = f"only memory of GPU {', '.join(newest.gpus)}" if newest.gpus else "no GPU's memory"
+            raise NotShared(f"replica {replica.name} can copy {reads}, and the learner's is on GPU {gpu}")
 
 
 def _unreachable(replica: WeightsReplica) -> PolicyUnavailable:
