@@ -334,10 +334,7 @@ class Pi0Passes(FlowPasses):
     def __init__(self, model: Any, compilation: Compilation, *, stated: bool = True) -> None:
         """Use the passes of a `PI0Pytorch` or `PI05Pytorch`; `stated`: whether its `denoise_step` takes the state."""
         self._stated = stated
-        language = model.paligemma_with_expert.paligemma.model.language_model
-        # Upstream's eager attention makes (P, heads, L, L) float32 in each layer: 340 MB for 16 rows of three cameras.
-        language.config._attn_implementation = "sdpa"
-        self._dtype = language.layers[0].self_attn.q_proj.weight.dtype  # of queries, which that needs for the mask
+        model.paligemma_with_expert.paligemma.model.language_model.config._attn_implementation = "eager"
         super().__init__(model, compilation)
         own = getattr(model, "_prepare_attention_masks_4d", None)  # a function in newer versions of LeRobot
         self._mask_4d = own or self.module.prepare_attention_masks_4d
@@ -348,7 +345,7 @@ class Pi0Passes(FlowPasses):
 
         embedded, seen, causal = self.model.embed_prefix(list(images), list(cameras.unbind(1)), tokens, mask)
         _, cache = self.model.paligemma_with_expert.forward(
-            attention_mask=self._mask_4d(self.module.make_att_2d_masks(seen, causal)).to(self._dtype),
+            attention_mask=self._mask_4d(self.module.make_att_2d_masks(seen, causal)),
             position_ids=seen.cumsum(1) - 1,
             inputs_embeds=[embedded, None],
             use_cache=True,
