@@ -407,7 +407,7 @@ class ModelPolicy(Agent, abc.ABC):
         whole, rest = divmod(rows, most)
         pass_s = {size: self.report.pass_s.get(size) for size in self.config.batch_sizes or () if size <= most}
         if rest and self.report.accelerated and pass_s and None not in pass_s.values():
-            return [most] * whole + fastest_split(rest, tuple(pass_s.items()))  # type: ignore[arg-type]
+            return [most] * whole + fastest_split(rest, tuple(pass_s.items()))
         return [most] * whole + [rest] * bool(rest)
 
     def _run_examples(self, size: int, seeds: Iterator[int]) -> None:
