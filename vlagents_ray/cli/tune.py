@@ -45,13 +45,7 @@ def tune_command(
     """Find the best batch size, compilation and precision by measuring, and print the settings to change."""
     began = time.monotonic()
     from vlagents_ray.bench.tuner import TunePlan, Tuner
-    from vlagents_ray.bench.tuning_choice import (
-        TuningGoal,
-        choose,
-        chosen_settings,
-        default_point,
-        figures,
-    )
+    from vlagents_ray.bench.tuning_choice import TuningGoal, choose, chosen_settings, default_point, figures
     from vlagents_ray.serve.config.deployment import ServerArgs
     from vlagents_ray.serve.launch.deployment_file import policy_application
 

@@ -191,12 +191,7 @@ class Calvin(SimulatorEnv):
     _open: ClassVar[str | None] = None  # upstream's code assumes that the process has only one simulation
 
     def __init__(
-        self,
-        task: str = "D",
-        *,
-        task_steps: int = STEPS,
-        renderer: RendererName = "egl",
-        source_dir: str | None = None,
+        self, task: str = "D", *, task_steps: int = STEPS, renderer: RendererName = "egl", source_dir: str | None = None
     ) -> None:
         """Make the environment; raises the errors of `make_env`, and `ConfigError` if another one is open.
 
@@ -319,11 +314,7 @@ class Calvin(SimulatorEnv):
         return Obs(cameras, 1.0 if robot[14] > 0 else 0.0, dict(zip(_STATE, parts, strict=True)))
 
     def _info(self) -> dict[str, Any]:
-        return {
-            "success": self._done == TASKS,
-            "solved": self._done,
-            "tasks": list(self._playing().tasks),
-        }
+        return {"success": self._done == TASKS, "solved": self._done, "tasks": list(self._playing().tasks)}
 
     def _playing(self) -> Chain:
         if self._chain is None:

@@ -64,14 +64,7 @@ class Recorder:
         MissingDependency: The extra "record" is not installed.
     """
 
-    def __init__(
-        self,
-        root: str | Path,
-        fps: float,
-        *,
-        frames: int = 100,
-        interventions: bool = False,
-    ) -> None:
+    def __init__(self, root: str | Path, fps: float, *, frames: int = 100, interventions: bool = False) -> None:
         self.dropped = 0
         self.error: Exception | None = None  # the first error in writing
         self._dataset = Dataset(Path(root), fps, interventions=interventions)

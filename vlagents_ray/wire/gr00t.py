@@ -295,17 +295,9 @@ def write_npy(value: Any) -> dict[str, Any]:
 
 PRESETS: dict[str, dict[str, Any]] = {
     # N1.6 and newer: {"video": {k: (1, T, H, W, 3)}, "state": {k: (1, T, D)}, "language": {"task": [[text]]}}
-    "gr00t": {
-        "cameras": {"*": "video/*"},
-        "state": {"*": "state/*"},
-        "instruction": "language/*",
-    },
+    "gr00t": {"cameras": {"*": "video/*"}, "state": {"*": "state/*"}, "instruction": "language/*"},
     # N1.5 has the same content with flat keys
-    "gr00t-n1.5": {
-        "cameras": {"*": "video.*"},
-        "state": {"*": "state.*"},
-        "instruction": "annotation.human.*",
-    },
+    "gr00t-n1.5": {"cameras": {"*": "video.*"}, "state": {"*": "state.*"}, "instruction": "annotation.human.*"},
 }
 
 

@@ -16,13 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.errors import (
-    InvalidObservation,
-    MalformedMessage,
-    MessageTooLarge,
-    MissingCamera,
-    MissingState,
-)
+from vlagents_ray.errors import InvalidObservation, MalformedMessage, MessageTooLarge, MissingCamera, MissingState
 from vlagents_ray.protocol.frame_layout import Buffer
 from vlagents_ray.protocol.messages import Budget, Limits
 from vlagents_ray.protocol.values import is_number
@@ -319,5 +313,5 @@ PRESETS: dict[str, dict[str, Any]] = {
         "cameras": {"*": f"{IMAGES}*"},
         "state": {"joints": {"key": STATE, "optional": True}},
         "instruction": TASK,
-    },
+    }
 }

@@ -601,9 +601,6 @@ def libero_state(key: str) -> dict[str, Any]:
     finger joints, 0.04 m when open.
     """
     return {
-        "state": {
-            "xyz_axis_angle": {"key": key, "stop": 6},
-            "gripper_qpos": {"key": key, "start": 6, "stop": 8},
-        },
+        "state": {"xyz_axis_angle": {"key": key, "stop": 6}, "gripper_qpos": {"key": key, "start": 6, "stop": 8}},
         "gripper": {"key": key, "index": 6, "open": 0.04, "closed": 0.0},
     }

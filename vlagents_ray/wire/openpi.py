@@ -71,12 +71,7 @@ def _texts(data: bytes, dtype: str, most: int) -> list[str]:
 
 def _node(value: Any) -> Any:
     if isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
-        return {
-            b"__ndarray__": True,
-            b"data": value.tobytes(),
-            b"dtype": value.dtype.str,
-            b"shape": value.shape,
-        }
+        return {b"__ndarray__": True, b"data": value.tobytes(), b"dtype": value.dtype.str, b"shape": value.shape}
     if isinstance(value, np.generic) and value.dtype.kind in "biuf":
         return value.item()
     if isinstance(value, Mapping):
@@ -138,5 +133,5 @@ ROBOARENA: dict[str, dict[str, Any]] = {
         "instruction": "prompt",
         "info": {"session_id": "session_id"},
         "action_gripper": {"index": 7, "open": 0.0, "closed": 1.0},
-    },
+    }
 }

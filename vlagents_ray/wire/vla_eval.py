@@ -90,12 +90,7 @@ def decode_images(payload: dict[str, Any], budget: Budget) -> dict[str, Any]:
 
 
 def encode(message: Message) -> bytes:
-    fields = {
-        "type": message.kind,
-        "payload": message.payload,
-        "seq": message.seq,
-        "timestamp": time.time(),
-    }
+    fields = {"type": message.kind, "payload": message.payload, "seq": message.seq, "timestamp": time.time()}
     return pack(fields, _node)
 
 
@@ -110,12 +105,7 @@ def _image(node: dict[Any, Any]) -> np.ndarray | _File:
 
 def _node(value: Any) -> Any:
     if isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
-        return {
-            "__ndarray__": True,
-            "data": value.tobytes(),
-            "dtype": value.dtype.str,
-            "shape": list(value.shape),
-        }
+        return {"__ndarray__": True, "data": value.tobytes(), "dtype": value.dtype.str, "shape": list(value.shape)}
     if isinstance(value, np.generic) and value.dtype.kind in "biuf":
         return value.item()
     raise TypeError(f"cannot send {type(value).__name__}; want plain values and arrays of numbers")
@@ -131,5 +121,5 @@ PRESETS: dict[str, dict[str, Any]] = {
         "cameras": {"*": "images/*"},
         "state": {"state": {"key": "states|state", "optional": True}},
         "instruction": "task_description",
-    },
+    }
 }

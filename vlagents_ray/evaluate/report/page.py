@@ -33,12 +33,7 @@ from vlagents_ray.evaluate.report.charts import (
 )
 from vlagents_ray.evaluate.report.episodes import AT_ONCE, Gallery, episodes, errors, failures
 from vlagents_ray.evaluate.report.provenance import configuration, protocol, repeat
-from vlagents_ray.evaluate.report.success import (
-    compare_all,
-    learning_curves,
-    real_time_gaps,
-    success_table,
-)
+from vlagents_ray.evaluate.report.success import compare_all, learning_curves, real_time_gaps, success_table
 from vlagents_ray.evaluate.results.reader import Results, by_timing, rate_of
 from vlagents_ray.evaluate.results.summary import Summary, median, summarize
 

@@ -419,11 +419,7 @@ async def _reset(seen: Sequence[SessionObs], request_id: str) -> None:
 
 
 async def _ask(
-    message: Message,
-    op: Op,
-    seen: Sequence[SessionObs],
-    instructions: Sequence[str | None],
-    request_id: str,
+    message: Message, op: Op, seen: Sequence[SessionObs], instructions: Sequence[str | None], request_id: str
 ) -> list[Reply]:
     names = [request_id] if len(seen) == 1 else [f"{request_id}-{place}" for place in range(len(seen))]
     requests = [

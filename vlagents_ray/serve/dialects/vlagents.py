@@ -380,7 +380,7 @@ class VlagentsDialect(PortDialect):
             "gripper": {"key": "gripper", "optional": True},
             "instruction": "instruction",
             "info": {"info": "info"},
-        },
+        }
     }
     config: VlagentsDialectConfig
 

@@ -9,13 +9,7 @@ from typing import Any
 
 from vlagents_ray.errors import BY_CODE
 from vlagents_ray.protocol.frames import CONTENT_TYPE
-from vlagents_ray.protocol.messages import (
-    DEADLINE_HEADER,
-    RANK_HEADER,
-    REQUEST_ID_HEADER,
-    SESSION_HEADER,
-    STEP_HEADER,
-)
+from vlagents_ray.protocol.messages import DEADLINE_HEADER, RANK_HEADER, REQUEST_ID_HEADER, SESSION_HEADER, STEP_HEADER
 
 STYLE = """
 :root { color-scheme: light dark; font: 16px/1.5 system-ui, sans-serif; }

@@ -399,13 +399,7 @@ class WebSocketConnection(PolledConnection):
             self._is_throttled()
 
     def _submit(
-        self,
-        sender: Sender,
-        message: Message,
-        admission: MessageAdmission,
-        size: int,
-        arrived: float,
-        decoded: Decoded,
+        self, sender: Sender, message: Message, admission: MessageAdmission, size: int, arrived: float, decoded: Decoded
     ) -> None:
         """Send the requests of a message to the engine; their deadlines count from the arrival of the message."""
         message.decoded(decoded)

@@ -307,12 +307,7 @@ def _warn_of_plain_http(config: ServeDeploySchema, host: str, tls: Tls | None) -
 
 @contextlib.contextmanager
 def _ray(
-    address: str | None,
-    host: str,
-    port: int,
-    tls: Tls | None,
-    num_cpus: int | None,
-    ingress: bool,
+    address: str | None, host: str, port: int, tls: Tls | None, num_cpus: int | None, ingress: bool
 ) -> Iterator[dict[str, Any]]:
     """Connect to a Ray or start one; yield Serve's options for its host, port and certificate."""
     import ray
@@ -357,12 +352,7 @@ def _serve_address(listener: PublicListener | None, host: str, port: int, tls: T
 
 @contextlib.contextmanager
 def own_ray(
-    host: str,
-    port: int,
-    *,
-    tls: Tls | None = None,
-    num_cpus: int | None = None,
-    ingress: bool = True,
+    host: str, port: int, *, tls: Tls | None = None, num_cpus: int | None = None, ingress: bool = True
 ) -> Iterator[PublicListener | None]:
     """Run a private Ray for the length of the context, which no other machine and no other user can reach.
 

@@ -30,11 +30,7 @@ class ReplicaObservers:
 
 
 def open_observers(
-    engine: Engine,
-    args: ServerArgs,
-    replica: str,
-    node: str,
-    metadata: Callable[[], Mapping[str, Any]],
+    engine: Engine, args: ServerArgs, replica: str, node: str, metadata: Callable[[], Mapping[str, Any]]
 ) -> ReplicaObservers:
     """Create the observers in the settings of a replica, which observe the engine's requests from now on.
 

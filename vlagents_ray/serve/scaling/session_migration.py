@@ -239,12 +239,7 @@ class SessionMigrator:
     may be called on any thread.
     """
 
-    def __init__(
-        self,
-        peers: Peers,
-        loop: asyncio.AbstractEventLoop,
-        in_thread: InThread | None = None,
-    ) -> None:
+    def __init__(self, peers: Peers, loop: asyncio.AbstractEventLoop, in_thread: InThread | None = None) -> None:
         """Create the migrator of one replica.
 
         Args:
