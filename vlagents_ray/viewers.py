@@ -95,7 +95,15 @@ class RerunRecordings:
         self.closing_s = CLOSING_S if self._folder is None else None
         """Time limit, s, for writing the remaining frames when it is closed; None for no limit."""
         if self._folder is None:
-            _require_viewer(self.target)
+            # If nothing listens at the address, the SDK would retry forever.
+            where = urlsplit(self.target)
+            try:
+                with socket.create_connection((where.hostname or "", where.port or _PORT), CLOSING_S):
+                    pass
+            except OSError as error:
+                raise ConfigError(
+                    f"rerun: no viewer listens at {self.target}: {error}; start it with `rerun`"
+                ) from error
             self._rerun.unregister_shutdown()  # it would wait forever for a viewer that has gone
         else:
             self._folder.mkdir(parents=True, exist_ok=True)
@@ -145,16 +153,6 @@ class RerunEpisode:
         if self._live:
             self._recording.flush(timeout_sec=CLOSING_S)
         self._recording.disconnect()
-
-
-def _require_viewer(address: str) -> None:
-    """Raise `ConfigError` if nothing listens at the address; the SDK would otherwise retry forever."""
-    where = urlsplit(address)
-    try:
-        with socket.create_connection((where.hostname or "", where.port or _PORT), CLOSING_S):
-            pass
-    except OSError as error:
-        raise ConfigError(f"rerun: no viewer listens at {address}: {error}; start it with `rerun`") from error
 
 
 def open_viewer(target: str) -> EpisodeViewer:

@@ -340,7 +340,10 @@ class Simulator:
             sensor_configs=dict(sensors),
         )
         try:
-            self._check_usable()
+            if not hasattr(self.env.agent, "robot"):  # no robot, or several
+                raise ConfigError(f"{self.name}: want a task with exactly one robot")
+            if "success" not in self.env.get_info():
+                raise ConfigError(f"{self.name} does not say what success is: there is nothing to evaluate")
             self.cameras = self._choose(cameras)
             self._robot = ManiSkillRobot(self.env.agent)
         except BaseException:
@@ -445,12 +448,6 @@ class Simulator:
         env, self.env = self.env, None
         if env is not None:
             env.close()
-
-    def _check_usable(self) -> None:
-        if not hasattr(self.env.agent, "robot"):  # no robot, or several
-            raise ConfigError(f"{self.name}: want a task with exactly one robot")
-        if "success" not in self.env.get_info():
-            raise ConfigError(f"{self.name} does not say what success is: there is nothing to evaluate")
 
     def _choose(self, cameras: Sequence[str] | None) -> dict[str, CameraSpec]:
         seen = self.env.single_observation_space["sensor_data"]

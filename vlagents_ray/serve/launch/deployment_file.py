@@ -71,7 +71,12 @@ def server_args(source: str, app: str | None = None) -> ServerArgs:
 
 def policy_application(source: str, app: str | None = None) -> ServeApplicationSchema:
     """Return one application of a deployment that serves a policy: the one named `app`, or the only one."""
-    return _only(read_deployment(source), source, app)
+    ours: dict[str, ServeApplicationSchema] = {one.name: one for one in our_apps(read_deployment(source))}
+    if app is None and len(ours) == 1:
+        [app] = ours
+    if app not in ours:
+        raise ConfigError(f"{source}: holds the policies {sorted(ours)}, got {app!r}; name one of them as the app")
+    return ours[app]
 
 
 def with_gateways_at(config: ServeDeploySchema, host: str) -> ServeDeploySchema:
@@ -175,15 +180,6 @@ def stated_contract(config: ServeDeploySchema) -> Contract | None:
     if environment.python is not None:
         return check_policy(environment, args.policy, settings, args.wrappers)
     return unloaded_contract(offered.make(settings))
-
-
-def _only(config: ServeDeploySchema, source: str, app: str | None) -> ServeApplicationSchema:
-    ours: dict[str, ServeApplicationSchema] = {one.name: one for one in our_apps(config)}
-    if app is None and len(ours) == 1:
-        [app] = ours
-    if app not in ours:
-        raise ConfigError(f"{source}: holds the policies {sorted(ours)}, got {app!r}; name one of them as the app")
-    return ours[app]
 
 
 def our_apps(config: ServeDeploySchema) -> list[Any]:
