@@ -88,10 +88,7 @@ def decode_files(
 ) -> list[np.ndarray]:
     """Decode JPEG or PNG files to (H, W, 3) uint8 RGB images, after reserving memory for all of them.
 
-    Args:
-        files: The files.
-        budget: The limits of the message.
-        names: The cameras of the files, for error messages.
+    Errors name the camera of a file if `names` has it.
 
     Raises:
         MalformedMessage: A file cannot be decoded.

@@ -88,12 +88,8 @@ def chosen_backend(wanted: str) -> str:
 def make_bare(task: str, control_mode: str | None, *, sim_backend: str, render_backend: str, **options: Any) -> Any:
     """Make the bare environment, without Gymnasium's wrappers.
 
-    Args:
-        task: ManiSkill's id.
-        control_mode: None selects the default mode, or the robot's own if the robot lacks that.
-        sim_backend: "physx_cpu" or "physx_cuda".
-        render_backend: "cpu" or "gpu".
-        options: Further options of `gymnasium.make`; ManiSkill's defaults replace those that are None.
+    A `control_mode` of None selects the default mode, or the robot's own if the robot lacks that. ManiSkill's defaults
+    replace `options` that are None.
 
     Raises:
         ConfigError: The robot lacks the control mode.

@@ -209,14 +209,9 @@ class RouteDialect(Dialect):
         return ImplicitSession(self.context.engine, sender, self.rank, name)
 
     async def receive(self, socket: WebSocket, gate: Sender) -> tuple[bytes | None, MessageAdmission] | None:
-        """Wait for the next message of a WebSocket, and before that until its key is within its rate.
+        """Wait for the next message of a WebSocket, and before that until the key of its `gate` is within its rate.
 
-        Args:
-            socket: The connection.
-            gate: The sender that `gate` returned for it.
-
-        Returns:
-            The message, or None for a text message, and its admission; None if the client is gone.
+        Returns the message, or None for a text message, and its admission; None if the client is gone.
         """
         await gate.wait_unthrottled()
         event = await socket.receive()
@@ -274,10 +269,7 @@ def _route(endpoint: Callable[..., Any], method: str, path: str) -> BaseRoute:
 async def decoded(read: Callable[[bytes, Budget], T], data: bytes | None, admission: MessageAdmission) -> T:
     """Decode a message with `read`, counting it as one request of the key even if it is invalid.
 
-    Args:
-        read: Decodes the message.
-        data: The message; None for a WebSocket's text, which is refused.
-        admission: The admission of the message.
+    `data` of None is a WebSocket's text, which is refused.
     """
     admission.begin_message()
     if data is None:
@@ -345,11 +337,7 @@ class ImplicitEpisode:
 class ImplicitSession:
     """A session of a client on the server's own port. Not thread-safe.
 
-    Args:
-        engine: The engine that serves it.
-        sender: The sender of the client's requests.
-        rank: Class of its requests.
-        name: Name of the session, unique in the replica; empty for the sender's own.
+    Its name is unique in the replica, or empty for the sender's own session.
     """
 
     def __init__(self, engine: Engine, sender: Sender, rank: RankName = "robot", name: str = "") -> None:
@@ -459,11 +447,8 @@ class HttpDialect(RouteDialect):
     ) -> Response:
         """Answer one request.
 
-        Args:
-            http: The request.
-            read: Decodes the body to the client's observation, within a budget; it may run on another thread.
-            write: Encodes the action, (H, D) float32 in the client's convention, as the body of the reply.
-            media_type: The media type of the reply.
+        `read` decodes the body to the client's observation, within a budget; it may run on another thread. `write`
+        encodes the action, (H, D) float32 in the client's convention, as the body of the reply.
         """
         name = request_id(http)
         message = self.arrived()

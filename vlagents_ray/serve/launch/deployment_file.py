@@ -122,11 +122,7 @@ def with_settings(
 ) -> ServeDeploySchema:
     """Return the deployment, with these settings of its policies in place of the file's.
 
-    Args:
-        config: The deployment.
-        settings: The settings of the policies.
-        steps: Whether sessions may choose any checkpoint step.
-        step_follows: See `read_deployment`.
+    With `steps`, sessions may choose any checkpoint step. See `read_deployment` for `step_follows`.
     """
     changed = config.model_copy(deep=True)
     for app in our_apps(changed):
@@ -226,14 +222,8 @@ def _runtime_envs(config: ServeDeploySchema) -> Iterator[Mapping[str, Any]]:
 def _require_policy(args: ServerArgs, own: dict[str, Any], *, installed: bool, step_follows: bool) -> None:
     """Build the policy in its environment, with each kind of settings, and check that the dialects fit its contract.
 
-    A replica repeats the check.
-
-    Args:
-        args: The settings of the server.
-        own: The policy's own settings.
-        installed: Whether the policy's packages are installed here; otherwise the application's `runtime_env` adds
-            them.
-        step_follows: Whether a missing step is set later.
+    A replica repeats the check. If the policy's packages are not `installed` here, the application's `runtime_env` adds
+    them. With `step_follows`, a missing step is set later.
     """
     environment = args.environment
     if not installed:

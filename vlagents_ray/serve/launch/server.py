@@ -72,11 +72,8 @@ _REMIND_S = 30.0
 def wait_for_proxies(proxies: list[Any], look_again: Callable[[], list[Any]]) -> None:
     """Wait until each of the proxies listens; raise the error of a proxy that cannot listen.
 
-    Serve kills a proxy that does not start within some seconds, as on a busy node, and starts another one.
-
-    Args:
-        proxies: The refs of the proxies.
-        look_again: Returns the refs of the current proxies.
+    Serve kills a proxy that does not start within some seconds, as on a busy node, and starts another one: `look_again`
+    returns the refs of the current ones.
     """
     import ray
 
