@@ -121,9 +121,6 @@ class Rollouts:
     def __init__(self, plan: RolloutPlan) -> None:
         """Check the plan. Workers start with the first episode.
 
-        Args:
-            plan: The settings.
-
         Raises:
             ConfigError: A setting is wrong.
             MissingDependency: pyarrow is not installed.

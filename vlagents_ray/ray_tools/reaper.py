@@ -31,7 +31,6 @@ def reaped(folder: Path, lost: type[Exception]) -> Iterator[None]:
     """End the processes marked with `folder` if this process dies within the context.
 
     Args:
-        folder: The folder of the cluster.
         lost: An exception of this type within the context has the same effect, as the cluster then does not end its
             remaining processes.
     """

@@ -178,10 +178,8 @@ def modality_config(
 ) -> dict[str, Any]:
     """Return the reply to `get_modality_config`: keys and time steps by modality, except for modalities without keys.
 
-    Args:
-        modalities: The keys and time steps of each modality.
-        flat: Whether to use the format of N1.5, in which keys contain their modality and a config is a JSON text. The
-            clients of N1.6 and newer read a map, and the newest refuses a modality without keys.
+    `flat` is the format of N1.5, in which keys contain their modality and a config is a JSON text. The clients of N1.6
+    and newer read a map, and the newest refuses a modality without keys.
     """
     answer: dict[str, Any] = {}
     for name, (keys, steps) in modalities.items():

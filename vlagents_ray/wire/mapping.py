@@ -343,7 +343,6 @@ def read_text(key: str, value: Any, texts: Mapping[str, str], limits: Limits, *,
         key: The client's key, for errors.
         value: A text, a list or array of one text, or an array of one integer.
         texts: The text for each integer.
-        limits: The limits of a request.
         needed: Whether an integer without a text is an error; if not, there is no instruction.
 
     Raises:

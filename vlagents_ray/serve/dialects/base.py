@@ -124,8 +124,6 @@ class Dialect(abc.ABC):
 
     Args:
         name: The dialect's name in the deployment, which is also the transport in statistics.
-        config: The dialect's settings.
-        context: The replica or the gateway in which the dialect runs.
     """
 
     Config: ClassVar[type[DialectConfig]] = DialectConfig

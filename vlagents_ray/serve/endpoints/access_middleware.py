@@ -48,9 +48,7 @@ class AccessMiddleware:
         """Protect `app`.
 
         Args:
-            app: The ASGI application that gets the accepted requests.
             keys: The server's keys; None if it has none.
-            name: The name of the Serve application.
             slow_s: Maximum time that a request may take to arrive, or a WebSocket's client to accept a message, s.
             idle_s: Maximum time that a WebSocket may be silent, s.
             hosts: Further host names of the server, see `require_own_page`.

@@ -99,9 +99,6 @@ class WebSocketServer(PolledServer["WebSocketConnection"]):
         """Bind a port.
 
         Args:
-            engine: Executes the requests.
-            limits: Limits of a request.
-            host: The address to bind.
             ports: The first and last port to try, both included; None for any free port.
             admit: Returns the caller that a key belongs to, or raises for an invalid key.
             slow_s: Maximum time that a message may take to arrive, s.
@@ -362,9 +359,6 @@ class WebSocketConnection(PolledConnection):
             return
         if self._received.size and self._partial is None and self._sender is not None:
             self._hold_partial(self._sender)
-        self._continue()
-
-    def _continue(self) -> None:
         self._process_frames()
         self._poll()
 

@@ -48,8 +48,6 @@ class Sender:
         """Create a sender.
 
         Args:
-            engine: The engine that serves the requests.
-            transport: Name of the transport, for the metrics.
             session_id: Name of the sender's own session; a random one by default.
             caller: The authenticated caller, or the reason why none is needed. It has no default, so that an endpoint
                 without authentication fails.
@@ -135,14 +133,9 @@ class Sender:
         """Submit the requests of a message.
 
         Args:
-            message: The message.
-            decoded: Its requests.
             then: Called with the message when all its answers have arrived, on the thread of the last one.
             admission: Admission of the message, which has already charged the requests to the key.
             waited_s: Time that the message waited before it was read, s, which counts towards the deadlines.
-
-        Returns:
-            The requests in flight.
         """
         engine, now, (requests, refused) = self._engine, self._engine.clock(), decoded
         watched = engine.observers.any

@@ -68,10 +68,7 @@ class CommandBoard:
     ) -> None:
         """Create a board without commands.
 
-        Args:
-            sessions: The sessions of the replica.
-            save: Writes the last seconds of a session and returns the path; it may be slow, and may raise errors.
-            clock: Clock, s.
+        `save` writes the last seconds of a session and returns the path; it may be slow, and may raise errors.
         """
         self._save = save
         self._sessions = sessions

@@ -73,7 +73,6 @@ def live_routes(fleet: Fleet, *, open_to_network: bool, videos: VideoFiles | Non
     """Return the routes of the live page.
 
     Args:
-        fleet: Gathers the data.
         open_to_network: Whether other machines reach this server without a key. Watching is then refused, since the
             pictures of all robots would be public.
         videos: Finds the videos that the document of an evaluation refers to; None on a policy's server.
@@ -246,7 +245,6 @@ def page_server(
     """Serve the live page of an evaluation on a thread for the length of the context, and yield its URL.
 
     Args:
-        fleet: Gathers the data.
         address: Host and port to listen on; port 0 selects a free one.
         keys: The accepted keys; None, which only loopback allows, admits all clients.
         name: The name by which keys for single applications allow this page.
