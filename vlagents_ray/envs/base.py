@@ -178,8 +178,7 @@ class BatchEnv(Environment):
     num_envs: int
     """The number of environments."""
 
-    restarts: bool = False
-    """Whether `restart` can begin an episode in one environment while the others continue theirs."""
+    restarts: bool = False  # whether `restart` can begin an episode in one environment while the others continue theirs
 
     @property
     @abstractmethod

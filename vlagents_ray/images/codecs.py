@@ -65,11 +65,9 @@ class PixelBudget(Protocol):
     @property
     def pixels(self) -> int:
         """The largest number of pixels of one image."""
-        ...
 
     def hold(self, size: int) -> None:
         """Reserve `size` bytes of memory; raises an error if they exceed the limits."""
-        ...
 
 
 RAW = ImageCodec("raw")

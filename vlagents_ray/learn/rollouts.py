@@ -141,8 +141,7 @@ class Rollouts:
         self._resources = ExitStack()
         self._pool: WorkerPool | None = None
         self._version = self._pushed = 0
-        self.stats = RolloutStats()
-        """The numbers of episodes so far."""
+        self.stats = RolloutStats()  # the numbers of episodes so far
 
     @property
     def version(self) -> int:

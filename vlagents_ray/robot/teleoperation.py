@@ -141,9 +141,7 @@ class AxesLeader:
 
 # A keyboard as a device with axes, read from the terminal so that it also works over SSH.
 
-
-HOLD_S = 0.2
-"""How long a key counts as pressed: terminals report no release, and repeat a key that is held."""
+HOLD_S = 0.2  # how long a key counts as pressed: terminals report no release, and repeat a key that is held
 AXES = {"w": (0, 1), "s": (0, -1), "a": (1, 1), "d": (1, -1), "r": (2, 1), "f": (2, -1)}
 AXES |= {"o": (3, 1), "u": (3, -1), "i": (4, 1), "k": (4, -1), "j": (5, 1), "l": (5, -1)}
 GRIPPER, TAKE = " ", "\n"
@@ -214,7 +212,6 @@ class Keyboard(AxesDevice):
 
 
 # A SpaceMouse as a device with axes; it needs the extra "spacemouse".
-
 
 _DEAD = 0.1  # of the range: the cap never rests exactly in the middle
 _REPORTS = 64  # reports read at one tick, as the device sends more reports than a loop has ticks
@@ -301,7 +298,6 @@ class TeleoperatedAgent(Agent):
 
 
 # The only reader of the terminal, so that each typed key has exactly one consumer.
-
 
 _POLL_S = 0.1
 Consumer = Callable[[str], bool]  # gets a key in lower case; returns whether it has a meaning for that key

@@ -240,7 +240,6 @@ def _text(key: Any, value: Any) -> str:
 # A file's header is matched, not evaluated, and must agree with the size of the content, so that no memory is allocated
 # for a false shape. Arrays of text become lists; arrays of objects and structures are refused.
 
-
 _NPY = b"\x93NUMPY"
 # The header that numpy writes for every plain array; any other (structures, objects) is refused. Each text has only one
 # match, so that matching is fast.
@@ -290,7 +289,6 @@ def write_npy(value: Any) -> dict[str, Any]:
 
 # Mappings of GR00T's clients; the names of an action's columns depend on the robot, so a deployment adds `action`.
 
-
 PRESETS: dict[str, dict[str, Any]] = {
     # N1.6 and newer: {"video": {k: (1, T, H, W, 3)}, "state": {k: (1, T, D)}, "language": {"task": [[text]]}}
     "gr00t": {"cameras": {"*": "video/*"}, "state": {"*": "state/*"}, "instruction": "language/*"},
@@ -305,7 +303,6 @@ PRESETS: dict[str, dict[str, Any]] = {
 # "options": None}` and receive `[action, info]`. The observation is nested, or flat for servers that run with
 # `--use-sim-policy-wrapper`. A server that marks its modalities with `__ModalityConfig__` reads arrays of
 # `msgpack_numpy`.
-
 
 _KEYS_AT_MOST = 64
 _ARRAYS = ("video", "state")

@@ -209,7 +209,6 @@ def _names(feature: Mapping[str, Any]) -> tuple[str, ...]:
 # Source: `transport/services.proto` of LeRobot 0.4.4 and 0.6.1. `Observation` has the field 1, `transfer_state`, and
 # the field 2, `data`; `PolicySetup` and `Actions` have the field 1, `data`; `Empty` has none.
 
-
 SERVICE = "transport.AsyncInference"
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5  # types of fields
 _VARINT_BYTES = 10  # largest length of a number
@@ -304,7 +303,6 @@ def _varint(view: memoryview, at: int) -> tuple[int, int]:
 
 
 # The mapping of LeRobot's robots: the names of its datasets, to which its own server converts a robot's names.
-
 
 STATE, IMAGES, TASK = "observation.state", "observation.images.", "task"
 

@@ -142,7 +142,6 @@ _FITS: dict[str, Callable[[Any], bool]] = {
     "float": lambda value: type(value) in (int, float) and np.isfinite(value),
     "bool": lambda value: isinstance(value, bool),
     "Literal['hwc', 'chw', 'any', 'rgba']": lambda value: value in ("hwc", "chw", "any", "rgba"),
-    'Literal["hwc", "chw", "any", "rgba"]': lambda value: value in ("hwc", "chw", "any", "rgba"),
 }
 
 
@@ -172,7 +171,6 @@ def stated(value: Any) -> Any:
 # Paths into nested observations, such as `images/wrist`: either that key itself, or `wrist` within `images`.
 #
 # `states|state` means the first of the two that exists.
-
 
 _SHOWN = 40  # largest number of keys that an error lists, and of characters of a key
 _LONGEST = 200  # characters of a client's key that are compared

@@ -84,7 +84,6 @@ def _node(value: Any) -> Any:
 # openpi's servers accept images as (H, W, 3) or (3, H, W), in uint8 or floats in [0, 1]: see `_parse_image` in its
 # src/openpi/policies/libero_policy.py and droid_policy.py, and `convert_image` in aloha_policy.py.
 
-
 PRESETS: dict[str, dict[str, Any]] = {
     # openpi, examples/libero/main.py
     "openpi-libero": {

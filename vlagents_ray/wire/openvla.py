@@ -72,7 +72,6 @@ def decode_action(body: bytes, limits: Limits = DEFAULT_LIMITS) -> np.ndarray | 
 
 # Mappings of the clients of OpenVLA and OpenVLA-OFT.
 
-
 PRESETS: dict[str, dict[str, Any]] = {
     # openvla, vla-scripts/deploy.py
     "openvla": {

@@ -113,7 +113,6 @@ def _node(value: Any) -> Any:
 
 # The mapping of vla-eval's benchmarks.
 
-
 PRESETS: dict[str, dict[str, Any]] = {
     # The benchmark chooses the names of cameras. Most benchmarks call the state `states`, some `state`, as recommended
     # in vla-eval's types.py; its own servers prefer the former.

@@ -41,19 +41,15 @@ class ClientApi(Protocol):
 
     async def attach(self, node: str = "", boot_id: str = "", must_be_near: bool = False) -> tuple[dict[str, Any], Any]:
         """Return metadata and actor of the best replica for a client on that node."""
-        ...
 
     async def call(self, session_id: str, frame: Any) -> bytes:
         """Return the replies to a frame of requests."""
-        ...
 
     async def lease(self, length: int) -> tuple[bytes, int]:
         """Lease a plasma channel for frames of `length` bytes; return its id and its capacity in bytes."""
-        ...
 
     async def nodes(self) -> dict[str, int]:
         """Return the number of replicas that accept sessions on each node."""
-        ...
 
 
 class HandleTransport:

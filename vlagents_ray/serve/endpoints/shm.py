@@ -68,15 +68,12 @@ class Payload(Protocol):
 
         The descriptors in use are removed from `descriptors`.
         """
-        ...
 
     def freed(self) -> int:
         """Return a bit field: bit n is set if memory n is free for the client and no reply has reported that."""
-        ...
 
     def free(self) -> None:
         """Free the memory of a closed connection."""
-        ...
 
 
 class UnixServer(PolledServer["UnixConnection"]):

@@ -27,8 +27,7 @@ logger = logging.getLogger(__name__)
 
 TO_ROBOT = ("pause", "stop", "success", "failure")
 """The commands that are sent to a robot. None of them makes it move."""
-SAVE = "save"
-"""The command that saves the session's last seconds, which the server does."""
+SAVE = "save"  # the command that saves the session's last seconds, which the server does
 COMMANDS = (*TO_ROBOT, SAVE)
 
 TRACKED_S = 15.0  # time for which the outcome of a command is awaited

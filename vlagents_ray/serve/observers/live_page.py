@@ -65,8 +65,7 @@ _LAST_S = 0.5  # time in which viewers are sent the end of an evaluation
 _END_S = 1  # time limit for their connections to close, s
 _LEAVE_S = 5.0  # time limit for the whole shutdown
 
-VideoFiles = Callable[[int], Path | None]
-"""Returns the file of the video with a number; None if there is none."""
+VideoFiles = Callable[[int], Path | None]  # returns the file of the video with a number; None if there is none
 
 
 def live_routes(fleet: Fleet, *, open_to_network: bool, videos: VideoFiles | None = None) -> list[BaseRoute]:
