@@ -214,7 +214,10 @@ class Calvin(SimulatorEnv):
             self._env = make_simulator(self._checkout, task, renderer)
             Calvin._open = self._name
             self._resources.callback(self._free, self._env)
-            self._judge, self._words = read_tasks(self._checkout)
+            hydra, omegaconf = require("hydra"), require("omegaconf").OmegaConf
+            with quietly():
+                self._judge = hydra.utils.instantiate(omegaconf.load(self._checkout / _TASKS))  # CALVIN's `Tasks`
+            self._words = {task: texts[0] for task, texts in omegaconf.load(self._checkout / _WORDS).items()}
             self._chains = Chains(self._checkout)
         self._chain: Chain | None = None
         self._done = 0  # number of finished tasks
@@ -370,14 +373,6 @@ def make_simulator(checkout: Path, scene: str, renderer: RendererName) -> Any:
             return hydra.utils.instantiate(settings.env, use_scene_info=True, use_egl=renderer == "egl")
         except SystemExit as error:  # PyBullet could not load its plug-in, and has printed why
             raise EnvFailed(f"calvin: PyBullet cannot draw through EGL; {EGL_CURE}, or set renderer to tiny") from error
-
-
-def read_tasks(checkout: Path) -> tuple[Any, dict[str, str]]:
-    """Return CALVIN's task checker, `Tasks`, and the instruction of each task in its evaluation."""
-    hydra, omegaconf = require("hydra"), require("omegaconf").OmegaConf
-    with quietly():
-        judge = hydra.utils.instantiate(omegaconf.load(checkout / _TASKS))
-    return judge, {task: texts[0] for task, texts in omegaconf.load(checkout / _WORDS).items()}
 
 
 @contextlib.contextmanager

@@ -190,10 +190,8 @@ def check_request(request: Request, limits: Limits) -> Request:
 def encode_replies(replies: Sequence[Reply], *, arrived: float | None = None) -> bytes:
     """Encode the replies to one frame of requests as one frame, in the order of the requests.
 
-    Args:
-        arrived: The time at which the requests arrived, s, of `time.perf_counter()`. If it is given, the `timing` of
-            replies without an error also gets `encode_ms` and `total_ms`, which exclude only the final joining of the
-            frame.
+    If `arrived` is given, the time at which the requests arrived, s, of `time.perf_counter()`, the `timing` of replies
+    without an error also gets `encode_ms` and `total_ms`, which exclude only the final joining of the frame.
     """
     begun = time.perf_counter()
     writer = ValueWriter()

@@ -264,18 +264,14 @@ def read_npy(data: Any, limits: Limits) -> Any:
     shape = [int(n) for n in header[3].replace(b" ", b"").split(b",") if n]
     content = memoryview(data)[start + length :]
     if _TEXT_DTYPE.fullmatch(dtype):
-        return _read_texts(content, dtype, shape, limits)
+        count = len(content) // max(1, 4 * int(dtype[2:]))
+        if count > limits.items or len(content) > 4 * limits.text or len(shape) > 2:
+            raise MessageTooLarge("gr00t: an array of more text than an instruction may have")
+        try:
+            return np.frombuffer(content, dtype).reshape(shape).tolist()
+        except (ValueError, SystemError) as error:
+            raise MalformedMessage("gr00t: an array of text that is none") from error
     return read_array(content, dtype, shape[::-1]).T if by_columns else read_array(content, dtype, shape)
-
-
-def _read_texts(content: memoryview, dtype: str, shape: list[int], limits: Limits) -> Any:
-    count = len(content) // max(1, 4 * int(dtype[2:]))
-    if count > limits.items or len(content) > 4 * limits.text or len(shape) > 2:
-        raise MessageTooLarge("gr00t: an array of more text than an instruction may have")
-    try:
-        return np.frombuffer(content, dtype).reshape(shape).tolist()
-    except (ValueError, SystemError) as error:
-        raise MalformedMessage("gr00t: an array of text that is none") from error
 
 
 def write_npy(value: Any) -> dict[str, Any]:

@@ -231,12 +231,8 @@ def pick(
 ) -> list[tuple[str, str, Any]]:
     """Return the values that a key of a mapping matches.
 
-    Args:
-        flat: The client's observation.
-        name: Our name of the value; its `*` is replaced by the text that the `*` of `key` matches.
-        key: The client's key.
-        optional: Whether the value may be missing.
-        missing: Creates the error for a missing value.
+    The `*` of our `name` is replaced by the text that the `*` of the client's `key` matches. `missing` creates the
+    error for a missing value.
 
     Returns:
         For each value, our name, the client's key and the value.
@@ -412,10 +408,7 @@ class KeyMapping:
     ) -> tuple[Obs, str | None]:
         """Convert a client's observation.
 
-        Args:
-            flat: The client's observation.
-            limits: The limits of a request.
-            contract: The policy's contract: an invalid gripper reading is dropped if the policy does not need it.
+        An invalid gripper reading is dropped if the policy, by its contract, does not need it.
 
         Returns:
             Our observation, whose arrays may be views of those of `flat`, and its instruction; None if there is none.

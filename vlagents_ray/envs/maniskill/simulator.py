@@ -340,7 +340,11 @@ class Simulator:
                 raise ConfigError(f"{self.name}: want a task with exactly one robot")
             if "success" not in self.env.get_info():
                 raise ConfigError(f"{self.name} does not say what success is: there is nothing to evaluate")
-            self.cameras = self._choose(cameras)
+            seen = self.env.single_observation_space["sensor_data"]
+            sizes = {name: textures["rgb"].shape[:2] for name, textures in seen.items() if "rgb" in textures.spaces}
+            require_cameras(self.name, cameras or (), sizes)
+            chosen = sizes if cameras is None else cameras
+            self.cameras = {name: CameraSpec(height=sizes[name][0], width=sizes[name][1]) for name in chosen}
             self._robot = ManiSkillRobot(self.env.agent)
         except BaseException:
             self.close()
@@ -444,13 +448,6 @@ class Simulator:
         env, self.env = self.env, None
         if env is not None:
             env.close()
-
-    def _choose(self, cameras: Sequence[str] | None) -> dict[str, CameraSpec]:
-        seen = self.env.single_observation_space["sensor_data"]
-        sizes = {name: textures["rgb"].shape[:2] for name, textures in seen.items() if "rgb" in textures.spaces}
-        require_cameras(self.name, cameras or (), sizes)
-        chosen = sizes if cameras is None else cameras
-        return {name: CameraSpec(height=sizes[name][0], width=sizes[name][1]) for name in chosen}
 
     @contextlib.contextmanager
     def _observing(self, mode: str) -> Iterator[None]:

@@ -122,8 +122,7 @@ class GatewayContext:
 class Dialect(abc.ABC):
     """A dialect that is enabled in a deployment; its two kinds are `RouteDialect` and `PortDialect`.
 
-    Args:
-        name: The dialect's name in the deployment, which is also the transport in statistics.
+    Its name in the deployment is also the transport in statistics.
     """
 
     Config: ClassVar[type[DialectConfig]] = DialectConfig
@@ -197,8 +196,7 @@ class RouteDialect(Dialect):
     def gate(self, *, counted: bool = False) -> Sender:
         """Return a sender whose `admission` provides the budget for decoding messages.
 
-        Args:
-            counted: Whether each message was counted for the key when it arrived.
+        `counted` is whether each message was counted for the key when it arrived.
         """
         return Sender(self.context.engine, self.name, caller=current_caller(), connected=False, counted=counted)
 
@@ -247,8 +245,7 @@ class PortDialect(Dialect):
     def serve(self, listener: socket.socket) -> None:
         """Start to accept clients, and return.
 
-        Args:
-            listener: A socket that is bound to the port and does not listen yet; the dialect must close it.
+        The socket `listener` is bound to the port and does not listen yet; the dialect must close it.
         """
 
     @abc.abstractmethod

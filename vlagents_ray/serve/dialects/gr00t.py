@@ -262,7 +262,11 @@ class GR00TDialect(PortDialect):
                     authenticator.send_multipart([version, request, b"200", b"", b"", b""])
                 if router in ready:
                     self._receive(router, zmq)
-                self._forget_quiet()
+                # End the sessions of idle clients and of clients whose key is no longer valid, twice a second.
+                now = time.monotonic()
+                if now - self._looked >= _TICK_MS / 1e3:
+                    self._looked = now
+                    self._clients.forget_quiet()
         except Exception:
             logger.exception("gr00t: the dialect has failed, and accepts no more clients")
         finally:
@@ -312,13 +316,6 @@ class GR00TDialect(PortDialect):
                 self.answer(envelope, gr00t.pack({"error": "malformed: wait for the answer before the next request"}))
         except VLAgentsError as error:
             self.answer(envelope, gr00t.pack({"error": f"{error.code}: {error}"}))
-
-    def _forget_quiet(self) -> None:
-        """End the sessions of idle clients and of clients whose key is no longer valid, twice a second."""
-        now = time.monotonic()
-        if now - self._looked >= _TICK_MS / 1e3:
-            self._looked = now
-            self._clients.forget_quiet()
 
 
 class _Strangers:

@@ -81,11 +81,7 @@ _TIMING = """\
 
 
 def docs_page(metadata: dict[str, Any]) -> str:
-    """Return the page as HTML.
-
-    Args:
-        metadata: The document of `GET /v1/metadata`; each dialect provides its own entry in it.
-    """
+    """Return the page as HTML, from the document of `GET /v1/metadata`; each dialect provides its own entry in it."""
     policy = html.escape(str(metadata["policy"]))
     dialects = "".join(
         f"`{', '.join(one.get('paths') or [one['address']])}`\n    Clients of {one['clients']}. {one['summary']}\n"

@@ -207,12 +207,7 @@ class Sender:
         for pending in watched:
             observers.on_answer(pending, message.replies[pending.place])
 
-    async def ask(
-        self,
-        message: Message,
-        decoded: Decoded,
-        admission: MessageAdmission | None = None,
-    ) -> list[Reply]:
+    async def ask(self, message: Message, decoded: Decoded, admission: MessageAdmission | None = None) -> list[Reply]:
         """Submit the requests of a message, and wait for the replies until the requests' deadlines.
 
         If a pause of the process delayed a request, the delay counts towards its deadline. When the caller stops
