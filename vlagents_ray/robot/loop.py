@@ -238,7 +238,7 @@ class _Run:
         """Run ticks until the policy, `until`, a mark or the time ends it; the report gets the timing in any case."""
         work_s: deque[float] = deque(maxlen=KEPT_TICKS)
         collected = time.monotonic()
-        ticks = None if seconds is None else pacer.ticks_in(seconds)
+        ticks = None if seconds is None else max(1, round(seconds / pacer.period_s))
         try:
             while not (until() or self.report.done):
                 # Collects the cycles of failed requests, as automatic collection is off.

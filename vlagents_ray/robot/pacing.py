@@ -69,10 +69,6 @@ class Pacer:
         """Return the time since this tick was due, s."""
         return time.perf_counter() - self._begin - self._tick * self.period_s
 
-    def ticks_in(self, seconds: float) -> int:
-        """Return the number of ticks that are due within a time, s; at least one."""
-        return max(1, round(seconds / self.period_s))
-
 
 def jitter(late_s: Sequence[float], missed: int, ticks: int | None = None) -> dict[str, float]:
     """Compute the punctuality of a loop, of whose `ticks` the last ones have a lateness in `late_s`, s.

@@ -10,7 +10,7 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -19,9 +19,6 @@ from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, MissingState
 from vlagents_ray.interface import INTERVENTION, Act, Agent, Obs
 from vlagents_ray.registry import require
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
 
 __all__ = ["AxesDevice", "AxesLeader", "Keyboard", "Leader", "SpaceMouse", "TeleoperatedAgent"]
 
@@ -173,7 +170,7 @@ class Keyboard(AxesDevice):
         self._until = np.zeros((6, 2))  # s of `time.monotonic`: until when a key counts, for each axis and direction
         self._open = contextlib.ExitStack()
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> Keyboard:
         self._open.enter_context(self._terminal.keys_at_once())
         self._open.enter_context(self._terminal.consumed_by(self._press))
         return self
@@ -239,7 +236,7 @@ class SpaceMouse(AxesDevice):
         self._axes = np.zeros(6, np.float32)
         self._buttons: list[int] = []
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> SpaceMouse:
         return self
 
     def __exit__(self, *exc: object) -> None:

@@ -209,6 +209,7 @@ class ManiSkillRobot:
         arm = getattr(agent, "arm_joint_names", names)
         self._arm = np.array([names.index(name) for name in arm])
         self._finger_m = _FINGER_M.get(agent.uid)
+        self.has_gripper = self._finger_m is not None
         self._fingers = np.array([names.index(name) for name in getattr(agent, "gripper_joint_names", ())], dtype=int)
         self._has_tool = _tool(agent) is not None
 
@@ -219,10 +220,6 @@ class ManiSkillRobot:
             parts["tquat"] = StateSpec(dim=7, unit="m+quat_xyzw")
             parts["xyzrpy"] = StateSpec(dim=6, unit="m+rad")
         return parts
-
-    @property
-    def has_gripper(self) -> bool:
-        return self._finger_m is not None
 
     def read(self, agent: Any) -> list[tuple[dict[str, np.ndarray], float | None]]:
         """Return the state of each environment, each part (D,) float32, and the gripper in [0, 1], 1 = open."""
