@@ -141,8 +141,10 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
         """Wrap environments, which `close` closes.
 
         Args:
+            batch: The environments.
             observation: The form of the observations, as for `as_vector_env`.
             autoreset: A `gymnasium.vector.AutoresetMode`.
+            reset_options: The options of each reset of an environment.
 
         Raises:
             ConfigError: The environments' contract does not state a size.
