@@ -214,10 +214,11 @@ class Calvin(SimulatorEnv):
             self._env = make_simulator(self._checkout, task, renderer)
             Calvin._open = self._name
             self._resources.callback(self._free, self._env)
-            hydra, omegaconf = require("hydra"), require("omegaconf").OmegaConf
+            omegaconf = require("omegaconf").OmegaConf
             with quietly():
-                self._judge = hydra.utils.instantiate(omegaconf.load(self._checkout / _TASKS))  # CALVIN's `Tasks`
-            self._words = {task: texts[0] for task, texts in omegaconf.load(self._checkout / _WORDS).items()}
+                self._judge = require("hydra").utils.instantiate(omegaconf.load(self._checkout / _TASKS))
+            texts = omegaconf.load(self._checkout / _WORDS)
+            self._words: dict[str, str] = {name: of_task[0] for name, of_task in texts.items()}  # instructions
             self._chains = Chains(self._checkout)
         self._chain: Chain | None = None
         self._done = 0  # number of finished tasks

@@ -359,6 +359,9 @@ class WebSocketConnection(PolledConnection):
             return
         if self._received.size and self._partial is None and self._sender is not None:
             self._hold_partial(self._sender)
+        self._continue()
+
+    def _continue(self) -> None:
         self._process_frames()
         self._poll()
 
