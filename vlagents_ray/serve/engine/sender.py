@@ -70,6 +70,7 @@ class Sender:
         self._paid = False  # whether a message without an admission, and with it its first request, was counted
         self._refused = 0  # number of consecutive refused messages
         self._prefix = f"{caller.name}/" if isinstance(caller, Caller) else ""  # prefix of the sender's session ids
+        self.session_id = self._prefix + self._session_id  # id of the sender's own session in the engine
         owner = uuid.uuid4().hex if connected else ""
         self._origin = Origin(transport, owner, self._session_id, self._caller, self._prefix)
 
@@ -249,11 +250,6 @@ class Sender:
         owner = self._origin.owner
         if owner and (for_good or not (self._asked_to_reconnect or self._engine.draining)):
             self._engine.sessions.close_owned(owner, tuple(self._origin.sessions))  # a migrator's thread may add one
-
-    @property
-    def session_id(self) -> str:
-        """Id of the sender's own session in the engine."""
-        return self._prefix + self._session_id
 
     def _count(self, caller: Caller, op: object, counted: bool) -> bool:
         """Charge a request to the key unless it is `counted` or a close; return False if the key is for simulations."""
