@@ -15,10 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from vlagents_ray.errors import (
-    ContractMismatch,
-    MalformedMessage,
-)
+from vlagents_ray.errors import ContractMismatch, MalformedMessage
 from vlagents_ray.naming import says_its_fields
 
 _MOST_PARTS = 12  # of the env's state, whose combinations are tried

@@ -219,10 +219,7 @@ def centre_between(lowest: float, highest: float) -> float | None:
 
 
 def centre_of(episodes: Sequence[np.ndarray]) -> float | None:
-    """Return the centre around which to wrap an angle, rad: opposite to the widest arc without a value.
-
-    Args:
-        episodes: The angle in each episode, (N,) rad.
+    """Return the centre around which to wrap an angle, (N,) rad in each episode: opposite to the widest empty arc.
 
     Returns:
         The centre; None if the angle never jumps, within an episode or from one to the next, or if it counts full

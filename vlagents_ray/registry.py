@@ -277,9 +277,6 @@ def require(module: str, *, extra: str | None = None) -> ModuleType:
         module: The module's full name, e.g. "torch" or "openpi.models.model".
         extra: The extra of this package that installs it for the caller, if different from the usual one.
 
-    Returns:
-        The module.
-
     Raises:
         MissingDependency: The module is not installed; the message names the extra or the requirements file with it.
     """

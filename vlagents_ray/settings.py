@@ -89,9 +89,6 @@ def wrong_settings(error: ValueError, model: type | None = None, option: str | N
             may be secrets.
         model: The pydantic model of the settings, whose fields are listed if one is unknown.
         option: The option of the command line that sets them, such as "--set".
-
-    Returns:
-        The message.
     """
     listed: Callable[[], Sequence[Mapping[str, Any]]] | None = getattr(error, "errors", None)
     if listed is None:

@@ -15,7 +15,7 @@ import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import urlsplit
 from uuid import uuid4
 
@@ -25,9 +25,6 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.images.jpeg_png import encode_jpeg
 from vlagents_ray.interface import AGE, CAPTURED, INTERVENTION, PLANNED, SAFE, SILENT, WANTED, Act, Obs
 from vlagents_ray.registry import require
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
 
 __all__ = ["EpisodeViewer", "ViewerFrame", "open_viewer"]
 
@@ -95,7 +92,15 @@ class RerunRecordings:
         self.closing_s = CLOSING_S if self._folder is None else None
         """Time limit, s, for writing the remaining frames when it is closed; None for no limit."""
         if self._folder is None:
-            _require_viewer(self.target)
+            # If nothing listens at the address, the SDK would retry forever.
+            where = urlsplit(self.target)
+            try:
+                with socket.create_connection((where.hostname or "", where.port or _PORT), CLOSING_S):
+                    pass
+            except OSError as error:
+                raise ConfigError(
+                    f"rerun: no viewer listens at {self.target}: {error}; start it with `rerun`"
+                ) from error
             self._rerun.unregister_shutdown()  # it would wait forever for a viewer that has gone
         else:
             self._folder.mkdir(parents=True, exist_ok=True)
@@ -145,16 +150,6 @@ class RerunEpisode:
         if self._live:
             self._recording.flush(timeout_sec=CLOSING_S)
         self._recording.disconnect()
-
-
-def _require_viewer(address: str) -> None:
-    """Raise `ConfigError` if nothing listens at the address; the SDK would otherwise retry forever."""
-    where = urlsplit(address)
-    try:
-        with socket.create_connection((where.hostname or "", where.port or _PORT), CLOSING_S):
-            pass
-    except OSError as error:
-        raise ConfigError(f"rerun: no viewer listens at {address}: {error}; start it with `rerun`") from error
 
 
 def open_viewer(target: str) -> EpisodeViewer:
@@ -249,7 +244,7 @@ class EpisodeViewer:
         line = f"rerun: {self.episodes} episodes in {self._recordings.target}, {self.dropped} frames dropped"
         return line if self.error is None else f"{line}; stopped by {type(self.error).__name__}: {self.error}"
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> EpisodeViewer:
         return self
 
     def __exit__(self, *exc: object) -> None:
@@ -259,20 +254,17 @@ class EpisodeViewer:
         with contextlib.suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
         while isinstance(item := self._queue.get(), tuple):
-            self._show(*item)
-
-    def _show(self, name: str, instruction: str) -> None:
-        frames = self._until_the_end()
-        try:
-            with contextlib.closing(self._recordings.begin(name, instruction)) as writer:
-                for frame in frames:
-                    writer.write(frame)
-            self.episodes += 1
-        except Exception as error:  # noqa: BLE001 - what is shown goes on without the viewer
-            logger.warning("rerun: episode %s is not shown: %s", name, error)
-            self.error = self.error or error
-        for _ in frames:
-            pass
+            (name, instruction), frames = item, self._until_the_end()
+            try:
+                with contextlib.closing(self._recordings.begin(name, instruction)) as writer:
+                    for frame in frames:
+                        writer.write(frame)
+                self.episodes += 1
+            except Exception as error:  # noqa: BLE001 - what is shown goes on without the viewer
+                logger.warning("rerun: episode %s is not shown: %s", name, error)
+                self.error = self.error or error
+            for _ in frames:
+                pass
 
     def _until_the_end(self) -> Iterator[ViewerFrame]:
         """Yield the frames of an episode as they arrive."""

@@ -44,10 +44,7 @@ class LineProcess:
             env={**os.environ, **(environment or {})},
             start_new_session=True,  # Ctrl-C goes to the bench, which ends its children in order
         )
-
-    @property
-    def pid(self) -> int:
-        return self._process.pid
+        self.pid = self._process.pid
 
     def read(self, timeout_s: float) -> Any:
         """Read the next line that the process writes, decoded; raises `ProcessFailed` on its end or a time-out."""

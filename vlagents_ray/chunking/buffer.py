@@ -182,8 +182,7 @@ class ChunkBuffer:
         return Step(action, newest, row)
 
 
-SKEW_S = 0.1
-"""The largest lead of the clock of a sensor's computer over this machine's clock, s."""
+SKEW_S = 0.1  # the largest lead of the clock of a sensor's computer over this machine's clock, s
 
 
 class CaptureClock:

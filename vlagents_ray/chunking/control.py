@@ -22,7 +22,6 @@ class Leader(Protocol):
 
     def engaged(self) -> bool:
         """Return whether the operator moves the robot at this tick; must not block."""
-        ...
 
     def action(self, obs: Obs) -> np.ndarray:
         """Return the operator's action for a tick with `engaged()`; must not block.
@@ -33,7 +32,6 @@ class Leader(Protocol):
         Raises:
             InvalidAction: The device has no action at this tick; the robot holds still.
         """
-        ...
 
 
 class Control:

@@ -179,14 +179,10 @@ class Motion:
 
     def __init__(self, check: Check | None, contract: Contract | None = None, safe: SafeAction | None = None) -> None:
         self._check, self._contract, self._safe = check, contract, safe
+        self.can_hold = safe is not None  # whether an action is known that keeps the robot still
         self._last: np.ndarray | None = None  # the last commanded action
         self._before: np.ndarray | None = None  # the last one of earlier ticks
         self._state: Literal["stopped", "moving", "held"] = "stopped"
-
-    @property
-    def can_hold(self) -> bool:
-        """Whether an action is known that keeps the robot still."""
-        return self._safe is not None
 
     def tick(self) -> None:
         """Begin a tick, at which one action may be commanded."""

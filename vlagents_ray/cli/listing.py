@@ -24,21 +24,13 @@ _SHORT = 5  # most ranges of tasks that a line of the listing names
 
 @dataclass(frozen=True)
 class Listed:
-    """A line of a listing.
+    """A line of a listing."""
 
-    Attributes:
-        kind: "policy", "wrapper" or "environment".
-        name: Its registered name.
-        what: A description, or an environment's tasks, in one line.
-        missing: The reason why it cannot run in this Python, with the cure; None if it is ready.
-        details: The settings of a policy or wrapper as `name=default`, the tasks of an environment.
-    """
-
-    kind: str
-    name: str
-    what: str
-    missing: str | None
-    details: list[str]
+    kind: str  # "policy", "wrapper" or "environment"
+    name: str  # as registered
+    what: str  # a description, or an environment's tasks, in one line
+    missing: str | None  # the reason why it cannot run in this Python, with the cure; None if it is ready
+    details: list[str]  # the settings of a policy or wrapper as `name=default`, the tasks of an environment
 
     def lines(self) -> Iterator[str]:
         """Yield the full description, in whole lines, which can be copied and searched."""

@@ -43,8 +43,7 @@ _Options = TypeVar("_Options")
 def command_of(options: type[_Options]) -> Callable[[Callable[[_Options], None]], Callable[..., None]]:
     """Make a command for Typer from a function that takes its options as one object.
 
-    Args:
-        options: A dataclass, each of whose fields is annotated with its `typer.Option` or `typer.Argument`.
+    Each field of the dataclass `options` is annotated with its `typer.Option` or `typer.Argument`.
     """
     hints = get_type_hints(options, include_extras=True)
     parameters = []

@@ -173,7 +173,7 @@ def replay_command(
     are printed, and written as JSON.
     """
     with errors():
-        if is_dataset(folder):
+        if (folder / "meta/info.json").is_file() or any(folder.glob("*/meta/info.json")):
             if episode is not None:
                 raise ConfigError(f"{folder}: is a dataset, got {episode!r}; want --episodes, or none of it")
             if policy is None:
@@ -210,11 +210,6 @@ def _same(folder: Path, episode: str, policy: str | None, out_dir: Path | None, 
     for line in [*lines, f"replay: {into}"]:
         out.print(line)
     return not found
-
-
-def is_dataset(folder: Path) -> bool:
-    """Return whether a folder is a LeRobotDataset, or has such datasets in it."""
-    return (folder / "meta/info.json").is_file() or any(folder.glob("*/meta/info.json"))
 
 
 def replay_dataset(folder: Path, policy: str, into: Path, plan: ReplayPlan) -> None:

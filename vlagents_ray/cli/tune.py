@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -45,13 +45,7 @@ def tune_command(
     """Find the best batch size, compilation and precision by measuring, and print the settings to change."""
     began = time.monotonic()
     from vlagents_ray.bench.tuner import TunePlan, Tuner
-    from vlagents_ray.bench.tuning_choice import (
-        TuningGoal,
-        choose,
-        chosen_settings,
-        default_point,
-        figures,
-    )
+    from vlagents_ray.bench.tuning_choice import TuningGoal, choose, chosen_settings, default_point, figures
     from vlagents_ray.serve.config.deployment import ServerArgs
     from vlagents_ray.serve.launch.deployment_file import policy_application
 
@@ -69,7 +63,12 @@ def tune_command(
         points = tuner.measure()
         title = f"{args.policy} on {tuner.device}"
         head, *rows = figures(points)
-        _show(head, rows, tuner.left_out, title)
+        shown = table(*head, title=title)
+        for row in rows:
+            shown.add_row(*row)
+        out.print(shown)
+        for sentence in tuner.left_out:
+            out.print(f"left out: {sentence}", style="yellow")
         chosen, default = choose(points, goal), default_point(points, goal, args.batch.max_size)
         settings = chosen_settings(chosen, args.batch, tuner.fixed)
         _show_choice(_words(chosen), _words(default), began, f"below args of {application.name!r} in {file}", settings)
@@ -82,15 +81,6 @@ def _words(point: MeasuredPoint | None) -> str:
 
     figures = f"{point.actions_per_s:.1f} actions/s, p99 {point.p99_ms:.1f} ms"
     return f"{point.variant.name}, {sessions(point.sessions)}: {figures}"
-
-
-def _show(head: Sequence[str], rows: Sequence[Sequence[str]], left_out: Sequence[str], title: str) -> None:
-    shown = table(*head, title=title)
-    for row in rows:
-        shown.add_row(*row)
-    out.print(shown)
-    for sentence in left_out:
-        out.print(f"left out: {sentence}", style="yellow")
 
 
 def _show_choice(chosen: str, own: str, began: float, where: str, settings: Mapping[str, Any]) -> None:

@@ -45,15 +45,10 @@ class Connection:
         *,
         leaves_silent: bool = True,
     ) -> None:
-        """Set up the connection, without opening it.
+        """Set up the connection, without opening it; each has its own choice by `codec`.
 
-        Args:
-            url: The server's URL.
-            new_transport: Makes a transport for each connection.
-            codec: The codec of the cameras, chosen on each connection.
-            timeout_s: The default time limit of a call.
-            connect_timeout_s: The time limit of `open`, by default.
-            leaves_silent: Whether to switch to another replica when one no longer answers.
+        The time limits are the defaults of a call and of `open`. With `leaves_silent` it switches to another replica
+        when one no longer answers.
         """
         self.url = url
         self._new_transport = new_transport

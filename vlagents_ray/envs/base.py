@@ -178,8 +178,7 @@ class BatchEnv(Environment):
     num_envs: int
     """The number of environments."""
 
-    restarts: bool = False
-    """Whether `restart` can begin an episode in one environment while the others continue theirs."""
+    restarts: bool = False  # whether `restart` can begin an episode in one environment while the others continue theirs
 
     @property
     @abstractmethod
@@ -289,15 +288,7 @@ def one_row(act: Act, contract: Contract) -> np.ndarray:
 
 
 def make_batch(name: str, num_envs: int, **options: Any) -> BatchEnv:
-    """Make several environments by name, in one simulator if the suite supports that with these options.
-
-    Args:
-        name: The name of the env, as for `make_env`.
-        num_envs: The number of environments.
-        options: The options of the env's constructor.
-
-    Returns:
-        The environments, which the caller closes.
+    """Make several environments as `make_env` does, in one simulator if the suite supports that with these options.
 
     Raises:
         ConfigError: `num_envs` is below 1, or an option is wrong; other errors are those of `make_env`.

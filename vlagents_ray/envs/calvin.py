@@ -191,12 +191,7 @@ class Calvin(SimulatorEnv):
     _open: ClassVar[str | None] = None  # upstream's code assumes that the process has only one simulation
 
     def __init__(
-        self,
-        task: str = "D",
-        *,
-        task_steps: int = STEPS,
-        renderer: RendererName = "egl",
-        source_dir: str | None = None,
+        self, task: str = "D", *, task_steps: int = STEPS, renderer: RendererName = "egl", source_dir: str | None = None
     ) -> None:
         """Make the environment; raises the errors of `make_env`, and `ConfigError` if another one is open.
 
@@ -219,7 +214,11 @@ class Calvin(SimulatorEnv):
             self._env = make_simulator(self._checkout, task, renderer)
             Calvin._open = self._name
             self._resources.callback(self._free, self._env)
-            self._judge, self._words = read_tasks(self._checkout)
+            omegaconf = require("omegaconf").OmegaConf
+            with quietly():
+                self._judge = require("hydra").utils.instantiate(omegaconf.load(self._checkout / _TASKS))
+            texts = omegaconf.load(self._checkout / _WORDS)
+            self._words: dict[str, str] = {name: of_task[0] for name, of_task in texts.items()}  # instructions
             self._chains = Chains(self._checkout)
         self._chain: Chain | None = None
         self._done = 0  # number of finished tasks
@@ -319,11 +318,7 @@ class Calvin(SimulatorEnv):
         return Obs(cameras, 1.0 if robot[14] > 0 else 0.0, dict(zip(_STATE, parts, strict=True)))
 
     def _info(self) -> dict[str, Any]:
-        return {
-            "success": self._done == TASKS,
-            "solved": self._done,
-            "tasks": list(self._playing().tasks),
-        }
+        return {"success": self._done == TASKS, "solved": self._done, "tasks": list(self._playing().tasks)}
 
     def _playing(self) -> Chain:
         if self._chain is None:
@@ -379,14 +374,6 @@ def make_simulator(checkout: Path, scene: str, renderer: RendererName) -> Any:
             return hydra.utils.instantiate(settings.env, use_scene_info=True, use_egl=renderer == "egl")
         except SystemExit as error:  # PyBullet could not load its plug-in, and has printed why
             raise EnvFailed(f"calvin: PyBullet cannot draw through EGL; {EGL_CURE}, or set renderer to tiny") from error
-
-
-def read_tasks(checkout: Path) -> tuple[Any, dict[str, str]]:
-    """Return CALVIN's task checker, `Tasks`, and the instruction of each task in its evaluation."""
-    hydra, omegaconf = require("hydra"), require("omegaconf").OmegaConf
-    with quietly():
-        judge = hydra.utils.instantiate(omegaconf.load(checkout / _TASKS))
-    return judge, {task: texts[0] for task, texts in omegaconf.load(checkout / _WORDS).items()}
 
 
 @contextlib.contextmanager

@@ -175,9 +175,7 @@ class Gymnasium(EvalEnv):
             self._view = View(self._name, self._env, mapped)
             first, _ = self._call("reset", seed=0)
             self._contract = self._view.contract(
-                self._observe(first),
-                instruction=bool(self._instruction),
-                control_hz=control_hz or defaults.control_hz,
+                self._observe(first), instruction=bool(self._instruction), control_hz=control_hz or defaults.control_hz
             )
         except BaseException:
             self.close()
@@ -299,12 +297,7 @@ class PushT(Gymnasium):
     """
 
     def __init__(
-        self,
-        task: str = "image",
-        *,
-        width: int | None = None,
-        height: int | None = None,
-        max_steps: int | None = None,
+        self, task: str = "image", *, width: int | None = None, height: int | None = None, max_steps: int | None = None
     ) -> None:
         """Make the environment; images are stretched to `width` and `height`, pixels."""
         self.require_task(task)

@@ -128,11 +128,6 @@ class LiberoTask:
     states: Path  # its initial states
 
 
-def task_names() -> list[str]:
-    """Return every task, e.g. "libero_spatial/0"; needs no simulator."""
-    return [f"{name}/{number}" for name, suite in SUITES.items() for number in range(suite.tasks)]
-
-
 def require_suite(name: str) -> tuple[str, str]:
     """Split "SUITE/NUMBER" or "SUITE/NAME"; raises `UnknownEnv` for an unknown suite or a number out of range."""
     suite, _, which = name.partition("/")
@@ -275,7 +270,7 @@ class Libero(SimulatorEnv):
 
     @classmethod
     def tasks(cls) -> list[str]:
-        return task_names()
+        return [f"{name}/{number}" for name, suite in SUITES.items() for number in range(suite.tasks)]
 
     @classmethod
     def _missing_assets(cls) -> str | None:

@@ -35,8 +35,7 @@ class RobosuiteEnv(SimulatorEnv):
     `info["sim_state"]`, for scripted experts only, has the positions and quaternions xyzw of objects.
     """
 
-    _raw: Mapping[str, str] = {}
-    """Names in the contract's state -> robosuite's names, where they differ."""
+    _raw: Mapping[str, str] = {}  # names in the contract's state -> robosuite's names, where they differ
 
     def _use(self, simulator: Any) -> None:
         self._env, self._renderer = simulator, CameraRenderer(simulator)

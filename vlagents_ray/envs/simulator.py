@@ -140,15 +140,10 @@ class SimulatorEnv(EvalEnv):
 
     @abstractmethod
     def _begin(self, seed: int, state: int) -> tuple[Obs, dict[str, Any]]:
-        """Begin an episode.
+        """Begin an episode by its seed, 0 to 2^32 - 1, and the number of its initial state, 0 if none is fixed.
 
-        Args:
-            seed: The seed, 0 to 2^32 - 1.
-            state: The number of the initial state; 0 if the task has no fixed ones.
-
-        Returns:
-            The first observation, and further entries of `info`; `init_state` and `success` (False) are added if
-            missing.
+        Returns the first observation, and further entries of `info`; `init_state` and `success` (False) are added if
+        missing.
         """
 
     @abstractmethod
@@ -197,14 +192,9 @@ class MujocoCameras:
     def __init__(
         self, env: str, model: Any, cameras: Sequence[str], size: Size, *, upside_down: Collection[str] = ()
     ) -> None:
-        """Make the renderer, and grow the model's frame buffer if needed.
+        """Make the renderer of a `mujoco.MjModel`, and grow the model's frame buffer if needed; `env` is for errors.
 
-        Args:
-            env: The name of the env, for errors.
-            model: The `mujoco.MjModel`.
-            cameras: The names of the cameras.
-            size: (height, width) of each image, pixels.
-            upside_down: Cameras whose images are turned by 180 degrees.
+        Images of cameras in `upside_down` are turned by 180 degrees.
         """
         require_cameras(env, cameras, camera_names(model))
         self._cameras, self._upside_down = list(cameras), upside_down

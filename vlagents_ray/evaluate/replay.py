@@ -109,17 +109,12 @@ def _actions(recorded: Recorded, replayed: Path) -> str:
         return f"actions: they differ; from which step on is not known, as {file}, the recorded trajectory, is gone"
     before = Trajectory.load(file).actions
     now = Trajectory.load(replayed).actions
-    step = _first_difference(before, now)
+    rows = zip(before, now, strict=False)
+    step = next((i for i, (a, b) in enumerate(rows) if a.tobytes() != b.tobytes()), None)
     if step is None:
         same = min(len(before), len(now))
         return f"actions: {len(before)} were recorded, now they are {len(now)}; the first {same} are the same"
     return f"actions: they differ from step {step} on: {_row(before[step])} was recorded, now it is {_row(now[step])}"
-
-
-def _first_difference(before: np.ndarray, now: np.ndarray) -> int | None:
-    """Return the index of the first row that differs in any byte, or None."""
-    rows = zip(before, now, strict=False)
-    return next((i for i, (a, b) in enumerate(rows) if a.tobytes() != b.tobytes()), None)
 
 
 def _row(action: np.ndarray) -> str:

@@ -14,8 +14,8 @@ from vlagents_ray.errors import ConfigError, StorageFailed, VLAgentsError, from_
 from vlagents_ray.evaluate.artifacts.recorder import Artifacts, save
 from vlagents_ray.evaluate.artifacts.storage import driver_code, policy_code, save_diffs, storing, versions
 from vlagents_ray.evaluate.episode.failures import Failure
-from vlagents_ray.evaluate.episode.records import EpisodeResult, WorkerInfo
-from vlagents_ray.evaluate.plan.cases import EvalCase, require_envs
+from vlagents_ray.evaluate.episode.records import EpisodeResult
+from vlagents_ray.evaluate.plan.cases import require_envs
 from vlagents_ray.evaluate.plan.config import EvalConfig
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job, JobQueue, plan
 from vlagents_ray.evaluate.report.page import FILE as REPORT
@@ -231,7 +231,11 @@ class _Run:
             self._store.note_env(job.cell.place, report.env)
             save_diffs(self._config.out, [report.env.code])
         if report.worker is not None:
-            self._note_worker(job.cell, report.worker)
+            self._store.note_worker(report.worker)
+            if report.worker.renderer is not None and not self._checked_gpus:
+                self._checked_gpus = True
+                if (hint := unused_gpus(job.cell, report.worker)) is not None:
+                    log.warning(hint)
         if report.failure is not None:
             self._failed(job, report.failure)
         elif report.result is not None:
@@ -247,13 +251,6 @@ class _Run:
             self._record(job, report.result, report.artifacts)
             if report.result.status == "policy_error":
                 self._attempts.note_policy_error(report.result.error or "")
-
-    def _note_worker(self, cell: EvalCase, worker: WorkerInfo) -> None:
-        self._store.note_worker(worker)
-        if worker.renderer is not None and not self._checked_gpus:
-            self._checked_gpus = True
-            if (hint := unused_gpus(cell, worker)) is not None:
-                log.warning(hint)
 
     def _failed(self, job: Job, failure: Failure) -> None:
         beyond = self._has_stopped(job)  # it is no longer needed

@@ -198,20 +198,17 @@ class TrackerFeed:
             self._updated.wait()
             self._updated.clear()
             over = self._closing  # read before the results, so that all cells complete by then are logged
-            self._log_to_all()
+            for tracker in list(self._working):
+                try:
+                    self._log_to(tracker, Results.load(self._config.out))
+                except Exception as error:  # noqa: BLE001 - whatever a tracker raises
+                    log.warning("%s: %s: %s; nothing more is logged to it", tracker, type(error).__name__, error)
+                    self._working.remove(tracker)
         for (name, _), run in self._runs.items():
             try:
                 run.finish()
             except Exception as error:  # noqa: BLE001 - whatever a tracker raises
                 log.warning("%s: %s: %s", name, type(error).__name__, error)
-
-    def _log_to_all(self) -> None:
-        for name in list(self._working):
-            try:
-                self._log_to(name, Results.load(self._config.out))
-            except Exception as error:  # noqa: BLE001 - whatever a tracker raises
-                log.warning("%s: %s: %s; nothing more is logged to it", name, type(error).__name__, error)
-                self._working.remove(name)
 
     def _log_to(self, name: Tracker, results: Results) -> None:
         with closing(sqlite3.connect(self._config.out / FILE, timeout=WAIT_S)) as db:

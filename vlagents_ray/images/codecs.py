@@ -65,11 +65,9 @@ class PixelBudget(Protocol):
     @property
     def pixels(self) -> int:
         """The largest number of pixels of one image."""
-        ...
 
     def hold(self, size: int) -> None:
         """Reserve `size` bytes of memory; raises an error if they exceed the limits."""
-        ...
 
 
 RAW = ImageCodec("raw")
@@ -88,10 +86,7 @@ def decode_files(
 ) -> list[np.ndarray]:
     """Decode JPEG or PNG files to (H, W, 3) uint8 RGB images, after reserving memory for all of them.
 
-    Args:
-        files: The files.
-        budget: The limits of the message.
-        names: The cameras of the files, for error messages.
+    Errors name the camera of a file if `names` has it.
 
     Raises:
         MalformedMessage: A file cannot be decoded.

@@ -14,15 +14,11 @@ import io
 import struct
 import warnings
 import zlib
-from typing import TYPE_CHECKING
 
 import numpy as np
 import simplejpeg
 
 from vlagents_ray.errors import InvalidObservation, MalformedMessage, MessageTooLarge, MissingDependency
-
-if TYPE_CHECKING:
-    from PIL.Image import Image
 
 MAX_PIXELS = 4096 * 4096  # default limit of one image
 JPEG_MAGIC = b"\xff\xd8\xff"
@@ -109,7 +105,11 @@ def _decode_png(data: bytes | memoryview, declared: tuple[int, int]) -> np.ndarr
             with Image.open(io.BytesIO(data), formats=("PNG",)) as file:
                 if (file.height, file.width) != declared:  # Pillow uses the last of several headers
                     raise MalformedMessage("image: broken PNG (it has two headers)")
-                return _rgb(file)
+                # The upper 8 of 16 bits, as Pillow does for colours; it would clip greys.
+                if file.mode.startswith("I"):  # "I;16", or "I" before Pillow 11
+                    grey = (np.asarray(file) >> 8).astype(np.uint8)
+                    return np.repeat(grey[:, :, None], 3, axis=2)
+                return np.array(file.convert("RGB"))
     except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
         raise MessageTooLarge(f"image: {error}") from error
     except (OSError, ValueError, SyntaxError) as error:
@@ -148,14 +148,6 @@ def _chunk_name(view: memoryview, at: int) -> bytes:
 def _chunk(kind: bytes, data: bytes) -> bytes:
     checksum = zlib.crc32(data, zlib.crc32(kind))
     return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", checksum)
-
-
-def _rgb(file: Image) -> np.ndarray:
-    """Convert to (H, W, 3) uint8, using the upper 8 of 16 bits, as Pillow does for colours; it would clip greys."""
-    if file.mode.startswith("I"):  # "I;16", or "I" before Pillow 11
-        grey = (np.asarray(file) >> 8).astype(np.uint8)
-        return np.repeat(grey[:, :, None], 3, axis=2)
-    return np.array(file.convert("RGB"))
 
 
 def _check(image: np.ndarray) -> None:

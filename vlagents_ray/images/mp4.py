@@ -46,13 +46,9 @@ class Mp4:
         self._stream = self._container.add_stream(
             "libx264rgb" if lossless else "libx264", rate=Fraction(fps).limit_denominator(1000), options=options
         )
-        self._stream.height, self._stream.width = self.size
+        # Unless the video is lossless, the last row or column of an odd image is repeated.
+        self.size = self._stream.height, self._stream.width = height + self._pad[0], width + self._pad[1]
         self._stream.pix_fmt = "rgb24" if lossless else "yuv420p"
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Height and width of the video; unless it is lossless, the last row or column of an odd image is repeated."""
-        return self._shape[0] + self._pad[0], self._shape[1] + self._pad[1]
 
     def add(self, image: np.ndarray) -> None:
         """Append an image, (H, W, 3) uint8 RGB; raises `InvalidObservation` if its shape differs."""

@@ -121,9 +121,6 @@ class Rollouts:
     def __init__(self, plan: RolloutPlan) -> None:
         """Check the plan. Workers start with the first episode.
 
-        Args:
-            plan: The settings.
-
         Raises:
             ConfigError: A setting is wrong.
             MissingDependency: pyarrow is not installed.
@@ -144,8 +141,7 @@ class Rollouts:
         self._resources = ExitStack()
         self._pool: WorkerPool | None = None
         self._version = self._pushed = 0
-        self.stats = RolloutStats()
-        """The numbers of episodes so far."""
+        self.stats = RolloutStats()  # the numbers of episodes so far
 
     @property
     def version(self) -> int:

@@ -25,12 +25,7 @@ class TransitionRecorder(EpisodeRecorder):
     """Keeps the transitions of one episode, as `vlagents_ray.learn.columns` describes them."""
 
     def __init__(
-        self,
-        _config: EvalConfig,
-        _hz: float | None,
-        *,
-        want: Sequence[str] = (),
-        images: bool = True,
+        self, _config: EvalConfig, _hz: float | None, *, want: Sequence[str] = (), images: bool = True
     ) -> None:
         """Begin an episode."""
         self._pa: Any = require("pyarrow", extra=EXTRA)

@@ -18,7 +18,6 @@ from vlagents_ray.registry import require
 
 # The Gymnasium spaces of an environment's contract, and its observations as members of them.
 
-
 Observation = Literal["all", "state"]
 
 

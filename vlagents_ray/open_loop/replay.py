@@ -32,8 +32,7 @@ from vlagents_ray.serve.python_env.probe import with_process
 from vlagents_ray.serve.requests import PendingRequest, Rank
 from vlagents_ray.serve.weights import OPTION
 
-Sessions = Callable[[], Agent]
-"""Opens a session; the caller closes it."""
+Sessions = Callable[[], Agent]  # opens a session; the caller closes it
 
 FILE = "open_loop.json"
 _WORST = 10

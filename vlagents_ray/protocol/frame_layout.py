@@ -52,10 +52,7 @@ def assemble(header: str, blobs: list[Buffer]) -> list[Buffer]:
 def unpack(data: Buffer, limits: Limits, budget: Budget | None = None) -> tuple[dict[str, Any], list[Buffer]]:
     """Return the header of a frame, and views of its blobs.
 
-    Args:
-        data: The frame.
-        limits: The limits of the frame.
-        budget: The budget that a request's header is charged to; None for a reply, whose header may be longer.
+    A request's header is charged to `budget`; None is for a reply, whose header may be longer.
 
     Raises:
         MalformedMessage: The data are not a frame.

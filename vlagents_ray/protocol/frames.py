@@ -89,10 +89,8 @@ def decode_requests(data: Buffer, budget: Budget, ops: Sequence[Op] = OPS) -> De
     """Decode the requests in a frame.
 
     Args:
-        data: The frame.
         budget: The budget to charge for the message before any of it is parsed, and for each further request before its
             images are decoded.
-        ops: The accepted operations.
 
     Raises:
         MalformedMessage: The data are not a frame of requests.
@@ -192,11 +190,8 @@ def check_request(request: Request, limits: Limits) -> Request:
 def encode_replies(replies: Sequence[Reply], *, arrived: float | None = None) -> bytes:
     """Encode the replies to one frame of requests as one frame, in the order of the requests.
 
-    Args:
-        replies: The replies.
-        arrived: The time at which the requests arrived, s, of `time.perf_counter()`. If it is given, the `timing` of
-            replies without an error also gets `encode_ms` and `total_ms`, which exclude only the final joining of the
-            frame.
+    If `arrived` is given, the time at which the requests arrived, s, of `time.perf_counter()`, the `timing` of replies
+    without an error also gets `encode_ms` and `total_ms`, which exclude only the final joining of the frame.
     """
     begun = time.perf_counter()
     writer = ValueWriter()

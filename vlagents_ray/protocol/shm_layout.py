@@ -159,11 +159,9 @@ class ShmReader:
         self._known: dict[int, Layout] = {}
 
     def read(self, message: memoryview, memory: np.ndarray) -> list[Request]:
-        """Return the requests of a message; raise `InvalidInput` if it is malformed.
+        """Return the requests of a message, whose arrays are views of `memory`, (N,) uint8.
 
-        Args:
-            message: The message, which names layouts and sizes.
-            memory: The memory with the arrays, (N,) uint8; the arrays of the requests are views of it.
+        Raises `InvalidInput` if the message is malformed.
         """
         try:
             (count,) = COUNT.unpack_from(message)

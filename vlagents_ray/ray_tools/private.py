@@ -78,7 +78,6 @@ def start_head(temp_dir: str, dashboard_port: int, **params: Any) -> Any:
     (90 MB, 1 s), and with an agent at a fixed port, whose start takes 3 s longer while another Ray uses that port.
 
     Args:
-        temp_dir: The folder of Ray's files.
         dashboard_port: The port of the dashboard, which is not served.
         params: Resources and further parameters of Ray's nodes: `num_cpus`, `num_gpus`, `resources`, ...
     """

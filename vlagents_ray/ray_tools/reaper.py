@@ -30,10 +30,8 @@ _QUIET_SWEEPS = 3  # consecutive sweeps that must find nothing; during exec a pr
 def reaped(folder: Path, lost: type[Exception]) -> Iterator[None]:
     """End the processes marked with `folder` if this process dies within the context.
 
-    Args:
-        folder: The folder of the cluster.
-        lost: An exception of this type within the context has the same effect, as the cluster then does not end its
-            remaining processes.
+    An exception of the type `lost` within the context has the same effect, as the cluster then does not end its
+    remaining processes.
     """
     # The reaper runs as a script, which starts quickly; therefore this module imports no other module of the package.
     command = [sys.executable, "-I", __file__, str(folder)]

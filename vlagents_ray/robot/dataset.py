@@ -69,7 +69,13 @@ class Dataset:
             self._open(rate)
         elif root.is_dir() and any(path.name != UNFINISHED for path in root.iterdir()):
             raise ConfigError(f"{root}: not a LeRobotDataset, and not empty; record into a new folder")
-        self._sweep()
+        # Remove the files of a running or uncounted episode after a crash.
+        shutil.rmtree(root / UNFINISHED, ignore_errors=True)
+        number = self.episodes
+        stray = FILE.format(chunk_index=number // FILES_IN_CHUNK, file_index=number % FILES_IN_CHUNK)
+        for folder in ("data", "videos/*", "meta/episodes"):
+            for path in root.glob(f"{folder}/{stray}.*"):
+                path.unlink()
 
     @property
     def episodes(self) -> int:
@@ -167,15 +173,6 @@ class Dataset:
                         key, _, name = column.removeprefix("stats/").rpartition("/")
                         found.setdefault(key, {})[name] = np.array(value)
                 self._stats = joined(self._stats, found)
-
-    def _sweep(self) -> None:
-        """Remove the files of a running or uncounted episode after a crash."""
-        shutil.rmtree(self.root / UNFINISHED, ignore_errors=True)
-        number = self.episodes
-        stray = FILE.format(chunk_index=number // FILES_IN_CHUNK, file_index=number % FILES_IN_CHUNK)
-        for folder in ("data", "videos/*", "meta/episodes"):
-            for path in self.root.glob(f"{folder}/{stray}.*"):
-                path.unlink()
 
     def _table(self, rows: Mapping[str, np.ndarray], features: Mapping[str, Any]) -> Any:
         pa = self._pa

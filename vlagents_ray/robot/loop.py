@@ -43,7 +43,6 @@ class Robot(Protocol):
 
     def observe(self) -> Obs:
         """Return the current sensor readings, within a fraction of a tick."""
-        ...
 
     def apply(self, action: np.ndarray) -> None:
         """Command an action without waiting for the motion.
@@ -51,11 +50,9 @@ class Robot(Protocol):
         Args:
             action: The action, (D,) float32, in the units of the policy's contract.
         """
-        ...
 
     def stop(self) -> None:
         """Bring the robot to rest from any state; may be called repeatedly, and from another thread."""
-        ...
 
 
 def import_class(option: str, name: str, methods: Sequence[str] = ()) -> Any:
@@ -241,7 +238,7 @@ class _Run:
         """Run ticks until the policy, `until`, a mark or the time ends it; the report gets the timing in any case."""
         work_s: deque[float] = deque(maxlen=KEPT_TICKS)
         collected = time.monotonic()
-        ticks = None if seconds is None else pacer.ticks_in(seconds)
+        ticks = None if seconds is None else max(1, round(seconds / pacer.period_s))
         try:
             while not (until() or self.report.done):
                 # Collects the cycles of failed requests, as automatic collection is off.

@@ -19,8 +19,7 @@ from vlagents_ray.errors import ConfigError
 SPIN_S = 0.001
 """The last part of a wait, s, in which the thread spins: a sleeping thread wakes tens of microseconds late or more."""
 ON_TIME_S = 0.002
-KEPT_TICKS = 200_000
-"""The number of ticks whose lateness is kept, as a loop may run for days."""
+KEPT_TICKS = 200_000  # the number of ticks whose lateness is kept, as a loop may run for days
 _SWITCH_S = 0.0005  # longest time for which another thread keeps the interpreter; Python's default is 5 ms
 _NICE = -10
 _FIFO = 10
@@ -69,10 +68,6 @@ class Pacer:
     def since_tick_s(self) -> float:
         """Return the time since this tick was due, s."""
         return time.perf_counter() - self._begin - self._tick * self.period_s
-
-    def ticks_in(self, seconds: float) -> int:
-        """Return the number of ticks that are due within a time, s; at least one."""
-        return max(1, round(seconds / self.period_s))
 
 
 def jitter(late_s: Sequence[float], missed: int, ticks: int | None = None) -> dict[str, float]:

@@ -10,7 +10,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, get_args
+from typing import get_args
 
 import numpy as np
 
@@ -18,9 +18,6 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import CAPTURED, Obs, copied
 from vlagents_ray.robot.dataset import Dataset
 from vlagents_ray.robot.episode import Label, RobotEpisode
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
 
 _NICE = 5  # the writing thread runs after the control loop's
 
@@ -64,14 +61,7 @@ class Recorder:
         MissingDependency: The extra "record" is not installed.
     """
 
-    def __init__(
-        self,
-        root: str | Path,
-        fps: float,
-        *,
-        frames: int = 100,
-        interventions: bool = False,
-    ) -> None:
+    def __init__(self, root: str | Path, fps: float, *, frames: int = 100, interventions: bool = False) -> None:
         self.dropped = 0
         self.error: Exception | None = None  # the first error in writing
         self._dataset = Dataset(Path(root), fps, interventions=interventions)
@@ -160,7 +150,7 @@ class Recorder:
             error, self.error = self.error, None
             raise error
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> Recorder:
         return self
 
     def __exit__(self, *exc: object) -> None:

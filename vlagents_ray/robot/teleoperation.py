@@ -10,7 +10,7 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -19,9 +19,6 @@ from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, MissingState
 from vlagents_ray.interface import INTERVENTION, Act, Agent, Obs
 from vlagents_ray.registry import require
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
 
 __all__ = ["AxesDevice", "AxesLeader", "Keyboard", "Leader", "SpaceMouse", "TeleoperatedAgent"]
 
@@ -141,9 +138,7 @@ class AxesLeader:
 
 # A keyboard as a device with axes, read from the terminal so that it also works over SSH.
 
-
-HOLD_S = 0.2
-"""How long a key counts as pressed: terminals report no release, and repeat a key that is held."""
+HOLD_S = 0.2  # how long a key counts as pressed: terminals report no release, and repeat a key that is held
 AXES = {"w": (0, 1), "s": (0, -1), "a": (1, 1), "d": (1, -1), "r": (2, 1), "f": (2, -1)}
 AXES |= {"o": (3, 1), "u": (3, -1), "i": (4, 1), "k": (4, -1), "j": (5, 1), "l": (5, -1)}
 GRIPPER, TAKE = " ", "\n"
@@ -175,7 +170,7 @@ class Keyboard(AxesDevice):
         self._until = np.zeros((6, 2))  # s of `time.monotonic`: until when a key counts, for each axis and direction
         self._open = contextlib.ExitStack()
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> Keyboard:
         self._open.enter_context(self._terminal.keys_at_once())
         self._open.enter_context(self._terminal.consumed_by(self._press))
         return self
@@ -215,7 +210,6 @@ class Keyboard(AxesDevice):
 
 # A SpaceMouse as a device with axes; it needs the extra "spacemouse".
 
-
 _DEAD = 0.1  # of the range: the cap never rests exactly in the middle
 _REPORTS = 64  # reports read at one tick, as the device sends more reports than a loop has ticks
 
@@ -242,7 +236,7 @@ class SpaceMouse(AxesDevice):
         self._axes = np.zeros(6, np.float32)
         self._buttons: list[int] = []
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> SpaceMouse:
         return self
 
     def __exit__(self, *exc: object) -> None:
@@ -301,7 +295,6 @@ class TeleoperatedAgent(Agent):
 
 
 # The only reader of the terminal, so that each typed key has exactly one consumer.
-
 
 _POLL_S = 0.1
 Consumer = Callable[[str], bool]  # gets a key in lower case; returns whether it has a meaning for that key

@@ -157,8 +157,6 @@ class Message:
     A message collects the answers, encodes them with their times, and records them for the metrics.
 
     Args:
-        stats: Buffer for the metrics.
-        transport: Name of the transport.
         op: Operation of its only request, if that is known before decoding.
         rank: Class of that request.
     """

@@ -130,12 +130,6 @@ def _memory(environ: Mapping[str, str], cpus: int) -> int | None:
     return mebibytes * 2**20 or None
 
 
-def print_address() -> None:
-    from ray.util import get_node_ip_address
-
-    sys.stdout.write(f"{get_node_ip_address()}\n")
-
-
 def run_node() -> int:
     """Run Ray, then remove its files; return the exit status of the step, which is that of Ray on the head."""
     allocation = Allocation.here()
@@ -327,7 +321,9 @@ def main() -> None:
     """Run the program that the first argument names."""
     what, *words = sys.argv[1:]
     if what == "address":
-        print_address()
+        from ray.util import get_node_ip_address
+
+        sys.stdout.write(f"{get_node_ip_address()}\n")
     elif what == "node":
         sys.exit(run_node())
     elif what == "announce":

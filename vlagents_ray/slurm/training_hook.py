@@ -69,7 +69,17 @@ def _submit_once(words: list[str], checkpoint: str, step: int, record: Path, pyt
     name = hashlib.sha256(json.dumps([os.path.abspath(checkpoint), step, words]).encode()).hexdigest()[:16]
     record.mkdir(parents=True, exist_ok=True)
     mark = record / f"step-{step}-{name}.json"
-    _submit_abandoned(record, mark, python)
+    # Submit other checkpoints whose claiming processes were killed, since no other call may follow for them.
+    for other in sorted(record.glob("step-*.json")):
+        abandoned = _read(other)
+        if other == mark or "words" not in abandoned or _abandoned_since(other) is None:
+            continue
+        try:
+            if _is_claimed(other, abandoned):
+                job = _submit(other, abandoned, python)
+                log.info("step %s: submitted as job %s, in place of a training that was killed", abandoned["step"], job)
+        except Exception:
+            log.exception("the evaluation of step %s was not submitted; training continues", abandoned["step"])
     claim = {"step": step, "checkpoint": checkpoint, "words": filled}
     return _submit(mark, claim, python) if _is_claimed(mark, claim) else None
 
@@ -97,20 +107,6 @@ def _abandoned_since(mark: Path) -> int | None:
     except FileNotFoundError:
         return None
     return None if "job" in _read(mark) or time.time() - since / 1e9 < _ABANDONED_S else since
-
-
-def _submit_abandoned(record: Path, mark: Path, python: str) -> None:
-    """Submit other checkpoints whose claiming processes were killed, since no other call may follow for them."""
-    for other in sorted(record.glob("step-*.json")):
-        claim = _read(other)
-        if other == mark or "words" not in claim or _abandoned_since(other) is None:
-            continue
-        try:
-            if _is_claimed(other, claim):
-                job = _submit(other, claim, python)
-                log.info("step %s: submitted as job %s, in place of a training that was killed", claim["step"], job)
-        except Exception:
-            log.exception("the evaluation of step %s was not submitted; training continues", claim["step"])
 
 
 def _submit(mark: Path, claim: dict[str, Any], python: str) -> str:

@@ -178,10 +178,8 @@ def modality_config(
 ) -> dict[str, Any]:
     """Return the reply to `get_modality_config`: keys and time steps by modality, except for modalities without keys.
 
-    Args:
-        modalities: The keys and time steps of each modality.
-        flat: Whether to use the format of N1.5, in which keys contain their modality and a config is a JSON text. The
-            clients of N1.6 and newer read a map, and the newest refuses a modality without keys.
+    `flat` is the format of N1.5, in which keys contain their modality and a config is a JSON text. The clients of N1.6
+    and newer read a map, and the newest refuses a modality without keys.
     """
     answer: dict[str, Any] = {}
     for name, (keys, steps) in modalities.items():
@@ -242,7 +240,6 @@ def _text(key: Any, value: Any) -> str:
 # A file's header is matched, not evaluated, and must agree with the size of the content, so that no memory is allocated
 # for a false shape. Arrays of text become lists; arrays of objects and structures are refused.
 
-
 _NPY = b"\x93NUMPY"
 # The header that numpy writes for every plain array; any other (structures, objects) is refused. Each text has only one
 # match, so that matching is fast.
@@ -267,18 +264,14 @@ def read_npy(data: Any, limits: Limits) -> Any:
     shape = [int(n) for n in header[3].replace(b" ", b"").split(b",") if n]
     content = memoryview(data)[start + length :]
     if _TEXT_DTYPE.fullmatch(dtype):
-        return _read_texts(content, dtype, shape, limits)
+        count = len(content) // max(1, 4 * int(dtype[2:]))
+        if count > limits.items or len(content) > 4 * limits.text or len(shape) > 2:
+            raise MessageTooLarge("gr00t: an array of more text than an instruction may have")
+        try:
+            return np.frombuffer(content, dtype).reshape(shape).tolist()
+        except (ValueError, SystemError) as error:
+            raise MalformedMessage("gr00t: an array of text that is none") from error
     return read_array(content, dtype, shape[::-1]).T if by_columns else read_array(content, dtype, shape)
-
-
-def _read_texts(content: memoryview, dtype: str, shape: list[int], limits: Limits) -> Any:
-    count = len(content) // max(1, 4 * int(dtype[2:]))
-    if count > limits.items or len(content) > 4 * limits.text or len(shape) > 2:
-        raise MessageTooLarge("gr00t: an array of more text than an instruction may have")
-    try:
-        return np.frombuffer(content, dtype).reshape(shape).tolist()
-    except (ValueError, SystemError) as error:
-        raise MalformedMessage("gr00t: an array of text that is none") from error
 
 
 def write_npy(value: Any) -> dict[str, Any]:
@@ -292,20 +285,11 @@ def write_npy(value: Any) -> dict[str, Any]:
 
 # Mappings of GR00T's clients; the names of an action's columns depend on the robot, so a deployment adds `action`.
 
-
 PRESETS: dict[str, dict[str, Any]] = {
     # N1.6 and newer: {"video": {k: (1, T, H, W, 3)}, "state": {k: (1, T, D)}, "language": {"task": [[text]]}}
-    "gr00t": {
-        "cameras": {"*": "video/*"},
-        "state": {"*": "state/*"},
-        "instruction": "language/*",
-    },
+    "gr00t": {"cameras": {"*": "video/*"}, "state": {"*": "state/*"}, "instruction": "language/*"},
     # N1.5 has the same content with flat keys
-    "gr00t-n1.5": {
-        "cameras": {"*": "video.*"},
-        "state": {"*": "state.*"},
-        "instruction": "annotation.human.*",
-    },
+    "gr00t-n1.5": {"cameras": {"*": "video.*"}, "state": {"*": "state.*"}, "instruction": "annotation.human.*"},
 }
 
 
@@ -315,7 +299,6 @@ PRESETS: dict[str, dict[str, Any]] = {
 # "options": None}` and receive `[action, info]`. The observation is nested, or flat for servers that run with
 # `--use-sim-policy-wrapper`. A server that marks its modalities with `__ModalityConfig__` reads arrays of
 # `msgpack_numpy`.
-
 
 _KEYS_AT_MOST = 64
 _ARRAYS = ("video", "state")

@@ -16,13 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.errors import (
-    InvalidObservation,
-    MalformedMessage,
-    MessageTooLarge,
-    MissingCamera,
-    MissingState,
-)
+from vlagents_ray.errors import InvalidObservation, MalformedMessage, MessageTooLarge, MissingCamera, MissingState
 from vlagents_ray.protocol.frame_layout import Buffer
 from vlagents_ray.protocol.messages import Budget, Limits
 from vlagents_ray.protocol.values import is_number
@@ -215,7 +209,6 @@ def _names(feature: Mapping[str, Any]) -> tuple[str, ...]:
 # Source: `transport/services.proto` of LeRobot 0.4.4 and 0.6.1. `Observation` has the field 1, `transfer_state`, and
 # the field 2, `data`; `PolicySetup` and `Actions` have the field 1, `data`; `Empty` has none.
 
-
 SERVICE = "transport.AsyncInference"
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5  # types of fields
 _VARINT_BYTES = 10  # largest length of a number
@@ -311,7 +304,6 @@ def _varint(view: memoryview, at: int) -> tuple[int, int]:
 
 # The mapping of LeRobot's robots: the names of its datasets, to which its own server converts a robot's names.
 
-
 STATE, IMAGES, TASK = "observation.state", "observation.images.", "task"
 
 PRESETS: dict[str, dict[str, Any]] = {
@@ -319,5 +311,5 @@ PRESETS: dict[str, dict[str, Any]] = {
         "cameras": {"*": f"{IMAGES}*"},
         "state": {"joints": {"key": STATE, "optional": True}},
         "instruction": TASK,
-    },
+    }
 }

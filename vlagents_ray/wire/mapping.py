@@ -142,7 +142,6 @@ _FITS: dict[str, Callable[[Any], bool]] = {
     "float": lambda value: type(value) in (int, float) and np.isfinite(value),
     "bool": lambda value: isinstance(value, bool),
     "Literal['hwc', 'chw', 'any', 'rgba']": lambda value: value in ("hwc", "chw", "any", "rgba"),
-    'Literal["hwc", "chw", "any", "rgba"]': lambda value: value in ("hwc", "chw", "any", "rgba"),
 }
 
 
@@ -172,7 +171,6 @@ def stated(value: Any) -> Any:
 # Paths into nested observations, such as `images/wrist`: either that key itself, or `wrist` within `images`.
 #
 # `states|state` means the first of the two that exists.
-
 
 _SHOWN = 40  # largest number of keys that an error lists, and of characters of a key
 _LONGEST = 200  # characters of a client's key that are compared
@@ -233,12 +231,8 @@ def pick(
 ) -> list[tuple[str, str, Any]]:
     """Return the values that a key of a mapping matches.
 
-    Args:
-        flat: The client's observation.
-        name: Our name of the value; its `*` is replaced by the text that the `*` of `key` matches.
-        key: The client's key.
-        optional: Whether the value may be missing.
-        missing: Creates the error for a missing value.
+    The `*` of our `name` is replaced by the text that the `*` of the client's `key` matches. `missing` creates the
+    error for a missing value.
 
     Returns:
         For each value, our name, the client's key and the value.
@@ -343,7 +337,6 @@ def read_text(key: str, value: Any, texts: Mapping[str, str], limits: Limits, *,
         key: The client's key, for errors.
         value: A text, a list or array of one text, or an array of one integer.
         texts: The text for each integer.
-        limits: The limits of a request.
         needed: Whether an integer without a text is an error; if not, there is no instruction.
 
     Raises:
@@ -415,10 +408,7 @@ class KeyMapping:
     ) -> tuple[Obs, str | None]:
         """Convert a client's observation.
 
-        Args:
-            flat: The client's observation.
-            limits: The limits of a request.
-            contract: The policy's contract: an invalid gripper reading is dropped if the policy does not need it.
+        An invalid gripper reading is dropped if the policy, by its contract, does not need it.
 
         Returns:
             Our observation, whose arrays may be views of those of `flat`, and its instruction; None if there is none.
@@ -601,9 +591,6 @@ def libero_state(key: str) -> dict[str, Any]:
     finger joints, 0.04 m when open.
     """
     return {
-        "state": {
-            "xyz_axis_angle": {"key": key, "stop": 6},
-            "gripper_qpos": {"key": key, "start": 6, "stop": 8},
-        },
+        "state": {"xyz_axis_angle": {"key": key, "stop": 6}, "gripper_qpos": {"key": key, "start": 6, "stop": 8}},
         "gripper": {"key": key, "index": 6, "open": 0.04, "closed": 0.0},
     }

@@ -24,7 +24,6 @@ def unpack(data: bytes | memoryview, limits: Limits, hook: Hook, text: int | Non
     """Read the value in `data`; the keys of maps that the hook returns must be text.
 
     Args:
-        data: The message.
         limits: The limits of its size, its number of values and their nesting.
         hook: Receives each map, innermost first, and returns the value that replaces it. Values of a list that it
             returns, such as an array of text, also count; the hook itself limits them to `limits.items`.

@@ -71,12 +71,7 @@ def _texts(data: bytes, dtype: str, most: int) -> list[str]:
 
 def _node(value: Any) -> Any:
     if isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
-        return {
-            b"__ndarray__": True,
-            b"data": value.tobytes(),
-            b"dtype": value.dtype.str,
-            b"shape": value.shape,
-        }
+        return {b"__ndarray__": True, b"data": value.tobytes(), b"dtype": value.dtype.str, b"shape": value.shape}
     if isinstance(value, np.generic) and value.dtype.kind in "biuf":
         return value.item()
     if isinstance(value, Mapping):
@@ -88,7 +83,6 @@ def _node(value: Any) -> Any:
 #
 # openpi's servers accept images as (H, W, 3) or (3, H, W), in uint8 or floats in [0, 1]: see `_parse_image` in its
 # src/openpi/policies/libero_policy.py and droid_policy.py, and `convert_image` in aloha_policy.py.
-
 
 PRESETS: dict[str, dict[str, Any]] = {
     # openpi, examples/libero/main.py
@@ -138,5 +132,5 @@ ROBOARENA: dict[str, dict[str, Any]] = {
         "instruction": "prompt",
         "info": {"session_id": "session_id"},
         "action_gripper": {"index": 7, "open": 0.0, "closed": 1.0},
-    },
+    }
 }

@@ -58,24 +58,19 @@ def decode_action(body: bytes, limits: Limits = DEFAULT_LIMITS) -> np.ndarray | 
             raise MalformedMessage(f"action: got rows of the shapes {sorted(shapes)[:8]}, want the same in all")
         value = np.stack(value)
     elif isinstance(value, list):
-        value = _plain_numbers(value)
+        try:
+            array = np.asarray(value)
+        except ValueError as error:
+            raise MalformedMessage(f"action: no array of numbers ({error})") from error
+        if array.dtype.kind not in "fiu":
+            raise MalformedMessage(f"action: got {array.dtype}, want numbers")
+        value = array
     if not isinstance(value, np.ndarray):
         raise MalformedMessage(f"action: got {type(value).__name__}, want an array, or a list of rows")
     return value
 
 
-def _plain_numbers(values: list[Any]) -> np.ndarray:
-    try:
-        array = np.asarray(values)
-    except ValueError as error:
-        raise MalformedMessage(f"action: no array of numbers ({error})") from error
-    if array.dtype.kind not in "fiu":
-        raise MalformedMessage(f"action: got {array.dtype}, want numbers")
-    return array
-
-
 # Mappings of the clients of OpenVLA and OpenVLA-OFT.
-
 
 PRESETS: dict[str, dict[str, Any]] = {
     # openvla, vla-scripts/deploy.py

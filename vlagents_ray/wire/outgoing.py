@@ -25,18 +25,13 @@ _MOST = 4096  # largest number of elements of a joined vector
 class Outgoing:
     """A mapping in reverse.
 
-    Attributes:
-        mapping: The mapping.
-        is_nested: Whether a key `a/b` means the key `b` within `a`; if not, it is a single key.
-        text_key: The replacement of `*` in the instruction's key.
-
     Raises:
         ConfigError: A state has several parts without `stop`, so that their lengths are unknown.
     """
 
     mapping: KeyMapping
-    is_nested: Callable[[str], bool] = lambda _key: True
-    text_key: str = "task"
+    is_nested: Callable[[str], bool] = lambda _key: True  # whether a key `a/b` means `b` within `a`; else a single key
+    text_key: str = "task"  # the replacement of `*` in the instruction's key
 
     def __post_init__(self) -> None:
         for name, parts in self.mapping.state.items():

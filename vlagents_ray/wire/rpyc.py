@@ -204,7 +204,6 @@ def _is_int(value: object) -> bool:
 #
 # Its other types (slices, sets, complex numbers, …) are refused, since no client needs them here.
 
-
 _DEPTH = 16
 _ITEMS = 1024  # largest number of values in a message
 _DIGITS = 20  # largest length of an integer, including its sign

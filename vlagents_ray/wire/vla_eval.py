@@ -90,12 +90,7 @@ def decode_images(payload: dict[str, Any], budget: Budget) -> dict[str, Any]:
 
 
 def encode(message: Message) -> bytes:
-    fields = {
-        "type": message.kind,
-        "payload": message.payload,
-        "seq": message.seq,
-        "timestamp": time.time(),
-    }
+    fields = {"type": message.kind, "payload": message.payload, "seq": message.seq, "timestamp": time.time()}
     return pack(fields, _node)
 
 
@@ -110,19 +105,13 @@ def _image(node: dict[Any, Any]) -> np.ndarray | _File:
 
 def _node(value: Any) -> Any:
     if isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
-        return {
-            "__ndarray__": True,
-            "data": value.tobytes(),
-            "dtype": value.dtype.str,
-            "shape": list(value.shape),
-        }
+        return {"__ndarray__": True, "data": value.tobytes(), "dtype": value.dtype.str, "shape": list(value.shape)}
     if isinstance(value, np.generic) and value.dtype.kind in "biuf":
         return value.item()
     raise TypeError(f"cannot send {type(value).__name__}; want plain values and arrays of numbers")
 
 
 # The mapping of vla-eval's benchmarks.
-
 
 PRESETS: dict[str, dict[str, Any]] = {
     # The benchmark chooses the names of cameras. Most benchmarks call the state `states`, some `state`, as recommended
@@ -131,5 +120,5 @@ PRESETS: dict[str, dict[str, Any]] = {
         "cameras": {"*": "images/*"},
         "state": {"state": {"key": "states|state", "optional": True}},
         "instruction": "task_description",
-    },
+    }
 }

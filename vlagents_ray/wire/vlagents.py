@@ -34,7 +34,6 @@ class Segments(Protocol):
 
     def read(self, name: str, size: int) -> bytearray:
         """Return a copy of the first `size` bytes of a segment; raise `InvalidObservation` if that is impossible."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -247,7 +246,6 @@ def _require_known(value: Mapping[str, Any], known: set[str], what: str) -> None
 #
 # The server sends a reference to its root once; calls consist of that reference and the name of a method. No object of
 # this process is offered to the server, which returns text, a truth value, or an error.
-
 
 _ACTION_LEVELS = 4  # levels of nesting above an action: reply, acts, step, robot
 _ERROR = 2000  # characters of an error that are kept

@@ -35,20 +35,16 @@ class RequestChannel(Protocol):
     @property
     def holds_sessions(self) -> bool:
         """Whether sessions end with the connection."""
-        ...
 
     @property
     def name(self) -> str:
         """The name of the transport for users: "shm", "plasma", "websocket", "http" or "handle"."""
-        ...
 
     def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
         """Send requests as one frame and wait for their replies, in order. Nothing is ever sent twice."""
-        ...
 
     def close(self) -> None:
         """End the connection."""
-        ...
 
 
 class Transport(RequestChannel, Protocol):
@@ -56,7 +52,6 @@ class Transport(RequestChannel, Protocol):
 
     def connect(self, timeout_s: float) -> dict[str, Any]:
         """Try once to reach the server; return its metadata."""
-        ...
 
 
 class ConnectReport:

@@ -16,7 +16,6 @@ from vlagents_ray.client.transports.base import ConnectReport, first_timeout_s
 from vlagents_ray.client.transports.shm import UnixTransport
 from vlagents_ray.errors import ConfigError, ConnectionLost, DeadlineExceeded, PolicyUnavailable, VLAgentsError
 from vlagents_ray.images.codecs import RAW
-from vlagents_ray.protocol.frame_layout import Buffer
 from vlagents_ray.protocol.frames import decode_replies, encode_requests, request_parts
 from vlagents_ray.protocol.messages import LocalAddress, PlasmaAddress, Reply, Request, boot_id
 from vlagents_ray.ray_tools.private import (
@@ -42,19 +41,15 @@ class ClientApi(Protocol):
 
     async def attach(self, node: str = "", boot_id: str = "", must_be_near: bool = False) -> tuple[dict[str, Any], Any]:
         """Return metadata and actor of the best replica for a client on that node."""
-        ...
 
     async def call(self, session_id: str, frame: Any) -> bytes:
         """Return the replies to a frame of requests."""
-        ...
 
     async def lease(self, length: int) -> tuple[bytes, int]:
         """Lease a plasma channel for frames of `length` bytes; return its id and its capacity in bytes."""
-        ...
 
     async def nodes(self) -> dict[str, int]:
         """Return the number of replicas that accept sessions on each node."""
-        ...
 
 
 class HandleTransport:
@@ -261,9 +256,20 @@ class PlasmaTransport(UnixTransport):
 
     def _write(self, requests: Sequence[Request], deadline: float) -> tuple[bytes, int | None]:
         written = self._writer.write(requests)
-        frame = _gather(request_parts(requests, RAW) if written is None else written.parts())
+        # Ray copies longer buffers with six threads, whose start takes longer than the copy: hence the chunks.
+        pieces = (
+            memoryview(part)[at : at + _CHUNK]
+            for part in (request_parts(requests, RAW) if written is None else written.parts())
+            for at in range(0, len(part), _CHUNK)
+        )
+        frame = channel_content(PlasmaAddress.TAG, pieces)
         if frame.total_bytes > self._capacity:
-            self._lease(frame.total_bytes, deadline)
+            import ray
+
+            key, self._capacity = self._handle.lease(frame.total_bytes, max(1e-3, deadline - time.monotonic()))
+            # The id is sufficient: the replica owns the object, and keeps it as long as it lives.
+            self._channel = ray.ObjectRef(key)
+            register_writer(self._channel)
         if (reason := write_channel(self._channel, frame, _WRITE_MS)) is not None:
             raise OSError(f"the channel cannot be written ({reason})")
         self._unread = True
@@ -281,23 +287,6 @@ class PlasmaTransport(UnixTransport):
         """End the session; the replica takes the channel back."""
         super().close()
         self._channel, self._capacity, self._unread = None, 0, False
-
-    def _lease(self, length: int, deadline: float) -> None:
-        import ray
-
-        key, self._capacity = self._handle.lease(length, max(1e-3, deadline - time.monotonic()))
-        # The id is sufficient: the replica owns the object, and keeps it as long as it lives.
-        self._channel = ray.ObjectRef(key)
-        register_writer(self._channel)
-
-
-def _gather(parts: list[Buffer]) -> Any:
-    """Return the pieces of a frame in a form that Ray copies straight into the channel, in sequence.
-
-    Ray copies longer buffers with six threads, whose start takes longer than the copy: hence the chunks.
-    """
-    pieces = (memoryview(part)[at : at + _CHUNK] for part in parts for at in range(0, len(part), _CHUNK))
-    return channel_content(PlasmaAddress.TAG, pieces)
 
 
 def this_node() -> str | None:

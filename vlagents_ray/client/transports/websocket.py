@@ -29,23 +29,10 @@ from websockets.uri import parse_uri
 from vlagents_ray.client.credentials import ANONYMOUS, WEBSOCKET_LOG, Credentials, require_plain, tls_failure
 from vlagents_ray.client.transports.base import CodecChoice, first_timeout_s, left_s
 from vlagents_ray.client.transports.http import HttpTransport, http_url, refusal
-from vlagents_ray.errors import (
-    ConnectionLost,
-    DeadlineExceeded,
-    MessageTooLarge,
-    NoReplica,
-    PolicyUnavailable,
-)
+from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, MessageTooLarge, NoReplica, PolicyUnavailable
 from vlagents_ray.protocol.frame_layout import Buffer
 from vlagents_ray.protocol.frames import decode_replies, request_parts
-from vlagents_ray.protocol.messages import (
-    DEFAULT_LIMITS,
-    SERVERS_MACHINE,
-    STREAM_BYTES,
-    Reply,
-    Request,
-    StreamAddress,
-)
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, SERVERS_MACHINE, STREAM_BYTES, Reply, Request, StreamAddress
 
 logger = logging.getLogger(__name__)
 

@@ -88,12 +88,8 @@ def chosen_backend(wanted: str) -> str:
 def make_bare(task: str, control_mode: str | None, *, sim_backend: str, render_backend: str, **options: Any) -> Any:
     """Make the bare environment, without Gymnasium's wrappers.
 
-    Args:
-        task: ManiSkill's id.
-        control_mode: None selects the default mode, or the robot's own if the robot lacks that.
-        sim_backend: "physx_cpu" or "physx_cuda".
-        render_backend: "cpu" or "gpu".
-        options: Further options of `gymnasium.make`; ManiSkill's defaults replace those that are None.
+    A `control_mode` of None selects the default mode, or the robot's own if the robot lacks that. ManiSkill's defaults
+    replace `options` that are None.
 
     Raises:
         ConfigError: The robot lacks the control mode.
@@ -213,6 +209,7 @@ class ManiSkillRobot:
         arm = getattr(agent, "arm_joint_names", names)
         self._arm = np.array([names.index(name) for name in arm])
         self._finger_m = _FINGER_M.get(agent.uid)
+        self.has_gripper = self._finger_m is not None
         self._fingers = np.array([names.index(name) for name in getattr(agent, "gripper_joint_names", ())], dtype=int)
         self._has_tool = _tool(agent) is not None
 
@@ -223,10 +220,6 @@ class ManiSkillRobot:
             parts["tquat"] = StateSpec(dim=7, unit="m+quat_xyzw")
             parts["xyzrpy"] = StateSpec(dim=6, unit="m+rad")
         return parts
-
-    @property
-    def has_gripper(self) -> bool:
-        return self._finger_m is not None
 
     def read(self, agent: Any) -> list[tuple[dict[str, np.ndarray], float | None]]:
         """Return the state of each environment, each part (D,) float32, and the gripper in [0, 1], 1 = open."""
@@ -340,8 +333,15 @@ class Simulator:
             sensor_configs=dict(sensors),
         )
         try:
-            self._check_usable()
-            self.cameras = self._choose(cameras)
+            if not hasattr(self.env.agent, "robot"):  # no robot, or several
+                raise ConfigError(f"{self.name}: want a task with exactly one robot")
+            if "success" not in self.env.get_info():
+                raise ConfigError(f"{self.name} does not say what success is: there is nothing to evaluate")
+            seen = self.env.single_observation_space["sensor_data"]
+            sizes = {name: textures["rgb"].shape[:2] for name, textures in seen.items() if "rgb" in textures.spaces}
+            require_cameras(self.name, cameras or (), sizes)
+            chosen = sizes if cameras is None else cameras
+            self.cameras = {name: CameraSpec(height=sizes[name][0], width=sizes[name][1]) for name in chosen}
             self._robot = ManiSkillRobot(self.env.agent)
         except BaseException:
             self.close()
@@ -445,19 +445,6 @@ class Simulator:
         env, self.env = self.env, None
         if env is not None:
             env.close()
-
-    def _check_usable(self) -> None:
-        if not hasattr(self.env.agent, "robot"):  # no robot, or several
-            raise ConfigError(f"{self.name}: want a task with exactly one robot")
-        if "success" not in self.env.get_info():
-            raise ConfigError(f"{self.name} does not say what success is: there is nothing to evaluate")
-
-    def _choose(self, cameras: Sequence[str] | None) -> dict[str, CameraSpec]:
-        seen = self.env.single_observation_space["sensor_data"]
-        sizes = {name: textures["rgb"].shape[:2] for name, textures in seen.items() if "rgb" in textures.spaces}
-        require_cameras(self.name, cameras or (), sizes)
-        chosen = sizes if cameras is None else cameras
-        return {name: CameraSpec(height=sizes[name][0], width=sizes[name][1]) for name in chosen}
 
     @contextlib.contextmanager
     def _observing(self, mode: str) -> Iterator[None]:

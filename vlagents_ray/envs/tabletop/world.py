@@ -74,7 +74,10 @@ class TabletopWorld:
             self._travel(dx / _SUBSTEPS, dy / _SUBSTEPS)
             self._raise(dz / _SUBSTEPS)
             self._grip(opening)
-            self._settle()
+            for puck in sorted(self.pucks, key=lambda p: p.z):
+                if puck is not self.held and puck.z > 0.0:
+                    puck.z = max(puck.z - _FALL, self._support(puck))
+                puck.lifted = puck.lifted or puck.z > _LIFTED
 
     def _travel(self, dx: float, dy: float) -> None:
         x, y = _clip(self.x + dx, REACH[0]), _clip(self.y + dy, REACH[1])
@@ -84,7 +87,7 @@ class TabletopWorld:
             puck.y += dy
         self.x, self.y = x, y
         lowest = self.z if self.held is None else min(self.z, self.held.z)
-        if lowest < self._highest_top():
+        if any(lowest < puck.z + PUCK_HEIGHT for puck in self.pucks if puck is not self.held):
             self._push()
 
     def _push(self) -> None:
@@ -162,12 +165,6 @@ class TabletopWorld:
                     break
         self.gap = gap
 
-    def _settle(self) -> None:
-        for puck in sorted(self.pucks, key=lambda p: p.z):
-            if puck is not self.held and puck.z > 0.0:
-                puck.z = max(puck.z - _FALL, self._support(puck))
-            puck.lifted = puck.lifted or puck.z > _LIFTED
-
     def _support(self, puck: Puck) -> float:
         """Return the height of the support of `puck`, m: the table, or a puck under its centre of mass."""
         height = 0.0
@@ -182,13 +179,10 @@ class TabletopWorld:
             return []
         carried = [self.held]
         for puck in sorted(self.pucks, key=lambda p: p.z):
-            if any(self._stands_on(puck, below) for below in carried):
+            below = [one for one in carried if abs(puck.z - one.z - PUCK_HEIGHT) < _EPSILON]
+            if any(_distance(puck, one) < PUCK_RADIUS for one in below):
                 carried.append(puck)
         return carried
-
-    @staticmethod
-    def _stands_on(puck: Puck, below: Puck) -> bool:
-        return abs(puck.z - below.z - PUCK_HEIGHT) < _EPSILON and _distance(puck, below) < PUCK_RADIUS
 
     def _between_fingers(self, puck: Puck) -> bool:
         return (
@@ -201,9 +195,6 @@ class TabletopWorld:
         reach = PUCK_RADIUS + FINGER_RADIUS - _EPSILON
         offset = self.gap + FINGER_RADIUS
         return any(math.hypot(self.x + s * offset - puck.x, self.y - puck.y) < reach for s in (-1.0, 1.0))
-
-    def _highest_top(self) -> float:
-        return max((p.z for p in self.pucks if p is not self.held), default=-PUCK_HEIGHT) + PUCK_HEIGHT
 
 
 def _overlap(puck: Puck, x: float, y: float, distance: float) -> tuple[float, float] | None:

@@ -212,7 +212,6 @@ def write_bundle(folder: Path, archive: Path, *, videos: bool = False) -> str:
 
     Args:
         folder: A folder of results, to which an evaluation may be writing; nothing in it is changed.
-        archive: The file.
         videos: Whether the bundle also holds the videos: those of the report, and of the policy's images.
 
     Returns:

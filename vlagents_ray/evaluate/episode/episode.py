@@ -72,8 +72,6 @@ def run_episodes(
     The policy is reset with each further instruction of an environment with `several_tasks`.
 
     Args:
-        env: The environments.
-        agent: The policy.
         sessions: The session of each episode.
         keys: Environment, number and seed of each episode.
         settings: The common settings of the episodes.

@@ -15,51 +15,36 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from vlagents_ray import errors
 from vlagents_ray.contract import Contract
-from vlagents_ray.errors import (
-    ConfigError,
-    ContractMismatch,
-    DeadlineExceeded,
-    EnvFailed,
-    InvalidAction,
-    InvalidInput,
-    InvalidObservation,
-    MalformedMessage,
-    MessageTooLarge,
-    MissingCamera,
-    MissingDependency,
-    MissingState,
-    NotOffered,
-    NotReset,
-    PolicyFailed,
-    PolicyUnavailable,
-    UnknownApp,
-    UnknownCheckpoint,
-    UnknownSession,
-    VLAgentsError,
-)
 from vlagents_ray.interface import Obs
 from vlagents_ray.validation import check_observation
 
 Cause = Literal["user", "policy", "worker", "operator"]
 _USER = (
-    ConfigError,
-    ContractMismatch,
-    MalformedMessage,
-    MessageTooLarge,
-    MissingCamera,
-    MissingDependency,
-    MissingState,
-    NotOffered,
-    PolicyFailed,
-    UnknownApp,
-    UnknownCheckpoint,
+    errors.ConfigError,
+    errors.ContractMismatch,
+    errors.MalformedMessage,
+    errors.MessageTooLarge,
+    errors.MissingCamera,
+    errors.MissingDependency,
+    errors.MissingState,
+    errors.NotOffered,
+    errors.PolicyFailed,
+    errors.UnknownApp,
+    errors.UnknownCheckpoint,
 )
-_POLICY = (PolicyUnavailable, DeadlineExceeded, UnknownSession, NotReset)
-_WORKER = (EnvFailed, InvalidInput)  # InvalidInput here: an unusable observation of the environment
+_POLICY = (errors.PolicyUnavailable, errors.DeadlineExceeded, errors.UnknownSession, errors.NotReset)
+_WORKER = (errors.EnvFailed, errors.InvalidInput)  # InvalidInput here: an unusable observation of the environment
 # These errors of an environment are no breakdown: they report settings, a breach of its contract, a missing package, or
 # a refused action.
-_FROM_ENV = (ConfigError, ContractMismatch, EnvFailed, InvalidAction, MissingDependency)
+_FROM_ENV = (
+    errors.ConfigError,
+    errors.ContractMismatch,
+    errors.EnvFailed,
+    errors.InvalidAction,
+    errors.MissingDependency,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +63,7 @@ class Failure:
     log: str = ""  # the end of the worker's log, if it broke
 
 
-def explain(error: VLAgentsError) -> Failure:
+def explain(error: errors.VLAgentsError) -> Failure:
     """Return the failure for `error`. A `PolicyFailed` outside an episode means that the policy cannot start."""
     cause: Cause
     if isinstance(error, _USER):
@@ -87,7 +72,9 @@ def explain(error: VLAgentsError) -> Failure:
         cause = "policy"
     else:
         cause = "worker"
-    message = f"{error} (worker's Python: {sys.executable})" if isinstance(error, MissingDependency) else str(error)
+    message = (
+        f"{error} (worker's Python: {sys.executable})" if isinstance(error, errors.MissingDependency) else str(error)
+    )
     return Failure(cause, error.code, message, "".join(traceback.format_exception(error)))
 
 
@@ -109,15 +96,15 @@ class env_side(_Side):  # noqa: N801 - a context manager
     def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
         # ManiSkill raises SystemExit when an asset is missing.
         if isinstance(error, Exception | SystemExit) and not isinstance(error, _FROM_ENV):
-            raise EnvFailed(f"env {self._what}: {type(error).__name__}: {error}") from error
+            raise errors.EnvFailed(f"env {self._what}: {type(error).__name__}: {error}") from error
 
 
 class policy_side(_Side):  # noqa: N801 - a context manager
     """Turn any exception of a policy into `PolicyFailed`; this package's own errors pass."""
 
     def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
-        if isinstance(error, Exception) and not isinstance(error, VLAgentsError):
-            raise PolicyFailed(f"policy {self._what}: {type(error).__name__}: {error}") from error
+        if isinstance(error, Exception) and not isinstance(error, errors.VLAgentsError):
+            raise errors.PolicyFailed(f"policy {self._what}: {type(error).__name__}: {error}") from error
 
 
 class EnvStep(NamedTuple):
@@ -133,7 +120,7 @@ class EnvStep(NamedTuple):
 def checked_instruction(instruction: object, where: str) -> str:
     """Return `instruction`; raises `EnvFailed` if it is not text."""
     if not isinstance(instruction, str):
-        raise EnvFailed(f"env {where}: got the instruction {instruction!r}, want a str, empty if there is none")
+        raise errors.EnvFailed(f"env {where}: got the instruction {instruction!r}, want a str, empty if there is none")
     return instruction
 
 
@@ -155,7 +142,7 @@ def checked_step(
     """
     if not isinstance(info, (dict, Mapping)) or "success" not in info:
         got = f"info with {sorted(map(str, info))}" if isinstance(info, Mapping) else f"{type(info).__name__} as info"
-        raise EnvFailed(f"env step: got {got}, want 'success' among it; see EvalEnv.step")
+        raise errors.EnvFailed(f"env step: got {got}, want 'success' among it; see EvalEnv.step")
     return EnvStep(
         checked_obs(obs, contract, "step", images=images),
         _number(reward),
@@ -172,7 +159,7 @@ def checked_obs(obs: object, contract: Contract, where: str, *, images: bool = T
         ContractMismatch: The first observation does not fit: every episode would fail in the same way.
         EnvFailed: A number is not finite, or a later observation does not fit.
     """
-    wrong: type[VLAgentsError] = ContractMismatch if where == "reset" else EnvFailed
+    wrong: type[errors.VLAgentsError] = errors.ContractMismatch if where == "reset" else errors.EnvFailed
     if not isinstance(obs, Obs):
         raise wrong(f"env {where}: got {type(obs).__name__} in place of the observation, want an Obs")
     for name, part in (("cameras", obs.cameras), ("state", obs.state), ("info", obs.info)):
@@ -180,10 +167,10 @@ def checked_obs(obs: object, contract: Contract, where: str, *, images: bool = T
             raise wrong(f"env {where}: got {type(part).__name__} as the observation's {name}, want a dict")
     try:
         check_observation(obs, contract if images else replace(contract, cameras=None))
-    except InvalidObservation as error:
+    except errors.InvalidObservation as error:
         numbers = [*map(np.asarray, obs.state.values()), np.asarray(0 if obs.gripper is None else obs.gripper)]
         if not all(np.isfinite(part).all() for part in numbers if part.dtype.kind == "f"):
-            wrong = EnvFailed
+            wrong = errors.EnvFailed
         raise wrong(f"env {where}: the observation does not fit the env's own contract: {error}") from error
     except TypeError as error:  # such as a gripper that is not a number
         raise wrong(f"env {where}: got {obs.gripper!r} as the gripper, want a number in [0, 1]") from error
@@ -196,7 +183,7 @@ def _number(reward: Any) -> float:
             return float(reward)
     except (TypeError, ValueError):
         pass
-    raise EnvFailed(f"env step: got the reward {reward!r}, want a finite number")
+    raise errors.EnvFailed(f"env step: got the reward {reward!r}, want a finite number")
 
 
 def _truth(value: object, name: str) -> bool:
@@ -205,4 +192,4 @@ def _truth(value: object, name: str) -> bool:
         return value
     if isinstance(value, bool | np.bool_) or (isinstance(value, Real) and value in (0, 1)):
         return bool(value)
-    raise EnvFailed(f"env step: got {value!r} as {name}, want a bool")
+    raise errors.EnvFailed(f"env step: got {value!r} as {name}, want a bool")

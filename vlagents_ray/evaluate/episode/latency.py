@@ -100,16 +100,13 @@ class ChunkExecutor:
             step = self._plan.next if self._clock.meanwhile == "chunk" else None
             if step is None:
                 tick = Tick(self._held(dim), waited=True, held=True)
-                if self._goes_on():
+                # A held relative action moves the robot on, so that it counts as a row.
+                if self._clock.meanwhile == "hold" and self._plan.executed > 0 and stopping(self._spec) == "zero":
                     self._plan.advance()
                 yield tick
             else:
                 self._plan.advance()
                 yield Tick(step.action, waited=True)
-
-    def _goes_on(self) -> bool:
-        """Return whether holding an action moves the robot; then the held action counts as a row."""
-        return self._clock.meanwhile == "hold" and self._plan.executed > 0 and stopping(self._spec) == "zero"
 
     def _held(self, dim: int) -> np.ndarray:
         """Return the action of a tick for which no row is left, (D,)."""

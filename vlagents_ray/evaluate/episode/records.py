@@ -106,8 +106,7 @@ class WorkerInfo:
 class EpisodeObserver:
     """The callbacks of one episode. This class ignores all: override some methods."""
 
-    request_info: Mapping[str, Any] = {}
-    """Added to the `Obs.info` of every request to the policy."""
+    request_info: Mapping[str, Any] = {}  # added to the `Obs.info` of every request to the policy
 
     def add_observation(self, obs: Obs) -> None:
         """Add an observation, beginning with that of the reset."""

@@ -14,14 +14,4 @@ EXPORTS: dict[str, Callable[..., int]] = {
     "hub": to_hub,
 }
 
-__all__ = [
-    "COLUMNS",
-    "EXPORTS",
-    "Column",
-    "rows",
-    "to_csv",
-    "to_hub",
-    "to_json",
-    "to_lerobot",
-    "to_parquet",
-]
+__all__ = ["COLUMNS", "EXPORTS", "Column", "rows", "to_csv", "to_hub", "to_json", "to_lerobot", "to_parquet"]

@@ -188,7 +188,10 @@ def to_hub(results: Results, path: Path, **settings: Any) -> int:
         )
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
         raise ConfigError(f"{path}: is there already; want a new folder")
-    ids = _task_ids([one.name for one in found])
+    # The names without their simulator, "libero_spatial" of "libero/libero_spatial", if they stay distinct.
+    names = [one.name for one in found]
+    short = [plain(name.rpartition("/")[2]) for name in names]
+    ids = dict(zip(names, short, strict=True)) if len(set(short)) == len(short) else distinct(names)
     entries = [_entry(one, given.task_id or ids[one.name], given) for one in found]
     with whole_folder(path) as folder:
         file = folder / ".eval_results" / f"{plain(given.dataset)}.yaml"
@@ -207,9 +210,3 @@ def _entry(score: Score, task: str, given: HubSettings) -> dict[str, Any]:
     if given.source_url is not None:
         entry["source"] = {"url": given.source_url, "name": "results by vlagents-ray"}
     return entry
-
-
-def _task_ids(names: list[str]) -> dict[str, str]:
-    """Return the names without their simulator, "libero_spatial" of "libero/libero_spatial", if they stay distinct."""
-    short = [plain(name.rpartition("/")[2]) for name in names]
-    return dict(zip(names, short, strict=True)) if len(set(short)) == len(short) else distinct(names)

@@ -33,12 +33,7 @@ from vlagents_ray.evaluate.report.charts import (
 )
 from vlagents_ray.evaluate.report.episodes import AT_ONCE, Gallery, episodes, errors, failures
 from vlagents_ray.evaluate.report.provenance import configuration, protocol, repeat
-from vlagents_ray.evaluate.report.success import (
-    compare_all,
-    learning_curves,
-    real_time_gaps,
-    success_table,
-)
+from vlagents_ray.evaluate.report.success import compare_all, learning_curves, real_time_gaps, success_table
 from vlagents_ray.evaluate.results.reader import Results, by_timing, rate_of
 from vlagents_ray.evaluate.results.summary import Summary, median, summarize
 
@@ -76,15 +71,10 @@ class Section:
 
 
 def write_report(results: Results, path: Path, *, inline: bool = False) -> Path:
-    """Write the report of `results` to `path`, one HTML file, whole or not at all.
+    """Write the report of one folder, or of several (`combined`), to the HTML file `path`, whole or not at all.
 
-    Args:
-        results: Of one folder, or of several (`combined`).
-        path: The file; missing folders are made.
-        inline: Whether videos are in the page, up to `episodes.BUDGET` bytes; others are links, relative to `path`.
-
-    Returns:
-        `path`.
+    With `inline`, videos are in the page, up to `episodes.BUDGET` bytes; others are links, relative to `path`. Missing
+    folders are made. Returns `path`.
     """
     text = report(summarize(results), Gallery(results, path, inline=inline))
     with storing(path.parent), whole(path) as part:

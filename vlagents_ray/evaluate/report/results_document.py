@@ -36,8 +36,7 @@ class ResultsDocument:
     reason = ""
     """The error that ended the evaluation."""
 
-    goes_on = False
-    """Whether further evaluations follow each other, as those of a training's checkpoints."""
+    goes_on = False  # whether further evaluations follow each other, as those of a training's checkpoints
 
     def __init__(self, out: Path) -> None:
         """Describe the results in the folder `out`, which need not exist yet."""

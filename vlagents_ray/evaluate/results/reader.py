@@ -22,8 +22,7 @@ from vlagents_ray.evaluate.results.database import FILE, RUNNING, is_locked, rea
 from vlagents_ray.evaluate.results.statistics import Rate
 from vlagents_ray.evaluate.results.stopping import Stopping, pooled
 
-KILLED = "killed"
-"""The state of a run that ended without saying so."""
+KILLED = "killed"  # the state of a run that ended without saying so
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,13 +13,7 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
-from vlagents_ray.errors import (
-    CheckpointFailed,
-    EnvFailed,
-    InvalidAction,
-    PolicyFailed,
-    PolicyUnavailable,
-)
+from vlagents_ray.errors import CheckpointFailed, EnvFailed, InvalidAction, PolicyFailed, PolicyUnavailable
 from vlagents_ray.evaluate.episode.episode import transport_of
 from vlagents_ray.evaluate.episode.failures import env_side, policy_side
 from vlagents_ray.evaluate.episode.records import EpisodeResult

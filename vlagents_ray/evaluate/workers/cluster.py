@@ -72,18 +72,10 @@ def runtime_env(cell: EvalCase) -> dict[str, Any]:
     """
     given: dict[str, Any] = dict(cell.worker.runtime_env)
     hides_gpus = not cell.worker.gpus and bool(cell.policy.url or cell.policy.source)  # or it is in the worker
-    variables = worker_variables(cell.worker.threads, gpus=not hides_gpus)
+    variables = dict.fromkeys(THREAD_VARIABLES, str(cell.worker.threads))
+    if hides_gpus:  # Ray does not hide GPUs from an actor that requests none
+        variables[GPUS] = ""
     return given | {"env_vars": variables | given.get("env_vars", {})}
-
-
-def worker_variables(threads: int, *, gpus: bool) -> dict[str, str]:
-    """Return the environment variables of a worker.
-
-    Args:
-        threads: The number of threads of each library.
-        gpus: Whether it may see GPUs: Ray does not hide them from an actor that requests none.
-    """
-    return dict.fromkeys(THREAD_VARIABLES, str(threads)) | ({} if gpus else {GPUS: ""})
 
 
 def unused_gpus(cell: EvalCase, where: WorkerInfo) -> str | None:

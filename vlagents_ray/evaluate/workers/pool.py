@@ -186,7 +186,11 @@ class WorkerPool(Workers):
         now = monotonic()
         if self.busy:
             self._capacity.note_playing()
-        self._reap_leaving(now)
+        # Kill workers that do not end by themselves: they hold resources that their successors wait for.
+        for actor, since in self._leaving:
+            if now - since > CLOSE_S:
+                ray.kill(actor)
+        self._leaving = [(actor, since) for actor, since in self._leaving if now - since <= CLOSE_S]
         for worker in list(self._workers):
             if worker.starting is not None:
                 if self._capacity.timed_out(worker.started_at) and self._head.answers():
@@ -200,13 +204,6 @@ class WorkerPool(Workers):
                 elif worker.query_is_due(now):
                     worker.queried_at = now
                     worker.query = worker.actor.progress.options(concurrency_group="watch").remote()
-
-    def _reap_leaving(self, now: float) -> None:
-        """Kill workers that do not end by themselves: they hold resources that their successors wait for."""
-        for actor, since in self._leaving:
-            if now - since > CLOSE_S:
-                ray.kill(actor)
-        self._leaving = [one for one in self._leaving if now - one[1] <= CLOSE_S]
 
     def _with_log(self, failure: Failure, worker: WorkerHandle) -> Failure:
         """Add the worker's log to the failure; a lost node is awaited only once, whatever its number of workers."""

@@ -293,15 +293,11 @@ def _worker_info(policy: str, agent: Agent, env: BatchEnv) -> WorkerInfo:
 def agents(config: EvalConfig, own: Callable[[], Agent] | None, rank: RankName = "simulation") -> AgentFactory:
     """Return the factory that a worker calls: `own`, or one of connections with this `rank`."""
     if own is not None:
-        return functools.partial(_own_agent, own)
+        return lambda _policy: own()
     for policy in config.policies:
         if policy.url is None:
             raise ConfigError(f"policy {policy.name!r}: got no url, want that of its server, as http://localhost:8000")
     return functools.partial(_remote_agent, config, rank)
-
-
-def _own_agent(make: Callable[[], Agent], _policy: PolicyConfig) -> Agent:
-    return make()
 
 
 def _remote_agent(config: EvalConfig, rank: RankName, policy: PolicyConfig) -> RemoteAgent:

@@ -31,11 +31,6 @@ _COMMIT = re.compile(r"[0-9a-f]{40}")
 _BESIDE = (".md", ".gitattributes", ".log")  # files about a checkpoint, which do not affect its behaviour
 
 
-def is_temporary(name: str) -> bool:
-    """Return whether the name of a file or folder marks it as incomplete, to be renamed later."""
-    return any(fnmatch.fnmatchcase(name, pattern) for pattern in TEMPORARY)
-
-
 def unfinished(path: Path) -> str | None:
     """Return the sign that a checkpoint, a file or a folder, is incomplete; None if there is no sign.
 
@@ -51,7 +46,7 @@ def unfinished(path: Path) -> str | None:
         if all(file.suffix in _TEXT for file in files):
             return f"{path.name}: holds no weights, only {[file.name for file in files]}"
         for entry in entries:
-            if is_temporary(entry.name):
+            if any(fnmatch.fnmatchcase(entry.name, pattern) for pattern in TEMPORARY):
                 return f"{entry.name}: its name is a temporary one"
         for file in files:
             trouble = _trouble(file)

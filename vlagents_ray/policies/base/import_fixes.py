@@ -88,11 +88,7 @@ _FIXES: dict[str, Callable[[Execute, ModuleType], None]] = {
 
 
 def decode_frames(
-    video_path: Path | str,
-    timestamps: Sequence[float],
-    tolerance_s: float,
-    *_: object,
-    **__: object,
+    video_path: Path | str, timestamps: Sequence[float], tolerance_s: float, *_: object, **__: object
 ) -> Any:
     """Return the frames nearest to `timestamps`, s, as LeRobot's `decode_video_frames_torchvision` does.
 

@@ -96,7 +96,6 @@ def state_vector(obs: Obs, parts: Sequence[str], dim: int | None = None) -> np.n
     """Return parts of the proprioception as one new (dim,) float32 vector.
 
     Args:
-        obs: The observation.
         parts: The names of the parts in order; `GRIPPER` and `CLOSED` select `Obs.gripper`.
         dim: The length of the vector; None accepts any.
 

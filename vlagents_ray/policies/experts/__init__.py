@@ -28,11 +28,9 @@ class Expert(Protocol):
 
     def reset(self, obs: Obs, instruction: str) -> None:
         """Begin an episode; raises `InvalidObservation` if the task cannot be determined."""
-        ...
 
     def act(self, obs: Obs) -> Act:
         """Compute an action, (D,) float32, in the units of the env's contract."""
-        ...
 
 
 def expert_class(env_name: str) -> type[Expert]:

@@ -67,7 +67,11 @@ class TabletopExpert:
     def act(self, obs: Obs) -> Act:
         if not self._plan:
             raise NotReset(f"{self._env_name}: act before reset; call reset(obs, instruction) first")
-        position, opening = _proprioception(obs)
+        if "xyzrpy" not in obs.state:
+            raise MissingState("xyzrpy", have=obs.state)
+        if obs.gripper is None:
+            raise InvalidObservation("gripper: got none, want a number in [0, 1] where 1 = open")
+        position, opening = obs.state["xyzrpy"][:3].astype(np.float64), obs.gripper
         done = False
         if self._has_arrived(position) and self._waited >= self._plan[0].wait:
             done = len(self._plan) == 1 and not self._plan[0].looks
@@ -176,12 +180,3 @@ def _image(obs: Obs) -> np.ndarray:
     if "front" not in obs.cameras:
         raise MissingCamera("front", have=obs.cameras)
     return obs.cameras["front"]
-
-
-def _proprioception(obs: Obs) -> tuple[np.ndarray, float]:
-    """Return the fingertips' position, (3,) m, and the gripper's opening in [0, 1]."""
-    if "xyzrpy" not in obs.state:
-        raise MissingState("xyzrpy", have=obs.state)
-    if obs.gripper is None:
-        raise InvalidObservation("gripper: got none, want a number in [0, 1] where 1 = open")
-    return obs.state["xyzrpy"][:3].astype(np.float64), obs.gripper

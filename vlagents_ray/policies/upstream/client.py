@@ -42,18 +42,13 @@ class ClientOptions:
 class UpstreamClient(abc.ABC):
     """One connection to an upstream, used by one thread at a time."""
 
-    batches: ClassVar[bool] = False
-    """Whether `ask` sends all observations in one message."""
-    keeps_sessions: ClassVar[bool] = False
-    """Whether the upstream keeps a session for each connection, by default."""
+    batches: ClassVar[bool] = False  # whether `ask` sends all observations in one message
+    keeps_sessions: ClassVar[bool] = False  # whether the upstream keeps a session for each connection, by default
     mapping: ClassVar[str | None] = None
     """The preset that is used if the deployment states no mapping."""
-    schemes: ClassVar[tuple[str, ...]] = ()
-    """The schemes that a URL may have, the usual one first."""
-    takes_key: ClassVar[bool] = True
-    """Whether the protocol has a place for an API key."""
-    text_key: ClassVar[str] = "task"
-    """The replacement of `*` in the key of the instruction."""
+    schemes: ClassVar[tuple[str, ...]] = ()  # the schemes that a URL may have, the usual one first
+    takes_key: ClassVar[bool] = True  # whether the protocol has a place for an API key
+    text_key: ClassVar[str] = "task"  # the replacement of `*` in the key of the instruction
 
     def __init__(self, options: ClientOptions) -> None:
         self.options = options
@@ -139,8 +134,7 @@ class WebSocketClient(UpstreamClient):
     """
 
     schemes: ClassVar[tuple[str, ...]] = ("ws", "wss")
-    key_scheme: ClassVar[str] = "Bearer"
-    """The word before the API key in the header `Authorization`."""
+    key_scheme: ClassVar[str] = "Bearer"  # the word before the API key in the header `Authorization`
 
     def __init__(self, options: ClientOptions) -> None:
         super().__init__(options)

@@ -141,10 +141,9 @@ def filled(instance: Any, message: Mapping[str, Any]) -> Any:
 
 
 class Rosbridge:
-    """A link to ROS that needs no ROS here. A thread receives, and connects again if the connection is lost.
+    """A link to ROS that needs no ROS here, by the URL of a server, "ws://arm-pc:9090".
 
-    Args:
-        url: The server, "ws://arm-pc:9090".
+    A thread receives, and connects again if the connection is lost.
     """
 
     name = "rosbridge"

@@ -341,8 +341,7 @@ def token_of(headers: Mapping[str, str]) -> str | None:
     return headers.get("x-api-key") or next(stated, None)
 
 
-Identity = Caller | NoKey
-"""The sender of requests: the holder of a key, or the reason why none is needed."""
+Identity = Caller | NoKey  # the sender of requests: the holder of a key, or the reason why none is needed
 
 _CALLER: ContextVar[Identity] = ContextVar("vlagents_ray_caller")
 

@@ -174,7 +174,12 @@ def _change(file: Path, change: Callable[[list[Key]], list[Key]]) -> None:
         except BaseException:
             Path(name).unlink(missing_ok=True)
             raise
-        _sync_folder(file.parent)
+        # Write the folder to disk, so that a revocation survives a power failure.
+        descriptor = os.open(file.parent, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
 
 
 def _belong(descriptor: int, file: Path) -> None:
@@ -194,15 +199,6 @@ def _belong(descriptor: int, file: Path) -> None:
             f"keys file {file}: is user {old.st_uid}'s (group {old.st_gid}), which a new one cannot be made "
             f"({error.strerror}); nothing was changed: run this as that user, or as root"
         ) from error
-
-
-def _sync_folder(folder: Path) -> None:
-    """Write the folder to disk, so that a revocation survives a power failure."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 @contextlib.contextmanager

@@ -24,14 +24,9 @@ _LONGEST = 260  # maximum length of a DNS name (253 characters) and a port
 
 
 def require_own_page(headers: Mapping[str, str], hosts: Collection[str] = ()) -> None:
-    """Refuse requests from pages of other sites.
+    """Refuse requests from pages of other sites: raise `Forbidden` if the page belongs, or could belong, to one.
 
-    Args:
-        headers: The headers of the request, with names in lower case.
-        hosts: Further host names of this server, in lower case, without a port.
-
-    Raises:
-        Forbidden: The page belongs to another site, or could belong to one.
+    Names of `headers` are in lower case, as are `hosts`, further host names of this server, without a port.
     """
     origin, host = headers.get("origin"), headers.get("host")
     if origin is not None and not _is_own(origin, host):

@@ -122,10 +122,7 @@ class GatewayContext:
 class Dialect(abc.ABC):
     """A dialect that is enabled in a deployment; its two kinds are `RouteDialect` and `PortDialect`.
 
-    Args:
-        name: The dialect's name in the deployment, which is also the transport in statistics.
-        config: The dialect's settings.
-        context: The replica or the gateway in which the dialect runs.
+    Its name in the deployment is also the transport in statistics.
     """
 
     Config: ClassVar[type[DialectConfig]] = DialectConfig
@@ -199,8 +196,7 @@ class RouteDialect(Dialect):
     def gate(self, *, counted: bool = False) -> Sender:
         """Return a sender whose `admission` provides the budget for decoding messages.
 
-        Args:
-            counted: Whether each message was counted for the key when it arrived.
+        `counted` is whether each message was counted for the key when it arrived.
         """
         return Sender(self.context.engine, self.name, caller=current_caller(), connected=False, counted=counted)
 
@@ -209,14 +205,9 @@ class RouteDialect(Dialect):
         return ImplicitSession(self.context.engine, sender, self.rank, name)
 
     async def receive(self, socket: WebSocket, gate: Sender) -> tuple[bytes | None, MessageAdmission] | None:
-        """Wait for the next message of a WebSocket, and before that until its key is within its rate.
+        """Wait for the next message of a WebSocket, and before that until the key of its `gate` is within its rate.
 
-        Args:
-            socket: The connection.
-            gate: The sender that `gate` returned for it.
-
-        Returns:
-            The message, or None for a text message, and its admission; None if the client is gone.
+        Returns the message, or None for a text message, and its admission; None if the client is gone.
         """
         await gate.wait_unthrottled()
         event = await socket.receive()
@@ -254,8 +245,7 @@ class PortDialect(Dialect):
     def serve(self, listener: socket.socket) -> None:
         """Start to accept clients, and return.
 
-        Args:
-            listener: A socket that is bound to the port and does not listen yet; the dialect must close it.
+        The socket `listener` is bound to the port and does not listen yet; the dialect must close it.
         """
 
     @abc.abstractmethod
@@ -274,10 +264,7 @@ def _route(endpoint: Callable[..., Any], method: str, path: str) -> BaseRoute:
 async def decoded(read: Callable[[bytes, Budget], T], data: bytes | None, admission: MessageAdmission) -> T:
     """Decode a message with `read`, counting it as one request of the key even if it is invalid.
 
-    Args:
-        read: Decodes the message.
-        data: The message; None for a WebSocket's text, which is refused.
-        admission: The admission of the message.
+    `data` of None is a WebSocket's text, which is refused.
     """
     admission.begin_message()
     if data is None:
@@ -345,11 +332,7 @@ class ImplicitEpisode:
 class ImplicitSession:
     """A session of a client on the server's own port. Not thread-safe.
 
-    Args:
-        engine: The engine that serves it.
-        sender: The sender of the client's requests.
-        rank: Class of its requests.
-        name: Name of the session, unique in the replica; empty for the sender's own.
+    Its name is unique in the replica, or empty for the sender's own session.
     """
 
     def __init__(self, engine: Engine, sender: Sender, rank: RankName = "robot", name: str = "") -> None:
@@ -419,11 +402,7 @@ async def _reset(seen: Sequence[SessionObs], request_id: str) -> None:
 
 
 async def _ask(
-    message: Message,
-    op: Op,
-    seen: Sequence[SessionObs],
-    instructions: Sequence[str | None],
-    request_id: str,
+    message: Message, op: Op, seen: Sequence[SessionObs], instructions: Sequence[str | None], request_id: str
 ) -> list[Reply]:
     names = [request_id] if len(seen) == 1 else [f"{request_id}-{place}" for place in range(len(seen))]
     requests = [
@@ -463,11 +442,8 @@ class HttpDialect(RouteDialect):
     ) -> Response:
         """Answer one request.
 
-        Args:
-            http: The request.
-            read: Decodes the body to the client's observation, within a budget; it may run on another thread.
-            write: Encodes the action, (H, D) float32 in the client's convention, as the body of the reply.
-            media_type: The media type of the reply.
+        `read` decodes the body to the client's observation, within a budget; it may run on another thread. `write`
+        encodes the action, (H, D) float32 in the client's convention, as the body of the reply.
         """
         name = request_id(http)
         message = self.arrived()

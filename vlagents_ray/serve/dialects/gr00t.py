@@ -91,7 +91,12 @@ class GR00TConnection(GatewayClient):
 
     def _answer(self, payload: bytes) -> bytes:
         try:
-            self._let_in(payload)
+            check = self._context.check
+            if isinstance(check, NoKey):
+                self.sessions.show(check, None)
+            else:
+                key = gr00t.read_token(payload, self._context.limits)
+                self.sessions.show(check(key), key)
             self.sessions.begin()
             request = gr00t.read_request(payload, self._context.limits)
             return gr00t.pack(self._value(request), packed=request.packed)
@@ -99,15 +104,6 @@ class GR00TConnection(GatewayClient):
             return gr00t.pack({"error": f"{error.code}: {error}"})
         except Exception:  # noqa: BLE001 - logged, and answered
             return gr00t.pack({"error": internal_error("gr00t")})
-
-    def _let_in(self, payload: bytes) -> None:
-        """Identify the client by the key in the message, before the rest of the message is decoded."""
-        check = self._context.check
-        if isinstance(check, NoKey):
-            self.sessions.show(check, None)
-        else:
-            key = gr00t.read_token(payload, self._context.limits)
-            self.sessions.show(check(key), key)
 
     def _value(self, request: GR00TRequest) -> Any:
         if request.endpoint == "ping":
@@ -266,7 +262,11 @@ class GR00TDialect(PortDialect):
                     authenticator.send_multipart([version, request, b"200", b"", b"", b""])
                 if router in ready:
                     self._receive(router, zmq)
-                self._forget_quiet()
+                # End the sessions of idle clients and of clients whose key is no longer valid, twice a second.
+                now = time.monotonic()
+                if now - self._looked >= _TICK_MS / 1e3:
+                    self._looked = now
+                    self._clients.forget_quiet()
         except Exception:
             logger.exception("gr00t: the dialect has failed, and accepts no more clients")
         finally:
@@ -316,13 +316,6 @@ class GR00TDialect(PortDialect):
                 self.answer(envelope, gr00t.pack({"error": "malformed: wait for the answer before the next request"}))
         except VLAgentsError as error:
             self.answer(envelope, gr00t.pack({"error": f"{error.code}: {error}"}))
-
-    def _forget_quiet(self) -> None:
-        """End the sessions of idle clients and of clients whose key is no longer valid, twice a second."""
-        now = time.monotonic()
-        if now - self._looked >= _TICK_MS / 1e3:
-            self._looked = now
-            self._clients.forget_quiet()
 
 
 class _Strangers:

@@ -176,10 +176,7 @@ class VlagentsConnection:
     def _read(self, length: int, silent_s: float, deadline: float) -> bytearray | None:
         """Receive `length` bytes, allocating memory as they arrive; return None if the client disconnected before them.
 
-        Args:
-            length: The number of bytes.
-            silent_s: Maximum time between two parts, s.
-            deadline: Latest time of the last part, s, of `time.monotonic()`.
+        At most `silent_s` s pass between two parts; the `deadline` of the last is in s, of `time.monotonic()`.
         """
         data = bytearray()
         while len(data) < length:
@@ -380,7 +377,7 @@ class VlagentsDialect(PortDialect):
             "gripper": {"key": "gripper", "optional": True},
             "instruction": "instruction",
             "info": {"info": "info"},
-        },
+        }
     }
     config: VlagentsDialectConfig
 

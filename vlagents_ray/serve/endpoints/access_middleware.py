@@ -17,14 +17,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from vlagents_ray.errors import MalformedMessage, Unauthorized, VLAgentsError
 from vlagents_ray.protocol.messages import REQUEST_ID_HEADER
-from vlagents_ray.serve.access.api_keys import (
-    Caller,
-    Identity,
-    Keys,
-    NoKey,
-    on_behalf_of,
-    token_of,
-)
+from vlagents_ray.serve.access.api_keys import Caller, Identity, Keys, NoKey, on_behalf_of, token_of
 from vlagents_ray.serve.access.origin_check import require_own_page
 from vlagents_ray.serve.endpoints.http_messages import headers_of, named, problem_response
 from vlagents_ray.serve.engine.pauses import note_connection
@@ -55,9 +48,7 @@ class AccessMiddleware:
         """Protect `app`.
 
         Args:
-            app: The ASGI application that gets the accepted requests.
             keys: The server's keys; None if it has none.
-            name: The name of the Serve application.
             slow_s: Maximum time that a request may take to arrive, or a WebSocket's client to accept a message, s.
             idle_s: Maximum time that a WebSocket may be silent, s.
             hosts: Further host names of the server, see `require_own_page`.

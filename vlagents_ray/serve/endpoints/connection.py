@@ -244,8 +244,6 @@ class PolledServer(ABC, Generic[C]):
     """Listens from `open` on; the polling thread of the batch queue reads all connections.
 
     Args:
-        engine: Executes the requests.
-        limits: Limits of a request.
         admit: Returns the caller that a key belongs to, or raises for an invalid key; or the reason why no key is
             needed.
         listener: A non-blocking socket.

@@ -9,13 +9,7 @@ from typing import Any
 
 from vlagents_ray.errors import BY_CODE
 from vlagents_ray.protocol.frames import CONTENT_TYPE
-from vlagents_ray.protocol.messages import (
-    DEADLINE_HEADER,
-    RANK_HEADER,
-    REQUEST_ID_HEADER,
-    SESSION_HEADER,
-    STEP_HEADER,
-)
+from vlagents_ray.protocol.messages import DEADLINE_HEADER, RANK_HEADER, REQUEST_ID_HEADER, SESSION_HEADER, STEP_HEADER
 
 STYLE = """
 :root { color-scheme: light dark; font: 16px/1.5 system-ui, sans-serif; }
@@ -87,11 +81,7 @@ _TIMING = """\
 
 
 def docs_page(metadata: dict[str, Any]) -> str:
-    """Return the page as HTML.
-
-    Args:
-        metadata: The document of `GET /v1/metadata`; each dialect provides its own entry in it.
-    """
+    """Return the page as HTML, from the document of `GET /v1/metadata`; each dialect provides its own entry in it."""
     policy = html.escape(str(metadata["policy"]))
     dialects = "".join(
         f"`{', '.join(one.get('paths') or [one['address']])}`\n    Clients of {one['clients']}. {one['summary']}\n"

@@ -78,9 +78,7 @@ def build_http_app(
     of each request: without one, requests fail.
 
     Args:
-        engine: Executes the requests.
         metadata: Returns the document of `GET /v1/metadata`.
-        limits: Limits of a request.
         machine_metadata: Returns the metadata for a caller on the machine with the given boot id.
         dialects: The routes of other systems' clients, see `vlagents_ray.serve.dialects`.
         others: The routes of learners and viewers, see `vlagents_ray.serve.endpoints.weights` and

@@ -268,7 +268,6 @@ def html_response(html: str, *, styles: Sequence[str] = (), scripts: Sequence[st
     """Return a page that loads nothing from other servers, and that no other site's page may frame.
 
     Args:
-        html: The page.
         styles: The texts of its style elements; no other style applies.
         scripts: The texts of its script elements; no other script runs.
         more: Further directives of its content security policy.

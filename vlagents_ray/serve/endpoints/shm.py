@@ -68,15 +68,12 @@ class Payload(Protocol):
 
         The descriptors in use are removed from `descriptors`.
         """
-        ...
 
     def freed(self) -> int:
         """Return a bit field: bit n is set if memory n is free for the client and no reply has reported that."""
-        ...
 
     def free(self) -> None:
         """Free the memory of a closed connection."""
-        ...
 
 
 class UnixServer(PolledServer["UnixConnection"]):
@@ -90,15 +87,7 @@ class UnixServer(PolledServer["UnixConnection"]):
         payload: Callable[[], Payload],
         ops: Sequence[Op] = OPS,
     ) -> None:
-        """Create the server.
-
-        Args:
-            engine: Executes the requests.
-            admit: See `PolledServer`.
-            limits: Limits of a request.
-            payload: Creates the payload of a connection.
-            ops: The accepted operations.
-        """
+        """Create the server; `payload` creates the payload of a connection, and `ops` are the accepted operations."""
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
         super().__init__(engine, limits, admit, listener)
         self.payload = payload

@@ -99,9 +99,6 @@ class WebSocketServer(PolledServer["WebSocketConnection"]):
         """Bind a port.
 
         Args:
-            engine: Executes the requests.
-            limits: Limits of a request.
-            host: The address to bind.
             ports: The first and last port to try, both included; None for any free port.
             admit: Returns the caller that a key belongs to, or raises for an invalid key.
             slow_s: Maximum time that a message may take to arrive, s.
@@ -399,13 +396,7 @@ class WebSocketConnection(PolledConnection):
             self._is_throttled()
 
     def _submit(
-        self,
-        sender: Sender,
-        message: Message,
-        admission: MessageAdmission,
-        size: int,
-        arrived: float,
-        decoded: Decoded,
+        self, sender: Sender, message: Message, admission: MessageAdmission, size: int, arrived: float, decoded: Decoded
     ) -> None:
         """Send the requests of a message to the engine; their deadlines count from the arrival of the message."""
         message.decoded(decoded)

@@ -116,8 +116,6 @@ class MessageAdmission(Budget):
         """Create the admission of one message.
 
         Args:
-            admission: The replica's bytes in flight.
-            limits: Limits for decoding the message.
             admit: Counts a "message", or a further request of an op, for the sender's key, or raises an error; returns
                 False if the request is scheduled after those of robots. None if the sender has no key.
             size: Bytes of the message itself, which the replica keeps while it works on the message.

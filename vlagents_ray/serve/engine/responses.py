@@ -38,8 +38,6 @@ def build_reply(
     """Build the reply to an act request, and count the step of its session if the result is valid.
 
     Args:
-        pending: The act.
-        session: Its session.
         result: The policy's result, or the error that it raised.
         contract: The policy's contract, if it has one; the action is checked against it.
         limit: Maximum size of action and info together, bytes.
@@ -136,18 +134,15 @@ class _BoundedWriter(ValueWriter):
         elif isinstance(value, (str, bytes, bytearray)):
             self._bytes += len(value)
         elif isinstance(value, (Mapping, Sequence)):
-            return self._nested(value)
+            if self._depth >= DEFAULT_LIMITS.depth:
+                raise MessageTooLarge(f"info: nested deeper than {DEFAULT_LIMITS.depth}; flatten it")
+            self._depth += 1
+            written = super().value(value)
+            self._depth -= 1
+            return written
         if self._bytes > self._limit:
             raise MessageTooLarge(_too_large("info", self._bytes, self._limit))
         return super().value(value)
-
-    def _nested(self, value: Any) -> Any:
-        if self._depth >= DEFAULT_LIMITS.depth:
-            raise MessageTooLarge(f"info: nested deeper than {DEFAULT_LIMITS.depth}; flatten it")
-        self._depth += 1
-        written = super().value(value)
-        self._depth -= 1
-        return written
 
 
 def _too_large(what: str, got: int, limit: int) -> str:

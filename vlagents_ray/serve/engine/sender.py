@@ -48,8 +48,6 @@ class Sender:
         """Create a sender.
 
         Args:
-            engine: The engine that serves the requests.
-            transport: Name of the transport, for the metrics.
             session_id: Name of the sender's own session; a random one by default.
             caller: The authenticated caller, or the reason why none is needed. It has no default, so that an endpoint
                 without authentication fails.
@@ -72,6 +70,7 @@ class Sender:
         self._paid = False  # whether a message without an admission, and with it its first request, was counted
         self._refused = 0  # number of consecutive refused messages
         self._prefix = f"{caller.name}/" if isinstance(caller, Caller) else ""  # prefix of the sender's session ids
+        self.session_id = self._prefix + self._session_id  # id of the sender's own session in the engine
         owner = uuid.uuid4().hex if connected else ""
         self._origin = Origin(transport, owner, self._session_id, self._caller, self._prefix)
 
@@ -135,14 +134,9 @@ class Sender:
         """Submit the requests of a message.
 
         Args:
-            message: The message.
-            decoded: Its requests.
             then: Called with the message when all its answers have arrived, on the thread of the last one.
             admission: Admission of the message, which has already charged the requests to the key.
             waited_s: Time that the message waited before it was read, s, which counts towards the deadlines.
-
-        Returns:
-            The requests in flight.
         """
         engine, now, (requests, refused) = self._engine, self._engine.clock(), decoded
         watched = engine.observers.any
@@ -214,12 +208,7 @@ class Sender:
         for pending in watched:
             observers.on_answer(pending, message.replies[pending.place])
 
-    async def ask(
-        self,
-        message: Message,
-        decoded: Decoded,
-        admission: MessageAdmission | None = None,
-    ) -> list[Reply]:
+    async def ask(self, message: Message, decoded: Decoded, admission: MessageAdmission | None = None) -> list[Reply]:
         """Submit the requests of a message, and wait for the replies until the requests' deadlines.
 
         If a pause of the process delayed a request, the delay counts towards its deadline. When the caller stops
@@ -261,11 +250,6 @@ class Sender:
         owner = self._origin.owner
         if owner and (for_good or not (self._asked_to_reconnect or self._engine.draining)):
             self._engine.sessions.close_owned(owner, tuple(self._origin.sessions))  # a migrator's thread may add one
-
-    @property
-    def session_id(self) -> str:
-        """Id of the sender's own session in the engine."""
-        return self._prefix + self._session_id
 
     def _count(self, caller: Caller, op: object, counted: bool) -> bool:
         """Charge a request to the key unless it is `counted` or a close; return False if the key is for simulations."""

@@ -71,7 +71,12 @@ def server_args(source: str, app: str | None = None) -> ServerArgs:
 
 def policy_application(source: str, app: str | None = None) -> ServeApplicationSchema:
     """Return one application of a deployment that serves a policy: the one named `app`, or the only one."""
-    return _only(read_deployment(source), source, app)
+    ours: dict[str, ServeApplicationSchema] = {one.name: one for one in our_apps(read_deployment(source))}
+    if app is None and len(ours) == 1:
+        [app] = ours
+    if app not in ours:
+        raise ConfigError(f"{source}: holds the policies {sorted(ours)}, got {app!r}; name one of them as the app")
+    return ours[app]
 
 
 def with_gateways_at(config: ServeDeploySchema, host: str) -> ServeDeploySchema:
@@ -117,11 +122,7 @@ def with_settings(
 ) -> ServeDeploySchema:
     """Return the deployment, with these settings of its policies in place of the file's.
 
-    Args:
-        config: The deployment.
-        settings: The settings of the policies.
-        steps: Whether sessions may choose any checkpoint step.
-        step_follows: See `read_deployment`.
+    With `steps`, sessions may choose any checkpoint step. See `read_deployment` for `step_follows`.
     """
     changed = config.model_copy(deep=True)
     for app in our_apps(changed):
@@ -177,15 +178,6 @@ def stated_contract(config: ServeDeploySchema) -> Contract | None:
     return unloaded_contract(offered.make(settings))
 
 
-def _only(config: ServeDeploySchema, source: str, app: str | None) -> ServeApplicationSchema:
-    ours: dict[str, ServeApplicationSchema] = {one.name: one for one in our_apps(config)}
-    if app is None and len(ours) == 1:
-        [app] = ours
-    if app not in ours:
-        raise ConfigError(f"{source}: holds the policies {sorted(ours)}, got {app!r}; name one of them as the app")
-    return ours[app]
-
-
 def our_apps(config: ServeDeploySchema) -> list[Any]:
     """Return the applications of a deployment that serve a policy."""
     return [app for app in config.applications if app.import_path == IMPORT_PATH]
@@ -230,14 +222,8 @@ def _runtime_envs(config: ServeDeploySchema) -> Iterator[Mapping[str, Any]]:
 def _require_policy(args: ServerArgs, own: dict[str, Any], *, installed: bool, step_follows: bool) -> None:
     """Build the policy in its environment, with each kind of settings, and check that the dialects fit its contract.
 
-    A replica repeats the check.
-
-    Args:
-        args: The settings of the server.
-        own: The policy's own settings.
-        installed: Whether the policy's packages are installed here; otherwise the application's `runtime_env` adds
-            them.
-        step_follows: Whether a missing step is set later.
+    A replica repeats the check. If the policy's packages are not `installed` here, the application's `runtime_env` adds
+    them. With `step_follows`, a missing step is set later.
     """
     environment = args.environment
     if not installed:

@@ -72,11 +72,8 @@ _REMIND_S = 30.0
 def wait_for_proxies(proxies: list[Any], look_again: Callable[[], list[Any]]) -> None:
     """Wait until each of the proxies listens; raise the error of a proxy that cannot listen.
 
-    Serve kills a proxy that does not start within some seconds, as on a busy node, and starts another one.
-
-    Args:
-        proxies: The refs of the proxies.
-        look_again: Returns the refs of the current proxies.
+    Serve kills a proxy that does not start within some seconds, as on a busy node, and starts another one: `look_again`
+    returns the refs of the current ones.
     """
     import ray
 
@@ -307,12 +304,7 @@ def _warn_of_plain_http(config: ServeDeploySchema, host: str, tls: Tls | None) -
 
 @contextlib.contextmanager
 def _ray(
-    address: str | None,
-    host: str,
-    port: int,
-    tls: Tls | None,
-    num_cpus: int | None,
-    ingress: bool,
+    address: str | None, host: str, port: int, tls: Tls | None, num_cpus: int | None, ingress: bool
 ) -> Iterator[dict[str, Any]]:
     """Connect to a Ray or start one; yield Serve's options for its host, port and certificate."""
     import ray
@@ -357,12 +349,7 @@ def _serve_address(listener: PublicListener | None, host: str, port: int, tls: T
 
 @contextlib.contextmanager
 def own_ray(
-    host: str,
-    port: int,
-    *,
-    tls: Tls | None = None,
-    num_cpus: int | None = None,
-    ingress: bool = True,
+    host: str, port: int, *, tls: Tls | None = None, num_cpus: int | None = None, ingress: bool = True
 ) -> Iterator[PublicListener | None]:
     """Run a private Ray for the length of the context, which no other machine and no other user can reach.
 

@@ -38,7 +38,6 @@ class Checkpoints:
 
         Args:
             make: Creates an agent from settings, without loading anything.
-            config: The deployment's own settings.
             choices: See `CheckpointArgs`, as for the other arguments.
             steps: Whether sessions may choose a step.
             loaded: Maximum number of loaded checkpoints.

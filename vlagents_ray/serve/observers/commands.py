@@ -27,8 +27,7 @@ logger = logging.getLogger(__name__)
 
 TO_ROBOT = ("pause", "stop", "success", "failure")
 """The commands that are sent to a robot. None of them makes it move."""
-SAVE = "save"
-"""The command that saves the session's last seconds, which the server does."""
+SAVE = "save"  # the command that saves the session's last seconds, which the server does
 COMMANDS = (*TO_ROBOT, SAVE)
 
 TRACKED_S = 15.0  # time for which the outcome of a command is awaited
@@ -68,10 +67,7 @@ class CommandBoard:
     ) -> None:
         """Create a board without commands.
 
-        Args:
-            sessions: The sessions of the replica.
-            save: Writes the last seconds of a session and returns the path; it may be slow, and may raise errors.
-            clock: Clock, s.
+        `save` writes the last seconds of a session and returns the path; it may be slow, and may raise errors.
         """
         self._save = save
         self._sessions = sessions

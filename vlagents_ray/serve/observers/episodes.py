@@ -99,8 +99,6 @@ class EpisodeWriter:
         """Create a writer; its first file is created with the first frame.
 
         Args:
-            folder: The folder of the datasets.
-            name: The beginning of their names.
             fps: The rate of frames that timestamps assume, Hz.
             lossless: Whether videos are encoded without loss.
             most_bytes: Maximum size of the folder, over which recording ends.

@@ -65,15 +65,13 @@ _LAST_S = 0.5  # time in which viewers are sent the end of an evaluation
 _END_S = 1  # time limit for their connections to close, s
 _LEAVE_S = 5.0  # time limit for the whole shutdown
 
-VideoFiles = Callable[[int], Path | None]
-"""Returns the file of the video with a number; None if there is none."""
+VideoFiles = Callable[[int], Path | None]  # returns the file of the video with a number; None if there is none
 
 
 def live_routes(fleet: Fleet, *, open_to_network: bool, videos: VideoFiles | None = None) -> list[BaseRoute]:
     """Return the routes of the live page.
 
     Args:
-        fleet: Gathers the data.
         open_to_network: Whether other machines reach this server without a key. Watching is then refused, since the
             pictures of all robots would be public.
         videos: Finds the videos that the document of an evaluation refers to; None on a policy's server.
@@ -246,7 +244,6 @@ def page_server(
     """Serve the live page of an evaluation on a thread for the length of the context, and yield its URL.
 
     Args:
-        fleet: Gathers the data.
         address: Host and port to listen on; port 0 selects a free one.
         keys: The accepted keys; None, which only loopback allows, admits all clients.
         name: The name by which keys for single applications allow this page.

@@ -30,20 +30,13 @@ class ReplicaObservers:
 
 
 def open_observers(
-    engine: Engine,
-    args: ServerArgs,
-    replica: str,
-    node: str,
-    metadata: Callable[[], Mapping[str, Any]],
+    engine: Engine, args: ServerArgs, replica: str, node: str, metadata: Callable[[], Mapping[str, Any]]
 ) -> ReplicaObservers:
     """Create the observers in the settings of a replica, which observe the engine's requests from now on.
 
     Args:
-        engine: The engine.
-        args: The settings.
         replica: Ray's name of the replica, which is unique over time.
         node: The name of its node, for viewers.
-        metadata: Returns the metadata of the policy.
 
     Raises:
         ConfigError: A folder is not writable.

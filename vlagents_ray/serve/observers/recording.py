@@ -125,8 +125,6 @@ class SessionRecorder(Observer):
         """Create a recorder, and start its threads.
 
         Args:
-            writer: Writes the episodes.
-            sessions: The sessions of the replica.
             share: Share of the episodes to record, drawn at each reset, in [0, 1].
             held_bytes: Maximum size of the requests that wait to be written.
         """
@@ -284,12 +282,6 @@ def open_recorder(
     sessions: SessionTable[LoadedModel], args: RecordArgs, replica: str, metadata: Callable[[], Mapping[str, Any]]
 ) -> SessionRecorder:
     """Create a recorder of the sessions of a replica.
-
-    Args:
-        sessions: The sessions.
-        args: The settings.
-        replica: Ray's name of the replica.
-        metadata: Returns the metadata of the policy.
 
     Raises:
         ConfigError: The folder is not writable.

@@ -43,12 +43,10 @@ class BatchQueue:
     so that the next batch is already decoded when the current one ends.
 
     Args:
-        max_batch_size: Maximum number of requests in a batch.
         idle_s: Time without a request after which `next` returns nothing, s.
         patience: After a batch that took D s, the thread waits at most `patience` * D s for the sessions of that batch
             that are about to send their next requests.
         is_open: Returns whether a session still exists.
-        clock: Clock, s.
         poller: Poller for the watched files; by default the queue creates one.
     """
 

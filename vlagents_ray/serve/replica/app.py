@@ -26,7 +26,6 @@ def build(args: ServerArgs, *, drains: bool = True) -> Application:
     """Build the Serve application of one policy.
 
     Args:
-        args: The settings of the policy.
         drains: Whether stopping replicas wait for requests over HTTP.
 
     Raises:

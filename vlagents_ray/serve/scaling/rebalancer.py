@@ -106,11 +106,9 @@ class Siblings(Protocol):
 
     async def loads(self) -> list[ReplicaLoad]:
         """Return the loads of the replicas that answer at once."""
-        ...
 
     async def announce_client(self, replica: str) -> Any:
         """Announce a client to that replica; return its answer for the client, None if it does not answer at once."""
-        ...
 
 
 class Rebalancer:

@@ -69,14 +69,7 @@ class HeldSessions:
     """Exports, releases and adopts the sessions of one engine, on the replica's event loop."""
 
     def __init__(self, engine: Engine, loop: asyncio.AbstractEventLoop, in_thread: InThread, spawn: Spawn) -> None:
-        """Move the sessions of an engine.
-
-        Args:
-            engine: The engine.
-            loop: The replica's event loop.
-            in_thread: Runs a slow call (unpickling) on another thread.
-            spawn: Starts a task on `loop`.
-        """
+        """Move the sessions of an engine; `in_thread` runs a slow call (unpickling) on another thread."""
         self._engine = engine
         self._loop = loop
         self._in_thread = in_thread
@@ -239,19 +232,10 @@ class SessionMigrator:
     may be called on any thread.
     """
 
-    def __init__(
-        self,
-        peers: Peers,
-        loop: asyncio.AbstractEventLoop,
-        in_thread: InThread | None = None,
-    ) -> None:
+    def __init__(self, peers: Peers, loop: asyncio.AbstractEventLoop, in_thread: InThread | None = None) -> None:
         """Create the migrator of one replica.
 
-        Args:
-            peers: Returns the other replicas.
-            loop: The replica's event loop.
-            in_thread: Runs a slow call (unpickling, loading a checkpoint) on another thread; by default on dedicated
-                threads.
+        `in_thread` runs a slow call (unpickling, loading a checkpoint) on another thread, by default a dedicated one.
         """
         self._peers = peers
         self._threads = ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="session-migration")
@@ -275,7 +259,6 @@ class SessionMigrator:
         """Fetch a session from another replica.
 
         Args:
-            session_id: Id of the session.
             then: Called once the session is here or was not found.
             caller: Owner of the search; the number of concurrent searches per caller is limited.
 
