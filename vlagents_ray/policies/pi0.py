@@ -164,7 +164,10 @@ class Pi0(ModelPolicy):
         state = np.zeros(processor.max_state_dim, np.float32)
         values = state_vector(obs, self.state, self.state_dim)
         state[: len(values)] = processor.normalize(torch.from_numpy(values), "state")
-        return self.loaded().staging.stage({**self._begun().prompt, "images": np.stack(images), "state": state})
+        staged: StagedRow = self.loaded().staging.stage(
+            {**self._begun().prompt, "images": np.stack(images), "state": state}
+        )
+        return staged
 
     def _begin(self, instruction: str, seed: int, adapter: str = "") -> None:
         """Begin an episode and tokenize its instruction; one longer than in training is refused, not truncated."""
