@@ -168,6 +168,8 @@ NOTHING_TO_DECODE = {
     "`POST /v1/close`",  # nothing that it brings is decoded
     "own port, another path",  # is refused
     "`WS /v1/weights`",  # is refused without the scope
+    "`POST /v1/weights/{step}`",  # is refused without the scope
+    "`POST /v1/weights/{step}`, scope `weights`",  # two options in the URL
     "`POST /v1/live/command`",  # is refused without the scope
     "`POST /v1/live/command`, scope `operate`",  # a name and a word, in 16 KiB at most
     "`WS /v1/live`",  # is refused without the scope

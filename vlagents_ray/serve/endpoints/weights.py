@@ -29,7 +29,7 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from vlagents_ray.errors import InvalidInput, MalformedMessage, MessageTooLarge, Overloaded, VLAgentsError
+from vlagents_ray.errors import InvalidInput, MalformedMessage, MessageTooLarge, Overloaded, VLAgentsError, shown
 from vlagents_ray.protocol.json_messages import problem
 from vlagents_ray.serve.access.api_keys import Caller, ScopeCheck, current_caller
 from vlagents_ray.serve.endpoints.http_messages import deny, problem_response, request_id
@@ -182,7 +182,7 @@ def _rest(step: Any, query: Mapping[str, str]) -> Rest:
         return Rest(step, **{name: read[name](value) for name, value in query.items()})
     except (KeyError, ValueError) as error:
         raise InvalidInput(
-            f"rest: got {step[:20]!r}, {dict(query)!r:.99}, want sleep, restore or wake, offload=true or false, and "
+            f"rest: got {step[:20]!r}, {shown(dict(query), 99)}, want sleep, restore or wake, offload=true or false, and "
             f"at_most_s=SECONDS"
         ) from error
 
