@@ -182,8 +182,8 @@ def _rest(step: Any, query: Mapping[str, str]) -> Rest:
         return Rest(step, **{name: read[name](value) for name, value in query.items()})
     except (KeyError, ValueError) as error:
         raise InvalidInput(
-            f"rest: got {step[:20]!r}, {shown(dict(query), 99)}, want sleep, restore or wake, offload=true or false, and "
-            f"at_most_s=SECONDS"
+            f"rest: got {step[:20]!r}, {shown(dict(query), 99)}, want sleep, restore or wake, offload=true or "
+            f"false, and at_most_s=SECONDS"
         ) from error
 
 
