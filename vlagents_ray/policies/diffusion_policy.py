@@ -28,6 +28,7 @@ from vlagents_ray.policies.base.model_inputs import (
     state_specs,
     state_vector,
 )
+from vlagents_ray.policies.base.staging import StagedRow, Staging
 from vlagents_ray.policies.compilation import Compilation
 from vlagents_ray.registry import require
 
@@ -105,11 +106,11 @@ class DiffusionPolicy(ModelPolicy):
     def load(self) -> DiffusionNetwork:
         network = DiffusionNetwork.load(self.config)
         self._cameras(network)
-        if self.config.compile_on(network.device.type):
+        if self.config.compile_on(network.staging.device.type):
             compile_with(network, self.compilation)
         return network
 
-    def perceive(self, obs: Obs) -> dict[str, np.ndarray]:
+    def perceive(self, obs: Obs) -> StagedRow:
         """Return images (H, W, 3) uint8 and vectors (D,) float32 by the checkpoint's names."""
         network: DiffusionNetwork = self.model
         seen = {
@@ -118,18 +119,17 @@ class DiffusionPolicy(ModelPolicy):
         }
         vector = state_vector(obs, self._parts(network), self.state_dim)
         ends = np.cumsum([0, *network.vectors.values()])
-        return seen | {name: vector[a:b] for name, (a, b) in zip(network.vectors, pairwise(ends), strict=True)}
+        parts = {name: vector[a:b] for name, (a, b) in zip(network.vectors, pairwise(ends), strict=True)}
+        return network.staging.stage(seen | parts)
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction]:
         network: DiffusionNetwork = self.model
-        torch = require("torch")
-        histories = [row.history(self.history) for row in rows]
-        inputs = {}
-        for name in histories[0][0]:
-            stacked = np.stack([np.stack([frame[name] for frame in frames]) for frames in histories])
-            tensor = torch.from_numpy(stacked).to(network.device, non_blocking=True)
-            # (B, T, H, W, 3) uint8 -> (B, T, 3, H, W) in [0, 1]
-            inputs[name] = tensor.movedim(-1, 2).float() / 255 if name in network.images else tensor
+        torch, steps = require("torch"), self.history
+        frames = [frame for row in rows for frame in row.history(steps)]
+        batch = network.staging.stack(frames, keep=steps > 1)
+        inputs = {name: tensor.unflatten(0, (len(rows), steps)) for name, tensor in batch.items()}
+        for name in network.images:  # (B, T, H, W, 3) uint8 -> (B, T, 3, H, W) in [0, 1]
+            inputs[name] = inputs[name].movedim(-1, 2).float() / 255
         from vlagents_ray.policies.sampling_rng import RowNoise
 
         own = network.module, require("diffusers.utils.torch_utils")  # the scheduler's steps draw in the latter
@@ -170,7 +170,7 @@ class DiffusionNetwork:
     """The policy's module and its inputs."""
 
     module: Any
-    device: Any
+    staging: Staging
     images: dict[str, tuple[int, int]]  # height and width, by the checkpoint's name
     vectors: dict[str, int]  # length, by the checkpoint's name, in its order
     absolute: bool  # poses with 6D rotations, as in the robomimic tasks with `abs_action`
@@ -206,7 +206,7 @@ class DiffusionNetwork:
         device = torch_device(config.device)
         absolute = bool(require("omegaconf").OmegaConf.select(settings, "task.abs_action"))
         module.to(device).eval()
-        return cls(module, device, images, vectors, absolute, _draws(module, device))
+        return cls(module, Staging(device), images, vectors, absolute, _draws(module, device))
 
 
 def checkpoint_file(config: DiffusionPolicyConfig) -> Path:
@@ -315,7 +315,7 @@ _CONDITIONS = {"obs_as_cond": "cond", "obs_as_local_cond": "local_cond", "obs_as
 def compile_with(network: DiffusionNetwork, compilation: Compilation) -> None:
     """Compile a module's denoising network and its image encoder, both of which `predict_action` calls."""
     module = network.module
-    _without_branches_on_values(module, network.device)
+    _without_branches_on_values(module, network.staging.device)
     condition = next((name for flag, name in _CONDITIONS.items() if getattr(module, flag, False)), "")
     module.model.forward = _denoising(module.model.forward, condition, compilation)
     if (encoder := getattr(module, "obs_encoder", None)) is not None:

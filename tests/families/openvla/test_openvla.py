@@ -144,7 +144,7 @@ ALL = ["logprob", "entropy", "replay"]
 def scored(policy: OpenVLA, seed: int, tokens: np.ndarray) -> torch.distributions.Categorical:
     """The distributions over bins of each token after those before it, all in one pass of the whole sequence."""
     model = policy.model.base
-    patches = model.network.projector(model.network.vision_backbone(policy.perceive(seen(seed))[None]))[0]
+    patches = model.network.projector(model.network.vision_backbone(model.pixels([policy.perceive(seen(seed))])[0]))[0]
     words = model.embed(torch.tensor(model.tokens(WORDS[seed])))
     sequence = torch.cat([words[:1], patches, words[1:], model.embed(torch.tensor(tokens[:-1]))])
     logits = model.network.language_model(inputs_embeds=sequence[None]).logits[0, -len(tokens) :]
@@ -190,9 +190,10 @@ def test_each_sample_has_its_log_probability(policy: OpenVLA) -> None:
 def test_pictures_may_be_those_of_libero(loaded: Callable[..., Any]) -> None:
     cropping = loaded("openvla", center_crop=True)
     obs = seen(0)
-    want = cropping.model.base.pixels(middle(resized(obs.cameras["front"])))
-    assert torch.equal(cropping.perceive(obs), want)
-    assert not torch.equal(cropping.perceive(obs), loaded("openvla").perceive(obs))
+    [got], [plain] = cropping.perceive(obs).values(), loaded("openvla").perceive(obs).values()
+    [want] = cropping.model.base.stage([middle(resized(obs.cameras["front"]))]).values()
+    np.testing.assert_array_equal(got, want)
+    assert not np.array_equal(got, plain)
 
 
 @pytest.mark.filterwarnings("ignore:the load_module:DeprecationWarning")  # transformers 4.40 imports such code with it

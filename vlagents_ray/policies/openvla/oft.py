@@ -24,6 +24,7 @@ from vlagents_ray.policies.base.model_inputs import (
     state_specs,
     state_vector,
 )
+from vlagents_ray.policies.base.staging import StagedRow
 from vlagents_ray.policies.compilation import Compilation
 from vlagents_ray.policies.openvla.prismatic import (
     OFFERED,
@@ -134,14 +135,14 @@ class OpenVLAOFT(PrismaticPolicy):
         parallel.compile_with(self.compilation)
         return parallel
 
-    def perceive(self, obs: Obs) -> tuple[tuple[Any, ...], np.ndarray | None]:
-        """Return the images as inputs of the backbones, (C, S, S) float32 each, and the state vector (P,)."""
+    def perceive(self, obs: Obs) -> tuple[StagedRow, np.ndarray | None]:
+        """Return the images, in the order of training, as inputs of the backbones, and the state vector (P,)."""
         seen = [resized(image) for image in camera_images(obs, self._cameras).values()]
         if self.config.center_crop:
             seen = [middle(image) for image in seen]
         projector = self.model.proprio
         state = None if projector is None else state_vector(obs, self._state, projector.dim)
-        return tuple(self.model.base.pixels(image) for image in seen), state
+        return self.model.base.stage(seen), state
 
     @property
     def _checkpoint(self) -> Prismatic | None:
@@ -194,7 +195,7 @@ _STOP = 2  # Llama's end of text, which follows the actions in training
 class ModelInput:
     """The inputs for one chunk."""
 
-    pictures: tuple[Any, ...]  # (C, S, S) float32 each, in the order of training
+    seen: StagedRow
     tokens: list[int]
     proprio: np.ndarray | None  # (P,) in [-1, 1]
 
@@ -234,12 +235,11 @@ class Parallel:
 
     def denoise(self, inputs: Sequence[ModelInput], owners: Sequence[int], noise: np.ndarray) -> np.ndarray:
         """Denoise chunks (B, H, D) in [-1, 1] from standard normal noise, for the inputs `owners` (B,)."""
-        torch = require("torch")
-        with torch.inference_mode():
+        with require("torch").inference_mode():
             sequences = self._sequences(inputs)
             index = self.base.moved(owners)
             sequences = Sequences(*(part[index] for part in sequences))
-            start = self.base.to_device(torch.from_numpy(noise))
+            start = self.base.moved(noise).to(self.base.dtype)
             return _numpy(denoise(start, lambda time, noisy: self._noise(sequences, time, noisy), *self.steps))
 
     def choose(self, inputs: Sequence[ModelInput], owners: Sequence[int], draws: np.ndarray) -> tuple[Any, Any]:
@@ -269,10 +269,10 @@ class Parallel:
         words, counts = base.embed(base.padded(prompts)), base.moved([len(tokens) for tokens in prompts])
         padding = torch.arange(words.shape[1], device=base.device) >= counts[:, None]
         language = words.float().masked_fill(padding[..., None], 0).sum(1) / counts[:, None]
-        pixels = base.to_device([picture for model_input in inputs for picture in model_input.pictures])
-        seen = self.encode_images(pixels.unflatten(0, (len(inputs), -1)), language.to(words.dtype))
+        pixels = base.pixels([model_input.seen for model_input in inputs])
+        seen = self.encode_images(pixels, language.to(words.dtype))
         if self.proprio is not None:
-            states = base.to_device([torch.from_numpy(model_input.proprio) for model_input in inputs])
+            states = base.moved([model_input.proprio for model_input in inputs]).to(base.dtype)
             seen = torch.cat([seen, self.proprio(states)[:, None]], 1)
         first, count = 1 + seen.shape[1] + timed, self.horizon * self.dim  # `first`: place of a row's first token
         actions = [(first + words.shape[1] + i) * timed for i in range(count)]  # zeros without a diffusion head

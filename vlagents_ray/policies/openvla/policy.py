@@ -20,6 +20,7 @@ from vlagents_ray.interface import Obs
 from vlagents_ray.policies.adapters import Adapters
 from vlagents_ray.policies.base import Row
 from vlagents_ray.policies.base.model_inputs import camera_images, camera_specs, choose_cameras
+from vlagents_ray.policies.base.staging import StagedRow
 from vlagents_ray.policies.compilation import Compilation
 from vlagents_ray.policies.openvla.prismatic import (
     OFFERED,
@@ -81,17 +82,17 @@ class OpenVLA(PrismaticPolicy):
         decoder.compile_with(self.compilation)
         return decoder
 
-    def perceive(self, obs: Obs) -> Any:
+    def perceive(self, obs: Obs) -> StagedRow:
         image = camera_images(obs, self._cameras)[_IMAGE]
         if self.config.center_crop:
             image = middle(resized(image))
-        return self.model.base.pixels(image)
+        return self.model.base.stage([image])
 
     @property
     def _checkpoint(self) -> Prismatic | None:
         return None if self.model is None else self.model.base
 
-    def _model_input(self, row: Row, key: str) -> tuple[Any, list[int]]:
+    def _model_input(self, row: Row, key: str) -> tuple[StagedRow, list[int]]:
         return row.frames[-1], self.model.base.tokens(row.instruction)
 
     def _compute(self, prepared: Sequence[PreparedRow]) -> list[DecodedChunk]:
@@ -123,7 +124,7 @@ class TokenDecoder:
 
     def decode(
         self,
-        prompts: Sequence[tuple[Any, list[int]]],
+        prompts: Sequence[tuple[StagedRow, list[int]]],
         owners: Sequence[int],
         draws: np.ndarray,
         fingerprints: Sequence[str] = (),
@@ -131,7 +132,7 @@ class TokenDecoder:
         """Decode R answers to P prompts.
 
         Args:
-            prompts: The pixels (C, S, S) and tokens of each prompt.
+            prompts: The image and the tokens of each prompt.
             owners: (R,), the prompt of each answer; a prompt with several answers is read once.
             draws: (R, S), for `ActionBins.choose`.
             fingerprints: (P,), the adapter of each prompt, see `Row.adapter`; empty: no prompt has one.
@@ -200,10 +201,10 @@ class TokenDecoder:
         own = tuple((keys[:, :, -1:], values[:, :, -1:]) for keys, values in result.past_key_values)
         return result.last_hidden_state[:, -1], _stacked(own)[..., 0, :]
 
-    def _left_padded(self, prompts: Sequence[tuple[Any, list[int]]]) -> tuple[Any, Any]:
+    def _left_padded(self, prompts: Sequence[tuple[StagedRow, list[int]]]) -> tuple[Any, Any]:
         """Return embeddings (P, L, D) and their mask (P, L); the patches follow the first token, as in training."""
         base, rows = self.base, [tokens for _, tokens in prompts]
-        patches = self.encode_images(base.to_device([pixels for pixels, _ in prompts]))
+        patches = self.encode_images(base.pixels([seen for seen, _ in prompts]).flatten(0, 1))
         first = 1 + patches.shape[1]  # place of a row's first token
         places = [[first, *range(1, first), *range(first + 1, first + len(tokens))] for tokens in rows]
         length = first - 1 + base.padded_tokens

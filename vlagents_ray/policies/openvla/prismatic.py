@@ -30,6 +30,7 @@ from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row
 from vlagents_ray.policies.base.accelerator import ensure_torchvision, torch_device, torch_dtype
 from vlagents_ray.policies.base.checkpoint import SavedTensors, find_checkpoint, require_loaded
 from vlagents_ray.policies.base.model_inputs import keeping_tokens
+from vlagents_ray.policies.base.staging import StagedRow, Staging
 from vlagents_ray.registry import require
 
 Bounds = Literal["q99", "min_max"]  # of each dimension: 1st and 99th percentile, or minimum and maximum
@@ -133,6 +134,7 @@ class Statistics:
 
 _NEEDS = ("config.json", "preprocessor_config.json", "tokenizer_config.json", "*.safetensors")
 _SPACE = 29871  # Llama's token of an empty word, between "Out:" and the action in training
+_PIXELS = "pixels"
 _PROMPT = "In: What action should the robot take to {}?\nOut:"
 _PROMPT_V01 = (  # OpenVLA v0.1 was fine-tuned from Vicuna; upstream also detects it by the checkpoint's name
     "A chat between a curious user and an artificial intelligence assistant. The assistant gives helpful, detailed, "
@@ -153,12 +155,19 @@ class Prismatic:
     prompt: str
     device: Any
     dtype: Any
+    staging: Staging
     padded_tokens: int  # the length to which shorter prompts are padded; 0: that of the longest prompt
     own: dict[str, Statistics] = field(default_factory=dict)  # of adapters that were trained on other datasets
 
-    def pixels(self, image: np.ndarray) -> Any:
-        """Convert an (H, W, 3) uint8 image to an input of the checkpoint's backbones, (C, S, S) float32 on the CPU."""
-        return self.processor.apply_transform(require("PIL.Image").fromarray(image))
+    def stage(self, images: Sequence[np.ndarray]) -> StagedRow:
+        """Begin to copy V images, (H, W, 3) uint8, as inputs of the checkpoint's backbones, to the model's device."""
+        convert = require("PIL.Image").fromarray
+        pixels = [self.processor.apply_transform(convert(image)).numpy() for image in images]
+        return self.staging.stage({_PIXELS: np.stack(pixels)})
+
+    def pixels(self, rows: Sequence[StagedRow]) -> Any:
+        """Return the images (B, V, C, S, S) of rows of `stage`, on the device and in the model's dtype."""
+        return self.staging.stack(rows)[_PIXELS].to(self.dtype)
 
     def tokens(self, instruction: str) -> list[int]:
         """Return the prompt's tokens, read-only; raises `InvalidObservation` if the instruction is too long."""
@@ -179,17 +188,9 @@ class Prismatic:
 
         return tokenized
 
-    def to_device(self, arrays: Sequence[Any]) -> Any:
-        """Stack tensors of one shape into a batch in the model's dtype; the copy to a GPU is asynchronous."""
-        torch = require("torch")
-        batch = torch.stack(list(arrays))
-        if self.device.type == "cuda":
-            batch = batch.pin_memory()
-        return batch.to(self.device, self.dtype, non_blocking=True)
-
     def moved(self, numbers: Any) -> Any:
         """Copy numbers to the model's device, without waiting for what a GPU computes."""
-        return require("torch").as_tensor(numbers).to(self.device, non_blocking=True)
+        return self.staging.upload(np.asarray(numbers))
 
     def padded(self, rows: Sequence[Sequence[int]], length: int = 0, *, left: bool = False) -> Any:
         """Return rows of int64 on the device with zeros after them, or before them, up to the longest or `length`."""
@@ -231,6 +232,7 @@ def load_prismatic(config: PrismaticConfig, bounds: Bounds = "q99") -> Prismatic
         statistics=statistics,
         prompt=_PROMPT_V01 if "openvla-v01" in config.checkpoint else _PROMPT,
         device=device,
+        staging=Staging(device),
         dtype=dtype,
         padded_tokens=config.compiled_tokens if config.compile_on(device.type) else 0,
     )
