@@ -204,7 +204,7 @@ def test_a_full_disk_costs_its_episode_and_no_later_one(tmp_path: Path) -> None:
 
 def test_a_killed_process_loses_the_running_episode_and_no_other(tmp_path: Path) -> None:
     code = f"""
-import os, pathlib, signal, sys, time
+import contextlib, os, pathlib, signal, sys, time
 import numpy as np
 from vlagents_ray import Obs
 from vlagents_ray.robot.record import Recorder
@@ -214,9 +214,10 @@ for episode in range(3):
         for i in range(6):
             recorder.add(Obs({{"front": np.zeros((48, 48, 3), np.uint8)}}), np.zeros(2, np.float32), tick=i)
         while episode == 2:  # killed in the third
-            if list(pathlib.Path({str(tmp_path)!r}).glob("unfinished/*/*.mp4")) and recorder.episodes == 2:
-                print("recording", flush=True)
-                time.sleep(60)
+            with contextlib.suppress(FileNotFoundError):  # a folder that was finished during the search
+                if list(pathlib.Path({str(tmp_path)!r}).glob("unfinished/*/*.mp4")) and recorder.episodes == 2:
+                    print("recording", flush=True)
+                    time.sleep(60)
             time.sleep(0.01)
 """
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as process:

@@ -103,8 +103,9 @@ class Barks:
 
 def test_what_was_stopped_stays_so_until_a_restart_after_the_silence() -> None:
     barks = Barks()
-    with Watchdog(barks, {"server": 0.05}) as watchdog:
-        assert not watchdog.control.stopped
+    watchdog = Watchdog(barks, {"server": 0.05})
+    assert not watchdog.control.stopped
+    with watchdog:
         barks.next()
         assert watchdog.control.stopped
         assert not watchdog.restart()  # while it is silent

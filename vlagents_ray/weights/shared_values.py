@@ -133,7 +133,8 @@ def opened(values: SharedValues) -> Iterator[Mapping[str, Any]]:
     for name, view in values.views.items():
         empty = torch.empty(0, dtype=getattr(torch, view.dtype), device=storages[view.storage].device)
         named[name] = empty.set_(storages[view.storage], view.begin, view.shape, view.stride)
-    del storages, empty
+        del empty
+    del storages
     try:
         yield named
         for device in devices:
