@@ -147,13 +147,7 @@ class RosRobot:
         self._connections = self._link.connections
         try:
             self._wait_for_messages()
-            for command in self.settings.actions:
-                pose = self.settings.state.get(command.stop)
-                if pose is not None and self._value(pose).shape != (command.dim,):
-                    raise ConfigError(
-                        f"{command.topic}: stop: got {command.stop!r} with {len(self._value(pose))} numbers, want "
-                        f"{command.dim}, as the topic takes; name a part of the state with these, in this order"
-                    )
+            self._require_poses()
         except BaseException:
             self._link.close()
             raise
@@ -218,14 +212,16 @@ class RosRobot:
             if command.stop in ("", ZEROS):
                 self._publish(command, np.zeros(command.dim, np.float32))
             elif command.stop != NOTHING:
-                reading = self.settings.state[command.stop]
-                reader = self._readers[id(reading)]
-                reader.refresh()
-                if reader.age_s > self.settings.max_age_of(reading) or self._from_before_loss(reader):
-                    self._stop_unsent = True  # until a pose is known
-                    logger.warning("%s: not told where to stop, as %s is old", command.topic, reading.topic)
-                else:
-                    self._publish(command, reader.value)
+                self._stop_where_it_is(command, self.settings.state[command.stop])
+
+    def _stop_where_it_is(self, command: ActionTopic, reading: InputTopic) -> None:
+        reader = self._readers[id(reading)]
+        reader.refresh()
+        if reader.age_s > self.settings.max_age_of(reading) or self._from_before_loss(reader):
+            self._stop_unsent = True  # until a pose is known
+            logger.warning("%s: not told where to stop, as %s is old", command.topic, reading.topic)
+        else:
+            self._publish(command, reader.value)
 
     def _from_before_loss(self, reader: TopicReader) -> bool:
         return time.monotonic() - self._lost_at <= reader.age_s < math.inf
@@ -294,6 +290,15 @@ class RosRobot:
             time.sleep(_POLL_S)
         for reading in self.settings.sensors:
             self._require_clock(self._readers[id(reading)], self.settings.silent_of(reading))
+
+    def _require_poses(self) -> None:
+        for command in self.settings.actions:
+            pose = self.settings.state.get(command.stop)
+            if pose is not None and self._value(pose).shape != (command.dim,):
+                raise ConfigError(
+                    f"{command.topic}: stop: got {command.stop!r} with {len(self._value(pose))} numbers, want "
+                    f"{command.dim}, as the topic takes; name a part of the state with these, in this order"
+                )
 
     def _require_clock(self, reader: TopicReader, limit_s: float) -> None:
         ago_s = time.time() - reader.captured_at
