@@ -191,6 +191,19 @@ def test_all_memory_on_the_gpu_moves_to_the_host_and_back(
     own, before = engine.models.own_weights, acted(engine)
     memories = [one.untyped_storage() for one in (*agent.parameters().values(), *own.newest.values.values())]
     assert all(memory.nbytes() for memory in memories)
+    hosts, made = torch.UntypedStorage, list[int]()
+
+    def short_of_memory(size: int) -> Any:
+        made.append(size)
+        if len(made) == 2:
+            raise RuntimeError("DefaultCPUAllocator: can't allocate memory")
+        return hosts(size)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(torch, "UntypedStorage", short_of_memory)
+        with pytest.raises(RuntimeError, match="can't allocate"):
+            weights.sleep()
+    assert acted(engine) == before, "what had moved came back"
     weights.sleep()
     assert not any(memory.nbytes() for memory in memories)
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import traceback
 from collections import Counter
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -67,6 +68,17 @@ class TorchCalls(TorchDispatchMode):
             if "/torch/" not in frame.filename and "/tests/" not in frame.filename
         ]
         self.waits[f"{why} in {lines[-1] if lines else '?'}"] += 1
+
+
+def calls_of_an_act(policy: Any, sessions: Sequence[Any], views: Sequence[Any]) -> TorchCalls:
+    """Act once with all sessions, on what they see and have prepared, and count."""
+    for session, obs in zip(sessions, views, strict=True):
+        obs.prepared = session.prepare(obs)
+    with TorchCalls() as counted:
+        acts = policy.act_batch(views, sessions)
+    assert not [act for act in acts if isinstance(act, Exception)]
+    print(f"{type(policy).__name__}: {counted.calls} calls, {counted.uploads} copies, waits: {dict(counted.waits)}")
+    return counted
 
 
 def _copied(indices: Any) -> str:

@@ -372,7 +372,7 @@ class ModelWeights:
                 self._asleep = True
                 self._agent.sleep()
                 held = [version.values for version in self._alive.values() if version.values is not None]
-                self._moved += to_host([self._agent.parameters(), *held])
+                to_host([self._agent.parameters(), *held], self._moved)
         free_memory()
 
     def wake(self) -> None:

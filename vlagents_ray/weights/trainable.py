@@ -223,19 +223,18 @@ def _is_module(value: Any) -> bool:
     return torch is not None and isinstance(value, torch.nn.Module)
 
 
-def to_host(groups: Iterable[Mapping[str, Any]]) -> list[tuple[Any, Any]]:
-    """Move torch tensors from GPUs to the host; return their memory, without bytes now, and that on the host.
+def to_host(groups: Iterable[Mapping[str, Any]], moved: list[tuple[Any, Any]]) -> None:
+    """Move torch tensors from GPUs to the host, and append to `moved` their memory, without bytes now, and the host's.
 
-    The tensors stay the same objects, with the same views and ties; until `from_host` they must not be read.
+    The tensors stay the same objects, with the same views and ties; until `from_host` they must not be read. After an
+    error, the list has those that were moved.
     """
     tensors = [value for named in groups for value in named.values() if _is_tensor(value) and _on_gpu(value)]
     storages = {value.untyped_storage().data_ptr(): value.untyped_storage() for value in tensors if value.numel()}
-    moved = []
     for storage in storages.values():
         if storage.resizable():  # otherwise it belongs to another library or process
-            moved.append((storage, storage.cpu() if storage.device.type != "cpu" else storage.clone()))
+            moved.append((storage, sys.modules["torch"].UntypedStorage(storage.nbytes()).copy_(storage)))
             storage.resize_(0)
-    return moved
 
 
 def from_host(moved: list[tuple[Any, Any]]) -> None:

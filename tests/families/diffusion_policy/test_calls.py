@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from torch_calls import TorchCalls
+from torch_calls import TorchCalls, calls_of_an_act
 
 from tests.families.diffusion_policy.conftest import LIBRARIES, Checkpoint, begun, made, seen
 
@@ -17,12 +17,7 @@ def test_an_act_waits_only_for_its_results(checkpoint: Checkpoint, kind: str, mo
     policy = made(checkpoint(kind), device="meta", max_rows=SIZE)
     with TorchCalls():
         policy.initialize()
-    sessions, views = [begun(policy, i) for i in range(SIZE)], [seen(i) for i in range(SIZE)]
-    for session, obs in zip(sessions, views, strict=True):
-        obs.prepared = session.prepare(obs)
-    with TorchCalls() as counted:
-        acts = policy.act_batch(views, sessions)
-    assert not [act for act in acts if isinstance(act, Exception)]
-    print(f"{kind}: {counted.calls} calls, {counted.uploads} copies, waits: {dict(counted.waits)}")
+    sessions = [begun(policy, i) for i in range(SIZE)]
+    counted = calls_of_an_act(policy, sessions, [seen(i) for i in range(SIZE)])
     assert sum(counted.waits.values()) == 1, counted.waits
     assert counted.calls <= most

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from torch_calls import META, TorchCalls
+from torch_calls import META, TorchCalls, calls_of_an_act
 
 from tests.families.lerobot import tiny
 from tests.families.lerobot.conftest import FILTERS, Made, begun, view
@@ -36,12 +36,7 @@ def counted(policy: LeRobot, **info: Any) -> TorchCalls:
     """Count the second act, as the first one may keep constants on the device."""
     sessions = [begun(policy, i) for i in range(SIZE)]
     for _ in range(2):
-        views = [view(i, **info) for i in range(SIZE)]
-        for session, obs in zip(sessions, views, strict=True):
-            obs.prepared = session.prepare(obs)
-        with TorchCalls() as calls:
-            acts = policy.act_batch(views, sessions)
-        assert not [act for act in acts if isinstance(act, Exception)]
+        calls = calls_of_an_act(policy, sessions, [view(i, **info) for i in range(SIZE)])
     return calls
 
 
@@ -67,6 +62,5 @@ def test_an_act_waits_for_its_results_and_where_lerobot_does(
     policy = LeRobot.from_config({"checkpoint": str(made(kind)), "actions": "chunk", **settings})
     policy.initialize()
     calls = counted(on_meta(policy), **info)
-    print(f"{kind}: {calls.calls} calls, {calls.uploads} copies, waits: {dict(calls.waits)}")
     assert sum(calls.waits.values()) == waits, calls.waits
     assert calls.calls <= most

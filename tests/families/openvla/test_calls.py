@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 import torch
-from torch_calls import TorchCalls
+from torch_calls import TorchCalls, calls_of_an_act
 
 from tests.families.openvla.conftest import LIBRARIES, begun, seen
 from vlagents_ray.interface import SAMPLES, WANT
@@ -51,12 +51,7 @@ def test_an_act_waits_only_for_its_results(
     )
     with TorchCalls():
         policy.initialize()
-    sessions, views = [begun(policy, i) for i in range(SIZE)], [seen(i, **info) for i in range(SIZE)]
-    for session, obs in zip(sessions, views, strict=True):
-        obs.prepared = session.prepare(obs)
-    with TorchCalls() as counted:
-        acts = policy.act_batch(views, sessions)
-    assert not [act for act in acts if isinstance(act, Exception)]
-    print(f"{kind}: {counted.calls} calls, {counted.uploads} copies, waits: {dict(counted.waits)}")
+    sessions = [begun(policy, i) for i in range(SIZE)]
+    counted = calls_of_an_act(policy, sessions, [seen(i, **info) for i in range(SIZE)])
     assert sum(counted.waits.values()) == 1, counted.waits
     assert counted.calls <= most

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from torch_calls import META, TorchCalls
+from torch_calls import META, calls_of_an_act
 
 from benchmarks.checkpoints import pi0 as recipe
 from benchmarks.checkpoints.recipe import Recipe
@@ -81,12 +81,7 @@ def published() -> Pi0:
     ids=["an act", "samples", "log-probabilities", "a plan"],
 )
 def test_an_act_waits_only_for_its_results(published: Pi0, info: dict[str, Any], waits: int) -> None:
-    sessions, views = [begun(published, i) for i in range(4)], [seen(i, **info) for i in range(4)]
-    for session, obs in zip(sessions, views, strict=True):
-        obs.prepared = session.prepare(obs)
-    with TorchCalls() as counted:
-        acts = published.act_batch(views, sessions)
-    assert not [act for act in acts if isinstance(act, Exception)]
-    print(f"π0: {counted.calls} calls, {counted.uploads} copies, waits: {dict(counted.waits)}")
+    sessions = [begun(published, i) for i in range(4)]
+    counted = calls_of_an_act(published, sessions, [seen(i, **info) for i in range(4)])
     assert sum(counted.waits.values()) == waits, counted.waits
     assert counted.calls <= MOST_CALLS

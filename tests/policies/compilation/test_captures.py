@@ -461,7 +461,8 @@ def test_a_model_that_sleeps_frees_its_graphs_and_weights_and_acts_the_same_when
 
     first, made = act(), len(cuda.captures)
     policy.sleep()
-    moved = to_host([policy.model, policy.model])
+    moved: list[tuple[Any, Any]] = []
+    to_host([policy.model, policy.model], moved)
     assert [memory.nbytes() for memory, _ in moved] == [0]
     assert (policy.compilation.sizes, policy.compilation.memories) == ([], {})
     from_host(moved)
