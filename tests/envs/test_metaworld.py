@@ -138,6 +138,16 @@ def test_a_camera_stands_where_it_is_told() -> None:
     assert not np.array_equal(seen[0], seen[1])
 
 
+def test_without_shadows_the_image_is_otherwise_the_same() -> None:
+    def image(shadows: bool) -> np.ndarray:
+        with MetaWorld("drawer-open-v3", width=64, height=64, shadows=shadows) as env:
+            return env.reset(seed=1)[0].cameras["corner2"].astype(int)
+
+    difference = np.abs(image(True) - image(False))
+    assert 0 < (difference.max(-1) > 20).mean() < 0.5
+    assert difference.mean() < 25
+
+
 def test_the_protocols_constants_are_the_simulators(reach: MetaWorld) -> None:
     assert PROTOCOL.max_steps == reach._env.max_path_length
     assert pytest.approx(1 / reach._env.dt) == PROTOCOL.control_hz

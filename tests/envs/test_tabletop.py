@@ -17,6 +17,7 @@ from many import many
 from vlagents_ray import Act
 from vlagents_ray.envs import make_env
 from vlagents_ray.envs.tabletop import Tabletop
+from vlagents_ray.envs.tabletop.render import PALETTE
 from vlagents_ray.errors import ConfigError, NotReset, UnknownEnv
 from vlagents_ray.images.jpeg_png import decode, encode_jpeg
 from vlagents_ray.interface import Obs
@@ -111,6 +112,39 @@ def test_a_chosen_instruction_leaves_the_scene_as_it_is() -> None:
     assert np.array_equal(before.cameras["front"], after.cameras["front"])
 
 
+def test_the_wrist_camera_follows_the_gripper_and_shows_what_is_below_it_enlarged() -> None:
+    env = Tabletop("lift", width=64, height=64, cameras=("front", "wrist"))
+    seen, _ = env.reset(seed=2)
+    expert = Scripted()
+    expert.reset(seen, env.instruction, env="tabletop", seed=0)
+    colour = np.array(PALETTE[env.instruction.split()[2]])
+    first, last = seen.cameras["wrist"], seen
+    while last.gripper == 1.0:  # until the fingers close around the puck
+        last = env.step(expert.act(last))[0]
+    assert first.shape == last.cameras["wrist"].shape == (64, 64, 3)
+
+    def coloured(image: np.ndarray) -> np.ndarray:
+        return np.abs(image.astype(int) - colour).sum(-1) < 60  # type: ignore[no-any-return]
+
+    near, far = coloured(last.cameras["wrist"]), coloured(last.cameras["front"])
+    assert near.sum() > 4 * far.sum() > 0 == coloured(first).sum()
+    assert np.abs(np.argwhere(near).mean(0) - 32).max() < 8
+
+
+def test_disturbances_follow_from_the_seed_and_the_expert_recovers() -> None:
+    def path(disturbance: float) -> np.ndarray:
+        env = Tabletop(width=64, height=64, disturbance=disturbance)
+        env.reset(seed=1)
+        return np.array([env.step(Act(np.zeros(4, np.float32)))[0].state["xyzrpy"][:3] for _ in range(80)])
+
+    assert np.array_equal(path(1.0), path(1.0))
+    moved = np.abs(np.diff(path(1.0), axis=0)).max(-1) > 0
+    assert 2 <= moved.sum() <= 20
+    assert not np.diff(path(0.0), axis=0).any()
+    env = Tabletop("pick_place", disturbance=0.5)
+    assert np.mean([play(env, seed) for seed in range(many(50))]) >= 0.8
+
+
 def test_what_there_is_not_is_refused() -> None:
     elsewhere = "put the orange puck on the blue pad"
     for option, value in (("instruction", elsewhere), ("init_state", "3")):
@@ -125,9 +159,13 @@ def test_what_there_is_not_is_refused() -> None:
         ("lift", "pucks", 0, "want 1 to 4 in 'lift'"),
         ("lift", "pucks", 5, "want 1 to 4 in 'lift'"),
         (None, "pucks", 1, "want 2 to 4 in 'mixed'"),
+        (None, "disturbance", 2.0, "want 0 to 1 in 'mixed'"),
     ):
         with pytest.raises(ConfigError, match=f"{option} is {value}, {text}"):
             Tabletop(task, **{option: value})
+
+    with pytest.raises(ConfigError, match=r"no camera \['top'\]: want some of \['front', 'wrist'\]"):
+        Tabletop(cameras=("top",))
 
 
 @pytest.mark.parametrize("task", ["pick_place", "slide", "lift"])

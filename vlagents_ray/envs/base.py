@@ -271,6 +271,13 @@ def known_contract(name: str, options: Mapping[str, Any]) -> Contract | None:
     return cls.known_contract(bound.arguments)
 
 
+def require_cameras(env: str, names: Collection[str], have: Collection[str]) -> None:
+    """Raise `ConfigError` unless an env has the cameras of these names."""
+    unknown = sorted(set(names) - set(have))
+    if unknown:
+        raise ConfigError(f"{env} has no camera {unknown}: want some of {sorted(have)}")
+
+
 def require_known(suite: str, task: str | None, known: Sequence[str], others: str = "") -> None:
     """Raise `UnknownEnv` unless a task is known; `others` are further allowed tasks, in words."""
     if task not in known:

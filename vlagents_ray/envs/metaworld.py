@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
+from vlagents_ray.envs.base import require_cameras
 from vlagents_ray.envs.graphics import prepare_rendering
-from vlagents_ray.envs.simulator import BenchmarkProtocol, MujocoCameras, SimulatorEnv, camera_names, require_cameras
+from vlagents_ray.envs.simulator import BenchmarkProtocol, MujocoCameras, SimulatorEnv, camera_names
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Obs
 from vlagents_ray.registry import require
@@ -65,6 +66,7 @@ class MetaWorld(SimulatorEnv):
         goals_seed: int | None = None,
         ends_on_success: bool = True,
         camera_positions: Mapping[str, Sequence[float]] | None = None,
+        shadows: bool = True,
     ) -> None:
         """Make the environment; raises the errors of `make_env`. Other options are described in `SimulatorEnv`.
 
@@ -75,6 +77,8 @@ class MetaWorld(SimulatorEnv):
             max_steps: 500 at most.
             goals_seed: The seed of MT1, whose 50 initial states are used; None: the seed of each episode draws one.
             camera_positions: Name -> (x, y, z) m, of cameras that are moved from their place in Meta-World.
+            shadows: Whether images have shadows, reflections and smooth edges as in Meta-World; they take ten times as
+                long without a GPU.
         """
         if max_steps > PROTOCOL.max_steps:
             raise ConfigError(f"metaworld: max_steps is {max_steps}, want at most {PROTOCOL.max_steps}: there it stops")
@@ -100,7 +104,9 @@ class MetaWorld(SimulatorEnv):
             require_cameras(self._name, moved, camera_names(env.model))
             for name, position in moved.items():
                 env.model.camera(name).pos = position
-            self._cameras = MujocoCameras(self._name, env.model, cameras, (height, width), upside_down=_UPSIDE_DOWN)
+            self._cameras = MujocoCameras(
+                self._name, env.model, cameras, (height, width), upside_down=_UPSIDE_DOWN, shadows=shadows
+            )
             self._resources.callback(self._cameras.close)
         stated = self.known_contract({"cameras": cameras, "width": width, "height": height})
         self._contract = replace(stated, control_hz=1.0 / self._env.dt)

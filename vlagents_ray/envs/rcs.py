@@ -17,9 +17,9 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, Rotation, StateSpec
-from vlagents_ray.envs.base import require_known
+from vlagents_ray.envs.base import require_cameras, require_known
 from vlagents_ray.envs.gymnasium import plain
-from vlagents_ray.envs.simulator import BenchmarkProtocol, SimulatorEnv, Size, require_cameras
+from vlagents_ray.envs.simulator import BenchmarkProtocol, SimulatorEnv, Size
 from vlagents_ray.errors import ConfigError, MissingDependency, UnknownEnv
 from vlagents_ray.interface import Obs
 from vlagents_ray.registry import require

@@ -7,6 +7,8 @@ metres. The camera "front" looks down at an elevation of 70 degrees without pers
 0.66 m and the origin lies in the image's centre, so that
 
     u = width / 2 + s * x,   v = height / 2 - s * (y * sin 70° + z * cos 70°),   s = min(width, height) / 0.66 m
+
+The camera "wrist" shows a third of that, enlarged, with the fingertips in its centre.
 """
 
 from vlagents_ray.envs.tabletop.env import Tabletop

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, get_args
 
 import numpy as np
 
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
-from vlagents_ray.envs.base import EvalEnv, one_row, require_known
-from vlagents_ray.envs.tabletop.render import ELEVATION, VIEW, TabletopRenderer
+from vlagents_ray.envs.base import EvalEnv, one_row, require_cameras, require_known
+from vlagents_ray.envs.tabletop.render import ELEVATION, VIEW, TabletopRenderer, WristRenderer
 from vlagents_ray.envs.tabletop.world import PUCKS, STEP_LIMIT, Goal, TabletopWorld, Task, draw_episode, goals
 from vlagents_ray.errors import ConfigError, NotReset
 from vlagents_ray.interface import Act, Obs
 
 MIXED = "mixed"
+_RENDERERS = {"front": TabletopRenderer, "wrist": WristRenderer}
 _TASKS: tuple[Task, ...] = get_args(Task)
+_DISTURBED = 0.1  # share of steps
 _VERSION = 1  # of the scenes and the physics; results of different versions are not comparable
 _CONTROL_HZ = 10.0
 _POINTING_DOWN = (math.pi, 0.0, 0.0)  # roll, pitch, yaw of the gripper in rad, constant
@@ -28,10 +30,11 @@ class Tabletop(EvalEnv):
     Tasks: `pick_place`, `slide` (never lift the puck), `stack`, `lift`, and `mixed`, the default, which draws one of
     them for each episode.
 
-    Observation: camera "front" (height, width, 3); `state["xyzrpy"]` (6,), the fingertips' position in m and the
-    gripper's constant orientation in rad, in the base frame of the package's docstring; `gripper` in [0, 1], 1 = open,
-    about 0.58 around a puck. With `object_state`, also `state["puck"]` (3,), the position of the underside of the
-    instruction's puck, and `state["target"]` (3,), its target; m, in the base frame.
+    Observation: cameras (height, width, 3), by default "front" alone, of "front" and "wrist"; `state["xyzrpy"]` (6,),
+    the fingertips' position in m and the gripper's constant orientation in rad, in the base frame of the package's
+    docstring; `gripper` in [0, 1], 1 = open, about 0.58 around a puck. With `object_state`, also `state["puck"]` (3,),
+    the position of the underside of the instruction's puck, and `state["target"]` (3,), its target; m, in the base
+    frame.
 
     Action (4,): `dx, dy, dz` in units of 0.03 m per step along the base frame's axes, and the gripper, 1 = open, -1 =
     closed. Components outside [-1, 1] are clipped, as by a robot's controller.
@@ -45,9 +48,11 @@ class Tabletop(EvalEnv):
         *,
         width: int = 224,
         height: int = 224,
+        cameras: Sequence[str] = ("front",),
         max_steps: int = 80,
         pucks: int = PUCKS,
         object_state: bool = False,
+        disturbance: float = 0.0,
     ) -> None:
         """Make the environment of a task.
 
@@ -55,9 +60,12 @@ class Tabletop(EvalEnv):
             task: One of `tasks()`; None selects `mixed`.
             width: The width of the image, at least 32 pixels.
             height: The height of the image, at least 32 pixels.
+            cameras: Of "front" and "wrist".
             max_steps: Steps until truncation.
             pucks: Pucks on the table, 1 to 4. A policy without instructions can identify its puck only if it is alone.
             object_state: Whether the state has the positions of the instruction's puck and of its target.
+            disturbance: Standard deviation of what is added to the motion of one step in ten, in units of an action;
+                demonstrations with it show how to recover from errors (DART, arXiv 1703.09327).
 
         Raises:
             ConfigError: There is no such task, or a number is out of its range.
@@ -65,20 +73,25 @@ class Tabletop(EvalEnv):
         self.require_task(task)
         self._task = task or MIXED
         fewest = 2 if self._task in (MIXED, "stack") else 1
-        ranges = {
+        ranges: dict[str, tuple[float, int, int | None]] = {
             "width": (width, 32, None),
             "height": (height, 32, None),
             "max_steps": (max_steps, 1, None),
             "pucks": (pucks, fewest, PUCKS),
+            "disturbance": (disturbance, 0, 1),
         }
         for name, (value, least, most) in ranges.items():
             if value < least or (most is not None and value > most):
                 wanted = f"at least {least}" if most is None else f"{least} to {most} in {self._task!r}"
                 raise ConfigError(f"tabletop: {name} is {value}, want {wanted}")
-        self.max_steps = max_steps
+        require_cameras("tabletop", cameras, _RENDERERS)
+        self.max_steps, self._disturbance = max_steps, disturbance
         self._pucks, self._object_state = pucks, object_state
-        self._contract = self.known_contract({"width": width, "height": height, "object_state": object_state})
-        self._renderer = TabletopRenderer(width, height)
+        self._contract = self.known_contract(
+            {"width": width, "height": height, "cameras": cameras, "object_state": object_state}
+        )
+        self._renderers = {name: _RENDERERS[name](width, height) for name in cameras}
+        self._draws = np.random.default_rng()
         self._world: TabletopWorld | None = None
         self._goal: Goal | None = None
         self._steps = 0
@@ -95,7 +108,10 @@ class Tabletop(EvalEnv):
     def known_contract(cls, arguments: Mapping[str, Any]) -> Contract:
         objects = {"puck": StateSpec(3, "m"), "target": StateSpec(3, "m")}
         return Contract(
-            cameras={"front": CameraSpec(arguments["height"], arguments["width"])},
+            cameras={
+                name: CameraSpec(arguments["height"], arguments["width"])
+                for name in arguments.get("cameras", ("front",))
+            },
             state={"xyzrpy": StateSpec(6, "m+rad")} | (objects if arguments.get("object_state") else {}),
             gripper=True,
             instruction=True,
@@ -146,8 +162,9 @@ class Tabletop(EvalEnv):
         world, goal = draw_episode(task, rng, self._pucks)
         if options:
             goal = self._chosen(world, options["instruction"])
-        self._world, self._goal, self._steps = world, goal, 0
-        self._renderer.begin(world.pads)
+        self._world, self._goal, self._steps, self._draws = world, goal, 0, rng
+        for renderer in self._renderers.values():
+            renderer.begin(world.pads)
         info = {"instructions": [g.instruction for g in goals(world, goal.task)], "success": False}
         return self._observe(world, goal), info
 
@@ -156,6 +173,8 @@ class Tabletop(EvalEnv):
         if world is None or goal is None:
             raise NotReset("tabletop: step before reset; call reset(seed=...) first")
         action = one_row(act, self._contract)
+        if self._disturbance and self._draws.random() < _DISTURBED:
+            action = action + np.append(self._draws.normal(0.0, self._disturbance, 3), 0.0)
         dx, dy, dz, grip = np.clip(action, -1.0, 1.0).tolist()
         world.step(dx * STEP_LIMIT, dy * STEP_LIMIT, dz * STEP_LIMIT, (grip + 1) / 2)
         self._steps += 1
@@ -177,7 +196,7 @@ class Tabletop(EvalEnv):
             puck = world.puck(goal.puck)
             state["puck"] = np.array((puck.x, puck.y, puck.z), np.float32)
             state["target"] = np.array(goal.place(world), np.float32)
-        cameras = {"front": self._renderer.draw(world)} if look else {}
+        cameras = {name: renderer.draw(world) for name, renderer in self._renderers.items()} if look else {}
         return Obs(cameras=cameras, gripper=world.opening, state=state)
 
     def _task_in_scene(self) -> Task:

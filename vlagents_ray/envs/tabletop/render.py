@@ -1,4 +1,4 @@
-"""A renderer of the table for the camera "front".
+"""Renderers of the table for the cameras "front" and "wrist".
 
 Objects at rest are drawn once; a step copies that image and adds the gripper, the held object, and their
 shadows. The camera's geometry is in the package's docstring.
@@ -38,6 +38,7 @@ _FINGER, _PALM, _PALM_FRONT, _WRIST = (150, 152, 156), (86, 88, 92), (62, 63, 66
 _TABLE_HALF = (0.315, 0.255)  # m
 _TABLE_THICKNESS = 0.04  # m
 _FINGER_LENGTH = 0.07  # m
+_ENLARGED = 3  # times, by the camera "wrist"
 _SHADOW = (0.35, -0.22)  # m, shadow offset along x and y per m of height
 
 
@@ -90,10 +91,14 @@ class TabletopRenderer:
         self._shade(image, self._puck_shadow, puck.x, puck.y, puck.z + PUCK_HEIGHT / 3)
         self._blend(image, self._pucks[puck.colour], puck.x, puck.y, puck.z)
 
-    def _blend(self, image: np.ndarray, sprite: Sprite, x: float, y: float, z: float) -> None:
+    def _pixel(self, x: float, y: float, z: float) -> tuple[int, int]:
+        """Return the column and the row of a point of the base frame."""
         u = self._centre[0] + self._scale * x
         v = self._centre[1] - self._scale * (y * self._up + z * self._deep)
-        sprite.blend(image, round(u), round(v))
+        return round(u), round(v)
+
+    def _blend(self, image: np.ndarray, sprite: Sprite, x: float, y: float, z: float) -> None:
+        sprite.blend(image, *self._pixel(x, y, z))
 
     def _shade(self, image: np.ndarray, shadow: Sprite, x: float, y: float, height: float) -> None:
         self._blend(image, shadow, x + _SHADOW[0] * height, y + _SHADOW[1] * height, 0.0)
@@ -175,6 +180,20 @@ class TabletopRenderer:
         canvas.paint(_WRIST, canvas.ellipse(0, above - rise, wrist, wrist * self._up))
         canvas.paint((176, 178, 182), canvas.ellipse(0, above - rise, wrist * 0.55, wrist * 0.55 * self._up))
         return canvas.sprite()
+
+
+class WristRenderer(TabletopRenderer):
+    """A renderer of what is around the gripper: a third of what `TabletopRenderer` shows, enlarged."""
+
+    def __init__(self, width: int, height: int) -> None:
+        super().__init__(_ENLARGED * width, _ENLARGED * height)
+        self._rows, self._columns = np.arange(height) - height // 2, np.arange(width) - width // 2
+
+    def draw(self, world: TabletopWorld) -> np.ndarray:
+        image = super().draw(world)
+        u, v = self._pixel(world.x, world.y, world.z)
+        rows, columns = (self._rows + v).clip(0, len(image) - 1), (self._columns + u).clip(0, image.shape[1] - 1)
+        return image[rows[:, None], columns]
 
 
 FloatArray = np.ndarray  # (h, w) float32 throughout, in pixels or as a coverage in [0, 1]
