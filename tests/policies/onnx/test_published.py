@@ -17,7 +17,7 @@ from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.serve.python_env.create import install
 
 pytestmark = pytest.mark.integration  # downloads 20 MB
-PACKAGES = ("holosoma-inference==0.1.3", "silero-vad==6.2.3")  # both of the MIT or Apache licence
+PACKAGES = ("holosoma-inference==0.1.3", "silero-vad==6.2.3")
 STEPS, SESSIONS = 50, 32
 WALK = {  # an observation of holosoma's loco_g1_29dof, with the factors of its observation config as 1 / std
     "actions": 29,
