@@ -338,10 +338,10 @@ OPEN = "g (float[N, T] x) => (float[N, T] action) { action = Identity(x) }"
 @pytest.mark.parametrize(
     ("graph", "settings", "said"),
     [
-        (TWO, {"state": ["joints"]}, r"leave inputs open \['x', 'y', 'h'\]"),
-        (TWO, {"cameras": {"rgb": "front"}}, r"unknown ones \['rgb'\]"),
-        (TWO, {"recurrent": {"h": "c"}}, r"unknown ones \['c'\]"),
-        (TWO, {"state": ["joints"], "cameras": {"x": "front"}, "recurrent": {"x": "h_out"}}, r"inputs twice \['x'\]"),
+        (TWO, {"state": ["joints"]}, r"inputs without a source: \['x', 'y', 'h'\]"),
+        (TWO, {"cameras": {"rgb": "front"}}, r"unknown: \['rgb'\]"),
+        (TWO, {"recurrent": {"h": "c"}}, r"unknown: \['c'\]"),
+        (TWO, {"state": ["joints"], "cameras": {"x": "front"}, "recurrent": {"x": "h_out"}}, r"named twice: \['x'\]"),
         (
             SAME.format(4),
             {"cameras": {"x": "front"}},
@@ -360,7 +360,7 @@ OPEN = "g (float[N, T] x) => (float[N, T] action) { action = Identity(x) }"
         (
             TWO,
             {"state": ["a"], "inputs": {"y": {"state": ["b"]}, "h": {"constant": 0}}},
-            r"which of \['action', 'h_out'\] is the action",
+            r"one of them the action: \['action', 'h_out'\]",
         ),
         (
             SAME.format(4),
@@ -373,7 +373,11 @@ OPEN = "g (float[N, T] x) => (float[N, T] action) { action = Identity(x) }"
             "action: got lists of statistics .* want 4 numbers",
         ),
         (SAME.format(4), {"state": ["previous_output", "previous_output"]}, "previous_output has 4 numbers"),
+        (SAME.format(4), {"state": ["a"], "info": ["action"]}, r"one of them the action: \['none of the outputs'\]"),
         (SAME.format(4), {"state": ["a"], "contract": {"hz": 3}}, r"contract: .*unknown keys \['hz'\]"),
+        (SAME.format(4), {"state": ["a"], "inputs": {"x": {"std": {"b": 2}}}}, r"inputs: x: has no use of \['b'\]"),
+        (SAME.format(4), {"state": ["a"], "inputs": {"x": {"range": [0, 1]}}}, r"inputs: x: has no use of \['range'\]"),
+        (SAME.format(4), {"state": ["a"], "action": {"std": {"a": 2}}}, r"action: has no use of \['a'\]"),
         (NOISY, {"state": ["joints"]}, "draws noise, or keeps a state"),
         (OPEN, {"state": ["joints"]}, r"inputs: x: shape: got None, the file states \[-1, -1\], want all lengths"),
         (

@@ -91,7 +91,7 @@ def test_a_suite_of_the_interface_accepts_it(archives: Path) -> None:
     [
         ("explicit.pt", {"trust_checkpoint": False}, r"is a program, .* set trust_checkpoint: true"),
         ("explicit.pt", {"inputs": {"x": {"shape": [-1, 4]}}}, r"inputs: h: shape: got None, the file states none"),
-        ("explicit.pt", {"outputs": ["action"], "recurrent": {}}, r"leave inputs open \['x', 'h'\]"),
+        ("explicit.pt", {"outputs": ["action"], "recurrent": {}}, r"inputs without a source: \['x', 'h'\]"),
         ("explicit.pt", {"outputs": ["action", "h_out", "c"], "info": ["c"]}, "want names for the 2 results"),
         ("hidden.pt", {"outputs": ["action"], "recurrent": {}, "inputs": {"x": {"shape": [1, 4]}}}, "keeps a state"),
     ],

@@ -5,12 +5,13 @@ from __future__ import annotations
 from typing import Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, Field, model_validator
+from pydantic import BaseModel, Field, PrivateAttr, model_validator
 from typing_extensions import Self
 
 from vlagents_ray.policies.base import ModelConfig
 
 Numbers = float | list[float]
+SOURCES = ("state", "constant", "step", "noise", "instruction")  # fields of `Input`
 
 
 class Scaling(BaseModel, extra="forbid"):
@@ -23,6 +24,7 @@ class Scaling(BaseModel, extra="forbid"):
     min: Numbers | dict[str, Numbers] | None = Field(default=None, description="with `max`, becomes -1 in the model")
     max: Numbers | dict[str, Numbers] | None = Field(default=None, description="with `min`, becomes 1 in the model")
     clip: tuple[float, float] | None = Field(default=None, description="limits of the model's numbers")
+    _known: dict[str, tuple[Any, Any]] = PrivateAttr(default_factory=dict)  # mean and std by part
 
     @model_validator(mode="after")
     def _one_pair(self) -> Self:
@@ -33,9 +35,10 @@ class Scaling(BaseModel, extra="forbid"):
         return self
 
     @property
-    def by_part(self) -> bool:
-        """Whether parts of the state have their own statistics."""
-        return any(isinstance(one, dict) for one in (self.mean, self.std, self.min, self.max))
+    def parts(self) -> set[str]:
+        """The parts of the state that have their own statistics."""
+        named = (one for one in (self.mean, self.std, self.min, self.max) if isinstance(one, dict))
+        return {part for one in named for part in one}
 
     def normalized(self, values: np.ndarray, part: str = "") -> np.ndarray:
         """Return the robot's numbers, float32, as the model's; `part` is the name of the part of the state."""
@@ -54,10 +57,13 @@ class Scaling(BaseModel, extra="forbid"):
         def named(value: Any, usual: float) -> Any:
             return np.asarray(value.get(part, usual) if isinstance(value, dict) else value, np.float32)
 
-        if self.min is None:
-            return named(self.mean, 0.0), named(self.std, 1.0)
-        low, high = named(self.min, -1.0), named(self.max, 1.0)
-        return (high + low) / 2, (high - low) / 2
+        if part not in self._known:
+            if self.min is None:
+                self._known[part] = named(self.mean, 0.0), named(self.std, 1.0)
+            else:
+                low, high = named(self.min, -1.0), named(self.max, 1.0)
+                self._known[part] = (high + low) / 2, (high - low) / 2
+        return self._known[part]
 
 
 class Input(Scaling):
@@ -79,9 +85,7 @@ class Input(Scaling):
 
     @model_validator(mode="after")
     def _one_source(self) -> Self:
-        named = [
-            name for name in ("state", "constant", "step", "noise", "instruction") if getattr(self, name) is not None
-        ]
+        named = [name for name in SOURCES if getattr(self, name) is not None]
         if len(named) > 1:
             raise ValueError(f"got {named}, want one source of an input")
         return self

@@ -13,7 +13,7 @@ import numpy as np
 from vlagents_ray.contract import CameraSpec, Contract
 from vlagents_ray.errors import ConfigError, InvalidObservation, MalformedMessage
 from vlagents_ray.policies.base.model_inputs import needs_gripper, state_specs
-from vlagents_ray.policies.onnx.config import Input, OnnxConfig
+from vlagents_ray.policies.onnx.config import SOURCES, Input, OnnxConfig, Scaling
 from vlagents_ray.policies.onnx.graph import TOKENIZER, Arrays, OnnxGraph, TorchScript, first_line
 from vlagents_ray.registry import require
 
@@ -32,6 +32,7 @@ class Network:
         self.options = {name: config.inputs.get(name, Input()) for name in graph.inputs}
         self.vectors = {name: one.state for name, one in self.options.items() if one.state is not None}
         self._require_mapped()
+        self._require_used()
         self.constants = {name: self._constant(name) for name, one in self.options.items() if one.constant is not None}
         self.inputs = {name: one for name, one in graph.inputs.items() if name not in self.constants}
         self.tokenizer = self._tokenizer(path)
@@ -142,8 +143,7 @@ class Network:
     def _require_mapped(self) -> None:
         """Give the one input that nothing names the parts in `state`; raises `ConfigError` unless all are mapped."""
         config, inputs, outputs = self.config, self.graph.inputs, self.graph.outputs
-        sources = {"constant", "step", "noise", "instruction", "state"}
-        sourced = [name for name, one in config.inputs.items() if sources & one.model_fields_set]
+        sourced = [name for name, one in config.inputs.items() if one.model_fields_set & {*SOURCES}]
         named = [*self.cameras, *config.recurrent, *sourced]
         left = [name for name in inputs if name not in named] or ["state"] * (config.state is not None)
         if config.state is not None and len(left) == 1 and left[0] in inputs:
@@ -151,16 +151,35 @@ class Network:
         unknown = {*self.cameras, *config.inputs, *config.recurrent} - inputs.keys()
         of_others = {*config.recurrent.values(), *config.info}
         unknown |= {*of_others, *filter(None, [config.action.output])} - {*outputs}
-        twice = {name for name in named if named.count(name) > 1}
         free = [name for name in outputs if name not in of_others]
-        open_action = free if config.action.output is None and len(free) != 1 else []
-        if unknown or left or twice or open_action:
+        problems = {
+            "unknown": sorted(unknown),
+            "named twice": sorted({name for name in named if named.count(name) > 1}),
+            "inputs without a source": left,
+            "one of them the action": [] if config.action.output or len(free) == 1 else free or ["none of the outputs"],
+        }
+        said = "; ".join(f"{what}: {names}" for what, names in problems.items() if names)
+        if said:
             raise ConfigError(
                 f"the file has inputs {', '.join(f'{name} {one.shape}' for name, one in inputs.items())} and outputs "
-                f"{outputs}; the settings name unknown ones {sorted(unknown)}, name inputs twice {sorted(twice)}, "
-                f"leave inputs open {left}, and which of {open_action} is the action; name each input in `cameras`, "
-                f"`recurrent` or `inputs`, but for one, which has the parts in `state`, and that output in `action`"
+                f"{outputs}, which the settings do not fit, {said}; name each input in `cameras`, `recurrent` or "
+                f"`inputs`, but for one, which has the parts in `state`, and the output in `action`"
             )
+
+    def _require_used(self) -> None:
+        """Raise `ConfigError` for an option that its input does not use, and a part that it does not have."""
+        unused = {"action": self.config.action.parts}
+        for name, one in self.config.inputs.items():
+            usable = {"shape", *SOURCES}
+            if name in {*self.vectors, *self.cameras}:
+                usable |= {"history", *Scaling.model_fields}
+            if name in self.cameras:
+                raw = self.graph.inputs[name].dtype == np.uint8
+                usable = (usable - {*Scaling.model_fields} if raw else usable | {"range"}) | {"resize"}
+            unused[f"inputs: {name}"] = (one.model_fields_set - usable) | (one.parts - {*self.vectors.get(name, ())})
+        for where, names in unused.items():
+            if names:
+                raise ConfigError(f"{where}: has no use of {sorted(names)}; leave it out, or correct the name")
 
     def _constant(self, name: str) -> np.ndarray:
         tensor, value = self.graph.inputs[name], self.options[name].constant
@@ -231,8 +250,8 @@ class Network:
 
 
 def _close(found: Arrays, wanted: Arrays) -> bool:
-    return all(
-        found[name].shape == one.shape
-        and np.abs(found[name] - one).max(initial=0) <= _TOLERANCE * (1 + np.abs(one).max(initial=0))
-        for name, one in wanted.items()
-    )
+    def close(one: np.ndarray, other: np.ndarray) -> bool:
+        largest = np.abs(other[np.isfinite(other)]).max(initial=1)
+        return one.shape == other.shape and np.allclose(one, other, rtol=0, atol=_TOLERANCE * largest, equal_nan=True)
+
+    return all(close(found[name], one) for name, one in wanted.items())

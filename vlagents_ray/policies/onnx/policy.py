@@ -36,7 +36,7 @@ class Onnx(ModelPolicy):
 
     @property
     def history(self) -> int:
-        return 1 if self.model is None else max(one.history for one in self.model.options.values())
+        return 1 if self.model is None else max((one.history for one in self.model.options.values()), default=1)
 
     @property
     def contract(self) -> Contract:
@@ -64,7 +64,7 @@ class Onnx(ModelPolicy):
             frame.values[name] = self._pixels(name, image)
         for name, parts in network.vectors.items():
             option, length = network.options[name], network.length(name)
-            if not option.by_part and PREVIOUS not in parts:
+            if not option.parts and PREVIOUS not in parts:
                 frame.values[name] = option.normalized(state_vector(obs, parts, length))
                 continue
             state_vector(obs, [part for part in parts if part != PREVIOUS], length)  # raises what does not fit
