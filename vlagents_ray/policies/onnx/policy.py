@@ -47,7 +47,7 @@ class Onnx(ModelPolicy):
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         info = super().reset(obs, instruction, **kwargs)
-        self._begun().prompt = self.model.texts(instruction or "")
+        self._begun().prompt = self.loaded().texts(instruction or "")
         return info
 
     def observe(self, obs: Obs) -> None:
