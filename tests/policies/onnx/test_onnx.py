@@ -16,6 +16,7 @@ from onnx.parser import parse_model
 from vlagents_ray import Act, Obs
 from vlagents_ray.contract import CameraSpec, StateSpec
 from vlagents_ray.errors import ConfigError, InvalidObservation
+from vlagents_ray.policies.base import accelerator
 from vlagents_ray.policies.base.checkpoint import used_checkpoints
 from vlagents_ray.policies.base.model_inputs import resize_with_pad
 from vlagents_ray.policies.onnx import Onnx
@@ -258,6 +259,17 @@ def test_a_history_begins_with_the_first_observation_again(tmp_path: Path) -> No
     assert [act.action[0, ::2].tolist() for act in found] == [[0, 0, 0], [0, 0, 1], [0, 1, 2], [1, 2, 3]]
 
 
+def test_a_history_has_the_previous_output_of_each_observation(tmp_path: Path) -> None:
+    graph = """g (float[N, 2, 2] x) => (float[N, 1] action) {
+        flat = Flatten(x)
+        axes = Constant <value_ints = [1]> ()
+        action = ReduceSum(flat, axes)
+    }"""
+    policy = loaded(exported(tmp_path, graph), state=["speed", "previous_output"], inputs={"x": {"history": 2}})
+    found = acts(policy, [of(speed=1)] * 4)
+    assert [float(act.action[0, 0]) for act in found] == [2, 1 + 0 + 1 + 2, 1 + 2 + 1 + 4, 1 + 4 + 1 + 8]
+
+
 def test_a_chunk_of_actions_is_one_act(tmp_path: Path) -> None:
     graph = """g (float[N, 6] x) => (float[N, 3, 2] action) {
         shape = Constant <value_ints = [-1, 3, 2]> ()
@@ -431,6 +443,38 @@ def test_a_device_that_the_runtime_lacks_is_an_error_with_its_cure(
     with pytest.raises(ConfigError, match=r"or set device: cpu with resources: \{num_gpus: 0\}"):
         loaded(recurrent, **MEMORY)
     assert action(loaded(recurrent, **MEMORY, device="cpu"), vectors(1)[0]).shape == (3,)
+
+
+@pytest.fixture
+def cuda(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """A runtime that claims to have CUDA; `providers` are those it was started with, and `started` what runs then."""
+    real, found = onnxruntime.InferenceSession, {"started": ["CUDAExecutionProvider"]}
+
+    def session(path: str, options: Any, providers: Any) -> Any:
+        found["providers"] = providers
+        computing = real(path, options, providers=["CPUExecutionProvider"])
+        computing.get_providers = lambda: found["started"]
+        return computing
+
+    monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: ["CUDAExecutionProvider"])
+    monkeypatch.setattr(onnxruntime, "InferenceSession", session)
+    monkeypatch.setattr(accelerator, "driver_version", lambda: "580.65.06")
+    return found
+
+
+def test_a_gpu_is_used_where_there_is_one_with_the_precision_that_is_set(recurrent: Path, cuda: dict[str, Any]) -> None:
+    policy = loaded(recurrent, **MEMORY, max_rows=4)
+    assert cuda["providers"] == [("CUDAExecutionProvider", {"device_id": "0", "use_tf32": "1"})]
+    assert (policy.report.accelerated, set(policy.report.pass_s)) == (True, {1, 4})
+    assert action(policy, vectors(1)[0]).shape == (3,)
+    loaded(recurrent, **MEMORY, device="cuda:1", matmul="highest")
+    assert cuda["providers"] == [("CUDAExecutionProvider", {"device_id": "1", "use_tf32": "0"})]
+
+
+def test_a_gpu_that_does_not_start_is_not_replaced_by_the_cpu(recurrent: Path, cuda: dict[str, Any]) -> None:
+    cuda["started"] = ["CPUExecutionProvider"]
+    with pytest.raises(ConfigError, match=r"CUDAExecutionProvider did not start, .* set device: cpu"):
+        loaded(recurrent, **MEMORY)
 
 
 def large(folder: Path, location: str) -> Path:
