@@ -112,14 +112,14 @@ class Onnx(ModelPolicy):
         for name, tensor in network.inputs.items():
             option = network.options[name]
             if name in self.config.recurrent:
-                feed[name] = row.memory[_RECURRENT][name] if _RECURRENT in row.memory else tensor.zeros()
+                value = row.memory.get(_RECURRENT, {}).get(name, tensor.zeros())
             elif option.step is not None:
-                feed[name] = np.full(tensor.row, option.step + row.memory.get(_STEP, 0), tensor.dtype)
+                value = np.full(tensor.row, option.step + row.memory.get(_STEP, 0))
             elif option.noise:
-                feed[name] = row.noise(*tensor.row).astype(tensor.dtype, copy=False)
+                value = row.noise(*tensor.row)
             else:
-                seen = np.stack([frame.values[name] for frame in row.history(option.history)])
-                feed[name] = seen.astype(tensor.dtype, copy=False).reshape(tensor.row)
+                value = np.stack([frame.values[name] for frame in row.history(option.history)]).reshape(tensor.row)
+            feed[name] = value.astype(tensor.dtype, copy=False)
         return feed
 
     def _pixels(self, name: str, image: np.ndarray) -> np.ndarray:
