@@ -62,8 +62,9 @@ def test_a_simulators_environment_is_for_the_workers_and_a_policys_for_its_deplo
 
 
 @pytest.mark.usefixtures("nothing_installed")
-def test_a_missing_simulator_is_cured_by_its_extra() -> None:
+def test_a_missing_simulator_or_runtime_is_cured_by_its_extra() -> None:
     assert cure("mani_skill.envs") == "pip install 'vlagents-ray[maniskill]'"
+    assert cure("onnxruntime") == "pip install 'vlagents-ray[onnx]'"
 
 
 @pytest.mark.usefixtures("nothing_installed")

@@ -33,7 +33,7 @@ def test_what_is_noted_is_of_tests_that_there_are(family: str) -> None:
 
 
 def test_each_family_with_a_page_is_listed() -> None:
-    no_families = {page_of(name, one) for name, one in POLICIES.items() if not one.needs} | {"index"}
+    no_families = {page_of(name, one) for name, one in POLICIES.items() if not one.requirements} | {"index"}
     assert set(verified.RUN_WITH) == {page.stem for page in verified.PAGES.glob("*.md")} - no_families
 
 

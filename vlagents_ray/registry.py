@@ -101,6 +101,13 @@ POLICIES: dict[str, Adapter] = {
         requirements=("hf",),
         checkouts=("VJEPA2_SRC",),
     ),
+    "onnx": Adapter(
+        "vlagents_ray.policies.onnx:Onnx",
+        "any exported policy, an ONNX file or a TorchScript archive; recurrent ones too",
+        needs=("onnxruntime",),
+        extra="onnx",
+        wants="`'.[onnx]'`",
+    ),
     "upstream": Adapter(
         "vlagents_ray.policies.upstream:Upstream",
         "any model behind a server of openpi, RoboArena, GR00T, OpenVLA, vla-eval or vlagents",
@@ -264,9 +271,9 @@ _BROUGHT = {"torchvision": "torch", "tokenizers": "transformers", "safetensors":
 
 
 def families() -> Iterator[tuple[str, Adapter]]:
-    """Yield the policies that need packages, with their names."""
+    """Yield the policies that need a Python environment of their own, with their names."""
     for name, one in POLICIES.items():
-        if one.needs:
+        if one.requirements:
             yield name, one
 
 
@@ -292,7 +299,8 @@ def require(module: str, *, extra: str | None = None) -> ModuleType:
 def _install(package: str, extra: str | None = None) -> str:
     """Return how to install an optional package, as the end of an error message."""
     simulators = [one for one in ENVS.values() if package in one.needs]
-    extra = extra or _EXTRAS.get(package) or next((one.extra for one in simulators if one.extra), None)
+    adapters = (one for one in (*simulators, *POLICIES.values()) if package in one.needs)
+    extra = extra or _EXTRAS.get(package) or next((one.extra for one in adapters if one.extra), None)
     if extra:
         return f"pip install 'vlagents-ray[{extra}]'"
     if simulators:

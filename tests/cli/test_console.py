@@ -105,6 +105,7 @@ def test_what_installs_the_rest_is_said_once_for_all_that_want_it(
     assert "  vlagents-ray env make requirements/openvla.txt  # openvla, openvla_oft" in rest
     assert "  export VJEPA2_SRC=FOLDER  # a checkout, for vjepa2_ac" in rest
     assert not any("OPENVLA" in line for line in rest)
+    assert "  onnx: not in this environment (onnxruntime): pip install 'vlagents-ray[onnx]'" in rest
 
 
 def test_of_one_policy_all_is_said(shown: io.StringIO, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -133,7 +133,8 @@ def run(block: Block, cwd: Path, host: str = DOCUMENTED_HOST, *, page: str = "RE
     if block.file is not None:
         (cwd / block.file).write_text(source.lstrip())
         return
-    script = cwd / f"{page}.{'py' if block.language in PYTHON else 'sh'}"
+    # not onnx.py, which would hide the package
+    script = cwd / f"{page}_page.{'py' if block.language in PYTHON else 'sh'}"
     env = ENV | {"PATH": f"{_BIN}{os.pathsep}{ENV['PATH']}", "HOME": str(cwd)}
     script.write_text(source)
     python = str(peers_python()) if block.peers else sys.executable

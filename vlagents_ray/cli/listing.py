@@ -13,7 +13,7 @@ from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
 from vlagents_ray.errors import MissingDependency, VLAgentsError
-from vlagents_ray.registry import env_class, families, names, policy_class, wrapper_class
+from vlagents_ray.registry import POLICIES, env_class, families, names, policy_class, wrapper_class
 
 if TYPE_CHECKING:
     from ray.serve.schema import ServeDeploySchema
@@ -96,6 +96,9 @@ def require_packages(config: ServeDeploySchema) -> None:
 
 def missing_packages(name: str, *, checkout: bool = True) -> str | None:
     """Return the packages that a model family lacks in this environment, with the cure; None if it lacks none."""
+    one = POLICIES.get(name)
+    if one is not None and one.extra and not all(map(importlib.util.find_spec, one.needs)):
+        return f"not in this environment ({', '.join(one.needs)}): pip install 'vlagents-ray[{one.extra}]'"
     modules, sources, requirements = _lacking(name)
     if not modules and not (sources and checkout):
         return None

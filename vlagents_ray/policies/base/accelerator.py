@@ -137,9 +137,34 @@ def jax_device(name: str = "auto") -> Any:
     return device
 
 
+def onnx_provider(name: str, matmul: Matmul) -> tuple[str, dict[str, str]]:
+    """Return the provider of ONNX Runtime for a device, and its settings; "auto" as in `torch_device`.
+
+    Raises `ConfigError` for a device that this ONNX Runtime was not built for.
+    """
+    runtime = require("onnxruntime")
+    kind, _, index = name.partition(":")
+    cuda = "CUDAExecutionProvider"
+    there = cuda in runtime.get_available_providers()
+    if name == "auto":
+        kind = "cuda" if (there and driver_version()) or _given_gpus() else "cpu"
+    if kind == "cpu":
+        report_device({"kind": "cpu", "device": "cpu", "onnxruntime": runtime.__version__})
+        return "CPUExecutionProvider", {}
+    if kind != "cuda" or not there:
+        raise ConfigError(
+            f"device {name!r}: this onnxruntime offers {runtime.get_available_providers()}; replace it by "
+            f"`pip uninstall onnxruntime && pip install onnxruntime-gpu`, or set device: cpu with "
+            f"resources: {{num_gpus: 0}}"
+        )
+    device = {"kind": "cuda", "device": f"cuda:{index or 0}", "onnxruntime": runtime.__version__, "matmul": matmul}
+    report_device(device)
+    return cuda, {"device_id": index or "0", "use_tf32": str(int(matmul == "high"))}
+
+
 def set_matmul(precision: Matmul, device: dict[str, Any]) -> None:
     """Set, and add to the description of a GPU, the precision of float32 products and convolutions of this process."""
-    if device["kind"] == "cpu":
+    if device["kind"] == "cpu" or "onnxruntime" in device:
         return
     if "jax" in device:
         named = {"high": "tensorfloat32", "highest": "float32"}[precision]
