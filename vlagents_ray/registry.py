@@ -108,6 +108,11 @@ POLICIES: dict[str, Adapter] = {
         extra="onnx",
         wants="`'.[onnx]'`",
     ),
+    "reference": Adapter(
+        "vlagents_ray.policies.reference:Reference",
+        "the reference policy: 4 million parameters, two cameras and words; trained on two cores",
+        wants="torch",
+    ),
     "upstream": Adapter(
         "vlagents_ray.policies.upstream:Upstream",
         "any model behind a server of openpi, RoboArena, GR00T, OpenVLA, vla-eval or vlagents",

@@ -199,7 +199,10 @@ def write_values(file: BinaryIO, named: Mapping[str, np.ndarray]) -> None:
 def read_values(file: BinaryIO) -> Mapping[str, np.ndarray]:
     """Return the values of a file, read-only, as `write_values` wrote them; raises `MalformedMessage`."""
     length = file.read(_LENGTH.size)
-    reader = ValuesReader(read_header(length + file.read(*_LENGTH.unpack(length))))
+    announced = _LENGTH.unpack(length)[0] if len(length) == _LENGTH.size else 0
+    reader = ValuesReader(read_header(length + file.read(min(announced, MESSAGE_BYTES))))
     while part := file.read(PART_BYTES):
         reader.add(part)
+    if reader.received != reader.size:
+        raise MalformedMessage(f"safetensors: got {reader.received} bytes of values, the header announced {reader.size}")
     return reader.values()

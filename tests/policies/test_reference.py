@@ -1,0 +1,223 @@
+"""The reference policy with random weights: what holds whatever it has learnt."""
+
+from __future__ import annotations
+
+import copy
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from counting_compiler import counting_compiler
+from normal_steps import logprob_of_steps
+from pushed_weights import check_pushed_weights
+from shared_readings import check_shared_readings
+
+from vlagents_ray import Act, Obs
+from vlagents_ray.errors import ConfigError, InvalidObservation, MissingCamera
+from vlagents_ray.interface import BEHAVIOUR, DELAY, DISTRIBUTION, LEFTOVER, SAMPLES, WANT
+from vlagents_ray.policies.adapters import CONFIG as ADAPTER_CONFIG
+from vlagents_ray.policies.adapters import WEIGHTS as ADAPTER_WEIGHTS
+from vlagents_ray.policies.flow import logprob_of_chain
+from vlagents_ray.testing import check_agent
+from vlagents_ray.weights.safetensors import write_values
+
+torch = pytest.importorskip("torch")
+pytestmark = pytest.mark.torch
+
+reference = pytest.importorskip("vlagents_ray.policies.reference")
+Reference = reference.Reference
+
+WORDS = ("put the red puck on the blue pad", "lift the blue puck", "open the drawer")
+ROBOTS = {
+    "tabletop": reference.Embodiment(
+        cameras={"scene": "front", "wrist": "wrist"}, state=["xyzrpy", "gripper"], state_mean=[0.0] * 7,
+        state_std=[0.1] * 6 + [0.0], action={"dim": 4, "space": "ee_position", "delta": True},
+    ),
+    "sawyer": reference.Embodiment(
+        cameras={"scene": "corner2", "wrist": "gripperPOV"}, state=["xyz", "gripper"], state_mean=[0.0] * 4,
+        state_std=[0.1] * 4, action={"dim": 4, "space": "ee_position", "delta": True}, execute=3,
+    ),
+}  # fmt: skip
+ALL = ["logprob", "entropy", "replay"]
+LEVEL = 0.5
+BATCHED = 1e-5  # how far a batch's actions may be off those of a lone row, in float32 on a CPU
+SUMMED = 2e-3  # how far a sum of 5 log-probabilities may be off, in float32
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path: Path = tmp_path_factory.mktemp("reference")
+    words = sorted({word for text in WORDS for word in reference.words_of(text)})
+    sizes = reference.NetworkSizes(words=len(words), width=32, head=32, queries=4, blocks=1, token_width=16)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        network = reference.ReferenceNetwork(sizes)
+    checkpoint = reference.Checkpoint(sizes=sizes, words=words, embodiments=ROBOTS)
+    (path / reference.CONFIG).write_text(checkpoint.model_dump_json())
+    with (path / reference.WEIGHTS).open("wb") as file:
+        write_values(file, {name: value.numpy() for name, value in network.state_dict().items()})
+    return path
+
+
+def made(folder: Path, **config: Any) -> Any:
+    policy = Reference.from_config({"checkpoint": str(folder), "embodiment": "tabletop", **config})
+    policy.initialize()
+    return policy
+
+
+@pytest.fixture(scope="module")
+def loaded(folder: Path) -> Any:
+    return made(folder)
+
+
+@pytest.fixture(scope="module")
+def learnt(folder: Path) -> Any:
+    return made(folder, noise_level=LEVEL)
+
+
+def seen(seed: int, side: tuple[int, int] = (64, 64), **info: Any) -> Obs:
+    rng = np.random.default_rng(seed)
+    cameras = {name: rng.integers(0, 256, (*side, 3), dtype=np.uint8) for name in ("front", "wrist")}
+    return Obs(cameras, float(rng.random()), {"xyzrpy": rng.normal(0, 0.1, 6).astype(np.float32)}, info)
+
+
+def begun(policy: Any, seed: int, words: str = WORDS[0], **options: Any) -> Any:
+    session = copy.copy(policy)
+    session.reset(seen(seed), words, seed=seed, **options)
+    return session
+
+
+def acted(policy: Any, views: Sequence[Obs], **options: Any) -> list[np.ndarray]:
+    acts = policy.act_batch(views, [begun(policy, i, **options) for i in range(len(views))])
+    assert all(isinstance(act, Act) for act in acts)
+    return [act.action for act in acts]
+
+
+def test_it_keeps_what_an_agent_promises(folder: Path) -> None:
+    views = [seen(0), seen(1, (120, 60)), seen(2)]
+    config = {"checkpoint": str(folder), "embodiment": "tabletop"}
+    check_agent(Reference.from_config(config), obs=views, instructions=WORDS[:2])
+
+
+def test_each_robot_has_its_own_contract(folder: Path, loaded: Any) -> None:
+    contract = loaded.contract
+    assert (set(contract.cameras), set(contract.state), contract.gripper) == ({"front", "wrist"}, {"xyzrpy"}, True)
+    assert (contract.action.dim, contract.chunk, contract.instruction) == (4, 8, True)
+    other = made(folder, embodiment="sawyer").contract
+    assert (set(other.cameras), set(other.state), other.chunk) == ({"corner2", "gripperPOV"}, {"xyz"}, 3)
+    with pytest.raises(ConfigError, match=r"got None, want one of \['sawyer', 'tabletop'\]"):
+        made(folder, embodiment=None)
+
+
+@pytest.mark.parametrize("size", [2, 5])
+def test_neighbours_change_nothing(loaded: Any, size: int) -> None:
+    alone = [begun(loaded, i).act(seen(i)).action for i in range(size)]
+    np.testing.assert_allclose(acted(loaded, [seen(i) for i in range(size)]), alone, atol=BATCHED)
+
+
+def test_images_state_words_and_their_order_all_matter(loaded: Any) -> None:
+    def of(obs: Obs, words: str = WORDS[0]) -> np.ndarray:
+        return begun(loaded, 0, words).act(obs).action  # type: ignore[no-any-return]
+
+    base, other = seen(0), seen(1)
+    changed = [
+        of(base, "put the blue puck on the red pad"),
+        of(base, WORDS[1]),
+        of(Obs(base.cameras, base.gripper, other.state)),
+        of(Obs({**base.cameras, "front": other.cameras["front"]}, base.gripper, base.state)),
+        of(Obs({**base.cameras, "wrist": other.cameras["wrist"]}, base.gripper, base.state)),
+    ]
+    assert min(np.abs(actions - of(base)).max() for actions in changed) > 5 * BATCHED
+
+
+def test_what_it_was_not_trained_with_is_refused(loaded: Any) -> None:
+    for words, said in (("lift the pink puck", "got 'pink' in"), ("puck " * 17, "got 17 words, want 1 to 16")):
+        with pytest.raises(InvalidObservation, match=said):
+            begun(loaded, 0, words)
+    with pytest.raises(MissingCamera, match="wrist"):
+        begun(loaded, 0).act(Obs({"front": seen(0).cameras["front"]}, 0.5, seen(0).state))
+
+
+def test_a_checkpoint_that_is_damaged_is_refused(folder: Path, tmp_path: Path) -> None:
+    for name in (reference.CONFIG, reference.WEIGHTS):
+        (tmp_path / name).write_bytes((folder / name).read_bytes())
+    whole = (folder / reference.WEIGHTS).read_bytes()
+    (tmp_path / reference.WEIGHTS).write_bytes(whole[:-5])
+    with pytest.raises(ConfigError, match=r"model.safetensors"):
+        made(tmp_path)
+    (tmp_path / reference.WEIGHTS).write_bytes(whole)
+    stated = json.loads((folder / reference.CONFIG).read_text())
+    (tmp_path / reference.CONFIG).write_text(json.dumps(stated | {"sizes": {**stated["sizes"], "head": 64}}))
+    with pytest.raises(ConfigError, match=r"model.safetensors: cannot be read: .*size mismatch"):
+        made(tmp_path)
+    (tmp_path / reference.CONFIG).write_text("{}")
+    with pytest.raises(ConfigError, match="is no checkpoint of the reference policy"):
+        made(tmp_path)
+
+
+def test_frozen_rows_come_back_as_planned_and_later_ones_follow_the_plan(loaded: Any) -> None:
+    plan, free = begun(loaded, 1).act(seen(1)).action[2:], begun(loaded, 0).act(seen(0)).action
+    guided = begun(loaded, 0).act(seen(0, **{LEFTOVER: plan, DELAY: 3})).action
+    np.testing.assert_allclose(guided[:3], plan[:3], atol=1e-5)
+    off, without = np.abs(guided[: len(plan)] - plan).mean(1), np.abs(free[: len(plan)] - plan).mean(1)
+    assert (off[3:] < without[3:]).all()
+
+
+def test_the_log_probability_is_the_one_that_a_learner_computes(learnt: Any) -> None:
+    views, sessions = [seen(i, **{WANT: ALL, SAMPLES: 2}) for i in range(2)], [begun(learnt, i) for i in range(2)]
+    rows = []
+    for session, obs in zip(sessions, views, strict=True):
+        frame = session.perceive(obs)
+        rows.append(reference.Row((frame,), WORDS[0], np.random.default_rng(0)))
+    inputs = {name: value.clone() for name, value in learnt._inputs(rows).items()}
+    acts = learnt.act_batch(views, sessions)
+    said = [act.info[BEHAVIOUR] for act in acts]
+    chains = torch.from_numpy(np.stack([one["replay"]["chain"] for one in said]))
+    with torch.no_grad():
+        velocity = reference.flow_velocity(learnt.model.network, inputs)
+        again = logprob_of_chain(velocity, chains, LEVEL)
+        first = reference.flow_velocity(learnt.model.network, {name: value[:1] for name, value in inputs.items()})
+        total = logprob_of_steps(first, said[0]["replay"]["chain"], LEVEL)
+    np.testing.assert_allclose(again, np.stack([one["logprob"] for one in said]), atol=SUMMED)
+    np.testing.assert_allclose(said[0]["logprob"], total, atol=SUMMED)
+    assert acts[0].info[DISTRIBUTION]["logprob"].shape == (2, 8, 4)
+
+
+def test_the_samples_of_an_observation_are_of_one_reading_of_it(learnt: Any) -> None:
+    check_shared_readings(learnt, [seen(0, **{SAMPLES: 4, WANT: ALL}), seen(1)], begun, reference, BATCHED)
+
+
+def test_compiled_in_bfloat16_and_with_pushed_weights_it_stays_itself(folder: Path, loaded: Any) -> None:
+    views = [seen(i) for i in range(3)]
+    with counting_compiler() as compiler:
+        compiled = made(folder, compile="require", batch_sizes=[3])
+        assert compiler.rows == [3, 3]  # what is seen, and one step of the flow
+        np.testing.assert_allclose(acted(compiled, views), acted(loaded, views), atol=BATCHED)
+        assert compiler.calls > 0
+    np.testing.assert_allclose(acted(made(folder, dtype="bfloat16"), views), acted(loaded, views), atol=0.1)
+    policy = made(folder)
+    check_pushed_weights(policy, lambda: begun(policy, 0).act(seen(0)).action)
+
+
+def test_a_row_with_an_adapter_acts_as_the_adapter_merged(folder: Path, tmp_path: Path, loaded: Any) -> None:
+    rng, layer = np.random.default_rng(0), "context"
+    weight = loaded.model.network.state_dict()[f"{layer}.weight"]
+    low, high = (rng.normal(0, 0.1, shape).astype(np.float32) for shape in ((2, weight.shape[1]), (weight.shape[0], 2)))
+    own = tmp_path / "adapter"
+    own.mkdir()
+    settings = {"peft_type": "LORA", "r": 2, "lora_alpha": 2, "target_modules": [layer]}
+    (own / ADAPTER_CONFIG).write_text(json.dumps({**settings, "base_model_name_or_path": str(folder)}))
+    with (own / ADAPTER_WEIGHTS).open("wb") as file:
+        write_values(file, {f"base_model.model.{layer}.lora_{name}.weight": value for name, value in
+                            (("A", low), ("B", high))})  # fmt: skip
+    adapted, merged = made(folder, adapters={"own": str(own)}), made(folder)
+    with torch.no_grad():
+        merged.model.network.context.weight += torch.from_numpy(high @ low)
+    views = [seen(0), seen(1)]
+    sessions = [begun(adapted, 0, adapter="own"), begun(adapted, 1)]
+    acts = [act.action for act in adapted.act_batch(views, sessions)]
+    np.testing.assert_allclose(acts[0], acted(merged, views)[0], atol=BATCHED)
+    np.testing.assert_allclose(acts[1], acted(loaded, views)[1], atol=BATCHED)

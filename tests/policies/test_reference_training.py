@@ -1,0 +1,98 @@
+"""The training of the reference policy, from demonstrations that are recorded and exported by the usual commands."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from vlagents_ray.evaluate import EvalConfig, evaluate
+from vlagents_ray.evaluate.exports.lerobot import to_lerobot
+from vlagents_ray.evaluate.results.reader import Results
+from vlagents_ray.policies.scripted import Scripted
+
+torch = pytest.importorskip("torch")
+pytestmark = pytest.mark.torch
+
+ROOT = Path(__file__).parents[2]
+CAMERAS = {"tabletop": {"scene": "front", "wrist": "wrist"}}
+
+
+@pytest.fixture(scope="module")
+def train() -> Any:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(ROOT / "reference")
+        yield __import__("train")
+        sys.modules.pop("train")
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two episodes of each task and strength of disturbance, as in the folder's plan of demonstrations."""
+    folder = tmp_path_factory.mktemp("data")
+    plan = yaml.safe_load((ROOT / "reference/demonstrations/tabletop.yaml").read_text())
+    plan["suites"] = [suite | {"episodes": 2} for suite in plan["suites"]]
+    plan["policies"] = [{"name": "expert"}]
+    evaluate(EvalConfig(**plan | {"out": folder / "runs"}), agent_factory=Scripted, in_process=True)
+    to_lerobot(Results(folder / "runs"), folder / "tabletop", successes=True)
+    return folder
+
+
+def test_frames_are_those_that_were_recorded(train: Any, data: Path, tmp_path: Path) -> None:
+    checkpoint, frames = train.read(data, CAMERAS, tmp_path / "images")
+    assert set(checkpoint.words) > {"put", "slide", "stack", "lift", "puck", "pad"}
+    robot = checkpoint.embodiments["tabletop"]
+    assert (robot.state, robot.action["gripper_open"]) == (["xyzrpy", "gripper"], 1.0)
+    assert frames.images.shape == (len(frames.state), 2, 64, 64, 3)
+    assert frames.images[0, 0].std() > 10 < frames.images[0, 1].std()
+    assert frames.action.abs().max() <= 1
+    ends = frames.end.unique()
+    assert int(ends[-1]) == len(frames.state)
+    begins = torch.cat([torch.zeros(1, dtype=torch.int64), ends[:-1]])
+    assert (frames.state[begins] == frames.state[0]).all()  # each episode begins at the same place
+    assert frames.state.std(0)[:3].numpy() == pytest.approx(np.ones(3), abs=1e-2)
+
+
+def test_a_training_that_was_cut_off_and_a_second_one_end_with_the_same_weights(
+    train: Any, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(train, "BATCH", 16)
+    checkpoint, frames = train.read(data, CAMERAS, tmp_path / "images")
+    monkeypatch.setattr(train, "KEEP_EVERY", 3)
+    whole = train.fit(checkpoint, frames, 5, 0, tmp_path / "whole.pt")
+    other = train.fit(checkpoint, frames, 5, 1, tmp_path / "other.pt")
+
+    def cut(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(train.os, "replace", lambda part, kept: (Path(part).rename(kept), cut()))
+        train.fit(checkpoint, frames, 5, 0, tmp_path / "cut.pt")
+    again = train.fit(checkpoint, frames, 5, 0, tmp_path / "cut.pt")
+    for name, value in whole.state_dict().items():
+        assert torch.equal(again.state_dict()[name], value), name
+    assert not torch.equal(other.queries, whole.queries)
+
+
+def test_what_was_trained_is_served(train: Any, data: Path, tmp_path: Path) -> None:
+    from vlagents_ray.envs.tabletop import Tabletop
+    from vlagents_ray.policies.reference import Reference
+
+    checkpoint, frames = train.read(data, CAMERAS, tmp_path / "images")
+    monkeypatch = pytest.MonkeyPatch()
+    with monkeypatch.context() as patch:
+        patch.setattr(train, "BATCH", 32)
+        train.save(checkpoint, train.fit(checkpoint, frames, 2, 0, tmp_path / "state.pt"), tmp_path / "checkpoint")
+    policy = Reference.from_config({"checkpoint": str(tmp_path / "checkpoint"), "execute": 4})
+    policy.initialize()
+    env = Tabletop("stack", width=64, height=64, cameras=("front", "wrist"))
+    obs, _ = env.reset(seed=0)
+    policy.reset(obs, env.instruction, seed=0)
+    chunk = policy.act(obs).action
+    assert chunk.shape == (4, 4)
+    assert policy.contract.action == env.contract.action.__class__(**checkpoint.embodiments["tabletop"].action)
+    env.step(policy.act(obs))
