@@ -25,6 +25,7 @@ _BFLOAT16 = np.dtype("V2")
 _SHOWN = 5  # faults in a message
 _THREADS = 4  # threads that compute a fingerprint: numpy releases Python's lock
 _WORDS = 2**20  # 4-byte words of a value that are summed at once for a fingerprint; on a GPU that takes 40 MB
+_FACTOR = -7046029254386353131  # odd, of a fingerprint's sum before that of the next words
 _AT_ONCE = 2**24  # elements of a tensor for which operations on versions need further memory
 _KINDS = (("float", "bfloat"), ("int", "uint"), ("bool",), ("complex",))
 
@@ -326,23 +327,19 @@ def require_fit(held: Mapping[str, Any], pushed: Mapping[str, Any], *, partial: 
 def fingerprint(named: Mapping[str, Any]) -> str:
     """Return a digest of 32 hexadecimal characters over names, shapes, types and all bytes of values on any device.
 
-    It detects any accidental difference: on the device of each value, every word is multiplied by two odd numbers, which
-    depend on its place, and summed modulo 2**64. That is faster than a cryptographic digest, which would also need all
-    values of a GPU on the host.
+    It detects any accidental difference: each word is multiplied by two odd numbers, which depend on its place, and
+    summed modulo 2**64, on a GPU if the value is there. A cryptographic digest would need all values on the host, and
+    take a few seconds for a large model.
     """
-    found, keys, threads = (
-        hashlib.blake2b(digest_size=16),
-        dict[Any, Any](),
-        ThreadPoolExecutor(_THREADS, "fingerprint"),
-    )
-    with threads:
-        on_cpu = {name: threads.submit(_sums, value) for name, value in named.items() if not _is_on_gpu(value)}
-        # on this thread, and so on its stream; all are queued before the first one is waited for
-        on_gpu = {name: _sums_on_gpu(value, keys) for name, value in named.items() if name not in on_cpu}
-        for name in sorted(named):
-            sums = on_cpu[name].result() if name in on_cpu else on_gpu[name].cpu().numpy()
-            found.update(f"{name} {dtype_name(named[name])} {tuple(named[name].shape)}\n".encode())
-            found.update(sums.tobytes())
+    found = hashlib.blake2b(digest_size=16)
+    on_gpus = {name: value for name, value in named.items() if _is_tensor(value) and value.is_cuda}
+    others = [name for name in named if name not in on_gpus]
+    with ThreadPoolExecutor(_THREADS, "fingerprint") as threads:
+        sums = dict(zip(others, threads.map(_sums, (named[name] for name in others)), strict=True))
+    sums |= _sums_on_gpus(on_gpus)
+    for name in sorted(named):
+        found.update(f"{name} {dtype_name(named[name])} {tuple(named[name].shape)}\n".encode())
+        found.update(sums[name].tobytes())
     return found.hexdigest()
 
 
@@ -392,36 +389,41 @@ def _is_equal(new: Any, held: Any) -> bool:
     return all(bool((one == (converted(other, one) if moved else other)).all()) for one, other in parts)
 
 
-def _is_on_gpu(value: Any) -> bool:
-    return _is_tensor(value) and bool(value.is_cuda)
-
-
 @functools.cache
-def _keys(count: int = _WORDS) -> np.ndarray:
+def _keys(count: int) -> np.ndarray:
     """Return (2, count) odd int64 without a pattern, by the finalizer of splitmix64."""
-    with np.errstate(over="ignore"):
-        key = np.arange(1, 2 * count + 1, dtype=np.uint64) * np.uint64(0x9E3779B97F4A7C15)
-        key = (key ^ (key >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-        key = (key ^ (key >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    key = np.arange(1, 2 * count + 1, dtype=np.uint64) * np.uint64(0x9E3779B97F4A7C15)
+    for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
+        key = (key ^ (key >> np.uint64(shift))) * np.uint64(factor)
     return ((key ^ (key >> np.uint64(31))) | np.uint64(1)).view(np.int64).reshape(2, count)
 
 
 def _sums(value: Any) -> np.ndarray:
-    """Return two int64 for each part of a value of the host."""
+    """Return the two sums (2,) int64 of a value of the host."""
     data = np.ascontiguousarray(portable(value)).reshape(-1).view(np.uint8)
     words = (np.pad(data, (0, -len(data) % 4)) if len(data) % 4 else data).view(np.int32)
-    parts = (words[begin : begin + _WORDS].astype(np.int64) for begin in range(0, len(words), _WORDS))
-    return np.array([_keys()[:, : len(part)] @ part for part in parts], np.int64)
+    sums = np.zeros(2, np.int64)
+    for begin in range(0, len(words), _WORDS):
+        part = words[begin : begin + _WORDS].astype(np.int64)
+        sums = sums * _FACTOR + _keys(_WORDS)[:, : len(part)] @ part
+    return sums
 
 
-def _sums_on_gpu(value: Any, keys: dict[Any, Any]) -> Any:
-    """Return those of a tensor on a GPU, on that GPU; `keys` has `_keys` on each device."""
-    torch = sys.modules["torch"]
-    if value.device not in keys:
-        keys[value.device] = torch.from_numpy(_keys()).to(value.device)
-    data = value.detach().reshape(-1).contiguous().view(torch.uint8)
-    if len(data) % 4 or data.storage_offset() % 4:
-        data = torch.nn.functional.pad(data, (0, -len(data) % 4))
-    parts = data.view(torch.int32).split(_WORDS) if len(data) else ()
-    sums = [(keys[value.device][:, : len(part)] * part.to(torch.int64)).sum(1) for part in parts]
-    return torch.stack(sums) if sums else torch.empty(0, dtype=torch.int64)
+def _sums_on_gpus(named: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Return those of tensors on GPUs, computed there; nothing waits for a GPU before all is queued on it."""
+    torch, found = sys.modules.get("torch"), dict[str, np.ndarray]()
+    for device in {value.device for value in named.values()} if torch is not None else ():
+        values = {name: value.detach() for name, value in named.items() if value.device == device}
+        keys, rows = None, []
+        for value in values.values():
+            if keys is None:
+                keys = copy(torch.from_numpy(_keys(_WORDS)), value.new_empty((2, _WORDS), dtype=torch.int64))
+            data = value.reshape(-1).contiguous().view(torch.uint8)
+            if len(data) % 4 or data.storage_offset() % 4:
+                data = torch.nn.functional.pad(data, (0, -len(data) % 4))
+            sums = keys.new_zeros(2)
+            for part in data.view(torch.int32).split(_WORDS) if len(data) else ():
+                sums = sums * _FACTOR + (keys[:, : len(part)] * part.to(torch.int64)).sum(1)
+            rows.append(sums)
+        found.update(zip(values, on_host(torch.stack(rows)).numpy(), strict=True))
+    return found

@@ -9,7 +9,7 @@ conditions:
   that batch. It does not wait again for a session that was late before that session has returned in time once.
 - The wait is at most `patience` times the duration of the last batch. It is also at most the time that one batch saves
   over two: the fixed cost of a batch, estimated from the durations of the last batches.
-- No robot waits for simulations, the wait endangers no deadline, and the waiting requests do not fill the batch already.
+- No robot waits for simulations, the wait endangers no deadline, and the waiting requests do not fill the batch.
 
 Robots that act as soon as they are answered, such as those behind their rate, are split in the same way, and each of
 their acts then takes two batches. So they wait for one another for as long as one batch saves over two, at most half of
