@@ -45,6 +45,7 @@ class Plan:
     scratch: Path  # for checkpoints, compiled programs, and what steps leave for later ones
     dry: bool = False
     seconds: float = 570.0  # for all steps together
+    rows: tuple[int, ...] = (1, 4, 16)  # batch sizes that are compiled
 
     def checkpoint(self, family: str) -> dict[str, Any]:
         """Return the settings of a policy with the family's random checkpoint, which the step "checkpoint" wrote."""
@@ -68,7 +69,7 @@ class Lab:
 
     @contextlib.contextmanager
     def lines_of(self, thread: str, title: str) -> Iterator[None]:
-        """Show, also while this context runs, the lines of the package in which the threads of a name spend its time."""
+        """Show the lines of the package in which the threads of a name spend this context, also while it runs."""
         seen, over = Counter[str](), threading.Event()
 
         def look() -> None:

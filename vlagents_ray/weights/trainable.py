@@ -273,7 +273,8 @@ def accepted(held: Mapping[str, Any], pushed: Mapping[str, Any], *, partial: boo
     places = {name: memory_of(name, value) for name, value in held.items()}
     last = {places[name]: name for name in pushed}
     new = {place: converted(pushed[name], held[name]) for place, name in last.items()}
-    finite = {name: _is_finite(new[place]) for place, name in last.items()}  # on a GPU, before the first wait for one
+    finite = {name: _is_finite(new[place]) for place, name in last.items()}
+    finite |= _fetched({name: one for name, one in finite.items() if _is_tensor(one)})
     _refuse([f"{name!r}: got NaN or infinite values, want finite ones" for name, is_so in finite.items() if not is_so])
     return {name: new[place] for name, place in places.items() if place in new}
 
@@ -336,7 +337,8 @@ def fingerprint(named: Mapping[str, Any]) -> str:
     others = [name for name in named if name not in on_gpus]
     with ThreadPoolExecutor(_THREADS, "fingerprint") as threads:
         sums = dict(zip(others, threads.map(_sums, (named[name] for name in others)), strict=True))
-    sums |= _sums_on_gpus(on_gpus)
+    keys = dict[Any, Any]()
+    sums |= _fetched({name: _sums_on_gpu(value, keys) for name, value in on_gpus.items()})
     for name in sorted(named):
         found.update(f"{name} {dtype_name(named[name])} {tuple(named[name].shape)}\n".encode())
         found.update(sums[name].tobytes())
@@ -409,21 +411,24 @@ def _sums(value: Any) -> np.ndarray:
     return sums
 
 
-def _sums_on_gpus(named: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Return those of tensors on GPUs, computed there; nothing waits for a GPU before all is queued on it."""
-    torch, found = sys.modules.get("torch"), dict[str, np.ndarray]()
-    for device in {value.device for value in named.values()} if torch is not None else ():
-        values = {name: value.detach() for name, value in named.items() if value.device == device}
-        keys, rows = None, []
-        for value in values.values():
-            if keys is None:
-                keys = copy(torch.from_numpy(_keys(_WORDS)), value.new_empty((2, _WORDS), dtype=torch.int64))
-            data = value.reshape(-1).contiguous().view(torch.uint8)
-            if len(data) % 4 or data.storage_offset() % 4:
-                data = torch.nn.functional.pad(data, (0, -len(data) % 4))
-            sums = keys.new_zeros(2)
-            for part in data.view(torch.int32).split(_WORDS) if len(data) else ():
-                sums = sums * _FACTOR + (keys[:, : len(part)] * part.to(torch.int64)).sum(1)
-            rows.append(sums)
-        found.update(zip(values, on_host(torch.stack(rows)).numpy(), strict=True))
+def _sums_on_gpu(value: Any, keys: dict[Any, Any]) -> Any:
+    """Return those of a tensor on a GPU, as a tensor there; `keys` holds the result of `_keys` by device."""
+    torch, value = sys.modules["torch"], value.detach()
+    if value.device not in keys:
+        keys[value.device] = copy(torch.from_numpy(_keys(_WORDS)), value.new_empty((2, _WORDS), dtype=torch.int64))
+    data = value.reshape(-1).contiguous().view(torch.uint8)
+    if len(data) % 4 or data.storage_offset() % 4:
+        data = torch.nn.functional.pad(data, (0, -len(data) % 4))
+    sums = keys[value.device].new_zeros(2)
+    for part in data.view(torch.int32).split(_WORDS) if len(data) else ():
+        sums = sums * _FACTOR + (keys[value.device][:, : len(part)] * part.to(torch.int64)).sum(1)
+    return sums
+
+
+def _fetched(named: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Return small tensors of equal shapes as arrays: one copy from each device waits for all of them."""
+    found: dict[str, np.ndarray] = {}
+    for device in {value.device for value in named.values()}:
+        own = {name: value for name, value in named.items() if value.device == device}
+        found.update(zip(own, on_host(sys.modules["torch"].stack([*own.values()])).numpy(), strict=True))
     return found
