@@ -33,9 +33,11 @@ class NetworkTimer:
         """Time the cores of each policy that is loaded within this context."""
         mark = Compilation.core
 
-        def core(compilation: Compilation, *args: Any, parts: Sequence[Any] = (), **options: Any) -> Callable[..., Any]:
+        def core(
+            compilation: Compilation, name: str, function: Any, rows: int | None = None, parts: Sequence[Any] = ()
+        ) -> Callable[..., Any]:
             cores = [getattr(part, "untimed", part) for part in parts]
-            return self._timed(mark(compilation, *args, parts=cores, **options))
+            return self._timed(mark(compilation, name, function, rows, cores))
 
         Compilation.core = core  # type: ignore[method-assign, assignment]
         try:

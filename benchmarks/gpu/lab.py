@@ -68,8 +68,8 @@ class Lab:
             self._file.write_text(json.dumps(self.found, default=float))
 
     @contextlib.contextmanager
-    def lines_of(self, thread: str, title: str) -> Iterator[None]:
-        """Show the lines of the package in which the threads of a name spend this context, also while it runs."""
+    def lines_of(self, thread: str | tuple[str, ...], title: str) -> Iterator[None]:
+        """Show, also while this context runs, the lines of the package in which threads spend it, by their names."""
         seen, over = Counter[str](), threading.Event()
 
         def look() -> None:

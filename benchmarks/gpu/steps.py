@@ -226,9 +226,11 @@ def pushes(lab: Lab) -> None:
             fixed.ask("reset", instruction=INSTRUCTION, kwargs={"seed": 50, "weights": "follow"})
             return np.asarray(fixed.ask().act.action)  # type: ignore[union-attr]
 
+        threads = ("asyncio_", "MainThread")  # on which values are staged
+
         def pushed(way: str, push: Callable[[], object]) -> None:
             forget_peak()
-            with Acting([robot.ask for robot in robots]) as acting, lab.lines_of("asyncio_", f"push from {way}"):
+            with Acting([robot.ask for robot in robots]) as acting, lab.lines_of(threads, f"push from {way}"):
                 found = acting.during(push, 2 * len(robots))
             reserved = {} if lab.dry else {"reserved_mib": torch.cuda.memory_reserved() / 2**20}
             changed = not np.array_equal(act(), before)  # both alone, as batches of other sizes round differently

@@ -404,7 +404,7 @@ def _sums(value: Any) -> np.ndarray:
     """Return the two sums (2,) int64 of a value of the host."""
     data = np.ascontiguousarray(portable(value)).reshape(-1).view(np.uint8)
     words = (np.pad(data, (0, -len(data) % 4)) if len(data) % 4 else data).view(np.int32)
-    sums = np.zeros(2, np.int64)
+    sums: np.ndarray = np.zeros(2, np.int64)
     for begin in range(0, len(words), _WORDS):
         part = words[begin : begin + _WORDS].astype(np.int64)
         sums = sums * _FACTOR + _keys(_WORDS)[:, : len(part)] @ part
