@@ -27,7 +27,9 @@ from vlagents_ray.policies.compilation import Compilation
 from vlagents_ray.registry import require
 
 _SPARE_S = 15.0  # without which no step is started
-_STACKS_S = 3.0  # before the limit of a step, when the log gets the stacks of all its threads
+_STACKS_S = (
+    1.0  # before the limit of a step, when the log gets the stacks of all its threads, at which Python may crash
+)
 
 
 def _child(plan: Plan, name: str, run: Callable[[Lab], None], limit_s: float) -> None:
