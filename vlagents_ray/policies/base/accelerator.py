@@ -156,8 +156,8 @@ def set_matmul(precision: Matmul, device: dict[str, Any]) -> None:
 def fetch(tensor: Any) -> np.ndarray:
     """Return the values of a tensor as an array, after the work that computes them.
 
-    Meanwhile other threads can use the GPU, to prepare the next batch or to load weights. With `Tensor.cpu`, whose copy
-    is to pageable memory, each of their calls of CUDA waits for all of that work.
+    Meanwhile other threads should use the GPU, to prepare the next batch or to load weights. During `Tensor.cpu`, whose
+    copy is to pageable memory, each of their calls of CUDA waited for all of that work (torch 2.11, H200).
     """
     if tensor.device.type != "cuda":
         return np.asarray(tensor.cpu())
